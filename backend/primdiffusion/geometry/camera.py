@@ -1,0 +1,74 @@
+"""Pinhole cameras in the OpenCV convention: x right, y down, z forward, metres; pixel centres at +0.5."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from primdiffusion.geometry.records import TensorRecord
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera(TensorRecord):
+    """One view: `x_pixel ~ intrinsics @ (world_to_camera @ [x_world, 1])`."""
+
+    intrinsics: Float[Tensor, "3 3"]
+    """Focal lengths and principal point, pixels."""
+    world_to_camera: Float[Tensor, "3 4"]
+    """[R | t], metres."""
+    width: int
+    height: int
+
+    @property
+    def position(self) -> Float[Tensor, "3"]:
+        """The centre of projection in the world, -R^T t."""
+        return -self.world_to_camera[:, :3].T @ self.world_to_camera[:, 3]
+
+    def rays(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "height width 3"]]:
+        """The common origin and, for each pixel centre, a unit direction in the world (SPEC 4)."""
+        k = self.intrinsics
+        v, u = torch.meshgrid(
+            torch.arange(self.height, dtype=k.dtype, device=k.device) + 0.5,
+            torch.arange(self.width, dtype=k.dtype, device=k.device) + 0.5,
+            indexing="ij",
+        )
+        y = (v - k[1, 2]) / k[1, 1]
+        x = (u - k[0, 2] - k[0, 1] * y) / k[0, 0]
+        in_camera = torch.stack([x, y, torch.ones_like(x)], dim=-1)
+        in_world = in_camera @ self.world_to_camera[:, :3]
+        return self.position, torch.nn.functional.normalize(in_world, dim=-1)
+
+    def project(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 2"], Float[Tensor, "*b"]]:
+        """Pixel coordinates and depth along the optical axis; points behind the camera have depth <= 0."""
+        in_camera = points @ self.world_to_camera[:, :3].T + self.world_to_camera[:, 3]
+        depth = in_camera[..., 2]
+        homogeneous = in_camera @ self.intrinsics.T
+        return homogeneous[..., :2] / homogeneous[..., 2:], depth
+
+
+def look_at(
+    position: Float[Tensor, "3"],
+    target: Float[Tensor, "3"],
+    *,
+    vertical_fov: float,
+    width: int,
+    height: int,
+    up: tuple[float, float, float] = (0.0, 1.0, 0.0),
+) -> Camera:
+    """A camera at `position` that sees `target` in the middle of its picture; `vertical_fov` in radians, square pixels.
+
+    Raises ValueError where position and target coincide or the view runs along `up`.
+    """
+    forward = target - position
+    right = torch.linalg.cross(forward, torch.as_tensor(up, dtype=position.dtype, device=position.device))
+    if right.norm() < 1e-8 * max(1.0, float(forward.norm())):
+        raise ValueError(f"no camera looks from {position.tolist()} at {target.tolist()} with up {up}: move one of the points")
+    forward, right = torch.nn.functional.normalize(forward, dim=0), torch.nn.functional.normalize(right, dim=0)
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    focal = height / (2 * math.tan(vertical_fov / 2))
+    intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]).to(position)
+    return Camera(intrinsics, torch.cat([rotation, -(rotation @ position)[:, None]], dim=1), width, height)
