@@ -66,7 +66,9 @@ def look_at(
     forward = target - position
     right = torch.linalg.cross(forward, torch.as_tensor(up, dtype=position.dtype, device=position.device))
     if right.norm() < 1e-8 * max(1.0, float(forward.norm())):
-        raise ValueError(f"no camera looks from {position.tolist()} at {target.tolist()} with up {up}: move one of the points")
+        raise ValueError(
+            f"no camera looks from {position.tolist()} at {target.tolist()} with up {up}: move one of the points"
+        )
     forward, right = torch.nn.functional.normalize(forward, dim=0), torch.nn.functional.normalize(right, dim=0)
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
     focal = height / (2 * math.tan(vertical_fov / 2))

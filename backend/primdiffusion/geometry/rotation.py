@@ -29,7 +29,7 @@ def axis_angle_to_matrix(axis_angle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b
 def matrix_to_axis_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     """The logarithm of a rotation, angle in [0, pi]; exact near 0 and near pi. Not differentiable at pi.
 
-    Goes through the quaternion whose largest component is taken from the diagonal, so no branch divides by a small number.
+    Goes through the quaternion whose largest component comes from the diagonal, so no division by a small number.
     """
     m = rotation
     t = torch.stack(

@@ -52,7 +52,9 @@ class Payload(TensorRecord):
             if tuple(value.shape[-len(tail) :]) != tail:
                 raise ValueError(f"payload field {name!r} has shape {tuple(value.shape)}; it must end in {tail}")
             if not torch.isfinite(value).all():
-                raise ValueError(f"payload field {name!r} holds NaN or infinite values; generate or import the person again")
+                raise ValueError(
+                    f"payload field {name!r} holds NaN or infinite values; generate or import the person again"
+                )
         return self
 
 
