@@ -1,7 +1,7 @@
 """Textured, skinned triangle meshes in parts: what a dressed person is before it becomes primitives.
 
-Conventions: metres, y up, z forward. Texture row 0 is the image's top row and the texture coordinates' v points up, so the
-texel under (u, v) is column floor(u * W), row floor((1 - v) * H); coordinates outside [0, 1] wrap around.
+Conventions: metres, y up, z forward. Texture row 0 is the image's top row and the texture coordinates' v points up, so
+the texel under (u, v) is column floor(u * W), row floor((1 - v) * H); coordinates outside [0, 1] wrap around.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, UInt8
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TexturedPart:
-    """One mesh with one texture: a body, a garment, a pair of eyes. The arrays are shared between people: never write to them."""
+    """One mesh with one texture: a body, a garment, a pair of eyes. Its arrays may be shared: never write to them."""
 
     name: str
     """What it is, such as "body", "outfit", "hair"; names of parts are unique within a mesh."""
