@@ -1,0 +1,1 @@
+"""Pictures of textured meshes: the rasteriser, and what is measured on its pictures."""

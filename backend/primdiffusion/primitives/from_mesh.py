@@ -1,0 +1,152 @@
+"""From a textured mesh to the payload of primitives, without a network: what people to learn from are made of."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int32
+
+from primdiffusion.capture.mip import pyramid
+from primdiffusion.capture.soup import Soup, flatten
+from primdiffusion.geometry.textured_mesh import TexturedMesh
+from primdiffusion.primitives.primitives import Frames, Payload, S
+from primdiffusion.primitives.surface_points import carve, look_around, nearest, visible_points
+
+FULL_DENSITY = 100.0
+"""Opacity per metre of solid matter; one over this is the depth at which solid matter hides what is behind it."""
+RAMP = 0.020
+"""Depth below the surface at which density is full, metres. A ramp centred on the surface would fatten silhouettes."""
+REACH = 0.030
+"""Voxels farther than this from the surface have no colour of their own, metres."""
+MIP_LEVELS = 6
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SurfaceField:
+    """What of a mesh each voxel shows: everything but the colours, so recoloured meshes share it."""
+
+    density: Float32[np.ndarray, "k s s s"]
+    """1/m."""
+    part: Int32[np.ndarray, "k s s s"]
+    """Part that the nearest surface point belongs to, -1 out of reach."""
+    uv: Float32[np.ndarray, "k s s s 2"]
+    """Texture coordinates of that point, v up."""
+    footprint: Float32[np.ndarray, "k s s s"]
+    """Side of a voxel in texture coordinates there (1 = the whole texture)."""
+    own: Float32[np.ndarray, "k s s s"]
+    """Share of the voxel's own colour, the rest is the mean of its primitive; 1 at the surface, 0 out of reach."""
+
+
+def from_mesh(mesh: TexturedMesh, frames: Frames) -> Payload:
+    """The payload that makes primitives in `frames` look like `mesh`; `surface_field`, then `colour`.
+
+    Raises:
+        UnusableMesh, ValueError: as `surface_field`.
+    """
+    return colour(surface_field(mesh, frames), mesh)
+
+
+def surface_field(mesh: TexturedMesh, frames: Frames) -> SurfaceField:
+    """Density and nearest visible surface point for every voxel of `frames` (unbatched, in the pose of `mesh`).
+
+    The mesh is drawn from all sides but below. A voxel that some view sees past is outside; the others are solid, with
+    a density that rises from 0 at the surface to FULL_DENSITY at a depth of RAMP. Open sheets such as hair and skirts
+    need no inside of their own.
+
+    Raises:
+        UnusableMesh: the mesh is empty or not finite.
+        ValueError: the frames are batched or not finite.
+    """
+    soup = flatten(mesh)
+    centres, pitch = voxel_centres(frames)
+    views, drawn = look_around(soup)
+    points = visible_points(soup, views, drawn)
+    index, distance = nearest(points.position, centres.reshape(-1, 3), REACH)
+    behind = carve(centres.reshape(-1, 3), views, drawn)
+    depth = np.where(behind > 0, np.minimum(distance, REACH), 0)
+    density = FULL_DENSITY * np.clip(depth / RAMP, 0, 1)
+
+    within = index >= 0
+    point_uv, point_footprint = _texture_coordinates(soup, points.face, points.barycentric)
+    chosen = np.maximum(index, 0)
+    shape = centres.shape[:-1]
+    pitch = np.broadcast_to(pitch[:, None, None, None], shape).reshape(-1)
+    return SurfaceField(
+        density=density.reshape(shape).astype(np.float32),
+        part=np.where(within, soup.part[points.face[chosen]], -1).astype(np.int32).reshape(shape),
+        uv=point_uv[chosen].reshape(*shape, 2),
+        footprint=(point_footprint[chosen] * pitch).reshape(shape).astype(np.float32),
+        own=np.clip(2 - 2 * distance / REACH, 0, 1).reshape(shape).astype(np.float32),
+    )
+
+
+def colour(field: SurfaceField, mesh: TexturedMesh) -> Payload:
+    """The payload of `field` with the colours of `mesh`, which differs from the field's mesh only in its textures.
+
+    A voxel takes the mean of the texture over its footprint.
+    """
+    rgb = np.zeros((*field.part.shape, 3), np.float32)
+    for number, part in enumerate(mesh.parts):
+        where = field.part == number
+        if where.any():
+            rgb[where] = _sample(part.texture, field.uv[where], field.footprint[where])
+    weight = field.own[..., None] + np.float32(1e-6)
+    mean = (rgb * weight).sum((1, 2, 3), keepdims=True) / weight.sum((1, 2, 3), keepdims=True)
+    rgb = field.own[..., None] * rgb + (1 - field.own[..., None]) * mean
+    return Payload(
+        rgb=torch.from_numpy(np.ascontiguousarray(np.moveaxis(rgb, -1, 1))),
+        density=torch.from_numpy(field.density),
+        delta_scale=torch.ones(len(field.density), 3),
+    )
+
+
+def voxel_centres(frames: Frames) -> tuple[Float32[np.ndarray, "k s s s 3"], Float32[np.ndarray, "k"]]:
+    """World positions of the voxels in the order D, H, W, and their spacing along T and B (geometric mean), metres.
+
+    Raises:
+        ValueError: the frames are batched or not finite.
+    """
+    position, rotation, half_extent = (
+        field.detach().cpu().double().numpy() for field in (frames.position, frames.rotation, frames.half_extent)
+    )
+    if position.ndim != 2:
+        raise ValueError(f"frames.position has shape {position.shape}; give the frames of one body, [k, 3].")
+    if not all(np.isfinite(field).all() for field in (position, rotation, half_extent)):
+        raise ValueError("The frames hold NaN or infinite values; check the body they were attached to.")
+    local = np.linspace(-1, 1, S)
+    along = [rotation[:, None, :, axis] * (half_extent[:, axis, None] * local)[:, :, None] for axis in range(3)]
+    t, b, n = along
+    centres = position[:, None, None, None] + n[:, :, None, None] + b[:, None, :, None] + t[:, None, None, :]
+    pitch = 2 / (S - 1) * np.sqrt(half_extent[:, 0] * half_extent[:, 1])
+    return centres.astype(np.float32), pitch.astype(np.float32)
+
+
+def _texture_coordinates(soup: Soup, face: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Texture coordinates of surface points, and texture coordinates per metre there."""
+    uv = np.einsum("ni,nij->nj", barycentric, soup.corner_uv[face])
+    corners = soup.vertices[soup.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    sides = soup.corner_uv[:, 1:] - soup.corner_uv[:, :1]
+    uv_area = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
+    return uv.astype(np.float32), np.sqrt(uv_area / np.maximum(area, 1e-12))[face].astype(np.float32)
+
+
+def _sample(
+    texture: np.ndarray, uv: Float32[np.ndarray, "n 2"], footprint: Float32[np.ndarray, "n"]
+) -> Float32[np.ndarray, "n 3"]:
+    """Linear colour, from the halving of the texture whose texels are nearest in size to the footprint."""
+    levels = pyramid(texture, MIP_LEVELS)
+    texels = footprint * np.sqrt(texture.shape[0] * texture.shape[1])
+    level = np.clip(np.rint(np.log2(np.maximum(texels, 1e-6))), 0, len(levels) - 1).astype(np.int64)
+    u, v = uv[:, 0] - np.floor(uv[:, 0]), 1 - (uv[:, 1] - np.floor(uv[:, 1]))
+    rgb = np.zeros((len(uv), 3), np.float32)
+    for number, image in enumerate(levels):
+        at = np.flatnonzero(level == number)
+        height, width = image.shape[:2]
+        row = np.minimum((v[at] * height).astype(np.int64), height - 1)
+        column = np.minimum((u[at] * width).astype(np.int64), width - 1)
+        texel = image[row, column]
+        rgb[at] = texel[:, :3] / np.maximum(texel[:, 3:], 1e-6)
+    return rgb

@@ -1,0 +1,145 @@
+"""The visible surface of a mesh as points, found by drawing it from several sides, and the nearest one to any place."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numba
+import numpy as np
+from jaxtyping import Float32, Int32
+
+from primdiffusion.capture.rasterise import Fragments, draw
+from primdiffusion.capture.soup import Soup
+from primdiffusion.capture.views import OrthographicView, view_along
+
+DIRECTIONS = (
+    (0.0, 0.0, -1.0),
+    (0.0, 0.0, 1.0),
+    (-1.0, 0.0, 0.0),
+    (1.0, 0.0, 0.0),
+    (0.0, -1.0, 0.0),
+    (-1.0, -0.3, -1.0),
+    (1.0, -0.3, -1.0),
+    (-1.0, -0.3, 1.0),
+    (1.0, -0.3, 1.0),
+    (0.0, -1.0, -1.0),
+    (0.0, -1.0, 1.0),
+)
+"""Where the parallel rays of the views go. None looks up: from below, the space between jacket and trousers would count
+as outside, and hems would become holes."""
+
+PIXEL = 0.003
+"""Side of a pixel of these views, metres."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points of the surface that at least one view sees, about one for each pixel of area."""
+
+    position: Float32[np.ndarray, "n 3"]
+    """Metres."""
+    normal: Float32[np.ndarray, "n 3"]
+    """Unit, towards the viewer."""
+    face: Int32[np.ndarray, "n"]
+    """Face of the soup."""
+    barycentric: Float32[np.ndarray, "n 3"]
+    """Where on the face."""
+
+
+def look_around(soup: Soup) -> tuple[list[OrthographicView], list[Fragments]]:
+    """The mesh drawn along all DIRECTIONS."""
+    used = soup.vertices[np.unique(soup.faces)]
+    bounds = np.stack([used.min(0), used.max(0)])
+    views = [view_along(direction, bounds, PIXEL) for direction in DIRECTIONS]
+    return views, [draw(soup, view) for view in views]
+
+
+def visible_points(soup: Soup, views: list[OrthographicView], drawn: list[Fragments]) -> SurfacePoints:
+    """What the views see, thinned to one point a cube of PIXEL; the one that most faces its viewer stays."""
+    corners = soup.vertices[soup.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    face = np.concatenate([fragments.face[fragments.face >= 0] for fragments in drawn])
+    barycentric = np.concatenate([fragments.barycentric[fragments.face >= 0] for fragments in drawn])
+    directions = np.repeat(
+        np.stack([view.direction for view in views]), [int((fragments.face >= 0).sum()) for fragments in drawn], axis=0
+    )
+    towards = -np.einsum("ni,ni->n", normals[face], directions)
+    position = np.einsum("ni,nij->nj", barycentric, corners[face])
+    cell = np.floor((position - position.min(0)) / PIXEL).astype(np.int64)
+    key = (cell[:, 0] << 42) + (cell[:, 1] << 21) + cell[:, 2]
+    order = np.lexsort((-np.abs(towards), key))
+    keep = order[np.concatenate([[True], np.diff(key[order]) != 0])]
+    sign = np.where(towards[keep] < 0, -1.0, 1.0)[:, None]
+    return SurfacePoints(
+        position=position[keep].astype(np.float32),
+        normal=(normals[face[keep]] * sign).astype(np.float32),
+        face=face[keep],
+        barycentric=barycentric[keep],
+    )
+
+
+def nearest(
+    points: Float32[np.ndarray, "n 3"], queries: Float32[np.ndarray, "q 3"], reach: float
+) -> tuple[Int32[np.ndarray, "q"], Float32[np.ndarray, "q"]]:
+    """The nearest point to each query within `reach` metres and its distance; -1 and inf where there is none.
+
+    Points are sorted into cubes of side `reach`, so a query looks at 27 of them.
+    """
+    low = points.min(0)
+    shape = np.floor((points.max(0) - low) / reach).astype(np.int64) + 1
+    cube = np.floor((points - low) / reach).astype(np.int64)
+    number = (cube[:, 0] * shape[1] + cube[:, 1]) * shape[2] + cube[:, 2]
+    order = np.argsort(number, kind="stable")
+    start = np.searchsorted(number[order], np.arange(shape.prod() + 1))
+    found = np.full(len(queries), -1, np.int32)
+    distance = np.full(len(queries), np.inf, np.float32)
+    _nearest(points[order], order, start, shape, low, np.float32(reach), queries, found, distance)
+    return found, distance
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _nearest(points, order, start, shape, low, reach, queries, found, distance):
+    for q in range(queries.shape[0]):
+        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        cx, cy = int(np.floor((x - low[0]) / reach)), int(np.floor((y - low[1]) / reach))
+        cz = int(np.floor((z - low[2]) / reach))
+        best, best_squared = -1, reach * reach
+        z_from, z_to = max(cz - 1, 0), min(cz + 2, shape[2])
+        if z_from >= z_to:
+            continue
+        for i in range(max(cx - 1, 0), min(cx + 2, shape[0])):
+            for j in range(max(cy - 1, 0), min(cy + 2, shape[1])):
+                row = (i * shape[1] + j) * shape[2]
+                for n in range(start[row + z_from], start[row + z_to]):
+                    dx, dy, dz = points[n, 0] - x, points[n, 1] - y, points[n, 2] - z
+                    squared = dx * dx + dy * dy + dz * dz
+                    if squared < best_squared:
+                        best, best_squared = n, squared
+        if best >= 0:
+            found[q] = order[best]
+            distance[q] = np.sqrt(best_squared)
+
+
+def carve(
+    queries: Float32[np.ndarray, "q 3"], views: list[OrthographicView], drawn: list[Fragments]
+) -> Float32[np.ndarray, "q"]:
+    """Over all views the least depth of a query behind what the view sees, metres; negative: some view sees past it."""
+    behind = np.full(len(queries), np.inf, np.float32)
+    for view, fragments in zip(views, drawn, strict=True):
+        _carve(queries, view.world_to_view.astype(np.float32), np.float32(view.pixel_size), fragments.depth, behind)
+    return behind
+
+
+@numba.njit(cache=True, nogil=True)
+def _carve(queries, world_to_view, pixel_size, depth, behind):
+    height, width = depth.shape
+    m = world_to_view
+    for q in range(queries.shape[0]):
+        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        column = int(np.floor((m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / pixel_size))
+        row = int(np.floor((m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / pixel_size))
+        past = np.float32(-np.inf)
+        if 0 <= column < width and 0 <= row < height:
+            past = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] - depth[row, column]
+        behind[q] = min(behind[q], past)
