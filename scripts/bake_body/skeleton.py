@@ -1,0 +1,78 @@
+"""SMPL's 24 joints and how the source rig's 104 bones collapse onto them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+JOINT_NAMES = (
+    "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot right_foot neck "
+    "left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist left_hand "
+    "right_hand"
+).split()
+PARENTS = np.array([-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21])
+_OTHER_SIDE = {"left": "right", "right": "left"}
+MIRRORED_JOINT = np.array(
+    [JOINT_NAMES.index("_".join(_OTHER_SIDE.get(word, word) for word in name.split("_"))) for name in JOINT_NAMES]
+)
+"""Joint j of a mirrored person is joint MIRRORED_JOINT[j] of the person."""
+
+_TRUNK_BONES = {
+    "root": "pelvis",
+    "pelvis": "pelvis",
+    "spine05": "pelvis",
+    "spine04": "spine1",
+    "spine03": "spine2",
+    "spine02": "spine3",
+    "spine01": "spine3",
+    "head": "head",
+    "eye": "head",
+}
+_LIMB_BONES = (  # first matching prefix wins: the thumb's root moves with the wrist, the other fingers with the hand
+    ("upperleg", "hip"),
+    ("lowerleg", "knee"),
+    ("foot", "ankle"),
+    ("toe", "foot"),
+    ("clavicle", "collar"),
+    ("shoulder01", "collar"),
+    ("upperarm", "shoulder"),
+    ("lowerarm", "elbow"),
+    ("wrist", "wrist"),
+    ("metacarpal", "wrist"),
+    ("finger1-1", "wrist"),
+    ("finger", "hand"),
+)
+_TRUNK_HEADS = {"pelvis": "root", "spine1": "spine04", "spine2": "spine03", "spine3": "spine02", "neck": "neck01", "head": "head"}
+_LIMB_HEADS = {
+    "hip": ["upperleg01"],
+    "knee": ["lowerleg01"],
+    "ankle": ["foot"],
+    "foot": ["toe2-1", "toe3-1", "toe4-1"],
+    "collar": ["clavicle"],
+    "shoulder": ["upperarm01"],
+    "elbow": ["lowerarm01"],
+    "wrist": ["wrist"],
+    "hand": ["finger2-1", "finger3-1", "finger4-1", "finger5-1"],
+}
+
+
+def joint_of_bone(bone: str) -> int:
+    """The SMPL joint that moves what the source's bone (such as "upperarm02.L") moves."""
+    stem, _, side = bone.partition(".")
+    if stem.startswith("neck"):
+        return JOINT_NAMES.index("neck")
+    if stem in _TRUNK_BONES:
+        return JOINT_NAMES.index(_TRUNK_BONES[stem])
+    for prefix, joint in _LIMB_BONES:
+        if stem.startswith(prefix):
+            return JOINT_NAMES.index({"L": "left_", "R": "right_"}[side] + joint)
+    raise KeyError(f"The rig has a bone {bone!r} that no SMPL joint takes; add it to the tables of {__name__}.")
+
+
+def joints_from_bone_heads(bones: list[str]) -> np.ndarray:
+    """[24, len(bones)]: an SMPL joint is the mean of one or more bone heads."""
+    weights = np.zeros((len(JOINT_NAMES), len(bones)))
+    for j, name in enumerate(JOINT_NAMES):
+        side, _, limb = name.partition("_")
+        heads = [f"{head}.{side[0].upper()}" for head in _LIMB_HEADS[limb]] if limb else [_TRUNK_HEADS[name]]
+        weights[j, [bones.index(head) for head in heads]] = 1 / len(heads)
+    return weights
