@@ -1,0 +1,153 @@
+"""A linear body model in SMPL's form, as a chain of types: BodyModel -> ShapedBody -> PosedBody (Loper et al. 2015)."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.resources
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from primdiffusion.body.skinning import rigid_matrix, skin, world_from_joints, world_from_rest
+from primdiffusion.geometry.records import TensorRecord
+from primdiffusion.geometry.rotation import axis_angle_to_matrix
+
+JOINT_NAMES = (
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
+    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
+    "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand",
+)  # fmt: skip
+"""SMPL's 24 joints in SMPL's order."""
+J = len(JOINT_NAMES)
+"""Joints of a body."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BodyPose(TensorRecord):
+    """What the joints do: pure numbers, valid for any body of the same skeleton."""
+
+    joint_rotation: Float[Tensor, "*b J 3 3"]
+    """Each joint relative to its parent; the first is the whole body's turn about its pelvis."""
+    translation: Float[Tensor, "*b 3"]
+    """Of the whole body, metres, after the rotations."""
+
+    @classmethod
+    def rest(cls, *batch: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None) -> BodyPose:
+        """The T pose the template is made in, for a batch of any shape."""
+        return cls(
+            torch.eye(3, dtype=dtype, device=device).expand(*batch, J, 3, 3),
+            torch.zeros(*batch, 3, dtype=dtype, device=device),
+        )
+
+    @classmethod
+    def from_axis_angle(cls, theta: Float[Tensor, "*b 72"], translation: Float[Tensor, "*b 3"] | None = None) -> BodyPose:
+        """From SMPL's pose vector: 24 axis-angle vectors in radians, the pelvis first.
+
+        Raises:
+            ValueError: theta does not end in 72 values.
+        """
+        if theta.shape[-1] != 3 * J:
+            raise ValueError(
+                f"A pose is {3 * J} numbers (24 joints x axis-angle) but theta has shape {tuple(theta.shape)}; "
+                "drop the hand joints of SMPL-H or SMPL-X, or prepend the pelvis rotation to a 69-number body pose."
+            )
+        if translation is None:
+            translation = theta.new_zeros(*theta.shape[:-1], 3)
+        return cls(axis_angle_to_matrix(theta.unflatten(-1, (J, 3))), translation)
+
+
+@dataclasses.dataclass(frozen=True)
+class BodyModel(TensorRecord):
+    """A body before it has a shape; metres, y up, facing +z, its left at +x."""
+
+    template: Float[Tensor, "V 3"]
+    """The mean body in the rest pose."""
+    shape_basis: Float[Tensor, "V 3 B"]
+    """What a unit of each shape coefficient adds, metres."""
+    pose_basis: Float[Tensor, "V 3 P"]
+    """What each entry of (R - I) of the 23 joints below the pelvis adds, row-major; zero where a body has none."""
+    joint_regressor: Float[Tensor, "J V"]
+    """Joints as weighted sums of the shaped vertices."""
+    skin_weights: Float[Tensor, "V J"]
+    """How much each joint moves a vertex; rows sum to 1."""
+    parents: Int[Tensor, "J"]
+    """Each joint's parent, -1 for the root; a parent comes before its children."""
+    faces: Int[Tensor, "F 3"]
+    """Counter-clockwise seen from outside."""
+    uv: Float[Tensor, "T 2"]
+    """Texture coordinates in [0, 1], v up as in OBJ files."""
+    uv_faces: Int[Tensor, "F 3"]
+    """The texture coordinate of each face's corners."""
+
+    def shape(self, betas: Float[Tensor, "*b N"]) -> ShapedBody:
+        """The body of a person (SMPL eqs. 8 and 10). Betas may be fewer than the basis holds; the rest count as zero.
+
+        Raises:
+            ValueError: there are more betas than the basis has components.
+        """
+        count, available = betas.shape[-1], self.shape_basis.shape[-1]
+        if count > available:
+            raise ValueError(f"{count} betas were given but this body has {available} shape components; drop the last ones.")
+        offsets = torch.einsum("vcn,...n->...vc", self.shape_basis[..., :count], betas)
+        vertices = self.template + offsets
+        return ShapedBody(self, vertices, self.joint_regressor @ vertices)
+
+
+@dataclasses.dataclass(frozen=True)
+class ShapedBody(TensorRecord):
+    """A person's body in the rest pose."""
+
+    model: BodyModel
+    vertices: Float[Tensor, "*b V 3"]
+    """Metres."""
+    joints: Float[Tensor, "*b J 3"]
+    """Metres."""
+
+    def pose(self, pose: BodyPose) -> PosedBody:
+        """The person in a pose (SMPL eqs. 2-4, 7 and 9); batches of bodies and poses broadcast."""
+        vertices, joints = self.vertices, self.joints
+        if self.model.pose_basis.numel() > 0:
+            identity = torch.eye(3, dtype=pose.joint_rotation.dtype, device=pose.joint_rotation.device)
+            feature = (pose.joint_rotation[..., 1:, :, :] - identity).flatten(-3)
+            vertices = vertices + torch.einsum("vcp,...p->...vc", self.model.pose_basis, feature)
+        world_from_joint = world_from_joints(pose.joint_rotation, joints, self.model.parents.tolist())
+        identity = torch.eye(3, dtype=joints.dtype, device=joints.device)
+        shift = rigid_matrix(identity.expand(*pose.translation.shape[:-1], 3, 3), pose.translation)[..., None, :, :]
+        world_from_joint = shift @ world_from_joint
+        skinning = world_from_rest(world_from_joint, joints)
+        return PosedBody(skin(vertices, self.model.skin_weights, skinning), world_from_joint, skinning)
+
+
+@dataclasses.dataclass(frozen=True)
+class PosedBody(TensorRecord):
+    """A person's body in the world."""
+
+    vertices: Float[Tensor, "*b V 3"]
+    """Metres."""
+    joints: Float[Tensor, "*b J 4 4"]
+    """World from joint: rotation and place of every joint's axes."""
+    skinning: Float[Tensor, "*b J 4 4"]
+    """World from rest: what each joint does to a point of the rest pose."""
+
+
+@functools.cache
+def default_body() -> BodyModel:
+    """The body that ships with the package: float32, 12,196 vertices, 10 shape components, no pose blend shapes."""
+    with importlib.resources.as_file(importlib.resources.files(__package__) / "data/body.npz") as path, np.load(path) as f:
+        arrays = {name: f[name] for name in ("v_template", "shapedirs", "J_regressor", "weights", "vt", "f", "ft")}
+        parents = f["kintree_table"][0].astype(np.int64)
+    parents[0] = -1
+    return BodyModel(
+        template=torch.from_numpy(arrays["v_template"]),
+        shape_basis=torch.from_numpy(arrays["shapedirs"]),
+        pose_basis=torch.zeros(len(arrays["v_template"]), 3, 0),
+        joint_regressor=torch.from_numpy(arrays["J_regressor"]),
+        skin_weights=torch.from_numpy(arrays["weights"]),
+        parents=torch.from_numpy(parents),
+        faces=torch.from_numpy(arrays["f"].astype(np.int64)),
+        uv=torch.from_numpy(arrays["vt"]),
+        uv_faces=torch.from_numpy(arrays["ft"].astype(np.int64)),
+    )
