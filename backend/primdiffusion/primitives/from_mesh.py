@@ -18,6 +18,9 @@ FULL_DENSITY = 100.0
 """Opacity per metre of solid matter; one over this is the depth at which solid matter hides what is behind it."""
 RAMP = 0.020
 """Depth below the surface at which density is full, metres. A ramp centred on the surface would fatten silhouettes."""
+INSET = 0.2
+"""Depth at which the ramp starts, in voxel spacings across the surface: between an outer voxel and an inner one density
+is interpolated, and without this the figure grows by about 3 mm."""
 REACH = 0.030
 """Voxels farther than this from the surface have no colour of their own, metres."""
 MIP_LEVELS = 6
@@ -60,24 +63,22 @@ def surface_field(mesh: TexturedMesh, frames: Frames) -> SurfaceField:
         ValueError: the frames are batched or not finite.
     """
     soup = flatten(mesh)
-    centres, pitch = voxel_centres(frames)
+    centres = voxel_centres(frames)
     views, drawn = look_around(soup)
     points = visible_points(soup, views, drawn)
     index, distance = nearest(points.position, centres.reshape(-1, 3), REACH)
     behind = carve(centres.reshape(-1, 3), views, drawn)
-    depth = np.where(behind > 0, np.minimum(distance, REACH), 0)
-    density = FULL_DENSITY * np.clip(depth / RAMP, 0, 1)
 
-    within = index >= 0
+    shape, within, chosen = centres.shape[:-1], index >= 0, np.maximum(index, 0)
+    through, along = _spacing(frames, points.normal[chosen].reshape(len(centres), -1, 3))
+    depth = np.where(within, distance - INSET * through, REACH)
+    density = np.where(behind > 0, FULL_DENSITY * np.clip(depth / RAMP, 0, 1), 0)
     point_uv, point_footprint = _texture_coordinates(soup, points.face, points.barycentric)
-    chosen = np.maximum(index, 0)
-    shape = centres.shape[:-1]
-    pitch = np.broadcast_to(pitch[:, None, None, None], shape).reshape(-1)
     return SurfaceField(
         density=density.reshape(shape).astype(np.float32),
         part=np.where(within, soup.part[points.face[chosen]], -1).astype(np.int32).reshape(shape),
         uv=point_uv[chosen].reshape(*shape, 2),
-        footprint=(point_footprint[chosen] * pitch).reshape(shape).astype(np.float32),
+        footprint=(point_footprint[chosen] * along).reshape(shape).astype(np.float32),
         own=np.clip(2 - 2 * distance / REACH, 0, 1).reshape(shape).astype(np.float32),
     )
 
@@ -102,8 +103,8 @@ def colour(field: SurfaceField, mesh: TexturedMesh) -> Payload:
     )
 
 
-def voxel_centres(frames: Frames) -> tuple[Float32[np.ndarray, "k s s s 3"], Float32[np.ndarray, "k"]]:
-    """World positions of the voxels in the order D, H, W, and their spacing along T and B (geometric mean), metres.
+def voxel_centres(frames: Frames) -> Float32[np.ndarray, "k s s s 3"]:
+    """World positions of the voxels in the order D, H, W, metres.
 
     Raises:
         ValueError: the frames are batched or not finite.
@@ -116,11 +117,20 @@ def voxel_centres(frames: Frames) -> tuple[Float32[np.ndarray, "k s s s 3"], Flo
     if not all(np.isfinite(field).all() for field in (position, rotation, half_extent)):
         raise ValueError("The frames hold NaN or infinite values; check the body they were attached to.")
     local = np.linspace(-1, 1, S)
-    along = [rotation[:, None, :, axis] * (half_extent[:, axis, None] * local)[:, :, None] for axis in range(3)]
-    t, b, n = along
+    t, b, n = (rotation[:, None, :, axis] * (half_extent[:, axis, None] * local)[:, :, None] for axis in range(3))
     centres = position[:, None, None, None] + n[:, :, None, None] + b[:, None, :, None] + t[:, None, None, :]
-    pitch = 2 / (S - 1) * np.sqrt(half_extent[:, 0] * half_extent[:, 1])
-    return centres.astype(np.float32), pitch.astype(np.float32)
+    return centres.astype(np.float32)
+
+
+def _spacing(
+    frames: Frames, normal: Float32[np.ndarray, "k n 3"]
+) -> tuple[Float32[np.ndarray, "kn"], Float32[np.ndarray, "kn"]]:
+    """Distance between voxels along each of the normals of each primitive, and (geometric mean) across it, metres."""
+    pitch = frames.half_extent.detach().cpu().numpy()[:, None] * np.float32(2 / (S - 1))
+    local = normal @ frames.rotation.detach().cpu().numpy().astype(np.float32)
+    along = np.linalg.norm(local * pitch, axis=-1)
+    across = np.sqrt(pitch.prod(-1) / np.maximum(along, 1e-9))
+    return along.reshape(-1), across.reshape(-1)
 
 
 def _texture_coordinates(soup: Soup, face: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
