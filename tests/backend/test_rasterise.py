@@ -1,0 +1,194 @@
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from primdiffusion.capture.rasterise import rasterise
+from primdiffusion.capture.soup import UnusableMesh
+from primdiffusion.capture.views import OrthographicView, view_along
+from primdiffusion.geometry.camera import Camera, look_at
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+
+
+def part(vertices, faces, texture=((255, 255, 255, 255),), corner_uv=None, name="part") -> TexturedPart:
+    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int32)
+    texture = np.asarray(texture, np.uint8)
+    return TexturedPart(
+        name=name,
+        vertices=vertices,
+        faces=faces,
+        corner_uv=np.zeros((len(faces), 3, 2), np.float32) if corner_uv is None else np.asarray(corner_uv, np.float32),
+        texture=texture[None] if texture.ndim == 2 else texture,
+        skin_index=np.zeros((len(vertices), 1), np.int32),
+        skin_weight=np.ones((len(vertices), 1)),
+    )
+
+
+def square(z: float, texture, side: float = 1.0) -> TexturedPart:
+    """An upright square in the plane z, texture upright as seen from +z."""
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side / 2
+    uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
+    faces = [[0, 1, 2], [0, 2, 3]]
+    return part(np.c_[corners, np.full(4, z)], faces, texture, uv[np.array(faces)], name=f"square at {z}")
+
+
+FRONT = OrthographicView(  # looks along -z, 8 x 8 pixels over [-1/2, 1/2]^2, from z = 2
+    np.array([[1.0, 0, 0, 0.5], [0, -1.0, 0, 0.5], [0, 0, -1.0, 2]]), pixel_size=1 / 8, width=8, height=8
+)
+RED, GREEN, BLUE, WHITE, HOLE = (
+    (255, 0, 0, 255),
+    (0, 255, 0, 255),
+    (0, 0, 255, 255),
+    (255, 255, 255, 255),
+    (9, 9, 9, 0),
+)
+
+
+def knot() -> trimesh.Trimesh:
+    """A closed surface that hides parts of itself."""
+    sphere = trimesh.creation.icosphere(subdivisions=4)
+    r = 1 + 0.35 * np.sin(5 * sphere.vertices[:, :1]) * np.cos(4 * sphere.vertices[:, 1:2])
+    return trimesh.Trimesh(sphere.vertices * r, sphere.faces, process=False)
+
+
+def test_a_triangle_covers_the_pixels_whose_centres_it_holds():
+    view = OrthographicView(np.eye(4)[:3], 1.0, 4, 4)
+    picture = rasterise(TexturedMesh((part([[0, 0, 1], [4, 0, 1], [0, 4, 1]], [[0, 1, 2]]),)), view)
+    # Centres with x + y <= 4, the diagonal included.
+    expected = [[1, 1, 1, 1], [1, 1, 1, 0], [1, 1, 0, 0], [1, 0, 0, 0]]
+    np.testing.assert_array_equal(picture.alpha, expected)
+    assert (picture.depth[picture.alpha > 0] == 1).all()
+    assert np.isinf(picture.depth[picture.alpha == 0]).all()
+
+
+def test_row_zero_of_a_texture_is_at_the_top():
+    texture = np.array([[RED, GREEN], [BLUE, WHITE]])
+    picture = rasterise(TexturedMesh((square(0, texture.repeat(4, 0).repeat(4, 1)),)), FRONT)
+    corners = picture.rgb[[1, 1, 6, 6], [1, 6, 1, 6]]
+    np.testing.assert_allclose(corners, [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], atol=0)
+
+
+def test_colours_are_linear():
+    picture = rasterise(TexturedMesh((square(0, [[(188, 188, 188, 255)]]),)), FRONT)
+    np.testing.assert_allclose(picture.rgb, ((188 / 255 + 0.055) / 1.055) ** 2.4, rtol=1e-6)
+
+
+def test_the_nearer_part_wins_whatever_the_order():
+    near, far = square(0.5, [[RED]], side=0.5), square(-0.5, [[GREEN]])
+    for parts, number_of_near in (((near, far), 0), ((far, near), 1)):
+        picture = rasterise(TexturedMesh(parts), FRONT)
+        assert picture.part[4, 4] == number_of_near
+        np.testing.assert_array_equal(picture.rgb[4, 4], [1, 0, 0])
+        np.testing.assert_array_equal(picture.rgb[0, 0], [0, 1, 0])
+        np.testing.assert_allclose(picture.depth[[4, 0], [4, 0]], [1.5, 2.5])
+
+
+def test_what_fails_the_alpha_test_is_seen_through():
+    leaf = square(0.5, np.array([[RED, HOLE], [HOLE, RED]]))
+    picture = rasterise(TexturedMesh((leaf, square(-0.5, [[GREEN]]))), FRONT)
+    np.testing.assert_array_equal(picture.part[:, 0], [0, 0, 0, 0, 1, 1, 1, 1])
+    np.testing.assert_array_equal(picture.rgb[0, 3], [1, 0, 0])  # the hole's colour tints nothing
+    np.testing.assert_array_equal(picture.rgb[0, 4], [0, 1, 0])
+
+
+def test_supersampling_counts_covered_samples():
+    view = OrthographicView(np.array([[1.0, 0, 0, 0.5], [0, -1.0, 0, 0.5], [0, 0, -1.0, 2]]), 1.0, 1, 1)
+    half = TexturedMesh((square(0, [[RED]], side=0.5),))
+    picture = rasterise(half, view, supersample=8)
+    assert picture.alpha[0, 0] == pytest.approx(0.25)
+    np.testing.assert_allclose(picture.rgb[0, 0], [0.25, 0, 0])
+    assert picture.depth[0, 0] == 2
+    assert rasterise(half, view).alpha[0, 0] == 1
+
+
+def test_perspective_textures_do_not_swim():
+    """On a tilted square seen in perspective, the texture's middle line falls where the camera projects it."""
+    tilt = part(
+        [[-1, -1, 2], [1, -1, 2], [1, 1, 6], [-1, 1, 6]], [[0, 1, 2], [0, 2, 3]],
+        np.array([[RED], [GREEN]]).repeat(64, 0), [[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]],
+    )  # fmt: skip
+    camera = Camera(torch.tensor([[200.0, 0, 100], [0, 200, 100], [0, 0, 1]]), torch.eye(3, 4), 200, 200)
+    picture = rasterise(TexturedMesh((tilt,)), camera, 4)
+    column = picture.rgb[:, 100]
+    # y down in the camera: v = 0 (green) is at y = -1, z = 2, row 0; the middle, y = 0, projects to row 100.
+    assert column[90, 1] > 0.9
+    assert column[120, 0] > 0.9
+    switch = 60 + np.argmin(np.abs(column[60:125, 0] - column[60:125, 1]))
+    assert abs(switch - 100) <= 1
+
+
+@pytest.mark.parametrize("kind", ["perspective", "orthographic"])
+def test_silhouette_and_depth_agree_with_embree(kind):
+    shape = knot()
+    mesh = TexturedMesh((part(shape.vertices, shape.faces),))
+    size = 256
+    if kind == "perspective":
+        view = look_at(
+            torch.tensor([1.0, 0.7, 4.0]).double(), torch.zeros(3).double(), vertical_fov=0.7, width=size, height=size
+        )
+        origin, directions = view.rays()
+        directions = directions.reshape(-1, 3).numpy()
+        origins = np.broadcast_to(origin.numpy(), directions.shape)
+    else:
+        view = view_along((-0.5, -0.3, -1), shape.bounds, 3.2 / size)
+        rotation, translation = view.world_to_view[:, :3], view.world_to_view[:, 3]
+        v, u = np.mgrid[0 : view.height, 0 : view.width] + 0.5
+        plane = np.stack([u * view.pixel_size, v * view.pixel_size, np.zeros_like(u)], -1).reshape(-1, 3)
+        origins = (plane - translation) @ rotation
+        directions = np.broadcast_to(view.direction, origins.shape)
+    picture = rasterise(mesh, view)
+    caster = trimesh.ray.ray_pyembree.RayMeshIntersector(shape)
+    places, rays, _ = caster.intersects_location(origins, directions, multiple_hits=False)
+    depth = np.full(len(origins), np.inf)
+    depth[rays] = np.einsum("ni,ni->n", places - origins[rays], directions[rays])
+    depth = depth.reshape(picture.depth.shape)
+    ours, theirs = picture.alpha > 0.5, np.isfinite(depth)
+    assert theirs.mean() > 0.2
+    assert (ours & theirs).sum() / (ours | theirs).sum() > 0.995
+    error = np.abs(picture.depth[ours & theirs] - depth[ours & theirs])
+    assert np.median(error) < 1e-5
+    assert np.mean(error > 1e-3) < 0.002  # rays that pass an edge on the other side
+
+
+def test_the_same_mesh_gives_the_same_bits():
+    shape = knot()
+    mesh = TexturedMesh((part(shape.vertices, shape.faces), square(0, [[RED]], side=3)))
+    view = view_along((0.3, -0.2, -1), mesh.bounds, 0.02)
+    first, second = rasterise(mesh, view, 2), rasterise(mesh, view, 2)
+    for field in dataclasses.fields(first):
+        np.testing.assert_array_equal(getattr(first, field.name), getattr(second, field.name))
+
+
+def test_triangles_behind_the_camera_are_left_out():
+    camera = Camera(torch.tensor([[50.0, 0, 32], [0, 50, 32], [0, 0, 1]]), torch.eye(3, 4), 64, 64)
+    behind = part([[-1, -1, -2], [1, -1, -2], [0, 1, -2]], [[0, 1, 2]])
+    assert rasterise(TexturedMesh((behind,)), camera).alpha.sum() == 0
+
+
+def test_a_view_along_a_direction_holds_the_whole_box():
+    bounds = np.array([[-0.2, 0.1, -0.5], [0.4, 1.9, 0.3]])
+    for direction in ((0, 0, -1), (0, -1, 0), (1, -0.3, 0.7)):
+        view = view_along(direction, bounds, 0.01)
+        corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), -1).reshape(8, 3)
+        seen = corners @ view.world_to_view[:, :3].T + view.world_to_view[:, 3]
+        assert (seen >= 0).all()
+        assert (seen[:, 0] <= view.width * 0.01).all()
+        assert (seen[:, 1] <= view.height * 0.01).all()
+        assert math.isclose(np.linalg.det(view.world_to_view[:, :3]), 1)
+
+
+def test_unusable_meshes_are_refused_in_words():
+    good = part([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    broken = dataclasses.replace(good, vertices=np.full((3, 3), np.nan))
+    with pytest.raises(UnusableMesh, match=r"no triangles in its 0 parts"):
+        rasterise(TexturedMesh(()), FRONT)
+    with pytest.raises(UnusableMesh, match="9 NaN or infinite values in vertices"):
+        rasterise(TexturedMesh((broken,)), FRONT)
+    with pytest.raises(UnusableMesh, match="vertices 0 to 7, but only 3"):
+        rasterise(TexturedMesh((dataclasses.replace(good, faces=np.array([[0, 1, 7]], np.int32)),)), FRONT)
+    with pytest.raises(UnusableMesh, match="empty texture"):
+        rasterise(TexturedMesh((dataclasses.replace(good, texture=np.zeros((0, 4, 4), np.uint8)),)), FRONT)
+    with pytest.raises(ValueError, match="supersample is 0"):
+        rasterise(TexturedMesh((good,)), FRONT, 0)
