@@ -1,0 +1,16 @@
+"""Dressed people from a MakeHuman asset folder: what the networks are trained on."""
+
+from primdiffusion.people.assets import Assets, AssetsMissingError, open_assets
+from primdiffusion.people.base_mesh import BaseMesh, load_base_mesh
+from primdiffusion.people.person import Person, make_person, recolour
+
+__all__ = [
+    "Assets",
+    "AssetsMissingError",
+    "BaseMesh",
+    "Person",
+    "load_base_mesh",
+    "make_person",
+    "open_assets",
+    "recolour",
+]

@@ -1,0 +1,53 @@
+"""Meshes of the asset pack put on a body: fitted, rigged, and hidden where something covers them."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from primdiffusion.people.assets import Assets
+from primdiffusion.people.base_mesh import BaseMesh
+from primdiffusion.people.mhclo import Proxy
+
+JOINTS = 24
+INFLUENCES = 4
+"""Joints that move a vertex."""
+
+
+@functools.lru_cache(maxsize=64)
+def item_skinning(
+    assets: Assets, base: BaseMesh, path: str
+) -> tuple[Int[np.ndarray, "V 4"], Float[np.ndarray, "V 4"], Float[np.ndarray, "V 3 3"]]:
+    """Joints, weights and turn of every vertex of a mesh: the base's, blended; the four strongest joints are kept."""
+    proxy, _ = assets.proxy(path)
+    dense = np.zeros((len(base.template), JOINTS))
+    np.add.at(dense, (np.arange(len(dense))[:, None], base.joint_index), base.joint_weight)
+    blended = np.maximum(proxy.blend(dense), 0)
+    turn = np.einsum("vj,jab->vab", blended / blended.sum(1, keepdims=True), base.rest_from_native)
+    index = np.argsort(-blended, axis=1, kind="stable")[:, :INFLUENCES]
+    weight = np.take_along_axis(blended, index, axis=1)
+    return index, weight / weight.sum(1, keepdims=True), turn
+
+
+def fit_item(
+    assets: Assets, base: BaseMesh, path: str, base_vertices: Float[np.ndarray, "B 3"]
+) -> Float[np.ndarray, "V 3"]:
+    """A mesh on a body in the base's rest pose, metres."""
+    return assets.proxy(path)[0].fit(base_vertices, item_skinning(assets, base, path)[2])
+
+
+def shown_faces(base: BaseMesh, proxies: dict[str, tuple[Proxy, Int[np.ndarray, "F 3"]]]) -> dict[str, np.ndarray]:
+    """Which faces of the body ("body") and of every proxy are seen: [F] bool by name.
+
+    From the outermost proxy inwards, each hides the base vertices it lists: on the body, and on what lies deeper.
+    A face goes when all of its vertices are hidden, so that a rim of it stays under the hem.
+    """
+    hidden = np.zeros(len(base.template), bool)
+    shown: dict[str, np.ndarray] = {}
+    for name, (proxy, faces) in sorted(proxies.items(), key=lambda item: -item[1][0].z_depth):
+        shown[name] = ~proxy.hidden_by(hidden)[faces].all(axis=1)
+        hidden[proxy.delete_vertices] = True
+    shown["body"] = ~hidden[base.faces].all(axis=1)
+    return shown

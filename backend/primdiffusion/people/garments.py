@@ -1,0 +1,145 @@
+"""Clothes in new colours: the texture's light and shade stay, its colours are replaced piece by piece."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy.ndimage import gaussian_filter
+
+from primdiffusion.people import palette, patterns
+from primdiffusion.people.assets import Assets
+from primdiffusion.people.base_mesh import BaseMesh
+from primdiffusion.people.colour import bytes_from_linear, lab_from_bytes, luminance
+from primdiffusion.people.fitting import fit_item
+from primdiffusion.people.texel_map import connected_faces, texel_map, uv_islands
+from primdiffusion.people.wardrobe import Garment, Kind
+
+SIZE = 512
+"""Texels of a garment's side: about 3 mm of cloth each."""
+ORIGINAL_SHARE: dict[str, float] = {"denim": 0.3, "shoe": 0.5, "overall": 0.2, "top": 0.06, "sock": 1.0}
+"""How often a piece keeps the pack's own colours."""
+TRIM_DISTANCE = 24.0
+"""Lab distance from a piece's own colour beyond which a texel is trim."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Cloth:
+    """What of a garment's texture stays when its colours change."""
+
+    original: UInt8[np.ndarray, "H W 4"] | None
+    """The pack's texture; None where the pack has none."""
+    piece: UInt8[np.ndarray, "H W"]
+    trim: np.ndarray
+    """[H, W] bool."""
+    shade: Float[np.ndarray, "H W"]
+    """Light and shade, 1 in the middle."""
+    position: Float[np.ndarray, "H W 3"]
+    """Rest position on the average body, metres."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Paint:
+    """The colours of one piece."""
+
+    main: Float[np.ndarray, "3"]
+    trim: Float[np.ndarray, "3"]
+    second: Float[np.ndarray, "3"]
+    pattern: str
+    """A name of `patterns.PATTERNS`, "solid", or "original" for the pack's own colours."""
+
+
+@functools.lru_cache(maxsize=24)
+def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
+    """Read a garment's texture apart: pieces, trim, shading, position. Takes about a quarter of a second, once."""
+    _, mesh = assets.proxy(garment.path)
+    texels = texel_map(mesh.corner_uv, SIZE)
+    pieces = uv_islands(mesh.corner_uv) if garment.by_island else connected_faces(mesh.faces, len(mesh.vertices))
+    piece = np.minimum(pieces, len(garment.pieces) - 1).astype(np.uint8)[texels.face]
+    position = texels.sample(fit_item(assets, base, garment.path, base.template), mesh.faces)
+    original = None
+    name = f"{garment.path}_diffuse"
+    if assets.has_picture(name):
+        original = assets.picture(name, SIZE)
+        light = luminance(original[..., :3])
+    else:
+        light = np.ones((SIZE, SIZE), np.float32)
+    trim = np.zeros((SIZE, SIZE), bool)
+    shade = np.ones((SIZE, SIZE), np.float32)
+    for number, kind in enumerate(garment.pieces):
+        here = piece == number
+        seen = here & texels.inside
+        if not seen.any():
+            continue
+        if kind.smooth:
+            light = np.where(here, _blurred(light, seen), light)
+        if kind.trim and original is not None:
+            lab = lab_from_bytes(original[..., :3])
+            distance = np.linalg.norm((lab - np.median(lab[seen], axis=0)) * np.float32([0.8, 1, 1]), axis=-1)
+            trim |= here & (distance > TRIM_DISTANCE)
+        for region in (here & ~trim, here & trim):
+            if (region & texels.inside).any():
+                middle = np.median(light[region & texels.inside])
+                shade[region] = np.clip((light[region] + 0.01) / (middle + 0.01), 0.15, 2.2) ** 0.75
+    shade *= _occlusion(assets, garment)
+    return Cloth(original, piece, trim, shade, position.astype(np.float32))
+
+
+def paint_garment(garment: Garment, draws: np.random.Generator) -> tuple[Paint, ...]:
+    """Draw colours for every piece; pieces of one kind in a garment go together."""
+    by_kind: dict[Kind, Paint] = {}
+    for piece in garment.pieces:
+        if piece.kind not in by_kind:
+            by_kind[piece.kind] = _paint(piece.kind, draws)
+    return tuple(by_kind[piece.kind] for piece in garment.pieces)
+
+
+def coloured(fabric: Cloth, paints: tuple[Paint, ...]) -> UInt8[np.ndarray, "H W 4"]:
+    """The garment's texture in new colours."""
+    main = np.stack([paint.main for paint in paints]).astype(np.float32)
+    trim = np.stack([paint.trim for paint in paints]).astype(np.float32)
+    target = np.where(fabric.trim[..., None], trim[fabric.piece], main[fabric.piece])
+    for number, paint in enumerate(paints):
+        pattern = dict(patterns.PATTERNS).get(paint.pattern)
+        if pattern is not None:
+            here = (fabric.piece == number) & ~fabric.trim
+            share = pattern(fabric.position[here])[:, None].astype(np.float32)
+            target[here] += share * (paint.second - paint.main).astype(np.float32)
+    texture = np.full((*fabric.piece.shape, 4), 255, np.uint8)
+    texture[..., :3] = bytes_from_linear(np.clip(target * fabric.shade[..., None], 0, 1))
+    if fabric.original is not None:
+        texture[..., 3] = fabric.original[..., 3]
+        kept = [number for number, paint in enumerate(paints) if paint.pattern == "original"]
+        here = np.isin(fabric.piece, kept)
+        texture[here] = fabric.original[here]
+    return texture
+
+
+def _paint(kind: Kind, draws: np.random.Generator) -> Paint:
+    """Colours for a kind of piece: tops may be patterned, all else is of one colour."""
+    main = palette.garment_colour(kind, draws)
+    partner = "shirt" if kind == "suit" else "top"
+    trim = palette.contrasting(main, partner, draws)
+    second = palette.contrasting(main, "top", draws)
+    pattern = "solid"
+    if kind == "top" and draws.random() > patterns.SOLID_SHARE:
+        pattern = patterns.PATTERNS[draws.integers(len(patterns.PATTERNS))][0]
+    if draws.random() < ORIGINAL_SHARE.get(kind, 0.0):
+        pattern = "original"
+    return Paint(main, trim, second, pattern)
+
+
+def _blurred(light: Float[np.ndarray, "H W"], seen: np.ndarray) -> Float[np.ndarray, "H W"]:
+    """The broad shading of the seen texels, with none of their fine stripes."""
+    weight = gaussian_filter(seen.astype(np.float32), 8) + 1e-6
+    return gaussian_filter(np.where(seen, light, 0).astype(np.float32), 8) / weight
+
+
+def _occlusion(assets: Assets, garment: Garment) -> Float[np.ndarray, "H W"] | np.float32:
+    """Folds from the pack's ambient occlusion picture, softened; one where it has none."""
+    name = f"{garment.path}_ao"
+    if not assets.has_picture(name):
+        return np.float32(1)
+    return 0.45 + 0.55 * assets.picture(name, SIZE)[..., :3].astype(np.float32).mean(-1) / 255

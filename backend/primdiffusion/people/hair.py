@@ -1,0 +1,87 @@
+"""Hair, brows and lashes in natural colours: the strands' light and shade from the pack's texture or drawn here."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy.ndimage import gaussian_filter
+
+from primdiffusion.people.assets import Assets
+from primdiffusion.people.colour import bytes_from_linear, luminance
+from primdiffusion.people.texel_map import TexelMap, texel_map
+from primdiffusion.people.wardrobe import hair_path, stream
+
+SIZE = 512
+CURLY = ("afro01",)
+OPAQUE = 128
+"""Alpha from which a texel is there (the alpha test of the rasteriser)."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Strands:
+    """A hair mesh's texture without its colour."""
+
+    shade: Float[np.ndarray, "H W"]
+    """Light and shade, 1 in the middle."""
+    alpha: UInt8[np.ndarray, "H W"]
+
+
+@functools.lru_cache(maxsize=16)
+def strands(assets: Assets, name: str) -> Strands:
+    """The strands of a hair mesh: from its texture, or drawn where the pack has none."""
+    picture = f"{hair_path(name)}_diffuse"
+    if not assets.has_picture(picture):
+        texels = texel_map(assets.proxy(hair_path(name))[1].corner_uv, SIZE)
+        return _curls(texels) if name in CURLY else _straight(texels, name)
+    texture = assets.picture(picture, SIZE)
+    light = luminance(texture[..., :3])
+    middle = np.median(light[texture[..., 3] >= OPAQUE])
+    return Strands(np.clip((light + 0.01) / (middle + 0.01), 0.2, 2.5) ** 0.7, texture[..., 3])
+
+
+def coloured_strands(hair: Strands, colour: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, "H W 4"]:
+    """Strands of one linear colour."""
+    rgb = bytes_from_linear(np.clip(hair.shade[..., None] * colour.astype(np.float32), 0, 1))
+    return np.concatenate([rgb, hair.alpha[..., None]], axis=-1)
+
+
+def tinted_cutout(picture: UInt8[np.ndarray, "H W 4"], colour: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, "H W 4"]:
+    """Brows or lashes: the picture's alpha, thickened to pass an alpha test, in one linear colour."""
+    texture = np.empty_like(picture)
+    texture[..., :3] = bytes_from_linear(colour.astype(np.float32))
+    texture[..., 3] = np.minimum(picture[..., 3].astype(np.int32) * 2, 255).astype(np.uint8)
+    return texture
+
+
+def _straight(texels: TexelMap, name: str) -> Strands:
+    """Strands that run down the texture and end raggedly where an island ends below."""
+    draws = stream(0, f"strands of {name}")
+    noise = draws.standard_normal((2, SIZE, SIZE)).astype(np.float32)
+    shade = _unit(gaussian_filter(noise[0], (60, 1.2))) + 0.7 * _unit(gaussian_filter(noise[1], (90, 5)))
+    below = np.zeros((SIZE, SIZE), np.float32)
+    above = np.zeros((SIZE, SIZE), np.float32)
+    for row in range(SIZE - 2, -1, -1):
+        below[row] = np.where(texels.inside[row], below[row + 1] + 1, 0)
+    for row in range(1, SIZE):
+        above[row] = np.where(texels.inside[row], above[row - 1] + 1, 0)
+    reach = np.abs(_unit(gaussian_filter(draws.standard_normal((SIZE, SIZE)).astype(np.float32), (40, 0.8))))
+    there = below > 0.06 * (below + above) * reach
+    return Strands(np.exp(0.22 * shade).astype(np.float32), np.where(there, 255, 0).astype(np.uint8))
+
+
+def _curls(texels: TexelMap) -> Strands:
+    """Small curls without a direction; between them the outermost sheets are open."""
+    draws = stream(0, "curls")
+    noise = draws.standard_normal((2, SIZE, SIZE)).astype(np.float32)
+    curls, tufts = _unit(gaussian_filter(noise[0], 2.0)), _unit(gaussian_filter(noise[1], 7.0))
+    edge = gaussian_filter(texels.inside.astype(np.float32), 5)
+    there = (edge > 0.75) | (curls + tufts + 6 * (edge - 0.6) > 0)
+    return Strands(np.exp(0.3 * (curls + 0.5 * tufts)).astype(np.float32), np.where(there, 255, 0).astype(np.uint8))
+
+
+def _unit(field: np.ndarray) -> np.ndarray:
+    """A field of mean 0 and standard deviation 1."""
+    return (field - field.mean()) / field.std()

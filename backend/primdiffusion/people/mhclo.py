@@ -1,0 +1,204 @@
+"""MakeHuman's proxy files: a mesh (.obj) and how it rides on the base mesh (.mhclo).
+
+A vertex of the proxy is a blend of three base vertices plus an offset in the base's own size,
+
+    p_i = sum_k w_ik v(r_ik) + R_i (scale * o_i),    scale_axis = |v(a) - v(b)|_axis / denominator,
+
+so clothes follow any body. R_i is the identity in the pose the files were written in; the base mesh of this package
+stands in T-pose, so the caller gives the turn of each vertex's limb.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+class ProxyFileError(ValueError):
+    """A .mhclo or .obj file that does not say what it must."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ObjMesh:
+    """A triangulated Wavefront mesh."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+    corner_uv: Float[np.ndarray, "F 3 2"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scale:
+    """The size of the base along one axis: the distance of two of its vertices over the file's own measure."""
+
+    first: int
+    second: int
+    denominator: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Proxy:
+    """How one mesh rides on the base mesh."""
+
+    name: str
+    reference: Int[np.ndarray, "V 3"]
+    weight: Float[np.ndarray, "V 3"]
+    offset: Float[np.ndarray, "V 3"]
+    scales: tuple[Scale | None, Scale | None, Scale | None]
+    """For x, y and z; None where the file gives none, and the offset is then taken in the base's unit."""
+    z_depth: int
+    """Larger is further out: what it hides is hidden on the body and on proxies of smaller depth."""
+    delete_vertices: Int[np.ndarray, " D"]
+    """Base vertices that the proxy hides."""
+
+    def fit(
+        self, base_vertices: Float[np.ndarray, "B 3"], turn: Float[np.ndarray, "V 3 3"] | None = None
+    ) -> Float[np.ndarray, "V 3"]:
+        """The proxy's vertices on a base mesh, in the base's unit; `turn` rotates each vertex's offset."""
+        return self.anchor(base_vertices) + self.displacement(base_vertices, turn)
+
+    def anchor(self, base_vertices: Float[np.ndarray, "B 3"]) -> Float[np.ndarray, "V 3"]:
+        """Where the proxy's vertices touch the base: the blend of three vertices, without the offset."""
+        return np.einsum("vk,vkc->vc", self.weight, base_vertices[self.reference])
+
+    def displacement(
+        self, base_vertices: Float[np.ndarray, "B 3"], turn: Float[np.ndarray, "V 3 3"] | None = None
+    ) -> Float[np.ndarray, "V 3"]:
+        """The offsets in the base's unit, turned."""
+        size = np.ones(3)
+        for axis, scale in enumerate(self.scales):
+            if scale is not None:
+                extent = abs(base_vertices[scale.first, axis] - base_vertices[scale.second, axis])
+                size[axis] = extent / scale.denominator
+        scaled = self.offset * size
+        return scaled if turn is None else np.einsum("vij,vj->vi", turn, scaled)
+
+    def blend(self, per_vertex: Float[np.ndarray, "B C"]) -> Float[np.ndarray, "V C"]:
+        """A quantity of the base mesh carried to the proxy by the same blend."""
+        return np.einsum("vk,vkc->vc", self.weight, per_vertex[self.reference])
+
+    def hidden_by(self, hidden_base: np.ndarray) -> np.ndarray:
+        """Which vertices of the proxy ride on hidden base vertices only ([B] bool -> [V] bool)."""
+        return hidden_base[self.reference].all(axis=1)
+
+
+def parse_obj(text: str) -> ObjMesh:
+    """Read vertices, texture coordinates and faces; polygons are cut into fans; corners without uv get (0, 0).
+
+    Raises:
+        ProxyFileError: a face names a vertex that is not there.
+    """
+    vertices: list[list[float]] = []
+    coordinates: list[list[float]] = [[0.0, 0.0]]
+    faces: list[tuple[int, int, int]] = []
+    face_coordinates: list[tuple[int, int, int]] = []
+    for line in text.splitlines():
+        words = line.split()
+        if not words:
+            continue
+        if words[0] == "v":
+            vertices.append([float(word) for word in words[1:4]])
+        elif words[0] == "vt":
+            coordinates.append([float(word) for word in words[1:3]])
+        elif words[0] == "f":
+            corners = [word.split("/") for word in words[1:]]
+            index = [int(corner[0]) - 1 for corner in corners]
+            uv_index = [int(corner[1]) if len(corner) > 1 and corner[1] else 0 for corner in corners]
+            for k in range(1, len(index) - 1):
+                faces.append((index[0], index[k], index[k + 1]))
+                face_coordinates.append((uv_index[0], uv_index[k], uv_index[k + 1]))
+    if not faces or not vertices:
+        raise ProxyFileError("The .obj has no faces or no vertices; give a Wavefront mesh of an asset pack.")
+    face_array = np.array(faces, np.int32)
+    uv_array = np.array(face_coordinates)
+    if face_array.min() < 0 or face_array.max() >= len(vertices) or uv_array.max() >= len(coordinates):
+        raise ProxyFileError(
+            f"The .obj names vertices outside its {len(vertices)} vertices and {len(coordinates) - 1} texture "
+            "coordinates; the file is damaged or uses relative indices, which asset packs do not."
+        )
+    return ObjMesh(np.array(vertices, np.float64), face_array, np.array(coordinates, np.float64)[uv_array])
+
+
+def parse_mhclo(text: str) -> Proxy:
+    """Read a .mhclo file; keys this package has no use for are passed over.
+
+    Raises:
+        ProxyFileError: no vertices, or a line with the wrong number of values.
+    """
+    reference: list[tuple[int, int, int]] = []
+    weight: list[list[float]] = []
+    offset: list[list[float]] = []
+    scales: dict[str, Scale] = {}
+    deleted: list[int] = []
+    name, z_depth, section = "", 50, ""
+    for line in text.splitlines():
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        key = words[0]
+        if key in ("verts", "delete_verts", "weights"):
+            section = key
+        elif key in ("x_scale", "y_scale", "z_scale"):
+            scales[key[0]] = Scale(int(words[1]), int(words[2]), float(words[3]))
+        elif key == "name":
+            name = " ".join(words[1:])
+        elif key == "z_depth":
+            z_depth = int(words[1])
+        elif key.isdigit() and section == "verts":
+            if len(words) not in (1, 6, 9):
+                raise ProxyFileError(f"A vertex line of {name or 'the .mhclo'} has {len(words)} values, not 1, 6 or 9.")
+            index = [int(word) for word in words[:3]] if len(words) > 1 else [int(key)] * 3
+            reference.append((index[0], index[1], index[2]))
+            weight.append([float(word) for word in words[3:6]] if len(words) > 1 else [1.0, 0.0, 0.0])
+            offset.append([float(word) for word in words[6:9]] if len(words) == 9 else [0.0, 0.0, 0.0])
+        elif key.isdigit() and section == "delete_verts":
+            deleted.extend(_vertex_ranges(words))
+    if not reference:
+        raise ProxyFileError(f"{name or 'The .mhclo'} lists no vertices after its line 'verts'; the file is damaged.")
+    return Proxy(
+        name=name,
+        reference=np.array(reference),
+        weight=np.array(weight),
+        offset=np.array(offset),
+        scales=(scales.get("x"), scales.get("y"), scales.get("z")),
+        z_depth=z_depth,
+        delete_vertices=np.unique(np.array(deleted, np.int64)),
+    )
+
+
+def _vertex_ranges(words: list[str]) -> list[int]:
+    """Vertex numbers of a line such as `3 7 - 9`: a range includes both of its ends."""
+    numbers: list[int] = []
+    in_range = False
+    for word in words:
+        if word == "-":
+            in_range = True
+        elif in_range:
+            numbers.extend(range(numbers[-1] + 1, int(word) + 1))
+            in_range = False
+        else:
+            numbers.append(int(word))
+    return numbers
+
+
+def read_pair(mhclo: Path, obj: Path) -> tuple[Proxy, ObjMesh]:
+    """A proxy and its mesh from disk.
+
+    Raises:
+        ProxyFileError: damaged files, or files that do not belong together; the message names them.
+    """
+    try:
+        proxy = parse_mhclo(mhclo.read_text(encoding="utf-8", errors="replace"))
+        mesh = parse_obj(obj.read_text(encoding="utf-8", errors="replace"))
+    except ProxyFileError as error:
+        raise ProxyFileError(f"{mhclo}: {error}") from error
+    except (ValueError, IndexError) as error:
+        raise ProxyFileError(f"{mhclo} or {obj} has a line that cannot be read ({error}); fetch it again.") from error
+    if len(proxy.reference) != len(mesh.vertices):
+        raise ProxyFileError(
+            f"{mhclo} places {len(proxy.reference)} vertices but {obj} has {len(mesh.vertices)}; fetch both again."
+        )
+    return proxy, mesh

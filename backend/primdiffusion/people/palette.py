@@ -1,0 +1,72 @@
+"""The colours people and their clothes come in, drawn as linear RGB."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from primdiffusion.people.colour import bytes_from_lab, lab_from_bytes, linear_from_bytes
+
+# sRGB, hexadecimal. Repeats are weights.
+CLOTHES: dict[str, str] = {
+    "top": "f2f2ee f2f2ee e8e3d5 c4c6c8 8d9196 4a4d52 22242a 1f2c4d 274f8f 3f7fc1 8db6d9 2e8b8b 3f7d4e 6b7a45 "
+    "c9a13b d9c04f c8703a b23a3a 7a2637 d79aa8 6f4a86 6b4c38 b89f7d",
+    "denim": "2a3a55 2f4a74 47658f 47658f 6d8bb5 8ba5c4 23252a 55595f b09a73 5b4636 55583c d5d0c2",
+    "trousers": "23252a 2e3138 1f2a40 4a4d52 6a6d70 5b4636 8b7a5c 3a3f33",
+    "tights": "1c1d21 23252a 2a2f45 3d3f45 4a2f3f 2f4a4a 5a5d63",
+    "skirt": "22242a 3b3f46 1f2c4d 6a6d70 5b3a3a 7a2637 8b7a5c 3f4a3a b89f7d 4a3f5a",
+    "jacket": "3f4a3a 55583c 5b4636 2e3138 1f2c4d 8b7a5c 6b2f2f 6a6d70 22242a 8a6a4a",
+    "suit": "1b1c20 26282e 1f2a40 2c3a5a 4a4d52 5b4a3e 77787a a89a80",
+    "overall": "2f4a74 47658f 6d8bb5 55583c 8b7a5c 6b3f2a 2e3138 3f6a5a",
+    "shoe": "1c1a19 2b2725 4a2f20 6b4328 8b5a33 a5764a d8d4cb f0eeea 5a5d63 1f2c4d 7a2a2a",
+    "sock": "eeeeea d5d5d0 8d9196 2a2c30 1f2c4d",
+    "hat": "1c1c1e 4a3f36 6a5a48 8d8a84 b7a88c 26304a d9d3c4",
+    "detail": "9a9a94 c0a050 3a3a3c 2a2420",
+    "shirt": "f2f2ee f2f2ee dfe6ee c9d8e8 e6d8dc 22242a",
+}
+HAIR: dict[str, str] = {
+    "black": "14110f",
+    "darkbrown": "2a1c14",
+    "brown": "452d1e",
+    "lightbrown": "6e4b30",
+    "auburn": "5e2a18",
+    "red": "8a4423",
+    "darkblond": "8f6d42",
+    "blond": "bf9a63",
+    "grey": "8a8783",
+    "white": "cfccc6",
+}
+JITTER = (5.0, 4.0, 4.0)
+"""Standard deviations in Lab of a garment colour about its palette entry."""
+
+
+def garment_colour(kind: str, draws: np.random.Generator) -> Float[np.ndarray, "3"]:
+    """A linear colour that suits a kind of garment."""
+    codes = CLOTHES[kind].split()
+    return _near(codes[draws.integers(len(codes))], draws, 1.0)
+
+
+def contrasting(colour: Float[np.ndarray, "3"], kind: str, draws: np.random.Generator) -> Float[np.ndarray, "3"]:
+    """The colour, of four that suit the kind, that is farthest from `colour` in lightness and hue."""
+    options = [garment_colour(kind, draws) for _ in range(4)]
+    return max(options, key=lambda option: float(np.abs(np.sqrt(option) - np.sqrt(colour)).sum()))
+
+
+def hair_colour(tone: float, old: bool, draws: np.random.Generator) -> tuple[str, Float[np.ndarray, "3"]]:
+    """A hair colour's name and linear value; dark skin (tone near 1) goes with dark hair, age with grey."""
+    light = (0.16, 0.2, 0.2, 0.13, 0.06, 0.05, 0.08, 0.09, 0.02, 0.01)
+    dark = (0.62, 0.22, 0.08, 0.01, 0.01, 0.0, 0.0, 0.01, 0.04, 0.01)
+    share = np.array(light) * (1 - tone) + np.array(dark) * tone
+    if old:
+        share *= 0.55
+        share[-2:] += 0.24
+    name = list(HAIR)[draws.choice(len(HAIR), p=share / share.sum())]
+    return name, _near(HAIR[name], draws, 0.5)
+
+
+def _near(code: str, draws: np.random.Generator, spread: float) -> Float[np.ndarray, "3"]:
+    """A linear colour about a hexadecimal one."""
+    lab = lab_from_bytes(np.frombuffer(bytes.fromhex(code), np.uint8))
+    moved = lab + draws.normal(0, JITTER).astype(np.float32) * spread
+    moved[0] = np.clip(moved[0], 3, 97)
+    return linear_from_bytes(bytes_from_lab(moved)).astype(np.float64)

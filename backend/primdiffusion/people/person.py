@@ -1,0 +1,168 @@
+"""A dressed person from a seed."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+from primdiffusion.people import garments, hair, palette, skin
+from primdiffusion.people.assets import Assets
+from primdiffusion.people.base_mesh import BaseMesh
+from primdiffusion.people.colour import bytes_from_linear
+from primdiffusion.people.fitting import fit_item, item_skinning, shown_faces
+from primdiffusion.people.wardrobe import EYES, Choice, choose, hair_path, stream
+
+EYE_SIZE, BROW_SIZE = 256, 512
+EYE_SHARES = {
+    "brown": 0.4,
+    "brownlight": 0.22,
+    "blue": 0.1,
+    "lightblue": 0.07,
+    "green": 0.07,
+    "grey": 0.07,
+    "bluegreen": 0.04,
+    "ice": 0.03,
+}
+CLOTHES = ("outfit", "shoes")
+"""Parts that hide what is under them. Outfits also list the base's eyes and hair, which must stay."""
+DARK_EYES = ("brown", "brownlight")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Person:
+    """A dressed, rigged person in the rest pose of the default body."""
+
+    mesh: TexturedMesh
+    """Parts "body", "eyes", "eyebrows", "eyelashes", "outfit", "shoes" and, if worn, "hair" and "hat"."""
+    betas: Float[np.ndarray, "10"]
+    attributes: dict[str, str | float]
+    """What can be said of the person: sex, skin tone, garments and their colours."""
+    sources: tuple[str, ...]
+    """Meshes and pictures of the asset folder that the person is made of."""
+    choice: Choice
+    assets: Assets
+    base: BaseMesh
+
+
+def make_person(assets: Assets, base: BaseMesh, seed: int) -> Person:
+    """A person drawn from a seed: body, clothes, hair and all colours; the same on any machine.
+
+    Takes about half a second once the process has decoded the files it needs.
+
+    Raises:
+        AssetsMissingError, ProxyFileError: the asset folder lacks files or has damaged ones.
+    """
+    choice = choose(seed, femininity(base))
+    return _coloured(assets, base, choice, _geometry(assets, base, choice), seed)
+
+
+def recolour(person: Person, seed: int) -> Person:
+    """The same person with other colours of skin, hair, eyes and clothes; geometry arrays are shared, not copied."""
+    return _coloured(person.assets, person.base, person.choice, person.mesh, seed)
+
+
+@functools.lru_cache(maxsize=4)
+def femininity(base: BaseMesh) -> Float[np.ndarray, "10"]:
+    """The direction in betas from male to female: regression of gender on the bodies the base mesh was made from."""
+    gender = base.sample_phenotypes[:, base.phenotype_names.index("gender")]
+    design = np.column_stack([base.sample_betas, np.ones(len(gender))])
+    return np.linalg.lstsq(design, gender, rcond=None)[0][:-1]
+
+
+def _geometry(assets: Assets, base: BaseMesh, choice: Choice) -> TexturedMesh:
+    """All parts in place, with a plain texture."""
+    vertices = base.vertices(choice.betas)
+    paths = {
+        "outfit": choice.outfit.path,
+        "shoes": choice.shoes.path,
+        "eyes": EYES,
+        "eyebrows": choice.eyebrows,
+        "eyelashes": choice.eyelashes,
+        "hair": hair_path(choice.hair) if choice.hair else None,
+        "hat": choice.hat,
+    }
+    worn = {name: path for name, path in paths.items() if path}
+    pairs = {name: assets.proxy(path) for name, path in worn.items()}
+    shown = shown_faces(base, {name: (pairs[name][0], pairs[name][1].faces) for name in CLOTHES})
+    plain = np.full((1, 1, 4), 255, np.uint8)
+    body = TexturedPart(
+        "body",
+        vertices,
+        base.faces[shown["body"]].astype(np.int32),
+        base.corner_uv[shown["body"]],
+        plain,
+        base.joint_index,
+        base.joint_weight,
+    )
+    parts = [_compact(body)]
+    for name, path in worn.items():
+        _, mesh = pairs[name]
+        index, weight, _ = item_skinning(assets, base, path)
+        fitted = fit_item(assets, base, path, vertices)
+        seen = shown.get(name, np.ones(len(mesh.faces), bool))
+        part = TexturedPart(name, fitted, mesh.faces[seen], mesh.corner_uv[seen], plain, index, weight)
+        parts.append(_compact(part))
+    return TexturedMesh(tuple(parts))
+
+
+def _compact(part: TexturedPart) -> TexturedPart:
+    """The part without vertices that no face uses."""
+    used, faces = np.unique(part.faces, return_inverse=True)
+    return dataclasses.replace(
+        part,
+        vertices=part.vertices[used],
+        faces=faces.reshape(-1, 3).astype(np.int32),
+        skin_index=part.skin_index[used],
+        skin_weight=part.skin_weight[used],
+    )
+
+
+def _coloured(assets: Assets, base: BaseMesh, choice: Choice, mesh: TexturedMesh, seed: int) -> Person:
+    """Draw all colours from a seed and put them on the geometry."""
+    complexion = skin.draw_skin(assets, choice.sex, stream(seed, "skin"))
+    hair_name, hair_linear = palette.hair_colour(complexion.tone, complexion.age == "old", stream(seed, "hair colour"))
+    eyes = _eye_picture(assets, complexion.tone, stream(seed, "eye colour"))
+    outfit = garments.paint_garment(choice.outfit, stream(seed, "outfit colour"))
+    shoes = garments.paint_garment(choice.shoes, stream(seed, "shoe colour"))
+    textures: dict[str, UInt8[np.ndarray, "H W 4"]] = {
+        "body": skin.skin_texture(assets, complexion),
+        "eyes": assets.picture(eyes, EYE_SIZE),
+        "eyebrows": hair.tinted_cutout(assets.picture(choice.eyebrows, BROW_SIZE), 0.5 * hair_linear),
+        "eyelashes": hair.tinted_cutout(assets.picture(choice.eyelashes, BROW_SIZE), np.full(3, 0.006)),
+        "outfit": garments.coloured(garments.cloth(assets, base, choice.outfit), outfit),
+        "shoes": garments.coloured(garments.cloth(assets, base, choice.shoes), shoes),
+    }
+    if choice.hair:
+        textures["hair"] = hair.coloured_strands(hair.strands(assets, choice.hair), hair_linear)
+    if choice.hat:
+        colour = palette.garment_colour("hat", stream(seed, "hat colour"))
+        textures["hat"] = np.append(bytes_from_linear(colour.astype(np.float32)), np.uint8(255)).reshape(1, 1, 4)
+    parts = tuple(dataclasses.replace(part, texture=textures[part.name]) for part in mesh.parts)
+    attributes: dict[str, str | float] = {
+        "sex": choice.sex,
+        "age": complexion.age,
+        "skin_tone": round(complexion.tone, 4),
+        "outfit": choice.outfit.name,
+        "pattern": ", ".join(dict.fromkeys(paint.pattern for paint in outfit)),
+        "shoes": choice.shoes.name,
+        "hair": choice.hair or "none",
+        "hair_colour": hair_name,
+        "hat": choice.hat.rsplit("/", 1)[-1] if choice.hat else "none",
+        "eyes": eyes.rsplit("/", 1)[-1],
+        "height": round(float(mesh.parts[0].vertices[:, 1].max() - mesh.bounds[0, 1]), 4),
+    }
+    sources = (choice.outfit.path, choice.shoes.path, choice.eyebrows, choice.eyelashes, complexion.base,
+               complexion.other, eyes, *([hair_path(choice.hair)] if choice.hair else []),
+               *([choice.hat] if choice.hat else []))  # fmt: skip
+    return Person(TexturedMesh(parts), choice.betas, attributes, sources, choice, assets, base)
+
+
+def _eye_picture(assets: Assets, tone: float, draws: np.random.Generator) -> str:
+    """A picture of an iris; dark skin goes with brown eyes."""
+    there = {name: share for name, share in EYE_SHARES.items() if assets.has_picture(f"eyes/materials/{name}_eye")}
+    shares = np.array([share if name in DARK_EYES else share * (1 - tone) ** 2 for name, share in there.items()])
+    return f"eyes/materials/{list(there)[draws.choice(len(there), p=shares / shares.sum())]}_eye"

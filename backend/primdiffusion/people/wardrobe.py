@@ -1,0 +1,170 @@
+"""What there is to wear, and what a person of a given seed wears: names only, no files.
+
+The tables name the meshes of the asset pack and say of each connected piece of a garment what it is (largest piece
+first), because that decides which colours and patterns suit it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import zlib
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+Sex = Literal["female", "male"]
+Kind = Literal[
+    "top", "denim", "trousers", "tights", "skirt", "jacket", "suit", "overall", "shoe", "sock", "hat", "detail"
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Piece:
+    """A connected piece of a garment."""
+
+    kind: Kind
+    trim: bool = False
+    """The texture has parts of a clearly different colour (edgings, a shirt under a jacket) to be coloured apart."""
+    smooth: bool = False
+    """The texture has fine stripes, which primitives cannot show: keep its broad shading only."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Garment:
+    """A mesh of the pack and what its pieces are."""
+
+    name: str
+    pieces: tuple[Piece, ...]
+    by_island: bool = False
+    """Pieces are islands of the texture instead of connected parts of the mesh."""
+
+    @property
+    def path(self) -> str:
+        """Where its files are in the asset folder, without ending."""
+        return f"clothes/{self.name}/{self.name}"
+
+
+TRIMMED_TOP, STRIPED_TOP, PLAIN_TOP = Piece("top", trim=True), Piece("top", smooth=True), Piece("top")
+DENIM, DETAIL = Piece("denim"), Piece("detail")
+
+OUTFITS: dict[Sex, tuple[Garment, ...]] = {
+    "female": (
+        Garment("female_casualsuit01", (TRIMMED_TOP, DENIM)),
+        Garment("female_casualsuit02", (DENIM, PLAIN_TOP, DETAIL)),
+        Garment("female_elegantsuit01", (STRIPED_TOP, Piece("skirt"))),
+        Garment("female_sportsuit01", (TRIMMED_TOP, Piece("tights", trim=True))),
+    ),
+    "male": (
+        Garment("male_casualsuit01", (DENIM, PLAIN_TOP, DENIM, PLAIN_TOP, PLAIN_TOP, PLAIN_TOP), by_island=True),
+        Garment("male_casualsuit02", (TRIMMED_TOP, DENIM)),
+        Garment("male_casualsuit03", (STRIPED_TOP, DENIM)),
+        Garment("male_casualsuit04", (DENIM, TRIMMED_TOP)),
+        Garment("male_casualsuit05", (Piece("jacket"), DENIM, STRIPED_TOP, STRIPED_TOP)),
+        Garment("male_casualsuit06", (PLAIN_TOP, DENIM)),
+        Garment("male_elegantsuit01", (Piece("suit", trim=True), Piece("trousers"))),
+        Garment("male_worksuit01", (Piece("overall"), PLAIN_TOP, DETAIL, DETAIL, DETAIL, DETAIL)),
+    ),
+}
+
+_SHOE = (Piece("shoe"), Piece("shoe"), Piece("sock"), Piece("sock"))
+SHOES: tuple[Garment, ...] = (
+    Garment("shoes01", _SHOE),
+    Garment("shoes02", _SHOE),
+    Garment("shoes03", (*_SHOE, *(Piece("shoe"),) * 8)),
+    Garment("shoes04", _SHOE),
+    Garment("shoes05", _SHOE),
+    Garment("shoes06", _SHOE),
+)
+
+HATS = ("clothes/fedora01/fedora", "clothes/fedora01/fedora_cocked")
+HAIR: dict[Sex, tuple[str, ...]] = {
+    "female": ("bob01", "bob02", "long01", "ponytail01", "braid01", "short03", "afro01"),
+    "male": ("short01", "short02", "short04", "short03", "afro01"),
+}
+HAT_HAIR: dict[Sex, tuple[str, ...]] = {
+    "female": ("bob02", "long01", "short03"),
+    "male": ("short02", "short04", "short03"),
+}
+EYEBROWS = tuple(f"eyebrows/eyebrow{number:03d}/eyebrow{number:03d}" for number in range(1, 13))
+EYELASHES = tuple(f"eyelashes/eyelashes{number:02d}/eyelashes{number:02d}" for number in range(1, 5))
+FEMALE_EYEBROWS, MALE_EYEBROWS = (0, 1, 3, 5, 6, 9, 10), (0, 1, 2, 3, 4, 7, 9, 11)
+EYES = "eyes/low-poly/low-poly"
+
+HAT_SHARE, BALD_SHARE = 0.08, 0.08
+LARGEST_BETA = 2.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Choice:
+    """The shape of a person: body and meshes, without colours."""
+
+    sex: Sex
+    betas: Float[np.ndarray, "10"]
+    outfit: Garment
+    shoes: Garment
+    hat: str | None
+    hair: str | None
+    eyebrows: str
+    eyelashes: str
+
+
+def stream(seed: int, purpose: str) -> np.random.Generator:
+    """Random numbers of one purpose: what is drawn for one does not move what is drawn for another."""
+    return np.random.default_rng([seed, zlib.crc32(purpose.encode())])
+
+
+def required_meshes() -> tuple[str, ...]:
+    """Every mesh a person may need, as paths without ending in the asset folder."""
+    clothes = [garment.path for outfits in OUTFITS.values() for garment in outfits] + [shoe.path for shoe in SHOES]
+    hair = [hair_path(name) for names in HAIR.values() for name in names]
+    return tuple(dict.fromkeys((*clothes, *HATS, *hair, *EYEBROWS, *EYELASHES, EYES)))
+
+
+def hair_path(name: str) -> str:
+    """Where the files of a hair mesh are, without ending."""
+    return f"hair/{name}/{name}"
+
+
+def choose(seed: int, femininity: Float[np.ndarray, "10"]) -> Choice:
+    """Draw a person's body and clothes; outfits are drawn evenly within a sex.
+
+    Args:
+        seed: same seed, same choice, on any machine.
+        femininity: the direction in betas along which bodies go from male to female.
+    """
+    betas, sex = draw_body(seed, femininity)
+    wear = stream(seed, "wear")
+    outfit = OUTFITS[sex][wear.integers(len(OUTFITS[sex]))]
+    shoes = SHOES[wear.integers(len(SHOES))]
+    head = stream(seed, "head")
+    hat = HATS[head.integers(len(HATS))] if head.random() < HAT_SHARE else None
+    bald = sex == "male" and head.random() < BALD_SHARE
+    styles = HAT_HAIR[sex] if hat else HAIR[sex]
+    hair = None if bald else styles[head.integers(len(styles))]
+    brows = FEMALE_EYEBROWS if sex == "female" else MALE_EYEBROWS
+    return Choice(
+        sex=sex,
+        betas=betas,
+        outfit=outfit,
+        shoes=shoes,
+        hat=hat,
+        hair=hair,
+        eyebrows=EYEBROWS[brows[head.integers(len(brows))]],
+        eyelashes=EYELASHES[head.integers(len(EYELASHES)) if sex == "female" else 0],
+    )
+
+
+def draw_body(seed: int, femininity: Float[np.ndarray, "10"]) -> tuple[Float[np.ndarray, "10"], Sex]:
+    """Betas of N(0, 1) within LARGEST_BETA, and the sex on whose side of the body shapes they fall.
+
+    Bodies are moved off the middle between the sexes, where clothes of neither sit well, to at least half a standard
+    deviation along `femininity`.
+    """
+    draws = stream(seed, "body")
+    betas = draws.standard_normal(10)
+    axis = femininity / np.linalg.norm(femininity)
+    side = float(betas @ axis)
+    sign = 1.0 if side >= 0 else -1.0
+    betas += axis * sign * max(0.0, 0.5 - abs(side))
+    return np.clip(betas, -LARGEST_BETA, LARGEST_BETA), "female" if sign > 0 else "male"
