@@ -154,7 +154,7 @@ def _march_ray(pixel, chunk, hit_box, hit_first, hit_last, direction, to_local, 
 
 @numba.njit(cache=True, fastmath={"contract", "arcp", "nsz", "afn"})
 def _gather(chunk, begin, first, last, k, direction, to_local, start, voxels, stride, spacing):
-    """Adds box k's samples at first, first + stride, ..., last (lattice points) to the chunk: opacity * colour, opacity."""
+    """Adds box k's samples at lattice points first, first + stride, ..., last to the chunk: a * colour and a."""
     size = voxels.shape[1]
     one, half_range = np.float32(1), np.float32(0.5 * (size - 1))
     x, y, z = _local(direction, first * spacing, to_local, start, k)

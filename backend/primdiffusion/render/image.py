@@ -5,7 +5,6 @@ from __future__ import annotations
 import colorsys
 import dataclasses
 import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +21,8 @@ from primdiffusion.render.compositing import Rendering
 __all__ = ["as_boxes", "decode_srgb", "depth_to_png", "encode_srgb", "over", "to_png"]
 
 Background = tuple[float, float, float]
-BOX_DENSITY = 2000.0
-"""1/m: boxes drawn as boxes are opaque within the first sample."""
+BOX_DENSITY = 1e5
+"""1/m: boxes drawn as boxes are opaque within a sample, almost up to their faces in spite of the window."""
 NEAR_TO_FAR = ((1.0, 0.95, 0.75), (0.98, 0.62, 0.25), (0.80, 0.25, 0.33), (0.42, 0.12, 0.47), (0.10, 0.07, 0.28))
 """Encoded sRGB of the depth picture, brightness falling with distance."""
 
@@ -88,11 +87,9 @@ def _to_bytes(values: Float[Tensor, "h w c"]) -> UInt8[ndarray, "h w c"]:
 
 def _save(path: str | Path, pixels: UInt8[ndarray, "h w c"]) -> None:
     target = Path(path)
-    handle, unfinished = tempfile.mkstemp(suffix=".png", dir=target.parent)
+    unfinished = target.with_name(f".{target.name}.{os.getpid()}")
     try:
-        with os.fdopen(handle, "wb") as file:
-            Image.fromarray(pixels).save(file, format="PNG")
+        Image.fromarray(pixels).save(unfinished, format="PNG")
         os.replace(unfinished, target)
-    except BaseException:
-        Path(unfinished).unlink(missing_ok=True)
-        raise
+    finally:
+        unfinished.unlink(missing_ok=True)

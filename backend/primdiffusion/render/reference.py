@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from primdiffusion.geometry.camera import Camera
@@ -99,18 +99,19 @@ def _march_rays(
     order = torch.argsort(ray * (n.max() + 1 if len(n) else 1) + n, stable=True)  # within a point: index order
     ray, box, n = ray[order], box[order], n[order]
 
-    point = origin + (n * settings.spacing)[:, None] * directions[ray]
+    distance = n.to(origin.dtype) * settings.spacing
+    point = origin + distance[:, None] * directions[ray]
     local = _to_local(primitives, box, point)
     rgb_density = torch.cat([primitives.rgb, primitives.density[:, None]], dim=1)
     rgb, density = trilinear(rgb_density, box, local).split((3, 1), dim=-1)
-    opacity = density[:, 0] * window(local) * (stride[box] * settings.spacing)
+    opacity = density[:, 0] * window(local) * (stride[box].to(distance.dtype) * settings.spacing)
 
     group, first = grouping(ray, n)
     group_opacity = opacity.new_zeros(len(first)).index_add(0, group, opacity)
     seen = group_opacity > 0
     group_rgb = rgb.new_zeros((len(first), 3)).index_add(0, group, opacity[:, None] * rgb)
     group_rgb = group_rgb / torch.where(seen, group_opacity, torch.ones_like(group_opacity))[:, None]
-    return composite(*_rows(ray[first], len(directions), group_opacity, group_rgb, n[first] * settings.spacing))
+    return composite(*_rows(ray[first], len(directions), group_opacity, group_rgb, distance[first]))
 
 
 def _to_local(primitives: Primitives, box: Int[Tensor, "m"], point: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
@@ -139,7 +140,7 @@ def _samples(
     q = torch.where(q.abs() < 1e-12, torch.full_like(q, 1e-12), q)
     near, far = ((-1 - p) / q), ((1 - p) / q)
     enter, leave = torch.minimum(near, far).amax(-1), torch.maximum(near, far).amin(-1)
-    step = stride[solid] * spacing
+    step = stride[solid].to(origin.dtype) * spacing
     # A little too wide, because of rounding; the test of |y| < 1 below decides.
     first, last = (enter / step - 1e-3).ceil().clamp_min(1), (leave / step + 1e-3).floor()
     ray, candidate = (first <= last).nonzero(as_tuple=True)
@@ -150,12 +151,9 @@ def _samples(
     within = torch.arange(len(begin), device=begin.device) - begin
     box = solid[candidate]
     n = (first.repeat_interleave(count) + within) * stride[box]
-    inside = _inside(_to_local(primitives, box, origin + (n * spacing)[:, None] * directions[ray]))
+    local = _to_local(primitives, box, origin + (n.to(origin.dtype) * spacing)[:, None] * directions[ray])
+    inside = (local.abs() < 1).all(-1)
     return ray[inside], box[inside], n[inside]
-
-
-def _inside(local: Float[Tensor, "m 3"]) -> Bool[Tensor, "m"]:
-    return (local.abs() < 1).all(-1)
 
 
 def _by_point(ray: Int[Tensor, "m"], n: Int[Tensor, "m"]) -> tuple[Int[Tensor, "m"], Int[Tensor, "g"]]:
@@ -186,5 +184,5 @@ def _rows(
     return (
         opacity.new_zeros((rays, width)).index_put(place, opacity),
         rgb.new_zeros((rays, width, 3)).index_put(place, rgb),
-        opacity.new_zeros((rays, width)).index_put(place, distance.to(opacity.dtype)),
+        opacity.new_zeros((rays, width)).index_put(place, distance),
     )

@@ -1,0 +1,55 @@
+"""Scenes for the marcher's tests, in float64."""
+
+import torch
+from primdiffusion.geometry.camera import Camera, look_at
+from primdiffusion.geometry.rotation import axis_angle_to_matrix
+from primdiffusion.primitives.primitives import Primitives
+from torch import Tensor
+
+
+def random_boxes(
+    count: int,
+    seed: int = 0,
+    *,
+    spread: float = 0.1,
+    smallest: float = 0.01,
+    largest: float = 0.06,
+    density: float = 40.0,
+    size: int = 8,
+) -> Primitives:
+    """Overlapping boxes around the origin with random contents; densities up to `density` per metre."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(shape, generator=generator, dtype=torch.float64)
+
+    return Primitives(
+        position=(uniform(count, 3) * 2 - 1) * spread,
+        rotation=axis_angle_to_matrix((uniform(count, 3) * 2 - 1) * 3),
+        half_extent=smallest + (largest - smallest) * uniform(count, 3),
+        rgb=uniform(count, 3, size, size, size),
+        density=uniform(count, size, size, size) * density,
+    )
+
+
+def one_box(half_extent: float = 0.05, density: float = 1.0, rgb: tuple[float, ...] = (0.2, 0.4, 0.8)) -> Primitives:
+    """A cube of constant contents at the origin, its axes the world's."""
+    colour = torch.tensor(rgb, dtype=torch.float64)[None, :, None, None, None]
+    return Primitives(
+        position=torch.zeros((1, 3), dtype=torch.float64),
+        rotation=torch.eye(3, dtype=torch.float64)[None],
+        half_extent=torch.full((1, 3), half_extent, dtype=torch.float64),
+        rgb=colour.expand(1, 3, 8, 8, 8).clone(),
+        density=torch.full((1, 8, 8, 8), density, dtype=torch.float64),
+    )
+
+
+def camera_at(position: tuple[float, ...], *, fov: float = 0.3, width: int = 24, height: int = 20) -> Camera:
+    """A camera that looks at the origin."""
+    where = torch.tensor(position, dtype=torch.float64)
+    return look_at(where, torch.zeros_like(where), vertical_fov=fov, width=width, height=height)
+
+
+def single_ray(distance: float) -> Camera:
+    """One pixel whose ray runs along -z through the origin, from `distance` in front of it."""
+    return camera_at((0.0, 0.0, distance), width=1, height=1)

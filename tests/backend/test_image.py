@@ -1,0 +1,119 @@
+"""sRGB, picture files and boxes drawn as boxes."""
+
+import math
+import os
+
+import numpy as np
+import pytest
+import torch
+from march_scenes import camera_at, random_boxes
+from PIL import Image
+from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.render.compositing import Rendering
+from primdiffusion.render.image import as_boxes, depth_to_png, to_png
+from primdiffusion.render.march import march
+
+KNOWN = {0.0: 0.0, 0.0031308: 0.04044994, 0.2140411: 0.5, 0.5: 0.7353570, 1.0: 1.0}
+
+
+def rendering(rgb: tuple[float, ...], alpha: float, depth: float = 1.0) -> Rendering:
+    """A 1 x 2 picture: the given pixel, then nothing."""
+    return Rendering(
+        rgb=torch.tensor([[rgb, (0.0, 0.0, 0.0)]]),
+        alpha=torch.tensor([[alpha, 0.0]]),
+        depth=torch.tensor([[depth, math.inf]]),
+        first_hit=torch.tensor([[depth, math.inf]]),
+    )
+
+
+def pixels(path) -> np.ndarray:
+    return np.asarray(Image.open(path))
+
+
+@pytest.mark.parametrize("convert", [np.asarray, torch.tensor])
+def test_encoding_gives_the_standards_values_and_decoding_takes_them_back(convert):
+    linear, encoded = convert(list(KNOWN)), convert(list(KNOWN.values()))
+    np.testing.assert_allclose(np.asarray(encode_srgb(linear)), np.asarray(encoded), atol=1e-6)
+    every = convert(np.linspace(0, 1, 1001).tolist())
+    assert type(encode_srgb(every)) is type(every)
+    np.testing.assert_allclose(np.asarray(decode_srgb(encode_srgb(every))), np.asarray(every), atol=2e-7)
+
+
+def test_conversion_keeps_the_dtype():
+    for dtype in (np.float32, np.float64):
+        assert decode_srgb(encode_srgb(np.ones(3, dtype))).dtype == dtype
+    assert encode_srgb(torch.ones(3)).dtype == torch.float32
+
+
+def test_gradients_are_finite_at_black():
+    for convert in (encode_srgb, decode_srgb):
+        linear = torch.tensor([0.0, -0.1, 1e-9, 0.5], dtype=torch.float64, requires_grad=True)
+        assert torch.autograd.gradcheck(convert, linear)
+
+
+def test_a_transparent_picture_holds_straight_colour(tmp_path):
+    """Half covered by linear 0.8 red: premultiplied 0.4; the file must say 0.8 encoded, and alpha 128."""
+    to_png(tmp_path / "a.png", rendering((0.4, 0.0, 0.1), 0.5), background=None)
+    got = pixels(tmp_path / "a.png")
+    assert got.shape == (1, 2, 4)
+    assert got[0, 0].tolist() == [round(255 * 0.9063317), 0, round(255 * 0.4845292), 128]
+    assert got[0, 1].tolist() == [0, 0, 0, 0]
+
+
+def test_over_a_background_colours_mix_in_linear_light(tmp_path):
+    to_png(tmp_path / "a.png", rendering((0.25, 0.0, 0.0), 0.5), background=(0.5, 1.0, 0.0))
+    assert pixels(tmp_path / "a.png")[0].tolist() == [[188, 188, 0], [188, 255, 0]]
+
+
+def test_the_default_background_is_black(tmp_path):
+    to_png(tmp_path / "a.png", rendering((0.25, 0.0, 0.0), 0.5))
+    assert pixels(tmp_path / "a.png")[0].tolist() == [[137, 0, 0], [0, 0, 0]]
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_rubbish(tmp_path, monkeypatch):
+    path = tmp_path / "a.png"
+    to_png(path, rendering((0.25, 0.0, 0.0), 0.5))
+    before = path.read_bytes()
+
+    def full_disk(*_):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(os, "replace", full_disk)
+    with pytest.raises(OSError, match="no space"):
+        to_png(path, rendering((0.9, 0.0, 0.0), 1.0))
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.png"]
+
+
+def test_written_pictures_can_be_read_by_others(tmp_path):
+    """Temporary files are private by default; the finished picture must have the usual permissions."""
+    to_png(tmp_path / "a.png", rendering((0.25, 0.0, 0.0), 0.5))
+    (tmp_path / "b").touch()
+    assert (tmp_path / "a.png").stat().st_mode == (tmp_path / "b").stat().st_mode
+
+
+def test_depth_is_brighter_where_nearer_and_black_where_empty(tmp_path):
+    alpha = torch.tensor([[1.0, 1.0, 1.0, 0.0]])
+    depth = torch.tensor([[1.0, 2.0, 3.0, math.inf]])
+    depth_to_png(tmp_path / "d.png", Rendering(torch.zeros(1, 4, 3), alpha, depth, depth))
+    near, middle, far, nothing = pixels(tmp_path / "d.png")[0].astype(int).sum(-1)
+    assert near > middle > far > nothing == 0
+    depth_to_png(tmp_path / "d.png", Rendering(torch.zeros(1, 4, 3), 0 * alpha, torch.full((1, 4), math.inf), depth))
+    assert pixels(tmp_path / "d.png").max() == 0
+
+
+def test_boxes_are_drawn_opaque_in_flat_colours_of_their_group():
+    boxes = random_boxes(6, 3, spread=0.1).to(dtype=torch.float32)
+    group = torch.tensor([0, 0, 0, 1, 1, 1])
+    drawn = as_boxes(boxes, group)
+    assert torch.equal(drawn.position, boxes.position)
+    assert drawn.rgb.flatten(2).std(-1).max() < 1e-6
+    hue = encode_srgb(drawn.rgb[:, :, 0, 0, 0])
+    order = hue.argsort(dim=-1)
+    assert torch.equal(order[0], order[1])
+    assert not torch.equal(order[0], order[3])
+    assert len(torch.unique(hue, dim=0)) == 6
+    camera = camera_at((0.0, 0.0, 0.6), fov=0.4).to(dtype=torch.float32)
+    alpha = march(drawn, camera).alpha
+    assert ((alpha == 0) | (alpha == 1)).float().mean() > 0.9
+    assert 0 < alpha.mean() < 1
