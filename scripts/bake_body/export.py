@@ -100,7 +100,8 @@ def report_errors(
         ("surface", np.linalg.norm(rebuilt - vertices[:, surface], axis=-1)),
         ("regressed joints", np.linalg.norm(regressor @ rebuilt - joints, axis=-1)),
     ):
-        print(f"{name}: mean {error.mean() * 1e3:.2f} mm, 95 % below {np.percentile(error, 95) * 1e3:.2f}, worst {error.max() * 1e3:.2f}")
+        mean, most, worst = error.mean() * 1e3, np.percentile(error, 95) * 1e3, error.max() * 1e3
+        print(f"{name}: mean {mean:.2f} mm, 95 % below {most:.2f}, worst {worst:.2f}")
     height = np.ptp(vertices[:, surface, 1], axis=1)
     print(f"heights {height.min():.2f} to {height.max():.2f} m, mean {height.mean():.2f}")
 

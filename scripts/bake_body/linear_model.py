@@ -31,7 +31,7 @@ class LinearModel:
 def fit_linear_model(vertices: np.ndarray, joints: np.ndarray, surface: np.ndarray, twin: np.ndarray) -> LinearModel:
     """Principal components of the vertices named by `surface`; all other points are regressed on the same betas.
 
-    Signs: positive beta 0 is taller, every other positive beta has more breadth (mean of |x|) .
+    Signs: positive beta 0 is taller, every other positive beta has more breadth (trunk and head).
     """
     mean = symmetrise(vertices.mean(0, dtype=np.float64), twin)
     centred = (vertices[:, surface] - mean[surface]).reshape(len(vertices), -1)
@@ -60,12 +60,17 @@ def fit_linear_model(vertices: np.ndarray, joints: np.ndarray, surface: np.ndarr
 
 
 def joint_regressor(linear: LinearModel, surface: np.ndarray, twin: np.ndarray) -> np.ndarray:
-    """[24, len(surface)]: weights on nearby vertices, rows summing to 1, that reproduce the linear joints at every betas.
+    """[24, len(surface)]: weights on nearby vertices, rows summing to 1, that reproduce the joints at every betas.
 
-    Of all such weights the ones closest to a bell around the joint: 3 (1 + 10) + 1 equations in 300 unknowns have room to
-    be met exactly, where weights held non-negative miss by millimetres.
+    Of all such weights the ones closest to a bell around the joint: 3 (1 + 10) + 1 equations in 300 unknowns have room
+    to be met exactly, where weights held non-negative miss by millimetres.
     """
-    mean, basis, joint_mean, joint_basis = linear.mean[surface], linear.basis[surface], linear.joint_mean, linear.joint_basis
+    mean, basis, joint_mean, joint_basis = (
+        linear.mean[surface],
+        linear.basis[surface],
+        linear.joint_mean,
+        linear.joint_basis,
+    )
     regressor = np.zeros((len(joint_mean), len(mean)))
     for j in range(len(joint_mean)):
         distance = np.linalg.norm(mean - joint_mean[j], axis=1)

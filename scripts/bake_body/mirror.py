@@ -14,7 +14,9 @@ def mirrored_vertex(template: np.ndarray) -> np.ndarray:
     number = {tuple(position): i for i, position in enumerate(np.round(template, 7) + 0.0)}
     twin = np.array([number[tuple(position)] for position in np.round(template * FLIP, 7) + 0.0])
     if not np.array_equal(twin[twin], np.arange(len(twin))):
-        raise ValueError("The template is not mirror symmetric: two vertices share a place; bake from a symmetric mesh.")
+        raise ValueError(
+            "The template is not mirror symmetric: two vertices share a place; bake from a symmetric mesh."
+        )
     return twin
 
 

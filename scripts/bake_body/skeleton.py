@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 JOINT_NAMES = (
-    "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot right_foot neck "
-    "left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist left_hand "
-    "right_hand"
-).split()
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
+    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
+    "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand",
+)  # fmt: skip
 PARENTS = np.array([-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21])
 _OTHER_SIDE = {"left": "right", "right": "left"}
 MIRRORED_JOINT = np.array(
@@ -41,7 +41,14 @@ _LIMB_BONES = (  # first matching prefix wins: the thumb's root moves with the w
     ("finger1-1", "wrist"),
     ("finger", "hand"),
 )
-_TRUNK_HEADS = {"pelvis": "root", "spine1": "spine04", "spine2": "spine03", "spine3": "spine02", "neck": "neck01", "head": "head"}
+_TRUNK_HEADS = {
+    "pelvis": "root",
+    "spine1": "spine04",
+    "spine2": "spine03",
+    "spine3": "spine02",
+    "neck": "neck01",
+    "head": "head",
+}
 _LIMB_HEADS = {
     "hip": ["upperleg01"],
     "knee": ["lowerleg01"],

@@ -35,7 +35,9 @@ class BodyPose(TensorRecord):
     """Of the whole body, metres, after the rotations."""
 
     @classmethod
-    def rest(cls, *batch: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None) -> BodyPose:
+    def rest(
+        cls, *batch: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
+    ) -> BodyPose:
         """The T pose the template is made in, for a batch of any shape."""
         return cls(
             torch.eye(3, dtype=dtype, device=device).expand(*batch, J, 3, 3),
@@ -43,7 +45,9 @@ class BodyPose(TensorRecord):
         )
 
     @classmethod
-    def from_axis_angle(cls, theta: Float[Tensor, "*b 72"], translation: Float[Tensor, "*b 3"] | None = None) -> BodyPose:
+    def from_axis_angle(
+        cls, theta: Float[Tensor, "*b 72"], translation: Float[Tensor, "*b 3"] | None = None
+    ) -> BodyPose:
         """From SMPL's pose vector: 24 axis-angle vectors in radians, the pelvis first.
 
         Raises:
@@ -90,7 +94,9 @@ class BodyModel(TensorRecord):
         """
         count, available = betas.shape[-1], self.shape_basis.shape[-1]
         if count > available:
-            raise ValueError(f"{count} betas were given but this body has {available} shape components; drop the last ones.")
+            raise ValueError(
+                f"{count} betas were given but this body has {available} shape components; drop the last ones."
+            )
         offsets = torch.einsum("vcn,...n->...vc", self.shape_basis[..., :count], betas)
         vertices = self.template + offsets
         return ShapedBody(self, vertices, self.joint_regressor @ vertices)
@@ -136,7 +142,10 @@ class PosedBody(TensorRecord):
 @functools.cache
 def default_body() -> BodyModel:
     """The body that ships with the package: float32, 12,196 vertices, 10 shape components, no pose blend shapes."""
-    with importlib.resources.as_file(importlib.resources.files(__package__) / "data/body.npz") as path, np.load(path) as f:
+    with (
+        importlib.resources.as_file(importlib.resources.files("primdiffusion.body") / "data/body.npz") as path,
+        np.load(path) as f,
+    ):
         arrays = {name: f[name] for name in ("v_template", "shapedirs", "J_regressor", "weights", "vt", "f", "ft")}
         parents = f["kintree_table"][0].astype(np.int64)
     parents[0] = -1

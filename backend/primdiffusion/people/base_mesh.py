@@ -56,7 +56,10 @@ class BaseMesh:
 @functools.cache
 def load_base_mesh() -> BaseMesh:
     """The base mesh that ships with the package."""
-    with importlib.resources.as_file(importlib.resources.files(__package__) / "data/hm08.npz") as path, np.load(path) as f:
+    with (
+        importlib.resources.as_file(importlib.resources.files("primdiffusion.people") / "data/hm08.npz") as path,
+        np.load(path) as f,
+    ):
         weight = f["joint_weight"].astype(np.float64)
         return BaseMesh(
             template=f["template"].astype(np.float64),

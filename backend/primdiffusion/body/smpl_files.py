@@ -1,0 +1,203 @@
+"""Reading body models in SMPL's file format: users' own SMPL files, or any body in the same layout.
+
+SMPL itself is licensed by its authors and never part of this package. Its files hold no texture coordinates, and
+primitives are laid out in texture space, so these come from a second file or from an automatic unwrap.
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import zipfile
+import zlib
+
+import numpy as np
+import torch
+import xatlas
+
+from primdiffusion.body.model import BodyModel, J
+from primdiffusion.body.smpl_pickle import BodyFileError, as_array, read_pickle
+
+SHAPE_COMPONENTS = 10
+"""Of SMPL's up to 300 shape components this many are kept unless more are asked for."""
+POSE_FEATURES = (J - 1) * 9
+_ROOT_MARKS = (-1, 2**32 - 1, 2**64 - 1)
+"""How files write "no parent": -1 or what it becomes in an unsigned integer."""
+
+Path = str | os.PathLike[str]
+
+
+def load_body(
+    path: Path, uv: Path | tuple[Path, Path] | None = None, shape_components: int = SHAPE_COMPONENTS
+) -> BodyModel:
+    """A body (float32) from an SMPL .pkl or .npz.
+
+    Args:
+        path: the model. Pickles are read by `smpl_pickle` and cannot run code.
+        uv: texture coordinates: an .obj with the body's vertex numbers, or the pair (vt.npy [T, 2], ft.npy [F, 3]).
+            Without it, "vt" and "ft" of the model file are used, and without those an automatic unwrap (seconds; many
+            small islands).
+        shape_components: how many leading shape components to keep, at most; files hold 10 to 300.
+
+    Raises:
+        FileNotFoundError: a file is not there.
+        BodyFileError: a file is cut short, misses an array, or holds one of the wrong shape, type or range.
+        UnsafePickleError: a pickle asks for more than a body model needs.
+    """
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no body model at {path}; give the path of an SMPL .pkl or .npz file.")
+    arrays = _ArrayFile(path)
+    template = arrays.real("v_template", ("V", 3))
+    vertex_count = len(template)
+    faces = arrays.whole("f", ("F", 3), vertex_count)
+    shape_basis = arrays.real("shapedirs", (vertex_count, 3, "N"))[..., :shape_components]
+    pose_basis = arrays.real("posedirs", (vertex_count, 3, POSE_FEATURES))
+    skin_weights = arrays.real("weights", (vertex_count, J))
+    if skin_weights.min() < -1e-4 or np.abs(skin_weights.sum(1) - 1).max() > 1e-2:
+        raise arrays.wrong("weights", "has rows that are no weights (non-negative, with sum 1)")
+    regressor = arrays.real("J_regressor", (J, vertex_count))
+    coordinates, coordinate_faces = _texture_coordinates(arrays, uv, template, faces)
+    return BodyModel(
+        template=torch.from_numpy(template),
+        shape_basis=torch.from_numpy(np.ascontiguousarray(shape_basis)),
+        pose_basis=torch.from_numpy(pose_basis if pose_basis.any() else pose_basis[..., :0]),
+        joint_regressor=torch.from_numpy(regressor),
+        skin_weights=torch.from_numpy(skin_weights),
+        parents=torch.from_numpy(_parents(arrays)),
+        faces=torch.from_numpy(faces),
+        uv=torch.from_numpy(coordinates),
+        uv_faces=torch.from_numpy(coordinate_faces),
+    )
+
+
+class _ArrayFile:
+    """Named arrays of one file, checked as they are taken out."""
+
+    def __init__(self, path: pathlib.Path) -> None:
+        self.path = path
+        if path.suffix not in (".pkl", ".npz"):
+            raise BodyFileError(f"{path} ends in {path.suffix!r}; body models are .pkl or .npz files.")
+        self._pickled = read_pickle(path) if path.suffix == ".pkl" else None
+        self._names = _npz_names(path) if self._pickled is None else set(self._pickled)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._names
+
+    def wrong(self, name: str, complaint: str) -> BodyFileError:
+        return BodyFileError(
+            f"{self.path}: {name!r} {complaint}; use an unchanged SMPL file or one in the same format."
+        )
+
+    def raw(self, name: str) -> np.ndarray:
+        if name not in self:
+            raise self.wrong(name, "is missing")
+        try:
+            if self._pickled is not None:
+                return as_array(self._pickled[name])
+            with np.load(self.path, allow_pickle=False) as file:
+                return file[name]
+        except (ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
+            raise self.wrong(name, f"cannot be read ({error})") from error
+
+    def shaped(self, name: str, shape: tuple[int | str, ...]) -> np.ndarray:
+        array = self.raw(name)
+        right = array.ndim == len(shape) and all(
+            size == wanted if isinstance(wanted, int) else size > 0
+            for size, wanted in zip(array.shape, shape, strict=True)
+        )
+        if not right:
+            wanted = " x ".join(map(str, shape))
+            raise self.wrong(name, f"has shape {' x '.join(map(str, array.shape))} where {wanted} is needed")
+        if array.dtype.kind not in "biuf":
+            raise self.wrong(name, f"holds {array.dtype} where numbers are needed")
+        return array
+
+    def real(self, name: str, shape: tuple[int | str, ...]) -> np.ndarray:
+        array = np.array(self.shaped(name, shape), np.float32)
+        if not np.isfinite(array).all():
+            raise self.wrong(name, "holds NaN or infinite numbers")
+        return array
+
+    def whole(self, name: str, shape: tuple[int | str, ...], limit: int) -> np.ndarray:
+        array = self.shaped(name, shape)
+        number = np.array(array, np.int64)
+        if not np.array_equal(number, array) or number.min() < 0 or number.max() >= limit:
+            raise self.wrong(name, f"holds numbers that are not whole and from 0 to {limit - 1}")
+        return number
+
+
+def _npz_names(path: pathlib.Path) -> set[str]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {name.removesuffix(".npy") for name in archive.namelist()}
+    except zipfile.BadZipFile as error:
+        raise BodyFileError(f"{path} is not a whole .npz file ({error}); download it again.") from error
+
+
+def _parents(arrays: _ArrayFile) -> np.ndarray:
+    parents, joints = np.array(arrays.shaped("kintree_table", (2, J)), np.float64)
+    parents = np.where(np.isin(parents, np.array(_ROOT_MARKS, np.float64)), -1, parents).astype(np.int64)
+    in_order = (parents[0] == -1) and (parents[1:] >= 0).all() and (parents < np.arange(J)).all()
+    if not np.array_equal(joints, np.arange(J)) or not in_order:
+        raise arrays.wrong("kintree_table", "is not a tree of joints in which parents come first")
+    return parents
+
+
+def _texture_coordinates(
+    arrays: _ArrayFile, uv: Path | tuple[Path, Path] | None, template: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    if isinstance(uv, tuple):
+        coordinates, coordinate_faces = (_numpy_file(pathlib.Path(part)) for part in uv)
+        source = str(uv[1])
+    elif uv is not None:
+        coordinates, coordinate_faces = _obj_texture_coordinates(pathlib.Path(uv), faces)
+        source = str(uv)
+    elif "vt" in arrays and "ft" in arrays:
+        coordinates, coordinate_faces, source = arrays.raw("vt"), arrays.raw("ft"), str(arrays.path)
+    else:
+        _, coordinate_faces, coordinates = xatlas.parametrize(template, faces.astype(np.uint32))
+        source = "the automatic unwrap"
+    if coordinates.ndim != 2 or coordinates.shape[1] != 2 or coordinate_faces.shape != faces.shape:
+        raise BodyFileError(
+            f"{source}: texture coordinates of shapes {coordinates.shape} and {coordinate_faces.shape} do not fit a "
+            f"body of {len(faces)} faces; they must be T x 2 and {len(faces)} x 3, in the body's face order."
+        )
+    coordinate_faces = coordinate_faces.astype(np.int64)
+    if not np.isfinite(coordinates).all() or coordinate_faces.min() < 0 or coordinate_faces.max() >= len(coordinates):
+        raise BodyFileError(
+            f"{source}: texture coordinates are NaN or their numbers out of range; use the body's own UV file."
+        )
+    return coordinates.astype(np.float32), coordinate_faces
+
+
+def _numpy_file(path: pathlib.Path) -> np.ndarray:
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise BodyFileError(f"{path} is not a whole .npy file of numbers ({error}); download it again.") from error
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf":
+        raise BodyFileError(f"{path} does not hold one array of numbers; give the pair (vt.npy, ft.npy).")
+    return array
+
+
+def _obj_texture_coordinates(path: pathlib.Path, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Texture coordinates of an OBJ whose triangles are the body's, in any order."""
+    coordinates, corner_of_face = [], {}
+    try:
+        for line in path.read_text(encoding="latin1").splitlines():
+            key, _, rest = line.partition(" ")
+            if key == "vt":
+                coordinates.append([float(number) for number in rest.split()[:2]])
+            elif key == "f":
+                corners = dict(tuple(int(number) - 1 for number in corner.split("/")[:2]) for corner in rest.split())
+                corner_of_face[frozenset(corners)] = corners
+        numbers = [[corner_of_face[frozenset(face)][v] for v in face] for face in faces.tolist()]
+    except (ValueError, TypeError) as error:
+        raise BodyFileError(f"{path} is not an OBJ with texture coordinates in every face ({error}).") from error
+    except KeyError as error:
+        raise BodyFileError(
+            f"{path} lacks a face of the body (vertices {sorted(error.args[0])}, counted from 0); "
+            "use the OBJ made for this body."
+        ) from error
+    return np.array(coordinates), np.array(numbers)
