@@ -38,6 +38,22 @@ def fit_item(
     return assets.proxy(path)[0].fit(base_vertices, item_skinning(assets, base, path)[2])
 
 
+def under_hat(
+    hat: Float[np.ndarray, "H 3"], hair: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> np.ndarray:
+    """Which faces of the hair a hat covers: those whose middle lies above the plane of its brim ([F] bool).
+
+    The brim is what is farthest from the hat's middle; hats sit askew, so its plane is fitted, not level.
+    """
+    middle = hat.mean(axis=0)
+    radius = np.linalg.norm((hat - middle)[:, [0, 2]], axis=1)
+    brim = hat[radius > 0.8 * radius.max()]
+    design = np.column_stack([brim[:, 0], brim[:, 2], np.ones(len(brim))])
+    slope_x, slope_z, height = np.linalg.lstsq(design, brim[:, 1], rcond=None)[0]
+    centre = hair[faces].mean(axis=1)
+    return centre[:, 1] > slope_x * centre[:, 0] + slope_z * centre[:, 2] + height
+
+
 def shown_faces(base: BaseMesh, proxies: dict[str, tuple[Proxy, Int[np.ndarray, "F 3"]]]) -> dict[str, np.ndarray]:
     """Which faces of the body ("body") and of every proxy are seen: [F] bool by name.
 

@@ -21,6 +21,8 @@ SIZE = 512
 """Texels of a garment's side: about 3 mm of cloth each."""
 ORIGINAL_SHARE: dict[str, float] = {"denim": 0.3, "shoe": 0.5, "overall": 0.2, "top": 0.06, "sock": 1.0}
 """How often a piece keeps the pack's own colours."""
+PLAIN_TRIM_SHARE = 0.5
+"""How often edgings and prints take the colour of their piece; a suit's shirt and tie never do."""
 TRIM_DISTANCE = 24.0
 """Lab distance from a piece's own colour beyond which a texel is trim."""
 
@@ -122,6 +124,8 @@ def _paint(kind: Kind, draws: np.random.Generator) -> Paint:
     main = palette.garment_colour(kind, draws)
     partner = "shirt" if kind == "suit" else "top"
     trim = palette.contrasting(main, partner, draws)
+    if kind != "suit" and draws.random() < PLAIN_TRIM_SHARE:
+        trim = main
     second = palette.contrasting(main, "top", draws)
     pattern = "solid"
     if kind == "top" and draws.random() > patterns.SOLID_SHARE:

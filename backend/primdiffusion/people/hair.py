@@ -7,7 +7,7 @@ import functools
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import binary_dilation, gaussian_filter
 
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.colour import bytes_from_linear, luminance
@@ -52,7 +52,7 @@ def tinted_cutout(picture: UInt8[np.ndarray, "H W 4"], colour: Float[np.ndarray,
     """Brows or lashes: the picture's alpha, thickened to pass an alpha test, in one linear colour."""
     texture = np.empty_like(picture)
     texture[..., :3] = bytes_from_linear(colour.astype(np.float32))
-    texture[..., 3] = np.minimum(picture[..., 3].astype(np.int32) * 2, 255).astype(np.uint8)
+    texture[..., 3] = np.minimum(picture[..., 3].astype(np.int32) * 3 // 2, 255).astype(np.uint8)
     return texture
 
 
@@ -68,7 +68,9 @@ def _straight(texels: TexelMap, name: str) -> Strands:
     for row in range(1, SIZE):
         above[row] = np.where(texels.inside[row], above[row - 1] + 1, 0)
     reach = np.abs(_unit(gaussian_filter(draws.standard_normal((SIZE, SIZE)).astype(np.float32), (40, 0.8))))
-    there = below > 0.06 * (below + above) * reach
+    ragged = below > 0.06 * (below + above) * reach
+    # Sideways across island borders, or sheets that meet there would let light through.
+    there = binary_dilation(ragged, np.ones((1, 5), bool))
     return Strands(np.exp(0.22 * shade).astype(np.float32), np.where(there, 255, 0).astype(np.uint8))
 
 

@@ -22,7 +22,7 @@ CLOTHES: dict[str, str] = {
     "sock": "eeeeea d5d5d0 8d9196 2a2c30 1f2c4d",
     "hat": "1c1c1e 4a3f36 6a5a48 8d8a84 b7a88c 26304a d9d3c4",
     "detail": "9a9a94 c0a050 3a3a3c 2a2420",
-    "shirt": "f2f2ee f2f2ee dfe6ee c9d8e8 e6d8dc 22242a",
+    "shirt": "f2f2ee f2f2ee dfe6ee c9d8e8 e6d8dc 22242a 3f5f8f 7a2637 6b7a45 8d9196",
 }
 HAIR: dict[str, str] = {
     "black": "14110f",
@@ -56,7 +56,8 @@ def hair_colour(tone: float, old: bool, draws: np.random.Generator) -> tuple[str
     """A hair colour's name and linear value; dark skin (tone near 1) goes with dark hair, age with grey."""
     light = (0.16, 0.2, 0.2, 0.13, 0.06, 0.05, 0.08, 0.09, 0.02, 0.01)
     dark = (0.62, 0.22, 0.08, 0.01, 0.01, 0.0, 0.0, 0.01, 0.04, 0.01)
-    share = np.array(light) * (1 - tone) + np.array(dark) * tone
+    darkness = min(1.0, 1.6 * tone)
+    share = np.array(light) * (1 - darkness) + np.array(dark) * darkness
     if old:
         share *= 0.55
         share[-2:] += 0.24

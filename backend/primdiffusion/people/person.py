@@ -13,7 +13,7 @@ from primdiffusion.people import garments, hair, palette, skin
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import BaseMesh
 from primdiffusion.people.colour import bytes_from_linear
-from primdiffusion.people.fitting import fit_item, item_skinning, shown_faces
+from primdiffusion.people.fitting import fit_item, item_skinning, shown_faces, under_hat
 from primdiffusion.people.wardrobe import EYES, Choice, choose, hair_path, stream
 
 EYE_SIZE, BROW_SIZE = 256, 512
@@ -99,12 +99,14 @@ def _geometry(assets: Assets, base: BaseMesh, choice: Choice) -> TexturedMesh:
         base.joint_weight,
     )
     parts = [_compact(body)]
+    fitted = {name: fit_item(assets, base, path, vertices) for name, path in worn.items()}
+    if choice.hair and choice.hat:
+        shown["hair"] = ~under_hat(fitted["hat"], fitted["hair"], pairs["hair"][1].faces)
     for name, path in worn.items():
         _, mesh = pairs[name]
         index, weight, _ = item_skinning(assets, base, path)
-        fitted = fit_item(assets, base, path, vertices)
         seen = shown.get(name, np.ones(len(mesh.faces), bool))
-        part = TexturedPart(name, fitted, mesh.faces[seen], mesh.corner_uv[seen], plain, index, weight)
+        part = TexturedPart(name, fitted[name], mesh.faces[seen], mesh.corner_uv[seen], plain, index, weight)
         parts.append(_compact(part))
     return TexturedMesh(tuple(parts))
 

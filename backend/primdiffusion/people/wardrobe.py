@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 Sex = Literal["female", "male"]
 Kind = Literal[
-    "top", "denim", "trousers", "tights", "skirt", "jacket", "suit", "overall", "shoe", "sock", "hat", "detail"
+    "top", "denim", "trousers", "tights", "skirt", "jacket", "suit", "overall", "shirt", "shoe", "sock", "hat", "detail"
 ]
 
 
@@ -47,6 +47,7 @@ class Garment:
 
 TRIMMED_TOP, STRIPED_TOP, PLAIN_TOP = Piece("top", trim=True), Piece("top", smooth=True), Piece("top")
 DENIM, DETAIL = Piece("denim"), Piece("detail")
+INNER_SHIRT = Piece("shirt", smooth=True)
 
 OUTFITS: dict[Sex, tuple[Garment, ...]] = {
     "female": (
@@ -60,9 +61,9 @@ OUTFITS: dict[Sex, tuple[Garment, ...]] = {
         Garment("male_casualsuit02", (TRIMMED_TOP, DENIM)),
         Garment("male_casualsuit03", (STRIPED_TOP, DENIM)),
         Garment("male_casualsuit04", (DENIM, TRIMMED_TOP)),
-        Garment("male_casualsuit05", (Piece("jacket"), DENIM, STRIPED_TOP, STRIPED_TOP)),
+        Garment("male_casualsuit05", (Piece("jacket"), DENIM, INNER_SHIRT, INNER_SHIRT)),
         Garment("male_casualsuit06", (PLAIN_TOP, DENIM)),
-        Garment("male_elegantsuit01", (Piece("suit", trim=True), Piece("trousers"))),
+        Garment("male_elegantsuit01", (Piece("suit", trim=True), Piece("suit"))),
         Garment("male_worksuit01", (Piece("overall"), PLAIN_TOP, DETAIL, DETAIL, DETAIL, DETAIL)),
     ),
 }

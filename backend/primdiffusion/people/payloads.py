@@ -1,0 +1,137 @@
+"""People as files of primitives: the training set of the diffusion model.
+
+A file `person_NNNNNN.npz` holds one geometry in several colourings: `voxels` uint8 [variants, K, 8, 8, 8, 4] (axes D, H,
+W; sRGB-encoded colour and density * 255 / full_density), `betas` [10], `attributes` (JSON: those of the first colouring,
+and under "variants" those of each), `full_density` (1/m) and `seed`. Files are made whole or not at all; a second run
+keeps the whole ones.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import zipfile
+from collections.abc import Callable
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from primdiffusion.body.model import default_body
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.people.assets import Assets
+from primdiffusion.people.base_mesh import load_base_mesh
+from primdiffusion.people.person import make_person, recolour
+from primdiffusion.primitives.anchors import attach, default_anchors
+from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
+from primdiffusion.primitives.primitives import Frames, K, Payload, S
+
+VARIANT_STRIDE = 1 << 32
+"""Variant j of the person with seed s is coloured with seed s + j * VARIANT_STRIDE."""
+KEYS = ("voxels", "betas", "attributes", "full_density", "seed")
+
+
+def make_payloads(
+    assets: Assets,
+    out_dir: Path,
+    count: int,
+    variants: int,
+    seed: int,
+    workers: int,
+    report: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Path]:
+    """Make the people of seeds seed ... seed + count - 1 into `out_dir`, those that are not there yet.
+
+    A person takes about 3 s and each further variant about half a second of one core. `report` is told of finished
+    people and of their total.
+
+    Raises:
+        ValueError: a count that is not positive.
+        AssetsMissingError, ProxyFileError: the asset folder lacks files or has damaged ones.
+    """
+    for name, value in (("count", count), ("variants", variants), ("workers", workers)):
+        if value < 1:
+            raise ValueError(f"{name} is {value}; it must be 1 or more.")
+    out_dir.mkdir(parents=True, exist_ok=True)
+    paths = [out_dir / f"person_{person_seed:06d}.npz" for person_seed in range(seed, seed + count)]
+    jobs = [
+        (path, person_seed)
+        for path, person_seed in zip(paths, range(seed, seed + count), strict=True)
+        if not is_complete(path, variants, person_seed)
+    ]
+    done = count - len(jobs)
+    report(done, count)
+    if workers == 1:
+        for path, person_seed in jobs:
+            write_person(assets, path, variants, person_seed)
+            done += 1
+            report(done, count)
+        return paths
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _one_thread) as pool:
+        waiting = {pool.submit(write_person, assets, path, variants, person_seed) for path, person_seed in jobs}
+        while waiting:
+            finished, waiting = wait(waiting, timeout=1.0, return_when=FIRST_EXCEPTION)
+            for future in finished:
+                if future.exception() is not None:
+                    pool.shutdown(wait=False, cancel_futures=True)
+                future.result()
+            done += len(finished)
+            report(done, count)
+    return paths
+
+
+def write_person(assets: Assets, path: Path, variants: int, seed: int) -> None:
+    """Make one person in all colourings and store it, whole or not at all."""
+    person = make_person(assets, load_base_mesh(), seed)
+    field = surface_field(person.mesh, rest_frames(person.betas))
+    people = [person, *(recolour(person, seed + number * VARIANT_STRIDE) for number in range(1, variants))]
+    voxels = np.empty((variants, K, S, S, S, 4), np.uint8)
+    for number, variant in enumerate(people):
+        voxels[number] = voxels_from_payload(colour(field, variant.mesh))
+    attributes = {**person.attributes, "variants": [variant.attributes for variant in people]}
+    arrays = (voxels, person.betas, np.array(json.dumps(attributes)), np.array(FULL_DENSITY), np.array(seed))
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        # Level 1: a person shrinks to a third; more effort gains little and takes longer than making the person.
+        with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+            for key, array in zip(KEYS, arrays, strict=True):
+                with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
+                    np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def rest_frames(betas: Float[np.ndarray, "10"]) -> Frames:
+    """The frames of the default body's primitives in its rest pose."""
+    body = default_body()
+    vertices = body.shape(torch.as_tensor(betas, dtype=body.template.dtype)).vertices
+    return attach(default_anchors(), vertices, body.faces)
+
+
+def voxels_from_payload(payload: Payload) -> UInt8[np.ndarray, "K 8 8 8 4"]:
+    """A payload as bytes: sRGB-encoded colour, and density of which 255 stands for FULL_DENSITY."""
+    encoded = encode_srgb(payload.rgb.clamp(0, 1)).movedim(1, -1)
+    density = (payload.density / FULL_DENSITY).clamp(0, 1)[..., None]
+    return (torch.cat([encoded, density], dim=-1) * 255).round().to(torch.uint8).numpy()
+
+
+def is_complete(path: Path, variants: int, seed: int) -> bool:
+    """Whether a file is whole and holds this person; damaged files are not an error, they are made again."""
+    if not path.is_file():
+        return False
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return (
+                file["voxels"].shape == (variants, K, S, S, S, 4) and int(file["seed"]) == seed and set(KEYS) <= {*file}
+            )
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return False
+
+
+def _one_thread() -> None:
+    """Every process keeps to one core: there are as many processes as cores."""
+    torch.set_num_threads(1)
