@@ -15,7 +15,7 @@ from primdiffusion.people.base_mesh import BaseMesh
 from primdiffusion.people.colour import bytes_from_linear, lab_from_bytes, luminance
 from primdiffusion.people.fitting import fit_item
 from primdiffusion.people.texel_map import connected_faces, texel_map, uv_islands
-from primdiffusion.people.wardrobe import Garment, Kind
+from primdiffusion.people.wardrobe import Garment, Kind, Piece
 
 SIZE = 512
 """Texels of a garment's side: about 3 mm of cloth each."""
@@ -94,7 +94,7 @@ def paint_garment(garment: Garment, draws: np.random.Generator) -> tuple[Paint, 
     by_kind: dict[Kind, Paint] = {}
     for piece in garment.pieces:
         if piece.kind not in by_kind:
-            by_kind[piece.kind] = _paint(piece.kind, draws)
+            by_kind[piece.kind] = _paint(piece, draws)
     return tuple(by_kind[piece.kind] for piece in garment.pieces)
 
 
@@ -119,8 +119,9 @@ def coloured(fabric: Cloth, paints: tuple[Paint, ...]) -> UInt8[np.ndarray, "H W
     return texture
 
 
-def _paint(kind: Kind, draws: np.random.Generator) -> Paint:
+def _paint(piece: Piece, draws: np.random.Generator) -> Paint:
     """Colours for a kind of piece: tops may be patterned, all else is of one colour."""
+    kind = piece.kind
     main = palette.garment_colour(kind, draws)
     partner = "shirt" if kind == "suit" else "top"
     trim = palette.contrasting(main, partner, draws)
@@ -130,7 +131,7 @@ def _paint(kind: Kind, draws: np.random.Generator) -> Paint:
     pattern = "solid"
     if kind == "top" and draws.random() > patterns.SOLID_SHARE:
         pattern = patterns.PATTERNS[draws.integers(len(patterns.PATTERNS))][0]
-    if draws.random() < ORIGINAL_SHARE.get(kind, 0.0):
+    if draws.random() < ORIGINAL_SHARE.get(kind, 0.0) and not piece.smooth:
         pattern = "original"
     return Paint(main, trim, second, pattern)
 

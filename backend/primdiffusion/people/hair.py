@@ -6,12 +6,12 @@ import dataclasses
 import functools
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from scipy.ndimage import binary_dilation, gaussian_filter
 
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.colour import bytes_from_linear, luminance
-from primdiffusion.people.texel_map import TexelMap, texel_map
+from primdiffusion.people.texel_map import TexelMap, texel_map, uv_islands
 from primdiffusion.people.wardrobe import hair_path, stream
 
 SIZE = 512
@@ -34,8 +34,9 @@ def strands(assets: Assets, name: str) -> Strands:
     """The strands of a hair mesh: from its texture, or drawn where the pack has none."""
     picture = f"{hair_path(name)}_diffuse"
     if not assets.has_picture(picture):
-        texels = texel_map(assets.proxy(hair_path(name))[1].corner_uv, SIZE)
-        return _curls(texels) if name in CURLY else _straight(texels, name)
+        corner_uv = assets.proxy(hair_path(name))[1].corner_uv
+        texels = texel_map(corner_uv, SIZE)
+        return _curls(texels, uv_islands(corner_uv)) if name in CURLY else _straight(texels, name)
     texture = assets.picture(picture, SIZE)
     light = luminance(texture[..., :3])
     middle = np.median(light[texture[..., 3] >= OPAQUE])
@@ -74,13 +75,13 @@ def _straight(texels: TexelMap, name: str) -> Strands:
     return Strands(np.exp(0.22 * shade).astype(np.float32), np.where(there, 255, 0).astype(np.uint8))
 
 
-def _curls(texels: TexelMap) -> Strands:
-    """Small curls without a direction; between them the outermost sheets are open."""
+def _curls(texels: TexelMap, island: Int[np.ndarray, " F"]) -> Strands:
+    """Small curls without a direction. The two large islands, a closed cap, are solid; the tufts around it have gaps."""
     draws = stream(0, "curls")
     noise = draws.standard_normal((2, SIZE, SIZE)).astype(np.float32)
     curls, tufts = _unit(gaussian_filter(noise[0], 2.0)), _unit(gaussian_filter(noise[1], 7.0))
     edge = gaussian_filter(texels.inside.astype(np.float32), 5)
-    there = (edge > 0.75) | (curls + tufts + 6 * (edge - 0.6) > 0)
+    there = (island < 2)[texels.face] | (curls + tufts + 6 * (edge - 0.6) > 0)
     return Strands(np.exp(0.3 * (curls + 0.5 * tufts)).astype(np.float32), np.where(there, 255, 0).astype(np.uint8))
 
 

@@ -1,9 +1,9 @@
 """People as files of primitives: the training set of the diffusion model.
 
-A file `person_NNNNNN.npz` holds one geometry in several colourings: `voxels` uint8 [variants, K, 8, 8, 8, 4] (axes D, H,
-W; sRGB-encoded colour and density * 255 / full_density), `betas` [10], `attributes` (JSON: those of the first colouring,
-and under "variants" those of each), `full_density` (1/m) and `seed`. Files are made whole or not at all; a second run
-keeps the whole ones.
+A file `person_NNNNNN.npz` holds one geometry in several colourings: `voxels` uint8 [variants, K, 8, 8, 8, 4] (axes D,
+H, W; sRGB-encoded colour and density * 255 / full_density), `betas` [10], `attributes` (JSON: those of the first
+colouring, and under "variants" those of each), `full_density` (1/m) and `seed`. Files are made whole or not
+at all; a second run keeps the whole ones.
 """
 
 from __future__ import annotations

@@ -13,7 +13,8 @@ from primdiffusion.people import garments, hair, palette, skin
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import BaseMesh
 from primdiffusion.people.colour import bytes_from_linear
-from primdiffusion.people.fitting import fit_item, item_skinning, shown_faces, under_hat
+from primdiffusion.people.fitting import fit_item, item_skinning, shown_faces, under_hat, under_hem
+from primdiffusion.people.texel_map import connected_faces
 from primdiffusion.people.wardrobe import EYES, Choice, choose, hair_path, stream
 
 EYE_SIZE, BROW_SIZE = 256, 512
@@ -100,6 +101,10 @@ def _geometry(assets: Assets, base: BaseMesh, choice: Choice) -> TexturedMesh:
     )
     parts = [_compact(body)]
     fitted = {name: fit_item(assets, base, path, vertices) for name, path in worn.items()}
+    shoes = pairs["shoes"][1].faces
+    sock_pieces = [number for number, piece in enumerate(choice.shoes.pieces) if piece.kind == "sock"]
+    sock = np.isin(connected_faces(shoes, len(pairs["shoes"][1].vertices)), sock_pieces)
+    shown["shoes"] &= ~(sock & under_hem(fitted["outfit"], fitted["shoes"], shoes))
     if choice.hair and choice.hat:
         shown["hair"] = ~under_hat(fitted["hat"], fitted["hair"], pairs["hair"][1].faces)
     for name, path in worn.items():

@@ -27,7 +27,7 @@ class Piece:
     trim: bool = False
     """The texture has parts of a clearly different colour (edgings, a shirt under a jacket) to be coloured apart."""
     smooth: bool = False
-    """The texture has fine stripes, which primitives cannot show: keep its broad shading only."""
+    """The texture has fine stripes or writing, which primitives cannot show: keep its broad shading only."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Garment:
         return f"clothes/{self.name}/{self.name}"
 
 
-TRIMMED_TOP, STRIPED_TOP, PLAIN_TOP = Piece("top", trim=True), Piece("top", smooth=True), Piece("top")
+TRIMMED_TOP, SMOOTHED_TOP, PLAIN_TOP = Piece("top", trim=True), Piece("top", smooth=True), Piece("top")
 DENIM, DETAIL = Piece("denim"), Piece("detail")
 INNER_SHIRT = Piece("shirt", smooth=True)
 
@@ -53,16 +53,16 @@ OUTFITS: dict[Sex, tuple[Garment, ...]] = {
     "female": (
         Garment("female_casualsuit01", (TRIMMED_TOP, DENIM)),
         Garment("female_casualsuit02", (DENIM, PLAIN_TOP, DETAIL)),
-        Garment("female_elegantsuit01", (STRIPED_TOP, Piece("skirt"))),
+        Garment("female_elegantsuit01", (SMOOTHED_TOP, Piece("skirt"))),
         Garment("female_sportsuit01", (TRIMMED_TOP, Piece("tights", trim=True))),
     ),
     "male": (
         Garment("male_casualsuit01", (DENIM, PLAIN_TOP, DENIM, PLAIN_TOP, PLAIN_TOP, PLAIN_TOP), by_island=True),
         Garment("male_casualsuit02", (TRIMMED_TOP, DENIM)),
-        Garment("male_casualsuit03", (STRIPED_TOP, DENIM)),
+        Garment("male_casualsuit03", (SMOOTHED_TOP, DENIM)),
         Garment("male_casualsuit04", (DENIM, TRIMMED_TOP)),
         Garment("male_casualsuit05", (Piece("jacket"), DENIM, INNER_SHIRT, INNER_SHIRT)),
-        Garment("male_casualsuit06", (PLAIN_TOP, DENIM)),
+        Garment("male_casualsuit06", (SMOOTHED_TOP, DENIM)),
         Garment("male_elegantsuit01", (Piece("suit", trim=True), Piece("suit"))),
         Garment("male_worksuit01", (Piece("overall"), PLAIN_TOP, DETAIL, DETAIL, DETAIL, DETAIL)),
     ),
