@@ -16,7 +16,7 @@ def surface_points(
     face: Int[Tensor, "k"],
     barycentric: Float[Tensor, "k 3"],
 ) -> Float[Tensor, "*b k c"]:
-    """The points (or whatever else vertices carry) with these barycentric coordinates on these faces; differentiable."""
+    """The points (or what else vertices carry) with these barycentric coordinates on these faces; differentiable."""
     corners = vertices.index_select(-2, faces[face].flatten()).unflatten(-2, (-1, 3))
     return (corners * barycentric[..., None]).sum(-2)
 

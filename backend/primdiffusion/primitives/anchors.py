@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from primdiffusion.body.model import default_body
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.surface import signed_volume, surface_points, uv_gradient
 from primdiffusion.geometry.uv_atlas import closest_in_uv, rasterise_uv
@@ -123,16 +124,17 @@ def anchor_skin_weights(anchors: Anchors, body: UvBody) -> Float[Tensor, "k j"]:
 def default_anchors() -> Anchors:
     """The anchors of the default body, from the layout in body/data/layout.npz (made by scripts/bake_layout)."""
     with resources.files("primdiffusion.body").joinpath("data/layout.npz").open("rb") as file, np.load(file) as stored:
-        layout = {name: torch.from_numpy(stored[name].astype(stored[name].dtype.newbyteorder("="))) for name in stored}
-    template, faces = layout["template"].float(), layout["faces"].long()
+        layout = {name: torch.from_numpy(stored[name].astype(np.float32)) for name in stored}
+    first, second = (layout["texel_barycentric"] / 65535).unbind(-1)
+    body = default_body()
     return footprint_anchors(
-        template,
-        faces,
+        body.template,
+        body.faces,
         layout["cell_face"].long(),
-        layout["cell_barycentric"].float(),
+        layout["cell_barycentric"],
         layout["cell_chart"].long(),
         layout["texel_face"].long(),
-        layout["texel_barycentric"].float(),
+        torch.stack([first, second, 1 - first - second], -1),
     )
 
 
