@@ -1,0 +1,123 @@
+"""A frozen orthonormal linear codec per primitive: the first and last layer of slab diffusion, in closed form.
+
+A primitive's 4 x 8^3 values (sRGB-encoded colour, density / full density; the slab's values, SPEC 3) become C numbers in
+one basis that all primitives share. Noise of the slab projected on orthonormal rows is standard normal again, and what
+the basis leaves out never feeds back, so diffusing latents is diffusing the slab with these two layers fixed.
+The delta scales of these people are all 1 and are not diffused.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from primdiffusion.geometry.records import TensorRecord
+from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.primitives.primitives import GRID, K, Payload, S
+
+VALUES = 4 * S**3
+"""Values of a primitive: encoded red, green, blue, relative density, each D, H, W."""
+DEAD_ZONE = (0.08, 0.84)
+"""Decoded relative density a becomes clip((a - 0.08) / 0.84): what truncation leaves around a person is not haze."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearCodec(TensorRecord):
+    """Cells [*b, 1024, 2048] to latents [*b, C, 32, 32] and back: z = scale * basis (v - mean)."""
+
+    mean: Float[Tensor, "k v"]
+    """Mean values of every primitive; equal to its own mirror image."""
+    basis: Float[Tensor, "c v"]
+    """Orthonormal rows, each even or odd under the mirror of a cell."""
+    parity: Float[Tensor, "c"]
+    """1 for even rows, -1 for odd ones."""
+    scale: float
+    """Latent units per unit of value; the only free scale, so that noise stays isotropic."""
+
+    def encode(self, cells: Float[Tensor, "*b k v"]) -> Float[Tensor, "*b c 32 32"]:
+        """Latents of cells; loses what lies outside the basis."""
+        latents = (cells - self.mean) @ self.basis.T * self.scale
+        return latents.transpose(-1, -2).unflatten(-1, (GRID, GRID))
+
+    def decode(self, latents: Float[Tensor, "*b c 32 32"]) -> Float[Tensor, "*b k v"]:
+        """Cells of latents, unclamped."""
+        return latents.flatten(-2).transpose(-1, -2) @ self.basis / self.scale + self.mean
+
+    def mirror(self, latents: Float[Tensor, "*b c 32 32"]) -> Float[Tensor, "*b c 32 32"]:
+        """The person seen in a mirror: grid columns reversed, each cell reversed along W (the layout is mirror symmetric)."""
+        return latents.flip(-1) * self.parity[:, None, None]
+
+
+def cells_from_voxels(voxels: UInt8[Tensor, "*b k 8 8 8 4"]) -> Float[Tensor, "*b k v"]:
+    """Stored voxels (encoded RGB and relative density, 0 ... 255) as cells in [0, 1]."""
+    return voxels.movedim(-1, -4).flatten(-4).float() / 255
+
+
+def cells_from_payload(payload: Payload, full_density: float) -> Float[Tensor, "*b k v"]:
+    """A payload as cells; `full_density` (1/m) is the density that counts as 1, and denser voxels are clamped to it."""
+    density = (payload.density / full_density).clamp(0, 1).unsqueeze(-4)
+    return torch.cat([encode_srgb(payload.rgb), density], dim=-4).flatten(-4)
+
+
+def payload_from_cells(cells: Float[Tensor, "*b k v"], full_density: float) -> Payload:
+    """The payload of decoded cells: clamped, with the dead zone on density; delta scales are 1."""
+    start, width = DEAD_ZONE
+    voxels = cells.unflatten(-1, (4, S, S, S))
+    density = ((voxels[..., 3, :, :, :] - start) / width).clamp(0, 1) * full_density
+    return Payload(decode_srgb(voxels[..., :3, :, :, :].clamp(0, 1)), density, torch.ones_like(density[..., :3, 0, 0]))
+
+
+def mirror_cells(cells: Float[Tensor, "*b k v"]) -> Float[Tensor, "*b k v"]:
+    """Cells of the mirrored person; what `LinearCodec.mirror` does to latents."""
+    grid = cells.unflatten(-2, (GRID, GRID)).unflatten(-1, (4, S, S, S))
+    return grid.flip(-6).flip(-1).flatten(-4).flatten(-3, -2)
+
+
+def fit_codec(
+    cells: Float[Tensor, "n k v"],
+    channels: int,
+    generator: torch.Generator,
+    cells_each: int = 128,
+    latent_std: float = 1.0,
+) -> LinearCodec:
+    """Per-cell mean and shared principal components of `cells_each` random cells of every person and their mirror images.
+
+    `latent_std` is the root mean square that latents of these people get. Raises ValueError for fewer samples than channels.
+    """
+    if cells.shape[0] * cells_each < channels or tuple(cells.shape[1:]) != (K, VALUES):
+        raise ValueError(
+            f"cells of shape {tuple(cells.shape)} cannot give {channels} components; give [n, {K}, {VALUES}]"
+        )
+    mean = cells.mean(0)
+    mean = ((mean + mirror_cells(mean)) / 2).half().float()  # stored in half precision: encode with what is stored
+    moments = [torch.zeros(VALUES // 2, VALUES // 2, dtype=torch.float64) for _ in range(2)]
+    for person in cells:
+        chosen = torch.randperm(K, generator=generator)[:cells_each]
+        for moment, part in zip(moments, _parity_parts(person[chosen] - mean[chosen]), strict=True):
+            moment += (part.T @ part).double()
+    variances, rows, parity = [], [], []
+    for sign, moment in zip((1.0, -1.0), moments, strict=True):
+        value, vector = torch.linalg.eigh(moment)
+        variances.append(value)
+        rows.append(_whole(vector.T.float(), sign))
+        parity.append(torch.full_like(value, sign))
+    order = torch.cat(variances).argsort(descending=True)[:channels]
+    basis, parity = torch.cat(rows)[order], torch.cat(parity)[order].float()
+    spread = ((cells[:: max(1, len(cells) // 64)] - mean) @ basis.T).square().mean().sqrt()
+    return LinearCodec(mean, basis.contiguous(), parity, float(latent_std / spread))
+
+
+def _parity_parts(values: Float[Tensor, "n v"]) -> tuple[Tensor, Tensor]:
+    """Orthonormal coordinates of the parts that are even and odd along W."""
+    left, right = values.unflatten(-1, (4 * S * S, S)).split(S // 2, dim=-1)
+    right = right.flip(-1)
+    return ((left + right) / 2**0.5).flatten(-2), ((left - right) / 2**0.5).flatten(-2)
+
+
+def _whole(part: Float[Tensor, "n h"], sign: float) -> Float[Tensor, "n v"]:
+    """Inverse of one of `_parity_parts`."""
+    left = part.unflatten(-1, (4 * S * S, S // 2)) / 2**0.5
+    return torch.cat([left, sign * left.flip(-1)], dim=-1).flatten(-2)

@@ -1,0 +1,89 @@
+"""The default denoiser: closed-form person prior, corrected by a network for the whole person and one for its cells."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.diffusion.local_unet import LocalUNet, LocalUNetConfig, PersonNetwork, PersonNetworkConfig
+from primdiffusion.diffusion.schedule import Schedule
+
+
+@dataclasses.dataclass(frozen=True)
+class DenoiserConfig:
+    """Networks of the default denoiser; None leaves a part to the closed form."""
+
+    person: PersonNetworkConfig | None = PersonNetworkConfig()
+    """Network over the person components."""
+    local: LocalUNetConfig | None = LocalUNetConfig()
+    """Network over the grid."""
+
+
+class PersonDenoiser(nn.Module):
+    """x0 guess of noisy latents: E[c | .] and E[r | .] of the prior plus learned corrections.
+
+    Corrections are in units of the closed form's own posterior standard deviation, so they are of order 1 at every noise
+    level and vanish with the noise. They start at 0: an untrained denoiser is the prior's. The two parts are orthogonal, so
+    the squared error is the sum of theirs and each can be trained alone.
+    """
+
+    def __init__(self, config: DenoiserConfig, prior: PersonPrior, schedule: Schedule):
+        super().__init__()
+        self.config, self.schedule = config, schedule
+        for field in dataclasses.fields(PersonPrior):
+            self.register_buffer(f"prior_{field.name}", getattr(prior, field.name))
+        component_std = prior.marginal_variance().sqrt()
+        self.register_buffer("component_std", component_std, persistent=False)
+        self.register_buffer("picture_std", _picture_std(prior, component_std), persistent=False)
+        channels, grid, components = prior.mean.shape[0], prior.mean.shape[-1], prior.basis.shape[0]
+        self.person = PersonNetwork(components, config.person) if config.person else None
+        self.local = LocalUNet(channels, components, grid, config.local) if config.local else None
+        if self.local is not None:
+            self.local.to(memory_format=torch.channels_last)
+
+    @property
+    def prior(self) -> PersonPrior:
+        """The closed-form part."""
+        return PersonPrior(
+            **{field.name: self.get_buffer(f"prior_{field.name}") for field in dataclasses.fields(PersonPrior)}
+        )
+
+    def forward(self, x: Float[Tensor, "b c h w"], t: Int[Tensor, "b"]) -> Float[Tensor, "b c h w"]:
+        """The x0 guess of latents x at steps t."""
+        signal, noise = self.schedule.levels(t, x)
+        prior = self.prior
+        y, rest = prior.split(x, signal)
+        coefficients = self.coefficients(y, t)
+        return prior.join(coefficients, self.rest(rest, coefficients, t))
+
+    def coefficients(self, y: Float[Tensor, "b r"], t: Int[Tensor, "b"]) -> Float[Tensor, "b r"]:
+        """The guess of clean person coefficients of noisy ones."""
+        signal, noise = self.schedule.levels(t, y)
+        guess = self.prior.denoise_coefficients(y, signal, noise)
+        if self.person is None:
+            return guess
+        std = self.component_std
+        total = (signal**2 * std**2 + noise**2).sqrt()
+        return guess + std * noise / total * self.person(y / total, guess / std, t)
+
+    def rest(self, rest: Float[Tensor, "b c h w"], coefficients: Float[Tensor, "b r"], t: Int[Tensor, "b"]) -> Tensor:
+        """The guess of the clean rest of a noisy one, for guessed person coefficients."""
+        signal, noise = self.schedule.levels(t, rest)
+        prior = self.prior
+        guess = prior.denoise_rest(rest, signal, noise)
+        if self.local is None:
+            return guess
+        total = (signal**2 * prior.rest_variance + noise**2).sqrt()
+        picture = (coefficients @ prior.basis).unflatten(1, prior.mean.shape) / self.picture_std[:, None, None]
+        correction = self.local(rest / total, picture, coefficients / self.component_std, t)
+        return guess + prior.rest_variance.sqrt() * noise / total * correction
+
+
+def _picture_std(prior: PersonPrior, component_std: Float[Tensor, "r"]) -> Float[Tensor, "c"]:
+    """Root mean square over the grid of what the person components draw in each channel."""
+    energy = component_std**2 @ prior.basis**2
+    return energy.unflatten(0, prior.mean.shape).mean((1, 2)).sqrt()

@@ -1,0 +1,179 @@
+"""The light networks of the default denoiser: one for the whole person, one for its 32 x 32 neighbourhoods.
+
+A local network is slow to learn what correlates over the whole body, such as one shirt's colour on 300 primitives. So a
+multilayer perceptron denoises the person components, which are few, and a small U-Net over the grid what they leave out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional
+
+from primdiffusion.diffusion.unet import TimeEmbedding
+
+
+@dataclasses.dataclass(frozen=True)
+class PersonNetworkConfig:
+    """Size of the perceptron over person components."""
+
+    width: int = 768
+    """Features of the residual stream."""
+    blocks: int = 3
+    """Residual blocks."""
+    dropout: float = 0.1
+    """Share of hidden features dropped in training; people are few and components are quickly learnt by heart."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LocalUNetConfig:
+    """Size of the U-Net over the 32 x 32 grid."""
+
+    widths: tuple[int, ...] = (64, 96, 128)
+    """Channels at 32, 16 and 8 cells a side."""
+    blocks: int = 1
+    """Residual blocks of a level, down and up."""
+    position_channels: int = 16
+    """Learned maps that tell the network which cell of the body it looks at."""
+    condition_width: int = 192
+    """Features of the time and person embedding that modulate every block."""
+    heads: int = 4
+    """Heads of the self-attention at 8 and 16 cells a side."""
+
+
+class PersonBlock(nn.Module):
+    """LayerNorm modulated by the condition, then a perceptron with one hidden layer, added."""
+
+    def __init__(self, width: int, condition_width: int, dropout: float):
+        super().__init__()
+        self.norm = nn.LayerNorm(width, elementwise_affine=False)
+        self.film = nn.Linear(condition_width, 2 * width)
+        self.mlp = nn.Sequential(
+            nn.Linear(width, 2 * width), nn.SiLU(), nn.Dropout(dropout), nn.Linear(2 * width, width)
+        )
+        nn.init.zeros_(self.mlp[3].weight)
+        nn.init.zeros_(self.mlp[3].bias)
+
+    def forward(self, x: Float[Tensor, "b f"], condition: Float[Tensor, "b e"]) -> Float[Tensor, "b f"]:
+        """The stream after this block."""
+        scale, shift = self.film(condition).chunk(2, dim=-1)
+        return x + self.mlp(self.norm(x) * (1 + scale) + shift)
+
+
+class PersonNetwork(nn.Module):
+    """Correction of the closed-form guess of R person components, all in units of standard deviations; starts at 0."""
+
+    def __init__(self, components: int, config: PersonNetworkConfig):
+        super().__init__()
+        self.time = TimeEmbedding(64, 256)
+        self.inner = nn.Linear(2 * components, config.width)
+        self.blocks = nn.ModuleList([PersonBlock(config.width, 256, config.dropout) for _ in range(config.blocks)])
+        self.outer = nn.Linear(config.width, components)
+        nn.init.zeros_(self.outer.weight)
+        nn.init.zeros_(self.outer.bias)
+
+    def forward(
+        self, noisy: Float[Tensor, "b r"], guess: Float[Tensor, "b r"], t: Int[Tensor, "b"]
+    ) -> Float[Tensor, "b r"]:
+        """Correction for noisy components and their closed-form guess at steps t."""
+        condition = functional.silu(self.time(t))
+        x = self.inner(torch.cat([noisy, guess], dim=-1))
+        for block in self.blocks:
+            x = block(x, condition)
+        return self.outer(functional.silu(x))
+
+
+class LocalBlock(nn.Module):
+    """GroupNorm - SiLU - conv, modulated by the condition, SiLU - conv, plus the input."""
+
+    def __init__(self, channels: int, out_channels: int, condition_width: int):
+        super().__init__()
+        self.norm1, self.conv1 = nn.GroupNorm(8, channels), nn.Conv2d(channels, out_channels, 3, padding=1)
+        self.norm2, self.conv2 = nn.GroupNorm(8, out_channels), nn.Conv2d(out_channels, out_channels, 3, padding=1)
+        self.film = nn.Linear(condition_width, 2 * out_channels)
+        self.skip = nn.Identity() if channels == out_channels else nn.Conv2d(channels, out_channels, 1)
+        nn.init.zeros_(self.conv2.weight)
+
+    def forward(self, x: Float[Tensor, "b c h w"], condition: Float[Tensor, "b e"]) -> Float[Tensor, "b d h w"]:
+        """The block's output."""
+        scale, shift = self.film(condition)[:, :, None, None].chunk(2, dim=1)
+        h = self.norm2(self.conv1(functional.silu(self.norm1(x)))) * (1 + scale) + shift
+        return self.skip(x) + self.conv2(functional.silu(h))
+
+
+class LocalAttention(nn.Module):
+    """Self-attention over the cells of a level, added to the input."""
+
+    def __init__(self, channels: int, heads: int):
+        super().__init__()
+        self.heads = heads
+        self.norm, self.qkv, self.out = (
+            nn.GroupNorm(8, channels),
+            nn.Conv2d(channels, 3 * channels, 1),
+            nn.Conv2d(channels, channels, 1),
+        )
+        nn.init.zeros_(self.out.weight)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """The input plus what other cells add."""
+        q, k, v = self.qkv(self.norm(x)).flatten(2).unflatten(1, (3, self.heads, -1)).transpose(-1, -2).unbind(1)
+        mixed = functional.scaled_dot_product_attention(q, k, v).transpose(-1, -2).flatten(1, 2)
+        return x + self.out(mixed.unflatten(-1, x.shape[2:]))
+
+
+class LocalUNet(nn.Module):
+    """Correction of the closed-form guess of what the person components leave out, in standard deviations; starts at 0."""
+
+    def __init__(self, channels: int, components: int, grid: int, config: LocalUNetConfig):
+        super().__init__()
+        widths, condition_width = config.widths, config.condition_width
+        self.time = TimeEmbedding(64, condition_width)
+        self.person = nn.Linear(components, condition_width)
+        self.position = nn.Parameter(0.5 * torch.randn(config.position_channels, grid, grid))
+        self.inner = nn.Conv2d(2 * channels + config.position_channels, widths[0], 3, padding=1)
+        self.down, self.up, self.shrink, self.grow, self.attend = (nn.ModuleList() for _ in range(5))
+        for level, width in enumerate(widths):
+            last = level == len(widths) - 1
+            self.down.append(nn.ModuleList([LocalBlock(width, width, condition_width) for _ in range(config.blocks)]))
+            self.up.append(
+                nn.ModuleList(
+                    [LocalBlock(2 * width if i == 0 else width, width, condition_width) for i in range(config.blocks)]
+                )
+            )
+            self.attend.append(LocalAttention(width, config.heads) if level else nn.Identity())
+            if not last:
+                self.shrink.append(nn.Conv2d(width, widths[level + 1], 2, stride=2))
+                self.grow.append(nn.Conv2d(widths[level + 1], width, 1))
+        self.norm, self.outer = nn.GroupNorm(8, widths[0]), nn.Conv2d(widths[0], channels, 3, padding=1)
+        nn.init.zeros_(self.outer.weight)
+        nn.init.zeros_(self.outer.bias)
+
+    def forward(
+        self,
+        noisy: Float[Tensor, "b c h w"],
+        picture: Float[Tensor, "b c h w"],
+        person: Float[Tensor, "b r"],
+        t: Int[Tensor, "b"],
+    ) -> Float[Tensor, "b c h w"]:
+        """Correction for a noisy rest, beside the picture that the guessed person components draw, and the components."""
+        condition = functional.silu(self.time(t) + self.person(person))
+        position = self.position.expand(len(noisy), -1, -1, -1)
+        x = self.inner(torch.cat([noisy, picture, position], dim=1).contiguous(memory_format=torch.channels_last))
+        skips = []
+        for level, blocks in enumerate(self.down):
+            for block in blocks:
+                x = block(x, condition)
+            x = self.attend[level](x)
+            skips.append(x)
+            if level < len(self.shrink):
+                x = self.shrink[level](x)
+        for level in reversed(range(len(self.up))):
+            x = torch.cat([x, skips.pop()], dim=1)
+            for block in self.up[level]:
+                x = block(x, condition)
+            if level:
+                x = self.grow[level - 1](functional.interpolate(x, scale_factor=2.0, mode="nearest"))
+        return self.outer(functional.silu(self.norm(x)))

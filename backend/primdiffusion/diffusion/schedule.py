@@ -1,0 +1,117 @@
+"""Noise schedules: how much of a person is left at step t, and one step back (paper eq. 4-7)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from primdiffusion.geometry.records import TensorRecord
+
+CLEAN = -1
+"""The step before the first: no noise, alpha_bar = 1."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Schedule(TensorRecord):
+    """The variance schedule beta_t, t = 0 ... T-1, in float64; every coefficient below is derived from alpha_bar.
+
+    A step is an integer t, or `CLEAN`. `t_prev` may be any earlier step, so a respaced chain needs no second schedule.
+    """
+
+    alpha_bar: Float[Tensor, "t"]
+    """Cumulative product of 1 - beta (paper eq. 5), decreasing, float64."""
+
+    @property
+    def length(self) -> int:
+        """T, the number of steps the schedule was defined with."""
+        return self.alpha_bar.shape[0]
+
+    def signal(self, t: int) -> float:
+        """sqrt(alpha_bar_t), the factor on the person; 1 at `CLEAN`."""
+        return 1.0 if t == CLEAN else float(self.alpha_bar[t]) ** 0.5
+
+    def noise(self, t: int) -> float:
+        """sqrt(1 - alpha_bar_t), the standard deviation of the noise; 0 at `CLEAN`."""
+        return 0.0 if t == CLEAN else (1.0 - float(self.alpha_bar[t])) ** 0.5
+
+    def levels(self, t: Int[Tensor, "b"], like: Tensor) -> tuple[Tensor, Tensor]:
+        """Signal and noise factors of a batch of steps, shaped [b, 1, ...] to multiply `like` [b, ...]."""
+        alpha_bar = self.alpha_bar.to(t.device)[t].reshape(-1, *([1] * (like.ndim - 1)))
+        return alpha_bar.sqrt().to(like), (1.0 - alpha_bar).sqrt().to(like)
+
+    def q_sample(self, x0: Float[Tensor, "b *s"], t: Int[Tensor, "b"], noise: Float[Tensor, "b *s"]) -> Tensor:
+        """The person with noise of level t (paper eq. 5)."""
+        signal, sigma = self.levels(t, x0)
+        return signal * x0 + sigma * noise
+
+    def epsilon(self, x: Tensor, x0: Tensor, t: int) -> Tensor:
+        """The noise that x holds if the clean person is x0; raises ValueError at `CLEAN`, which holds none."""
+        if t == CLEAN:
+            raise ValueError("a clean sample holds no noise to be solved for; ask for a step t >= 0")
+        return (x - self.signal(t) * x0) / self.noise(t)
+
+    def posterior_mean(self, x: Tensor, x0: Tensor, t: int, t_prev: int) -> Tensor:
+        """Mean of q(x_prev | x, x0) (paper eq. 6); exactly x0 when t_prev is `CLEAN`."""
+        if t_prev == CLEAN:
+            return x0
+        alpha = self._alpha(t, t_prev)
+        variance, variance_prev = self.noise(t) ** 2, self.noise(t_prev) ** 2
+        return (alpha**0.5 * variance_prev * x + self.signal(t_prev) * (1.0 - alpha) * x0) / variance
+
+    def posterior_std(self, t: int, t_prev: int) -> float:
+        """Standard deviation sqrt(beta tilde) of q(x_prev | x, x0); 0 when t_prev is `CLEAN`."""
+        return (self.noise(t_prev) ** 2 / self.noise(t) ** 2 * (1.0 - self._alpha(t, t_prev))) ** 0.5
+
+    def _alpha(self, t: int, t_prev: int) -> float:
+        if not CLEAN <= t_prev < t:
+            raise ValueError(f"a step back goes from t to an earlier t_prev >= {CLEAN}; got t={t}, t_prev={t_prev}")
+        return (self.signal(t) / self.signal(t_prev)) ** 2
+
+
+def linear(length: int = 1000, first: float = 1e-4, last: float = 2e-2) -> Schedule:
+    """beta linear in t: the paper's schedule (DDPM's; SPEC 1.4)."""
+    return _from_betas(torch.linspace(first, last, length, dtype=torch.float64))
+
+
+def sqrt_linear(length: int = 1000, first: float = 1e-4, last: float = 2e-2) -> Schedule:
+    """sqrt(beta) linear in t: the released code's schedule, which it also calls linear (SPEC 1.4)."""
+    return _from_betas(torch.linspace(first**0.5, last**0.5, length, dtype=torch.float64) ** 2)
+
+
+def zero_terminal_snr(schedule: Schedule) -> Schedule:
+    """The schedule shifted and scaled in sqrt(alpha_bar) so that step T-1 holds noise only (Lin et al. 2024, alg. 1).
+
+    A sampler may then start from pure noise without losing variety. Epsilon prediction is impossible at T-1; x0 is not.
+    """
+    root = schedule.alpha_bar.sqrt()
+    return Schedule(((root - root[-1]) * root[0] / (root[0] - root[-1])) ** 2)
+
+
+SCHEDULES = {"linear": linear, "sqrt_linear": sqrt_linear}
+"""Schedules by the name a configuration or checkpoint states."""
+
+
+def trailing_steps(length: int, steps: int) -> list[int]:
+    """`steps` evenly spaced t, descending, beginning at T-1: sampling starts at the schedule's own terminal noise."""
+    _check_steps(length, steps)
+    return [round(length - i * length / steps) - 1 for i in range(steps)]
+
+
+def leading_steps(length: int, steps: int, offset: int = 1) -> list[int]:
+    """Descending t = offset + i * (T // steps), the released code's spacing (offset 1: 991, 981, ... 1 for 100 of 1000)."""
+    _check_steps(length, steps)
+    return [i * (length // steps) + offset for i in reversed(range(steps))]
+
+
+def _check_steps(length: int, steps: int) -> None:
+    if not 1 <= steps <= length:
+        raise ValueError(f"a schedule of {length} steps can be sampled in 1 to {length}; {steps} were asked for")
+
+
+def _from_betas(betas: Float[Tensor, "t"]) -> Schedule:
+    if not bool(((betas > 0) & (betas < 1)).all()):
+        raise ValueError(f"every beta must lie between 0 and 1; these run from {betas.min():.3g} to {betas.max():.3g}")
+    return Schedule(torch.cumprod(1.0 - betas, dim=0))

@@ -1,0 +1,161 @@
+"""The file a trained model is handed on as: one safetensors file with weights, codec, prior and a card that says what it is."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from primdiffusion.diffusion.codec import LinearCodec
+from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
+from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkConfig
+from primdiffusion.diffusion.model import STANDARD_SHAPES, CellCodec, DiffusionModel, ShapePrior, WholeSlab
+from primdiffusion.diffusion.schedule import SCHEDULES
+from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
+from primdiffusion.training.config import write_atomically
+
+FORMAT = "primdiffusion-checkpoint"
+FORMAT_VERSION = 1
+_HALVED = ("codec.mean", "denoiser.")
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be used; the message says which, why and what to do."""
+
+
+def default_checkpoint() -> Path:
+    """Where the package's own weights are."""
+    return Path(str(resources.files("primdiffusion.weights") / "default.safetensors"))
+
+
+def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
+    """Write a model; networks, prior and codec mean in half precision. `schedule` is its schedule's name."""
+    tensors: dict[str, Tensor] = {f"denoiser.{key}": value for key, value in model.denoiser.state_dict().items()}
+    architecture: dict[str, Any] = {"schedule": schedule, "full_density": model.full_density}
+    if isinstance(model.codec, CellCodec):
+        codec = model.codec.codec
+        tensors |= {f"codec.{name}": getattr(codec, name) for name in ("mean", "basis", "parity")}
+        tensors |= {
+            f"shapes.{field.name}": getattr(model.shapes, field.name) for field in dataclasses.fields(ShapePrior)
+        }
+        architecture |= {"kind": "person", "codec_scale": codec.scale}
+    else:
+        architecture |= {"kind": "slab"}
+    architecture["config"] = dataclasses.asdict(model.denoiser.config)
+    halved = {key: value.half() if _is_halved(key, value) else value for key, value in tensors.items()}
+    metadata = {
+        "format": FORMAT,
+        "format_version": str(FORMAT_VERSION),
+        "architecture": json.dumps(architecture),
+        "card": json.dumps(dict(model.card)),
+    }
+    contents = {key: value.detach().cpu().contiguous().clone() for key, value in halved.items()}
+    _check_finite(path, contents)
+    write_atomically(path, save(contents, metadata=metadata))
+
+
+def load_checkpoint(path: Path | str | None = None, device: torch.device | str = "cpu") -> DiffusionModel:
+    """A model ready to sample, in float32; without a path the package's default.
+
+    Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
+    format or version, does not match its own architecture or holds values that are not finite.
+    """
+    path = default_checkpoint() if path is None else Path(path)
+    tensors, metadata = _read(path)
+    _check_finite(path, tensors)
+    tensors = {key: value.float() for key, value in tensors.items()}
+    try:
+        architecture = json.loads(metadata["architecture"])
+        model = _build(tensors, architecture, json.loads(metadata["card"]))
+    except (KeyError, TypeError, json.JSONDecodeError, RuntimeError) as error:
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+        raise CheckpointError(
+            f"{path} does not match its own description ({reason}): download or train it again"
+        ) from error
+    return model.to(device)
+
+
+def read_card(path: Path | str | None = None) -> dict[str, Any]:
+    """The card of a checkpoint, without its weights; errors as in `load_checkpoint`."""
+    path = default_checkpoint() if path is None else Path(path)
+    return json.loads(_read_metadata(path)["card"])
+
+
+def _build(tensors: Mapping[str, Tensor], architecture: dict[str, Any], card: dict[str, Any]) -> DiffusionModel:
+    schedule = SCHEDULES[architecture["schedule"]]()
+    config = architecture["config"]
+    weights = _under(tensors, "denoiser.")
+    if architecture["kind"] == "slab":
+        lists = {key: tuple(value) if isinstance(value, list) else value for key, value in config.items()}
+        denoiser: torch.nn.Module = SlabUNet(UNetConfig(**lists))
+        codec, shapes = WholeSlab(), STANDARD_SHAPES
+    else:
+        prior = PersonPrior(**_under(weights, "prior_"))
+        denoiser = PersonDenoiser(denoiser_config(config), prior, schedule)
+        codec = CellCodec(LinearCodec(**_under(tensors, "codec."), scale=float(architecture["codec_scale"])))
+        shapes = ShapePrior(**_under(tensors, "shapes."))
+    denoiser.load_state_dict(weights)
+    denoiser.eval().requires_grad_(False)
+    return DiffusionModel(denoiser, schedule, codec, shapes, float(architecture["full_density"]), card)
+
+
+def denoiser_config(tree: Mapping[str, Any]) -> DenoiserConfig:
+    """A denoiser's configuration from its JSON."""
+    person, local = tree["person"], tree["local"]
+    return DenoiserConfig(
+        person=None if person is None else PersonNetworkConfig(**person),
+        local=None if local is None else LocalUNetConfig(**{**local, "widths": tuple(local["widths"])}),
+    )
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    metadata = _read_metadata(path)
+    with safe_open(path, framework="pt") as file:
+        return {key: file.get_tensor(key) for key in file.keys()}, metadata  # noqa: SIM118 - safe_open is no mapping
+
+
+def _read_metadata(path: Path) -> dict[str, str]:
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"there is no checkpoint at {path}: give the path of a .safetensors file, or reinstall the package"
+        )
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(
+            f"{path} is truncated or no safetensors file ({error}): download or train it again"
+        ) from error
+    if metadata.get("format") != FORMAT:
+        raise CheckpointError(
+            f"{path} is a safetensors file of format {metadata.get('format')!r}, not {FORMAT!r}: choose another file"
+        )
+    if metadata.get("format_version") != str(FORMAT_VERSION):
+        version = metadata.get("format_version")
+        raise CheckpointError(
+            f"{path} has format version {version}, this program reads {FORMAT_VERSION}: use the matching release"
+        )
+    return metadata
+
+
+def _check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    for key, value in tensors.items():
+        if not torch.isfinite(value).all():
+            raise CheckpointError(f"{path}: weights {key!r} hold NaN or infinite values: download or train them again")
+
+
+def _is_halved(key: str, value: Tensor) -> bool:
+    return key.startswith(_HALVED) and value.is_floating_point() and value.ndim > 1 and "prior_variance" not in key
+
+
+def _under(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}

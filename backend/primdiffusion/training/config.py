@@ -1,0 +1,125 @@
+"""Settings of a training run; saved as JSON beside its weights."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import Literal
+
+from primdiffusion.diffusion.denoiser import DenoiserConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class CodecConfig:
+    """The frozen linear codec."""
+
+    channels: int = 64
+    """Latent channels of a primitive."""
+    people: int = 160
+    """People (geometry and colours) that the basis is fitted to, drawn at random."""
+    latent_std: float = 1.0
+    """Root mean square of the latents: where the noise schedule lies in relation to the data."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PriorConfig:
+    """The closed-form person prior."""
+
+    components: int = 128
+    """Person components."""
+    clusters: Literal["outfit", "none"] = "outfit"
+    """What the parts of the mixture are: people of one outfit each, or all in a single Gaussian."""
+    folds: int = 4
+    """Parts of the people, each left out once, to measure how much of a component's variance holds for new people."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PhaseConfig:
+    """Training of one network."""
+
+    steps: int
+    """Optimiser steps; the learning rate falls to a tenth along a cosine over them."""
+    batch: int
+    """People, with noise of random level each, in a step."""
+    learning_rate: float = 1e-3
+    """AdamW's, after a warm-up of 100 steps."""
+    weight_decay: float = 0.01
+    """AdamW's."""
+    gradient_clip: float = 1.0
+    """Largest norm of a step's gradient."""
+    ema: float = 0.999
+    """Decay of the average of weights that is evaluated and shipped."""
+    error_power: float = 1.0
+    """Errors count in units of posterior std s as s^power: 0 whitened, 2 the paper's plain squares, normalised per level."""
+    blend: float = 0.3
+    """Share of people that are blends of the colour variants of one geometry."""
+    evaluate_every: int = 500
+    """Steps between evaluations on held-out people."""
+    bfloat16: bool = False
+    """Forward and backward in bfloat16, where the processor multiplies it faster."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingConfig:
+    """A run of `python -m primdiffusion.training.diffuse`."""
+
+    data: Path
+    """Folder of people: one .npz each, as `people` writes them."""
+    run: Path
+    """Folder for weights, metrics and this configuration; an unfinished run in it is resumed."""
+    minutes: float | None = None
+    """Stop after this time, to be resumed; None trains to the end."""
+    seed: int = 0
+    """Of everything random."""
+    schedule: Literal["linear", "sqrt_linear"] = "linear"
+    """Noise schedule over 1000 steps."""
+    holdout: float = 0.05
+    """Share of geometries, with all their colour variants, that is evaluated on and never trained on."""
+    save_every: float = 60.0
+    """Seconds between checkpoints."""
+    threads: int | None = None
+    """Processor threads; None leaves torch's choice."""
+    codec: CodecConfig = dataclasses.field(default_factory=CodecConfig)
+    prior: PriorConfig = dataclasses.field(default_factory=PriorConfig)
+    model: DenoiserConfig = dataclasses.field(default_factory=DenoiserConfig)
+    person: PhaseConfig = dataclasses.field(
+        default_factory=lambda: PhaseConfig(steps=8000, batch=512, evaluate_every=1000)
+    )
+    local: PhaseConfig = dataclasses.field(
+        default_factory=lambda: PhaseConfig(steps=6000, batch=8, blend=0.2, weight_decay=0.0, bfloat16=True)
+    )
+
+
+def to_json(config: TrainingConfig) -> str:
+    """The configuration as readable JSON."""
+    return json.dumps(dataclasses.asdict(config), indent=2, default=str)
+
+
+def check_resumable(saved: str, config: TrainingConfig) -> None:
+    """ValueError that names the settings in which a saved run differs from `config`, other than when and where to stop."""
+    before, now = (_comparable(json.loads(text)) for text in (saved, to_json(config)))
+    changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
+    if changed:
+        raise ValueError(
+            f"the run in {config.run} was begun with other settings ({', '.join(changed)}): give the same, or a new --run folder"
+        )
+
+
+def _comparable(tree: dict, prefix: str = "") -> dict[str, object]:
+    flat = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            flat |= _comparable(value, f"{prefix}{key}.")
+        elif prefix or key not in ("run", "data", "minutes", "save_every", "threads"):
+            flat[prefix + key] = value
+    return {key: value for key, value in flat.items() if not key.endswith((".steps", ".evaluate_every"))}
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """The whole file or none: written under a temporary name in the same folder, then renamed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+    os.replace(temporary, path)

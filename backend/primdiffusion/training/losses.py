@@ -1,0 +1,134 @@
+"""Objectives of the denoiser's two networks, and the error they are judged by."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from primdiffusion.diffusion.codec import LinearCodec
+from primdiffusion.diffusion.denoiser import PersonDenoiser
+from primdiffusion.diffusion.samplers import gaussian_noise
+from primdiffusion.training.config import PhaseConfig
+from primdiffusion.training.latents import LatentSet
+
+LEVELS = (50, 100, 300, 500, 700, 900)
+"""Steps at which held-out error is reported."""
+
+
+def weighted_error(error: Float[Tensor, "b n"], std: Float[Tensor, "b n"], power: float) -> Tensor:
+    """Mean square of `error` given in units of `std`, each entry weighted by std^power; every level's weights have mean 1.
+
+    power 2 is the paper's unweighted x0 error (eq. 9) divided by the error of the closed form at the same level.
+    """
+    weight = std**power
+    return (weight / weight.mean(1, keepdim=True) * error.square()).mean()
+
+
+@dataclasses.dataclass
+class PersonObjective:
+    """Loss of the network over person components: it needs no pictures, so a step costs little."""
+
+    denoiser: PersonDenoiser
+    coefficients: Float[Tensor, "n r"]
+    geometry: Int[Tensor, "n"]
+    config: PhaseConfig
+
+    @property
+    def network(self) -> nn.Module:
+        """What is trained."""
+        return self.denoiser.person
+
+    def loss(self, generator: torch.Generator) -> Tensor:
+        """Weighted x0 error of a random batch at random levels."""
+        weights, indices = blends(self.geometry, self.config.batch, self.config.blend, generator)
+        c = torch.einsum("bk,bkr->br", weights, self.coefficients[indices])
+        flip = torch.rand(len(c), 1, generator=generator) < 0.5
+        c = torch.where(flip, c * self.denoiser.prior_parity, c)
+        t = torch.randint(self.denoiser.schedule.length, (len(c),), generator=generator)
+        y = self.denoiser.schedule.q_sample(c, t, gaussian_noise(c, generator))
+        signal, noise = self.denoiser.schedule.levels(t, c)
+        std = self.denoiser.component_std
+        std = std * noise / (signal**2 * std**2 + noise**2).sqrt()
+        return weighted_error((self.denoiser.coefficients(y, t) - c) / std, std, self.config.error_power)
+
+
+@dataclasses.dataclass
+class RestObjective:
+    """Loss of the local network: what person components leave out, given those that the person network guesses."""
+
+    denoiser: PersonDenoiser
+    people: LatentSet
+    codec: LinearCodec
+    config: PhaseConfig
+
+    @property
+    def network(self) -> nn.Module:
+        """What is trained."""
+        return self.denoiser.local
+
+    def loss(self, generator: torch.Generator) -> Tensor:
+        """Weighted x0 error of a random batch at random levels."""
+        weights, indices = blends(self.people.geometry, self.config.batch, self.config.blend, generator)
+        z = torch.einsum("bk,bkchw->bchw", weights, self.people.latents[indices].float())
+        flip = torch.rand(len(z), 1, 1, 1, generator=generator) < 0.5
+        z = torch.where(flip, self.codec.mirror(z), z)
+        t = torch.randint(self.denoiser.schedule.length, (len(z),), generator=generator)
+        x = self.denoiser.schedule.q_sample(z, t, gaussian_noise(z, generator))
+        signal, noise = self.denoiser.schedule.levels(t, z)
+        with torch.no_grad():
+            _, clean = self.denoiser.prior.split(z)
+            y, rest = self.denoiser.prior.split(x, signal)
+            coefficients = self.denoiser.coefficients(y, t)
+        std = self.denoiser.prior_rest_variance.sqrt()
+        std = std * noise / (signal**2 * std**2 + noise**2).sqrt()
+        error = (self.denoiser.rest(rest, coefficients, t) - clean) / std
+        return weighted_error(error.flatten(1), std.flatten(1), self.config.error_power)
+
+
+def blends(
+    geometry: Int[Tensor, "n"], batch: int, share: float, generator: torch.Generator
+) -> tuple[Float[Tensor, "batch 2"], Int[Tensor, "batch 2"]]:
+    """Weights and places of two people of one geometry each; a `share` of them mixed, the others the first alone.
+
+    Colour variants of one geometry have the same density, so their mixture is a person again, of mixed colours.
+    """
+    first = torch.randint(len(geometry), (batch,), generator=generator)
+    counts = torch.bincount(geometry)
+    starts = counts.cumsum(0) - counts
+    own = geometry[first]
+    second = starts[own] + (torch.rand(batch, generator=generator) * counts[own]).long()
+    part = torch.rand(batch, generator=generator) * (torch.rand(batch, generator=generator) < share)
+    return torch.stack([1 - part, part], dim=1), torch.stack([first, second], dim=1)
+
+
+Guess = Callable[[Tensor, Tensor], Tensor]
+
+
+def x0_errors(
+    guesses: dict[str, Guess],
+    denoiser: PersonDenoiser,
+    latents: Float[Tensor, "n c h w"],
+    levels: Sequence[int] = LEVELS,
+) -> dict[str, dict[int, float]]:
+    """Root mean square x0 error of each guess at each level, all on the same noise; in units of latents."""
+    errors = {name: dict.fromkeys(levels, 0.0) for name in guesses}
+    generator = torch.Generator().manual_seed(20_231)
+    with torch.inference_mode():
+        for level in levels:
+            for chunk in latents.split(16):
+                z = chunk.float()
+                t = torch.full((len(z),), level)
+                x = denoiser.schedule.q_sample(z, t, gaussian_noise(z, generator))
+                for name, guess in guesses.items():
+                    errors[name][level] += float((guess(x, t) - z).square().sum())
+    return {name: {level: (e / latents.numel()) ** 0.5 for level, e in by.items()} for name, by in errors.items()}
+
+
+def closed_form(denoiser: PersonDenoiser, single: bool) -> Guess:
+    """The prior's own guess, of the single Gaussian or of the mixture that it holds."""
+    prior = denoiser.prior.gaussian() if single else denoiser.prior
+    return lambda x, t: prior.denoise(x, *denoiser.schedule.levels(t, x))

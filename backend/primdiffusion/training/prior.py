@@ -1,0 +1,136 @@
+"""Fitting the closed-form person prior and the body shapes that go with it."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from primdiffusion.diffusion.codec import LinearCodec
+from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.diffusion.model import ShapePrior
+from primdiffusion.training.config import PriorConfig
+from primdiffusion.training.latents import LatentSet
+
+
+def fit_prior(people: LatentSet, codec: LinearCodec, config: PriorConfig) -> PersonPrior:
+    """Principal components of people and their mirror images, and a mixture of Gaussians over them.
+
+    Components are found from Gram matrices of the even and the odd parts of people, so that each is even or odd under the
+    mirror. Variances of trailing components fitted to few people are too large for new people and those of the rest too
+    small: both are corrected by leaving `config.folds` parts of the geometries out in turn.
+    """
+    parts = _mirror_parts(people, codec)
+    grams = [part @ part.T for _, part in parts]
+    vectors = [_principal(gram, config.components) for gram in grams]
+    components, signs, order = _merge([variance for variance, _ in vectors], config.components)
+    rows = [
+        (vector.T @ part) / (variance * len(people)).sqrt()[:, None]
+        for (_, part), (variance, vector) in zip(parts, vectors, strict=True)
+    ]
+    basis = torch.linalg.qr(torch.cat(rows)[order].T)[0].T.contiguous()
+    kept, rest_ratio = _held_out_ratios(grams, people.geometry, config)
+    coefficients, rest_energy = [], torch.zeros(basis.shape[1])
+    mean = parts[0][0]
+    for chunk in people.latents.split(256):
+        centred = (chunk.float() - mean).flatten(1)
+        c = centred @ basis.T
+        coefficients.append(c)
+        rest_energy += (centred - c @ basis).square().sum(0)
+    rest = (rest_energy / len(people)).unflatten(0, mean.shape)
+    rest = (rest + codec.mirror(rest).abs()) / 2 * rest_ratio
+    c = torch.cat(coefficients) * kept.sqrt()
+    both = torch.cat([c, c * signs])
+    label = (
+        people.label[people.geometry] if config.clusters == "outfit" else torch.zeros(len(people), dtype=torch.int64)
+    )
+    weight, centre, axes, variance = _mixture(both, torch.cat([label, label]))
+    return PersonPrior(mean, basis, signs, rest.clamp_min(1e-6), weight, centre, axes, variance)
+
+
+def _mirror_parts(people: LatentSet, codec: LinearCodec) -> list[tuple[Tensor, Tensor]]:
+    """Mean and centred rows of (z + Mz)/2, and zero and rows of (z - Mz)/2."""
+    latents = people.latents.float()
+    mirrored = codec.mirror(latents)
+    even, odd = (latents + mirrored) / 2, (latents - mirrored) / 2
+    mean = even.mean(0)
+    return [(mean, (even - mean).flatten(1)), (torch.zeros_like(mean), odd.flatten(1))]
+
+
+def _principal(gram: Float[Tensor, "n n"], components: int) -> tuple[Tensor, Tensor]:
+    """Leading variances and eigenvectors of a Gram matrix, largest first."""
+    value, vector = torch.linalg.eigh(gram.double())
+    count = min(components, len(gram))
+    value, vector = value.flip(0)[:count], vector.flip(1)[:, :count]
+    return (value / len(gram)).clamp_min(1e-12).float(), vector.float()
+
+
+def _merge(variances: list[Tensor], components: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The largest of even and odd variances, their signs, and their places in the concatenation."""
+    joined = torch.cat(variances)
+    order = joined.argsort(descending=True)[:components]
+    signs = torch.cat([torch.full_like(v, s) for v, s in zip(variances, (1.0, -1.0), strict=True)])
+    return joined[order], signs[order], order
+
+
+def _held_out_ratios(grams: list[Tensor], geometry: Int[Tensor, "n"], config: PriorConfig) -> tuple[Tensor, float]:
+    """Variance of new people over variance of fitted people: along each component (of the same rank) and of the rest."""
+    fold = geometry % config.folds
+    fitted_all, held_all, rest_fitted, rest_held = 0.0, 0.0, 0.0, 0.0
+    for index in range(config.folds):
+        train, test = (fold != index).nonzero()[:, 0], (fold == index).nonzero()[:, 0]
+        if not len(train) or not len(test):
+            raise ValueError(f"{config.folds} folds need as many geometries; there are {int(geometry.max()) + 1}")
+        fitted, held, energy_fitted, energy_held = [], [], 0.0, 0.0
+        for gram in grams:
+            variance, vector = _principal(gram[train][:, train], config.components)
+            projected = gram[test][:, train] @ vector / (variance * len(train)).sqrt()
+            fitted.append(variance)
+            held.append(projected.square().mean(0))
+            energy_fitted += float(gram.diagonal()[train].mean())
+            energy_held += float(gram.diagonal()[test].mean())
+        order = torch.cat(fitted).argsort(descending=True)[: config.components]
+        fitted_now, held_now = torch.cat(fitted)[order], torch.cat(held)[order]
+        fitted_all, held_all = fitted_all + fitted_now, held_all + held_now
+        rest_fitted += energy_fitted - float(fitted_now.sum())
+        rest_held += energy_held - float(held_now.sum())
+    ratio = _smooth(torch.as_tensor(held_all) / torch.as_tensor(fitted_all))
+    return ratio.clamp(0.05, 1.0), max(1.0, rest_held / rest_fitted)
+
+
+def _smooth(values: Float[Tensor, "r"], width: int = 9) -> Float[Tensor, "r"]:
+    """Running mean in log space: the ratio of a single component is noisy, its trend is not."""
+    padded = torch.nn.functional.pad(values.log()[None, None], (width // 2, width // 2), mode="replicate")
+    return torch.nn.functional.avg_pool1d(padded, width, stride=1)[0, 0].exp()
+
+
+def _mixture(
+    c: Float[Tensor, "n r"], label: Int[Tensor, "n"], shrink: float = 1.0
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Weight, centre, axes and variances of each label's Gaussian; small groups lean on the mean within-group covariance."""
+    groups = [c[label == value] for value in label.unique()]
+    within = sum((g - g.mean(0)).T @ (g - g.mean(0)) for g in groups) / len(c)
+    pull = shrink * c.shape[1]
+    centre, axes, variance = [], [], []
+    for group in groups:
+        centred = group - group.mean(0)
+        covariance = (centred.T @ centred + pull * within) / (len(group) + pull)
+        value, vector = torch.linalg.eigh(covariance.double())
+        centre.append(group.mean(0))
+        axes.append(vector.T.float())
+        variance.append(value.clamp_min(float(value.max()) * 1e-7).float())
+    weight = torch.tensor([len(group) / len(c) for group in groups])
+    return weight, torch.stack(centre), torch.stack(axes), torch.stack(variance)
+
+
+def fit_shapes(people: LatentSet, prior: PersonPrior, features: int = 24, ridge: float = 30.0) -> ShapePrior:
+    """Body shapes by ridge regression on the leading person coefficients in standard deviations."""
+    first = torch.searchsorted(people.geometry, torch.arange(len(people.betas)))
+    x = torch.cat([prior.split(chunk.float())[0] for chunk in people.latents[first].split(256)])
+    x = (x / prior.marginal_variance().sqrt())[:, :features]
+    bias = people.betas.mean(0)
+    target = people.betas - bias
+    weight = torch.linalg.solve(x.T @ x + ridge * torch.eye(x.shape[1]), x.T @ target).T
+    left = target - x @ weight.T
+    covariance = left.T @ left / len(left) + 1e-4 * torch.eye(left.shape[1])
+    return ShapePrior(weight, bias, torch.linalg.cholesky(covariance), people.betas.abs().amax(0).clamp_min(1.0))

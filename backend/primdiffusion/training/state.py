@@ -1,0 +1,90 @@
+"""What a training run needs to go on exactly where it stopped."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from pathlib import Path
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from primdiffusion.training.config import PhaseConfig, write_atomically
+
+
+class TrainingState:
+    """A network with its optimiser, average of weights, random state and place; saved and loaded as one file."""
+
+    def __init__(self, network: nn.Module, config: PhaseConfig, seed: int):
+        self.network, self.config = network, config
+        self.average = copy.deepcopy(network).eval().requires_grad_(False)
+        self.optimiser = torch.optim.AdamW(
+            network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, betas=(0.9, 0.99)
+        )
+        self.generator = torch.Generator().manual_seed(seed)
+        self.step, self.seconds = 0, 0.0
+
+    def update(self, loss: Tensor) -> float:
+        """One optimiser step and one step of the average; returns the gradient's norm. FloatingPointError if not finite."""
+        rate = self.config.learning_rate * learning_rate_factor(self.step, self.config.steps)
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = float(nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip))
+        if not norm < float("inf"):
+            raise FloatingPointError(
+                f"the gradient at step {self.step} is not finite: lower the learning rate and resume"
+            )
+        self.optimiser.step()
+        decay = min(self.config.ema, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            for mean, now in zip(self.average.parameters(), self.network.parameters(), strict=True):
+                mean.lerp_(now, 1 - decay)
+        self.step += 1
+        return norm
+
+    def save(self, path: Path) -> None:
+        """Write everything to one safetensors file, whole or not at all."""
+        tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
+        tensors |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
+        for index, moments in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"optimiser.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
+        tensors |= {"random.data": self.generator.get_state(), "random.torch": torch.get_rng_state()}
+        place = {"step": str(self.step), "seconds": repr(self.seconds)}
+        write_atomically(path, save({k: v.detach().contiguous() for k, v in tensors.items()}, metadata=place))
+
+    def load(self, path: Path) -> None:
+        """Go on from a saved file; ValueError if it belongs to another network or is damaged."""
+        try:
+            with safe_open(path, framework="pt") as file:
+                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
+                place = file.metadata()
+            for name, module in (("network", self.network), ("average", self.average)):
+                module.load_state_dict(_under(tensors, name))
+        except (OSError, RuntimeError, KeyError) as error:
+            raise ValueError(
+                f"{path} does not fit this network or is damaged ({error}): start a new run folder"
+            ) from error
+        optimiser = self.optimiser.state_dict()
+        optimiser["state"] = {}
+        for key, value in _under(tensors, "optimiser").items():
+            index, name = key.split(".")
+            optimiser["state"].setdefault(int(index), {})[name] = value
+        self.optimiser.load_state_dict(optimiser)
+        self.generator.set_state(tensors["random.data"])
+        torch.set_rng_state(tensors["random.torch"])
+        self.step, self.seconds = int(place["step"]), json.loads(place["seconds"])
+
+
+def learning_rate_factor(step: int, steps: int, warm_up: int = 100, last: float = 0.1) -> float:
+    """A linear rise over `warm_up` steps times a cosine from 1 to `last` over `steps`."""
+    cosine = 0.5 + 0.5 * math.cos(math.pi * min(1.0, step / steps))
+    return min(1.0, (step + 1) / warm_up) * (last + (1 - last) * cosine)
+
+
+def _under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {key.removeprefix(f"{prefix}."): value for key, value in tensors.items() if key.startswith(f"{prefix}.")}
