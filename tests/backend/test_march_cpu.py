@@ -1,6 +1,7 @@
 """The fast marcher against the readable one in float64, over the scenes that break marchers."""
 
 import dataclasses
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -154,3 +155,11 @@ def test_march_takes_the_reference_where_gradients_or_float64_are_asked_for():
     assert march(leaf, view).rgb.requires_grad
     with torch.no_grad():
         assert torch.equal(march(leaf, view).rgb, march_cpu(single, view).rgb)
+
+
+def test_threads_may_march_at_the_same_time():
+    boxes, camera = random_boxes(40, 19).to(dtype=torch.float32), camera_at((0.0, 0.0, 0.5)).to(dtype=torch.float32)
+    alone = march_cpu(boxes, camera).rgb
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda _: march_cpu(boxes, camera).rgb, range(8)))
+    assert all(torch.equal(rgb, alone) for rgb in together)

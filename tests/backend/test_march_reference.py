@@ -255,3 +255,11 @@ def test_gradients_are_finite_with_grazed_empty_and_flat_boxes():
     (got.rgb.sum() + got.alpha.sum() + got.depth[got.alpha > 0].sum()).backward()
     assert all(torch.isfinite(tensor.grad).all() for tensor in vars(inputs).values())
     assert all(tensor.grad.abs().max() > 0 for tensor in vars(inputs).values())
+
+
+def test_mixed_and_narrow_dtypes_are_refused_with_a_way_out():
+    boxes, camera = random_boxes(2), camera_at((0.0, 0.0, 0.5))
+    with pytest.raises(ValueError, match=r"mix dtypes or devices .*convert one with \.to\(\)"):
+        march_reference(boxes.to(dtype=torch.float32), camera)
+    with pytest.raises(ValueError, match="use float32 or float64"):
+        march_reference(boxes.to(dtype=torch.bfloat16), camera.to(dtype=torch.bfloat16))

@@ -8,6 +8,7 @@ composites the chunk, and stops when it is opaque.
 from __future__ import annotations
 
 import math
+import threading
 
 import numba
 import numpy as np
@@ -21,8 +22,12 @@ from primdiffusion.render.compositing import SURFACE_OPACITY, Rendering
 from primdiffusion.render.lattice import WINDOW_SHARPNESS, MarchSettings, check_scene, strides_of
 from primdiffusion.render.tiles import TILE, tile_lists
 
+# numba's disk cache watches this file only: touch it after changing a constant that is imported above.
 CHUNK = 32
 """Lattice points gathered before they are composited: long enough to amortise the loop, short enough to stop early."""
+
+_ONE_AT_A_TIME = threading.Lock()
+"""numba's built-in thread pool, all there is on some systems, ends the process when two threads use it at once."""
 
 
 def march_cpu(primitives: Primitives, camera: Camera, settings: MarchSettings = MarchSettings()) -> Rendering:  # noqa: B008
@@ -46,7 +51,8 @@ def march_cpu(primitives: Primitives, camera: Camera, settings: MarchSettings = 
     picture = np.zeros((camera.height, camera.width, 6), np.float32)
     order = _dealt(tile_start)
     rays, spacing = directions.numpy(), settings.spacing
-    _march_tiles(picture, rays, to_local, start, voxels, stride, tile_start, tile_box, order, spacing)
+    with _ONE_AT_A_TIME:
+        _march_tiles(picture, rays, to_local, start, voxels, stride, tile_start, tile_box, order, spacing)
     rgb, alpha, depth, first_hit = torch.from_numpy(picture).split((3, 1, 1, 1), dim=-1)
     return Rendering(rgb.contiguous(), *(field[..., 0].contiguous() for field in (alpha, depth, first_hit)))
 
@@ -156,34 +162,38 @@ def _march_ray(pixel, chunk, hit_box, hit_first, hit_last, direction, to_local, 
 def _gather(chunk, begin, first, last, k, direction, to_local, start, voxels, stride, spacing):
     """Adds box k's samples at lattice points first, first + stride, ..., last to the chunk: a * colour and a."""
     size = voxels.shape[1]
-    one, half_range = np.float32(1), np.float32(0.5 * (size - 1))
+    one, half_range, last_cell = np.float32(1), np.float32(0.5 * (size - 1)), np.int32(size - 2)
+    sharpness, length = np.float32(-WINDOW_SHARPNESS), np.float32(stride[k] * spacing)
     x, y, z = _local(direction, first * spacing, to_local, start, k)
-    length = np.float32(stride[k] * spacing)
-    dx, dy, dz = _local(direction, (first + stride[k]) * spacing, to_local, start, k)
-    dx, dy, dz = dx - x, dy - y, dz - z
+    x_next, y_next, z_next = _local(direction, (first + stride[k]) * spacing, to_local, start, k)
+    dx, dy, dz = x_next - x, y_next - y, z_next - z
+    box = voxels[k]
     for i in range((last - first) // stride[k] + 1):
-        n = np.float32(i)
-        lx, ly, lz = x + n * dx, y + n * dy, z + n * dz
+        along = np.float32(i)
+        lx, ly, lz = x + along * dx, y + along * dy, z + along * dz
         x4, y4, z4 = lx * lx * lx * lx, ly * ly * ly * ly, lz * lz * lz * lz
-        fade = math.exp(np.float32(-WINDOW_SHARPNESS) * (x4 * x4 + y4 * y4 + z4 * z4))
+        fade = math.exp(sharpness * (x4 * x4 + y4 * y4 + z4 * z4))
         u, v, w = (lx + one) * half_range, (ly + one) * half_range, (lz + one) * half_range
-        iu, iv, iw = min(max(int(u), 0), size - 2), min(max(int(v), 0), size - 2), min(max(int(w), 0), size - 2)
+        iu = min(max(np.int32(u), np.int32(0)), last_cell)
+        iv = min(max(np.int32(v), np.int32(0)), last_cell)
+        iw = min(max(np.int32(w), np.int32(0)), last_cell)
         fu, fv, fw = u - np.float32(iu), v - np.float32(iv), w - np.float32(iw)
-        gu, gv, gw = one - fu, one - fv, one - fw
-        slot = first + i * stride[k] - begin
-        c0, c1, c2, c3 = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-        for corner in range(8):
-            a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
-            weight = (fu if a else gu) * (fv if b else gv) * (fw if c else gw)
-            voxel = voxels[k, iw + c, iv + b, iu + a]
-            c0 += weight * voxel[0]
-            c1 += weight * voxel[1]
-            c2 += weight * voxel[2]
-            c3 += weight * voxel[3]
-        opacity = c3 * fade * length
-        chunk[slot, 0] += opacity * c0
-        chunk[slot, 1] += opacity * c1
-        chunk[slot, 2] += opacity * c2
+        near_u, near_v, near_w = np.uint32(iu), np.uint32(iv), np.uint32(iw)
+        far_u, far_v, far_w = np.uint32(iu + 1), np.uint32(iv + 1), np.uint32(iw + 1)
+        slot = np.uint32(first + i * stride[k] - begin)
+        red, green, blue, density = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+        for d, weight_d in ((near_w, one - fw), (far_w, fw)):
+            for h, weight_h in ((near_v, one - fv), (far_v, fv)):
+                for t, weight_t in ((near_u, one - fu), (far_u, fu)):
+                    weight = weight_d * weight_h * weight_t
+                    red += weight * box[d, h, t, 0]
+                    green += weight * box[d, h, t, 1]
+                    blue += weight * box[d, h, t, 2]
+                    density += weight * box[d, h, t, 3]
+        opacity = density * fade * length
+        chunk[slot, 0] += opacity * red
+        chunk[slot, 1] += opacity * green
+        chunk[slot, 2] += opacity * blue
         chunk[slot, 3] += opacity
 
 
