@@ -14,8 +14,8 @@ from primdiffusion.people.mhclo import Proxy
 JOINTS = 24
 INFLUENCES = 4
 """Joints that move a vertex."""
-TUCK = 0.012
-"""How far hair reaches up into a hat and socks into trousers, metres."""
+OVERLAP = 0.012
+"""How far socks reach up into trousers, metres."""
 
 
 @functools.lru_cache(maxsize=64)
@@ -53,14 +53,14 @@ def under_hat(
     design = np.column_stack([brim[:, 0], brim[:, 2], np.ones(len(brim))])
     slope_x, slope_z, height = np.linalg.lstsq(design, brim[:, 1], rcond=None)[0]
     centre = hair[faces].mean(axis=1)
-    return centre[:, 1] > slope_x * centre[:, 0] + slope_z * centre[:, 2] + height + TUCK
+    return centre[:, 1] > slope_x * centre[:, 0] + slope_z * centre[:, 2] + height
 
 
 def under_hem(
     outfit: Float[np.ndarray, "O 3"], socks: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> np.ndarray:
-    """Which faces of the socks trousers cover: those above the outfit's lowest point, or none under a skirt ([F] bool)."""
-    return socks[faces].mean(axis=1)[:, 1] > outfit[:, 1].min() + TUCK
+    """Which faces of the socks trousers cover: those above the outfit's lowest point ([F] bool). Skirts cover none."""
+    return socks[faces].mean(axis=1)[:, 1] > outfit[:, 1].min() + OVERLAP
 
 
 def shown_faces(base: BaseMesh, proxies: dict[str, tuple[Proxy, Int[np.ndarray, "F 3"]]]) -> dict[str, np.ndarray]:

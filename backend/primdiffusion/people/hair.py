@@ -76,7 +76,7 @@ def _straight(texels: TexelMap, name: str) -> Strands:
 
 
 def _curls(texels: TexelMap, island: Int[np.ndarray, " F"]) -> Strands:
-    """Small curls without a direction. The two large islands, a closed cap, are solid; the tufts around it have gaps."""
+    """Small curls without a direction; the two large islands, a cap, are solid, the tufts around it have gaps."""
     draws = stream(0, "curls")
     noise = draws.standard_normal((2, SIZE, SIZE)).astype(np.float32)
     curls, tufts = _unit(gaussian_filter(noise[0], 2.0)), _unit(gaussian_filter(noise[1], 7.0))

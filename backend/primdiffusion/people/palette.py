@@ -36,14 +36,14 @@ HAIR: dict[str, str] = {
     "grey": "8a8783",
     "white": "cfccc6",
 }
-JITTER = (5.0, 4.0, 4.0)
-"""Standard deviations in Lab of a garment colour about its palette entry."""
+CLOTHES_SPREAD, HAIR_SPREAD = (5.0, 4.0, 4.0), (2.5, 0.7, 1.2)
+"""Standard deviations in Lab of colours about their palette entries."""
 
 
 def garment_colour(kind: str, draws: np.random.Generator) -> Float[np.ndarray, "3"]:
     """A linear colour that suits a kind of garment."""
     codes = CLOTHES[kind].split()
-    return _near(codes[draws.integers(len(codes))], draws, 1.0)
+    return _near(codes[draws.integers(len(codes))], draws, CLOTHES_SPREAD)
 
 
 def contrasting(colour: Float[np.ndarray, "3"], kind: str, draws: np.random.Generator) -> Float[np.ndarray, "3"]:
@@ -62,12 +62,12 @@ def hair_colour(tone: float, old: bool, draws: np.random.Generator) -> tuple[str
         share *= 0.55
         share[-2:] += 0.24
     name = list(HAIR)[draws.choice(len(HAIR), p=share / share.sum())]
-    return name, _near(HAIR[name], draws, 0.5)
+    return name, _near(HAIR[name], draws, HAIR_SPREAD)
 
 
-def _near(code: str, draws: np.random.Generator, spread: float) -> Float[np.ndarray, "3"]:
+def _near(code: str, draws: np.random.Generator, spread: tuple[float, float, float]) -> Float[np.ndarray, "3"]:
     """A linear colour about a hexadecimal one."""
     lab = lab_from_bytes(np.frombuffer(bytes.fromhex(code), np.uint8))
-    moved = lab + draws.normal(0, JITTER).astype(np.float32) * spread
+    moved = lab + draws.normal(0, spread).astype(np.float32)
     moved[0] = np.clip(moved[0], 3, 97)
     return linear_from_bytes(bytes_from_lab(moved)).astype(np.float64)
