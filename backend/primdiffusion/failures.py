@@ -1,0 +1,57 @@
+"""Which exceptions are news for the user, and what to tell: one sentence, a kind for programs, a remedy.
+
+Domain errors of this package subclass builtins, so builtin types decide; everything else is a defect of ours and keeps
+its traceback. Imports no torch: the child answers `hello` before torch is there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class Failure:
+    """An error as a user reads it."""
+
+    kind: str
+    sentence: str
+    remedy: str
+
+
+MEMORY_REMEDY = "close other programs, or choose a smaller checkpoint or picture, then try again"
+
+
+def describe(error: BaseException) -> Failure | None:
+    """The failure `error` stands for, or None where it is no domain error but a defect."""
+    sentence = " ".join(str(error).split()) or type(error).__name__
+    if _out_of_memory(error):
+        first = sentence.split(". ")[0]
+        return Failure("out_of_memory", f"the machine ran out of memory: {first[:200]}", MEMORY_REMEDY)
+    if isinstance(error, ImportError):
+        remedy = "install the backend's packages into the Python that runs it, or choose another Python"
+        return Failure("environment", f"a package of the backend could not be loaded: {sentence}", remedy)
+    if isinstance(error, PermissionError | NotADirectoryError | IsADirectoryError):
+        return Failure("unwritable", _of_file(error), "choose a folder and files that you may read and write")
+    if isinstance(error, FileNotFoundError):
+        return Failure("missing_file", _of_file(error), "check the path, or make the file first")
+    if isinstance(error, OSError):
+        return Failure("file_system", _of_file(error), "check the disk's free space and the path, then try again")
+    if isinstance(error, ValueError):
+        return Failure("bad_input", sentence, "correct what the sentence names and try again")
+    return None
+
+
+def _out_of_memory(error: BaseException) -> bool:
+    """torch raises plain RuntimeError where its CPU allocator gives up, and its own subclass on a GPU."""
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return True
+    return isinstance(error, RuntimeError) and (
+        "not enough memory" in str(error) or "can't allocate memory" in str(error)
+    )
+
+
+def _of_file(error: OSError) -> str:
+    """Python's own OSErrors read "[Errno 13] Permission denied: 'x'"; ours are sentences already."""
+    if error.strerror and error.filename:
+        return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,58 @@
+"""Parameters of the jobs the child runs, checked before any work starts. Imports no torch."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+LARGEST_SEED = 2**63 - 1
+LARGEST_PICTURE = 4096
+"""Pixels a side."""
+STEP_LIMIT = 1000
+"""The schedule's length: a sampler cannot take more steps."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GenerateParams:
+    """Parameters of generate."""
+
+    seed: int
+    out_dir: str
+    """Folder for human.npz, person.human.safetensors and pictures; made if missing."""
+    steps: int = 30
+    sampler: str = "ddim"
+    checkpoint: str | None = None
+    """A .safetensors file; None for the one that ships with the package."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed <= LARGEST_SEED:
+            raise ValueError(f"seed {self.seed} is outside 0 ... 2^63-1")
+        if not 1 <= self.steps <= STEP_LIMIT:
+            raise ValueError(f"{self.steps} steps were asked for: choose 1 to {STEP_LIMIT}")
+        if not self.out_dir:
+            raise ValueError("out_dir is empty: name a folder")
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderParams:
+    """Parameters of render."""
+
+    human: str
+    """A person.human.safetensors file."""
+    out: str
+    """The PNG to write."""
+    width: int = 512
+    height: int = 512
+    yaw: float = 0.0
+    """Where the camera stands around the person: 0 in front, pi/2 at the person's left; radians."""
+    pose: str | list | None = None
+    """72 axis-angle values (24 x 3, radians), or a pose file (.json, .npz); None for the T pose."""
+    depth: str | None = None
+    """A second PNG, of depth."""
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            if not 1 <= getattr(self, name) <= LARGEST_PICTURE:
+                raise ValueError(f"{name} {getattr(self, name)} is outside 1 ... {LARGEST_PICTURE} pixels")
+        if not math.isfinite(self.yaw):
+            raise ValueError(f"yaw is {self.yaw}: give an angle in radians")

@@ -1,0 +1,52 @@
+"""What this machine offers: memory at once, the torch device when torch is there."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Any
+
+import psutil
+
+if TYPE_CHECKING:
+    import torch
+
+GB = 1e9
+
+
+def memory() -> dict[str, float]:
+    """Total and available memory of the machine in GB (1e9 bytes). Needs no torch."""
+    now = psutil.virtual_memory()
+    return {"memory_gb": round(now.total / GB, 2), "memory_free_gb": round(now.available / GB, 2)}
+
+
+def peak_memory_gb() -> float:
+    """The most memory this process has held at once so far, GB (1e9 bytes)."""
+    if sys.platform == "win32":
+        return psutil.Process().memory_info().peak_wset / GB
+    import resource
+
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / GB
+
+
+def best_device() -> torch.device:
+    """CUDA where torch sees one, otherwise the CPU."""
+    import torch
+
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def device_info(device: torch.device) -> dict[str, Any]:
+    """The device as `hello` and the panel state it: its name, and its own memory where it has some."""
+    import torch
+
+    if device.type == "cuda":
+        free, total = torch.cuda.mem_get_info(device)
+        return {
+            "device": str(device),
+            "device_name": torch.cuda.get_device_name(device),
+            "device_memory_gb": round(total / GB, 2),
+            "device_memory_free_gb": round(free / GB, 2),
+        }
+    name = f"CPU, {torch.get_num_threads()} threads"
+    return {"device": str(device), "device_name": name, "device_memory_gb": None, "device_memory_free_gb": None}

@@ -1,0 +1,67 @@
+"""All files of a job or none: they are written aside and renamed into place together."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+
+STAGING_PREFIX = ".primdiffusion-partial-"
+"""Followed by the writing process' id; what a killed process leaves is removed by the next job in the same folder."""
+
+
+@contextlib.contextmanager
+def staged(folder: str | Path) -> Iterator[Path]:
+    """A folder to write into; on a good end its files move to `folder`, on an error all of it (and a new `folder`) goes.
+
+    Yields a new folder inside `folder`, so that a folder that cannot be written to fails here, before any work is done.
+    Files of the same names in `folder` are replaced. Raises OSError.
+    """
+    target = Path(folder)
+    made = _make(target)
+    try:
+        _remove_leftovers(target)
+        aside = target / f"{STAGING_PREFIX}{os.getpid()}"
+        aside.mkdir()
+    except OSError:
+        _unmake(made)
+        raise
+    try:
+        yield aside
+        for path in sorted(aside.iterdir()):
+            os.replace(path, target / path.name)
+        made = []
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+        _unmake(made)
+
+
+def _make(folder: Path) -> list[Path]:
+    """Creates `folder` and its missing parents; returns the created ones, innermost first."""
+    missing = []
+    while not folder.exists():
+        missing.append(folder)
+        folder = folder.parent
+    for path in reversed(missing):
+        path.mkdir(exist_ok=True)
+    return missing
+
+
+def _unmake(created: list[Path]) -> None:
+    """Removes folders this job created, as far as nobody else has put something into them."""
+    for path in created:
+        try:
+            path.rmdir()
+        except OSError:
+            return
+
+
+def _remove_leftovers(folder: Path) -> None:
+    for path in folder.glob(f"{STAGING_PREFIX}*"):
+        pid = path.name.removeprefix(STAGING_PREFIX)
+        if not (pid.isdecimal() and int(pid) != os.getpid() and psutil.pid_exists(int(pid))):
+            shutil.rmtree(path, ignore_errors=True)

@@ -1,0 +1,110 @@
+"""Which Python runs the backend: found and tried before a child is started with it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from .client import child_environment
+
+VARIABLE = "PRIMDIFFUSION_PYTHON"
+TRIAL_S = 90.0
+"""A first import of torch from a slow disk, with a virus scanner, takes most of a minute."""
+TRIAL = (
+    "import json, sys, primdiffusion, torch; "
+    "print(json.dumps({'version': primdiffusion.__version__, 'torch': torch.__version__, 'python': sys.version.split()[0]}))"
+)
+
+
+class BackendNotFound(RuntimeError):
+    """No Python that can run the backend; the message names each that was tried and why it will not do."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BackendPython:
+    """An interpreter that has imported torch and the backend."""
+
+    path: Path
+    source: str
+    """Who named it, in words for the user."""
+    version: str
+    """Of primdiffusion."""
+    torch: str
+    python: str
+
+
+def python_of_environment(folder: Path) -> Path:
+    """The interpreter of the virtual environment in `folder` on this system."""
+    return folder / "Scripts" / "python.exe" if os.name == "nt" else folder / "bin" / "python"
+
+
+def candidates(preference: str | Path | None, own_environment: Path | None) -> Iterator[tuple[str, Path]]:
+    """Who may name the Python, strongest first: the preferences, the variable, the extension's own, the running one.
+
+    An explicit wish (preferences or variable) that fails is an error and not a reason to look further.
+    """
+    if preference and str(preference).strip():
+        yield "the extension's preferences", Path(preference)
+        return
+    if os.environ.get(VARIABLE):
+        yield f"the environment variable {VARIABLE}", Path(os.environ[VARIABLE])
+        return
+    if own_environment is not None and python_of_environment(own_environment).exists():
+        yield "the extension's own environment", python_of_environment(own_environment)
+    yield "Blender's own Python", Path(sys.executable)
+
+
+def find_backend_python(
+    preference: str | Path | None = None,
+    own_environment: Path | None = None,
+    module_path: Path | None = None,
+    *,
+    cache_dir: Path | None = None,
+    timeout_s: float = TRIAL_S,
+) -> BackendPython:
+    """The first candidate that imports primdiffusion and torch. Takes seconds: call it from a thread (Backend does).
+
+    `module_path` and `cache_dir` as in `child_environment`. Raises BackendNotFound with one reason for each candidate.
+    """
+    environment = child_environment(module_path, cache_dir, {})
+    reasons = []
+    for source, path in candidates(preference, own_environment):
+        try:
+            return _try(path, source, environment, timeout_s)
+        except BackendNotFound as e:
+            reasons.append(str(e))
+    advice = "name a Python with PrimDiffusion's packages in the extension's preferences"
+    raise BackendNotFound(f"No Python for the backend: {'; '.join(reasons)}. To go on, {advice}.")
+
+
+def _try(path: Path, source: str, environment: Mapping[str, str], timeout_s: float) -> BackendPython:
+    named = f"{path} ({source})"
+    try:
+        done = subprocess.run(
+            [str(path), "-P", "-c", TRIAL],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            env=dict(environment),
+            timeout=timeout_s,
+            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+            check=False,
+        )
+    except FileNotFoundError as e:
+        raise BackendNotFound(f"{named} does not exist") from e
+    except OSError as e:
+        raise BackendNotFound(f"{named} cannot be run: {e.strerror}") from e
+    except subprocess.TimeoutExpired as e:
+        raise BackendNotFound(f"{named} did not import torch within {timeout_s:.0f} s") from e
+    if done.returncode != 0:
+        lines = done.stderr.decode("utf-8", "replace").strip().splitlines()
+        raise BackendNotFound(f"{named} cannot run it: {lines[-1] if lines else f'exit code {done.returncode}'}")
+    try:
+        about = json.loads(done.stdout.decode("utf-8", "replace").strip().splitlines()[-1])
+        return BackendPython(path, source, about["version"], about["torch"], about["python"])
+    except (ValueError, IndexError, KeyError) as e:
+        raise BackendNotFound(f"{named} is no Python interpreter: it answered {done.stdout[:80]!r}") from e

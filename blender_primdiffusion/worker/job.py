@@ -1,0 +1,241 @@
+"""One generation as Blender follows it: a small state machine that a timer ticks."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+from .client import BackendClient, Died, Event, Failure, Notification, Response, Silent
+
+State = Literal["starting", "running", "cancelling", "done", "failed", "cancelled"]
+FINAL: tuple[State, ...] = ("done", "failed", "cancelled")
+CANCELLED_CODE = -32001
+CANCEL_PATIENCE_S = 15.0
+"""A cancel takes effect at the end of a step; a child that takes longer than this is ended."""
+STAGES = {
+    "load": "Loading the model",
+    "sample": "Generating",
+    "preview": "Drawing the previews",
+    "write": "Writing the person",
+}
+
+
+class Backend:
+    """The child that jobs share: started at first use, kept warm, started anew after it died."""
+
+    def __init__(self, make_client: Callable[[], BackendClient]):
+        """`make_client` finds a Python and returns a client not yet started; it runs in a thread, so it must not touch bpy."""
+        self._make_client = make_client
+        self._lock = threading.Lock()
+        self._client: BackendClient | None = None
+
+    @property
+    def client(self) -> BackendClient | None:
+        """The running child, if there is one; never starts one."""
+        client = self._client
+        return client if client is not None and client.alive else None
+
+    def connect(self) -> BackendClient:
+        """The running child, started now if there is none. Takes seconds. Raises BackendNotFound or OSError."""
+        with self._lock:
+            running = self.client
+            if running is not None:
+                return running
+            client = self._make_client()
+            client.start()
+            self._client = client
+            return client
+
+    def shutdown(self) -> None:
+        """Ends the child; the next `connect` starts another."""
+        if self._client is not None:
+            self._client.shutdown()
+        self._client = None
+
+
+@dataclasses.dataclass(frozen=True)
+class JobError:
+    """Why a job failed, for the user and, in `log`, for a bug report."""
+
+    message: str
+    remedy: str
+    kind: str
+    log: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{self.message}. {self.remedy[:1].upper()}{self.remedy[1:]}." if self.remedy else f"{self.message}."
+
+
+class GenerateJob:
+    """Generates one person into `out_dir`. Call `tick` from a timer until `finished`; then read `result` or `error`.
+
+    starting -> running -> done | failed;  cancel: -> cancelling -> cancelled.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        *,
+        seed: int,
+        steps: int,
+        out_dir: Path,
+        sampler: str = "ddim",
+        checkpoint: Path | None = None,
+    ):
+        self._params = {"seed": seed, "steps": steps, "out_dir": str(out_dir), "sampler": sampler}
+        if checkpoint is not None:
+            self._params["checkpoint"] = str(checkpoint)
+        self._backend = backend
+        self._out_dir = out_dir
+        self._out_dir_is_new = not out_dir.exists()
+        self._client: BackendClient | None = None
+        self._request: int | None = None
+        self._cancel_asked_at: float | None = None
+        self.state: State = "starting"
+        self.step = 0
+        self.total = steps
+        self.eta_s: float | None = None
+        """Seconds that are left, None while unknown."""
+        self.message = "Starting the backend"
+        self.result: dict[str, Any] | None = None
+        """Of generate: human, preview (paths), seed, steps, seconds."""
+        self.error: JobError | None = None
+        self._connect_error: BaseException | None = None
+        self._connecting = threading.Thread(target=self._connect, name="primdiffusion start", daemon=True)
+        self._connecting.start()
+
+    @property
+    def finished(self) -> bool:
+        """Nothing more will happen."""
+        return self.state in FINAL
+
+    @property
+    def fraction(self) -> float:
+        """Progress from 0 to 1."""
+        return 1.0 if self.state == "done" else self.step / max(self.total, 1)
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """What the backend says of itself (version, device, memory); empty until it answers."""
+        return self._client.info if self._client is not None else {}
+
+    def tick(self) -> bool:
+        """Takes in what has happened; True if something visible changed. Never waits."""
+        if self.finished:
+            return False
+        before = (self.state, self.step, self.total, self.eta_s, self.message)
+        if self._client is None:
+            self._tick_start()
+        if self._client is not None and not self.finished:
+            for event in self._client.poll():
+                self._take(event)
+                if self.finished:
+                    break
+            self._lose_patience()
+        return before != (self.state, self.step, self.total, self.eta_s, self.message)
+
+    def cancel(self) -> None:
+        """Asks for an end; `tick` goes on until the state is cancelled (within one step of the sampler)."""
+        if self.finished or self._cancel_asked_at is not None:
+            return
+        self._cancel_asked_at = time.monotonic()
+        self.state, self.message, self.eta_s = "cancelling", "Cancelling", None
+        if self._client is not None and self._request is not None:
+            self._client.cancel(self._request)
+
+    # starting
+
+    def _connect(self) -> None:
+        try:
+            self._connected = self._backend.connect()
+        except Exception as e:
+            self._connect_error = e
+
+    def _tick_start(self) -> None:
+        if self._connecting.is_alive():
+            return
+        if self._connect_error is not None:
+            if self._cancel_asked_at is not None:
+                self._end("cancelled", "Cancelled")
+                return
+            sentence = str(self._connect_error).rstrip(".") or type(self._connect_error).__name__
+            self._fail(JobError(sentence, "", "environment"))
+            return
+        self._client = self._connected
+        if self._cancel_asked_at is not None:
+            self._end("cancelled", "Cancelled")
+            return
+        self._request = self._client.request("generate", self._params)
+        if not self._client.info.get("ready"):
+            self.message = "Loading PyTorch"
+
+    # following
+
+    def _take(self, event: Event) -> None:
+        if isinstance(event, Notification) and event.method == "progress" and event.params.get("id") == self._request:
+            self._take_progress(event.params)
+        elif isinstance(event, Response) and event.id == self._request:
+            self.result = event.result
+            self.step, self.eta_s = self.total, 0.0
+            self._end("done", f"Generated in {event.result['seconds']:.1f} s")
+        elif isinstance(event, Failure) and event.id == self._request:
+            if event.code == CANCELLED_CODE:
+                self._end("cancelled", "Cancelled")
+            else:
+                self._fail(JobError(event.message, event.remedy, event.kind, self._log()))
+        elif isinstance(event, Died):
+            self._clear_leftovers()
+            if self._cancel_asked_at is not None:
+                self._end("cancelled", "Cancelled")
+            else:
+                self._fail(JobError(event.message, "Try again; the log tells more", "died", event.stderr))
+        elif isinstance(event, Silent):
+            self._kill()
+            sentence = f"the backend hung: it said nothing for {event.seconds:.0f} s and was ended"
+            self._fail(JobError(sentence, "Try again; the log tells more", "hung", self._log()))
+
+    def _take_progress(self, params: dict[str, Any]) -> None:
+        if self._cancel_asked_at is not None:
+            return
+        stage = params.get("stage", "")
+        self.state = "running"
+        self.message = STAGES.get(stage, stage)
+        self.eta_s = params.get("eta_s")
+        if stage == "sample":
+            self.step, self.total = params["step"], params["total"]
+            self.message = f"{self.message}: step {self.step} of {self.total}"
+
+    def _lose_patience(self) -> None:
+        asked = self._cancel_asked_at
+        if not self.finished and asked is not None and time.monotonic() - asked > CANCEL_PATIENCE_S:
+            self._kill()
+            self._end("cancelled", "Cancelled; the backend did not answer and was ended")
+
+    def _kill(self) -> None:
+        if self._client is not None:
+            self._client.kill()
+        self._clear_leftovers()
+
+    def _clear_leftovers(self) -> None:
+        """Half-written files of a killed child lie in a folder of its own (the backend's staging.py names it so)."""
+        if self._client is not None:
+            shutil.rmtree(self._out_dir / f".primdiffusion-partial-{self._client.pid}", ignore_errors=True)
+            if self._out_dir_is_new:
+                with contextlib.suppress(OSError):  # holds other things, or never came to be
+                    self._out_dir.rmdir()
+
+    def _log(self) -> tuple[str, ...]:
+        return self._client.stderr if self._client is not None else ()
+
+    def _fail(self, error: JobError) -> None:
+        self.error = error
+        self._end("failed", str(error))
+
+    def _end(self, state: State, message: str) -> None:
+        self.state, self.message, self.eta_s = state, message[:1].upper() + message[1:], None
