@@ -86,9 +86,10 @@ def open_assets(folder: str | os.PathLike[str] | None = None, required: tuple[st
             f"The MakeHuman asset folder {root} is not there; pass the folder that holds {', '.join(ROOMS)}."
         )
     lacking = [room for room in ROOMS if not (root / room).is_dir()]
-    lacking += [name for name in required for end in (".mhclo", ".obj") if not (root / f"{name}{end}").is_file()]
+    files = [f"{name}{ending}" for name in required for ending in (".mhclo", ".obj")]
+    lacking += [file for file in files if not (root / file).is_file()]
     if lacking:
-        shown = ", ".join(dict.fromkeys(lacking[:6])) + (", ..." if len(lacking) > 6 else "")
+        shown = ", ".join(lacking[:6]) + (", ..." if len(lacking) > 6 else "")
         raise AssetsMissingError(
             f"The MakeHuman asset folder {root} is incomplete, it lacks {shown}; "
             f"get the pack's folder 'base' from {SOURCE}."

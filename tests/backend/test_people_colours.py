@@ -1,0 +1,78 @@
+"""Colours, patterns and texel maps of people, without asset files."""
+
+import numpy as np
+import pytest
+from primdiffusion.people import palette, patterns
+from primdiffusion.people.colour import bytes_from_lab, lab_from_bytes
+from primdiffusion.people.texel_map import connected_faces, texel_map, uv_islands
+from skimage.color import lab2rgb, rgb2lab
+
+SQUARE = np.array([[[0.0, 0], [0.5, 0], [0.5, 0.5]], [[0, 0], [0.5, 0.5], [0, 0.5]]])
+
+
+def test_lab_agrees_with_scikit_image():
+    colours = np.random.default_rng(0).integers(0, 256, (500, 3)).astype(np.uint8)
+    assert np.abs(lab_from_bytes(colours) - rgb2lab(colours[None])[0]).max() < 0.02
+    lab = rgb2lab(colours[None])[0].astype(np.float32)
+    assert np.abs(bytes_from_lab(lab) / 255 - lab2rgb(lab[None])[0]).max() < 1.01 / 255
+
+
+def test_lab_round_trip_is_off_by_at_most_one():
+    colours = np.stack(np.meshgrid(*[np.arange(0, 256, 5, dtype=np.uint8)] * 3), -1).reshape(-1, 3)
+    assert np.abs(bytes_from_lab(lab_from_bytes(colours)).astype(int) - colours).max() <= 1
+
+
+def test_texel_map_puts_v_up_and_interpolates():
+    texels = texel_map(SQUARE, 8)
+    assert texels.inside[4:, :4].all()
+    assert texels.inside.sum() == 16
+    vertices = np.array([[0.0, 0], [0.5, 0], [0.5, 0.5], [0, 0.5]])
+    uv = texels.sample(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
+    assert uv[5, 2] == pytest.approx([2.5 / 8, 1 - 5.5 / 8], abs=1e-6)
+
+
+def test_texels_outside_take_the_nearest_island():
+    corner_uv = np.concatenate([SQUARE * 0.5, SQUARE * 0.5 + 0.75])
+    texels = texel_map(corner_uv, 32)
+    assert set(np.unique(texels.face[-4:, :4])) <= {0, 1}
+    assert set(np.unique(texels.face[:4, -4:])) <= {2, 3}
+
+
+def test_mesh_without_texture_coordinates_is_refused():
+    with pytest.raises(ValueError, match="no texture coordinates"):
+        texel_map(np.zeros((3, 3, 2)), 16)
+
+
+def test_connected_pieces_are_numbered_from_the_largest():
+    faces = np.array([[0, 1, 2], [3, 4, 5], [4, 5, 6]])
+    assert connected_faces(faces, 7).tolist() == [1, 0, 0]
+
+
+def test_islands_part_where_texture_coordinates_do():
+    corner_uv = np.concatenate([SQUARE, SQUARE[:1] + 0.3])
+    assert uv_islands(corner_uv).tolist() == [0, 0, 1]
+
+
+@pytest.mark.parametrize(("name", "pattern"), patterns.PATTERNS)
+def test_patterns_show_both_colours_and_are_mirror_symmetric(name, pattern):
+    draws = np.random.default_rng(1)
+    position = draws.uniform((-0.6, -0.1, -0.2), (0.6, 0.5, 0.2), (4000, 3))
+    share = pattern(position)
+    assert share.min() == 0
+    assert share.max() == 1
+    mirrored = pattern(position * [-1, 1, 1])
+    assert np.abs(share - mirrored).max() < 1e-9, name
+
+
+def test_bands_run_on_from_body_to_sleeve():
+    body = np.array([[patterns.SHOULDER_X - 1e-6, patterns.SHOULDER_Y, 0.0]])
+    sleeve = np.array([[patterns.SHOULDER_X + 1e-6, patterns.SHOULDER_Y, 0.0]])
+    assert patterns.hanging_height(body) == pytest.approx(patterns.hanging_height(sleeve), abs=1e-5)
+
+
+@pytest.mark.parametrize("tone", [0.0, 0.3, 1.0])
+def test_hair_shares_are_those_of_the_tone(tone):
+    draws = np.random.default_rng(2)
+    names = [palette.hair_colour(tone, False, draws)[0] for _ in range(600)]
+    dark = sum(name in ("black", "darkbrown") for name in names) / 600
+    assert dark == pytest.approx({0.0: 0.36, 0.3: 0.5904, 1.0: 0.84}[tone], abs=0.06)
