@@ -9,14 +9,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 from importlib import resources
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from primdiffusion.body.model import default_body
+from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.surface import signed_volume, surface_points, uv_gradient
 from primdiffusion.geometry.uv_atlas import closest_in_uv, rasterise_uv
@@ -44,28 +44,18 @@ JOINT_REGION = (
 """Region of each of SMPL's 24 joints, in their order."""
 SPACING_TO_HALF_EXTENT = 0.9
 """In-plane half extent as a share of the distance to the next cell; 0.5 would tile. The marcher's window fades the
-outer fifth of a box, and boxes fan out where cloth hangs off the skin: of the surface of eight dressed people 94 % lies in the
-unfaded part of some box at 0.75, 97 % at 0.9, 97.6 % at 1.0 with coarser voxels."""
+outer fifth of a box, and boxes fan out where cloth hangs off the skin: of the surface of eight dressed people 94 %
+lies in the unfaded part of some box at 0.75, 97 % at 0.9, 97.6 % at 1.0 with coarser voxels."""
 SMALLEST_IN_PLANE = 0.008
 """Metres; voxels finer than 2 mm are finer than any picture needs."""
 LARGEST_IN_PLANE = {"torso": 0.050, "head": 0.050, "arm": 0.050, "hand": 0.035, "leg": 0.050, "foot": 0.050}
 """Metres, by region. The cells at the thumb span the gap to the fingers and would fill it with one coarse box."""
 NORMAL_HALF_EXTENT = {"torso": 0.070, "head": 0.060, "arm": 0.050, "hand": 0.025, "leg": 0.070, "foot": 0.045}
-"""Metres along the normal, by region. Jackets, skirts and hair stand 4-6 cm off the skin; a surface outside every box is
-a hole. Sleeves and shoes stand off less, and a hand's eight voxels must resolve fingers 2 cm thick."""
+"""Metres along the normal, by region. Jackets, skirts and hair stand 4-6 cm off the skin; a surface outside every box
+is a hole. Sleeves and shoes stand off less, and a hand's eight voxels must resolve fingers 2 cm thick."""
 RELEASED_NEIGHBOURS = 23
 RELEASED_DISTANCE_LIMITS = (0.005, 0.050)
 """Metres; SPEC 2."""
-
-
-class UvBody(Protocol):
-    """What anchors need of a body: a rest surface with UV coordinates (a BodyModel is one)."""
-
-    template: Float[Tensor, "v 3"]
-    faces: Int[Tensor, "f 3"]
-    uv: Float[Tensor, "t 2"]
-    uv_faces: Int[Tensor, "f 3"]
-    skin_weights: Float[Tensor, "v j"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,7 +102,7 @@ def tangent_plane(
     return du, dv
 
 
-def anchor_skin_weights(anchors: Anchors, body: UvBody) -> Float[Tensor, "k j"]:
+def anchor_skin_weights(anchors: Anchors, body: BodyModel) -> Float[Tensor, "k j"]:
     """The body's skinning weights at the anchors, by their barycentric coordinates; rows add up to 1."""
     return surface_points(body.skin_weights, body.faces, anchors.face, anchors.barycentric)
 
@@ -121,18 +111,19 @@ def anchor_skin_weights(anchors: Anchors, body: UvBody) -> Float[Tensor, "k j"]:
 def default_anchors() -> Anchors:
     """The anchors of the default body, from the layout in body/data/layout.npz (made by scripts/bake_layout)."""
     with resources.files("primdiffusion.body").joinpath("data/layout.npz").open("rb") as file, np.load(file) as stored:
-        layout = {name: torch.from_numpy(stored[name].astype(np.float32)) for name in stored}
+        layout = {name: torch.from_numpy(stored[name].astype(np.float64)) for name in stored}
     first, second = (layout["texel_barycentric"] / 65535).unbind(-1)
     body = default_body()
+    # In float64: a tangent plane's weights must cancel to the last bit, or frames would depend on where a body stands.
     return footprint_anchors(
-        body.template,
+        body.template.double(),
         body.faces,
         layout["cell_face"].long(),
         layout["cell_barycentric"],
         layout["cell_chart"].long(),
         layout["texel_face"].long(),
         torch.stack([first, second, 1 - first - second], -1),
-    )
+    ).to(dtype=torch.float32)
 
 
 def footprint_anchors(
@@ -202,12 +193,14 @@ def paper_half_extent(anchors: Anchors, template: Float[Tensor, "v 3"]) -> Float
 
 
 def released_half_extent(position: Float[Tensor, "k 3"]) -> Float[Tensor, "k 3"]:
-    """Isotropic sizes of the released code: 2/3 of the mean distance to the 23 nearest others, clipped to 5 .. 50 mm."""
-    distance = torch.cdist(position, position).sort(-1).values[:, 1 : RELEASED_NEIGHBOURS + 1].mean(-1)
+    """Isotropic sizes of the released code: 2/3 of the mean distance to the 23 nearest others, clipped to 5-50 mm."""
+    # The faster mode of cdist goes through squares and puts coincident points a millimetre apart.
+    every = torch.cdist(position, position, compute_mode="donot_use_mm_for_euclid_dist")
+    distance = every.sort(-1).values[:, 1 : RELEASED_NEIGHBOURS + 1].mean(-1)
     return (distance.clamp(*RELEASED_DISTANCE_LIMITS) * (2 / 3))[:, None].expand(-1, 3).contiguous()
 
 
-def build_anchors(body: UvBody, rule: Literal["paper", "released"] = "paper") -> Anchors:
+def build_anchors(body: BodyModel, rule: Literal["paper", "released"] = "paper") -> Anchors:
     """Anchors for any body with UV coordinates; grid points are texels 4, 12, 20, ... of a 256 x 256 raster (SPEC 2).
 
     "paper": a grid point outside every chart takes the closest chart point, sizes follow the UV gradient per axis.
@@ -219,11 +212,8 @@ def build_anchors(body: UvBody, rule: Literal["paper", "released"] = "paper") ->
     """
     if rule not in ("paper", "released"):
         raise ValueError(f"there is no anchor rule {rule!r}; choose 'paper' or 'released'")
-    if body.uv.numel() == 0 or body.uv_faces.shape != body.faces.shape:
-        raise ValueError(
-            f"the body has {len(body.uv)} UV coordinates and {len(body.uv_faces)} UV faces for {len(body.faces)} "
-            "faces; load it with a UV map (vt and ft arrays, or an OBJ file)"
-        )
+    if body.uv.numel() == 0:
+        raise ValueError("the body has no UV coordinates; load it with a UV map (vt and ft arrays, or an OBJ file)")
     if not torch.isfinite(body.template).all():
         raise ValueError("the body's template holds NaN or infinite values; load the body file again")
     corner_uv = body.uv[body.uv_faces].double().cpu().numpy()
@@ -240,7 +230,7 @@ def build_anchors(body: UvBody, rule: Literal["paper", "released"] = "paper") ->
     return _face_anchors(body, torch.from_numpy(face), torch.from_numpy(barycentric), rule)
 
 
-def _face_anchors(body: UvBody, face: Tensor, barycentric: Tensor, rule: str) -> Anchors:
+def _face_anchors(body: BodyModel, face: Tensor, barycentric: Tensor, rule: str) -> Anchors:
     """Anchors with the tangent planes of single faces."""
     device, dtype = body.template.device, body.template.dtype
     face, barycentric = face.to(device), barycentric.to(device, dtype)
@@ -261,7 +251,7 @@ def _face_anchors(body: UvBody, face: Tensor, barycentric: Tensor, rule: str) ->
     return dataclasses.replace(anchors, rest_half_extent=paper_half_extent(anchors, body.template))
 
 
-def region_charts(body: UvBody) -> Int[Tensor, "v"]:
+def region_charts(body: BodyModel) -> Int[Tensor, "v"]:
     """The region of each vertex as an index into CHARTS, from the joint that moves it most."""
     return torch.tensor([CHARTS.index(region) for region in JOINT_REGION], device=body.template.device)[
         body.skin_weights.argmax(-1)
