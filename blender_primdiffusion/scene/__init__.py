@@ -1,0 +1,1 @@
+"""A person in Blender: armature, proxy mesh, volumes and their material, built from one human.npz."""

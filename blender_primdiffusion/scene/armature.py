@@ -1,0 +1,106 @@
+"""SMPL's skeleton as a Blender armature, and poses given as SMPL joint rotations."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+from mathutils import Vector
+from numpy.typing import NDArray
+
+from .convention import points_to_blender, rotations_to_blender
+from .human_file import JOINT_NAMES, PARENTS
+from .quaternion import matrix_to_quaternion
+
+_TOWARDS = {"pelvis": "spine1", "spine3": "neck"}
+"""Which child a bone points at, where a joint has several."""
+_LEAF_LENGTH = {"head": 0.15, "left_foot": 0.06, "right_foot": 0.06, "left_hand": 0.08, "right_hand": 0.08}
+_LEAF_DIRECTION = {"head": (0.0, 0.0, 1.0), "left_foot": (0.0, -1.0, 0.0), "right_foot": (0.0, -1.0, 0.0)}
+_SHORTEST = 0.01
+
+
+def bone_tails(joints: NDArray) -> NDArray[np.float64]:
+    """Tails [24, 3] of bones with heads at `joints` [24, 3], both z up: towards the child, leaves straight on."""
+    tails = np.array(joints, np.float64)
+    for index, name in enumerate(JOINT_NAMES):
+        children = [child for child, parent in enumerate(PARENTS) if parent == index]
+        if children:
+            target = JOINT_NAMES.index(_TOWARDS[name]) if name in _TOWARDS else children[0]
+            offset = joints[target] - joints[index]
+        else:
+            direction = np.asarray(_LEAF_DIRECTION.get(name, joints[index] - joints[PARENTS[index]]), np.float64)
+            offset = direction / max(float(np.linalg.norm(direction)), 1e-9) * _LEAF_LENGTH[name]
+        if np.linalg.norm(offset) < _SHORTEST:  # Blender deletes bones of no length when edit mode ends
+            offset = np.array([0.0, 0.0, _SHORTEST])
+        tails[index] = joints[index] + offset
+    return tails
+
+
+def build_armature(context: bpy.types.Context, name: str, joints: NDArray) -> bpy.types.Object:
+    """An armature object with a bone for each joint, heads at `joints` [24, 3] (z up, metres), linked to no collection.
+
+    Bones exist only in edit mode, so the object is linked to the scene for the moment; the active object and the
+    selection are as before afterwards.
+    """
+    data = bpy.data.armatures.new(name)
+    armature = bpy.data.objects.new(name, data)
+    layer = context.view_layer
+    active = layer.objects.active
+    if active is not None and active.mode != "OBJECT":
+        bpy.ops.object.mode_set(mode="OBJECT")
+    context.scene.collection.objects.link(armature)
+    try:
+        layer.objects.active = armature
+        bpy.ops.object.mode_set(mode="EDIT")
+        tails = bone_tails(joints)
+        for index, joint in enumerate(JOINT_NAMES):
+            bone = data.edit_bones.new(joint)
+            bone.head, bone.tail = Vector(joints[index]), Vector(tails[index])
+            forward = bone.vector.normalized().y < -0.9  # the feet: their roll needs another direction than -y
+            bone.align_roll((0.0, 0.0, 1.0) if forward else (0.0, -1.0, 0.0))
+            if PARENTS[index] >= 0:
+                bone.parent = data.edit_bones[JOINT_NAMES[PARENTS[index]]]
+        bpy.ops.object.mode_set(mode="OBJECT")
+    finally:
+        context.scene.collection.objects.unlink(armature)
+        layer.objects.active = active
+    data.display_type = "STICK"
+    armature.show_in_front = True
+    for bone in armature.pose.bones:
+        bone.rotation_mode = "QUATERNION"
+    return armature
+
+
+def rest_rotations(armature: bpy.types.Object) -> NDArray[np.float64]:
+    """Bone axes at rest [24, 3, 3] in the armature's space, in SMPL's joint order.
+
+    Raises ValueError when the armature lacks one of SMPL's joints.
+    """
+    bones = armature.data.bones
+    missing = [name for name in JOINT_NAMES if name not in bones]
+    if missing:
+        raise ValueError(f"the armature {armature.name!r} has no bone {missing[0]!r}; select a person's armature")
+    return np.array([np.array(bones[name].matrix_local.to_3x3()) for name in JOINT_NAMES], np.float64)
+
+
+def bone_bases(rest: NDArray, rotations: NDArray, translation: NDArray) -> tuple[NDArray, NDArray]:
+    """Pose-bone quaternions [*b, 24, 4] (w first) and the pelvis bone's location [*b, 3] for SMPL joint rotations.
+
+    `rotations` [*b, 24, 3, 3] turn each joint about itself along the world's rest axes, y up, and `translation` [*b, 3]
+    moves the whole person. A bone's own axes O at rest differ, so its basis is O^T R O: then Blender's bone matrix is
+    G_j B_j with SMPL's skinning transform G_j and the bone's rest matrix B_j, whatever O is.
+    """
+    inverse = np.swapaxes(rest, -1, -2)
+    local = inverse @ rotations_to_blender(rotations) @ rest
+    return matrix_to_quaternion(local), points_to_blender(translation) @ rest[0]
+
+
+def pose_from_joint_rotations(armature: bpy.types.Object, rotations: NDArray, translation: NDArray | None = None) -> None:
+    """Pose the bones by SMPL joint rotations [24, 3, 3] and a translation [3] in metres, in the backend's axes (y up)."""
+    shift = np.zeros(3) if translation is None else translation
+    quaternions, location = bone_bases(rest_rotations(armature), np.asarray(rotations), shift)
+    for name, quaternion in zip(JOINT_NAMES, quaternions, strict=True):
+        bone = armature.pose.bones[name]
+        bone.rotation_mode = "QUATERNION"
+        bone.rotation_quaternion = quaternion
+        bone.scale = (1.0, 1.0, 1.0)
+        bone.location = location if name == JOINT_NAMES[0] else (0.0, 0.0, 0.0)

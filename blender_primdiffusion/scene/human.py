@@ -1,0 +1,115 @@
+"""The human as a whole: from human.npz to one collection in the scene, and away again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from . import volumes
+from .armature import build_armature
+from .attach import attach_volumes
+from .body_mesh import build_body_mesh
+from .convention import frames_to_blender, points_to_blender
+from .human_file import HumanFile, read_human
+from .material import volume_material
+from .overlap import CYCLES_LIMIT, most_overlapping
+
+MARK = "primdiffusion_human"
+"""Custom property of a person's collection: its provenance as JSON."""
+_NAME_LENGTH = 40
+_KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials")
+
+
+def build_human(context: bpy.types.Context, human_npz: str | Path, name: str = "Human") -> bpy.types.Collection:
+    """Build the person of a human.npz in the scene: armature, hidden body mesh and a volume for every primitive.
+
+    The person faces -y with the soles on z = 0 at the world's origin: the armature object is lifted, its space is the
+    backend's turned z up. Volumes are written to `humans_folder()/<collection name>`. Raises HumanFileError or
+    VolumeWriteError, and then leaves neither data nor files. Takes several seconds; makes no undo step, its caller does.
+    """
+    human = read_human(human_npz)
+    with _nothing_left_on_failure():
+        collection = bpy.data.collections.new(name[:_NAME_LENGTH])
+        label = collection.name
+        armature = build_armature(context, label, points_to_blender(human.joints))
+        collection.objects.link(armature)
+        vertices = points_to_blender(human.vertices)
+        armature.location = (0.0, 0.0, -vertices[:, 2].min())
+        body = build_body_mesh(f"{label}_body", armature, vertices, human.faces, human.uv_corner, human.skin_weights)
+        collection.objects.link(body)
+        primitives = bpy.data.collections.new(f"{label}_primitives")
+        collection.children.link(primitives)
+        rotation = frames_to_blender(human.rotation)
+        grids = volumes.bake(human.density, human.rgb, human.half_extent)
+        with volumes.written(grids, volumes.humans_folder() / bpy.path.clean_name(label)) as files:
+            attach_volumes(
+                label,
+                armature,
+                primitives,
+                files,
+                points_to_blender(human.position),
+                rotation,
+                human.primitive_weights,
+                volume_material(),
+            )
+        collection[MARK] = _provenance(human)
+        context.scene.collection.children.link(collection)
+    return collection
+
+
+def overlap_warning(collection: bpy.types.Collection) -> str | None:
+    """A sentence for the user when Cycles will drop volumes of this person, else None."""
+    most = int(json.loads(collection[MARK])["most_overlapping"])
+    if most <= CYCLES_LIMIT:
+        return None
+    return (
+        f"up to {most} volumes of {collection.name!r} overlap at a point and Cycles draws only {CYCLES_LIMIT}; "
+        "render it with the exact marcher"
+    )
+
+
+def armature_of(collection: bpy.types.Collection) -> bpy.types.Object:
+    """The person's armature object; ValueError when the collection is no person or lost it."""
+    for candidate in collection.objects:
+        if MARK in collection and candidate.type == "ARMATURE":
+            return candidate
+    raise ValueError(f"the collection {collection.name!r} holds no generated person; select one that does")
+
+
+def humans(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
+    """The people of a scene."""
+    return [collection for collection in scene.collection.children_recursive if MARK in collection]
+
+
+def remove_human(collection: bpy.types.Collection) -> None:
+    """Take a person out of the .blend: objects, their data and the actions only they use.
+
+    The VDB files stay, so that an undo of the removal, or an older copy of the .blend, finds them.
+    """
+    objects = list(collection.all_objects)
+    data = [thing.data for thing in objects]
+    actions = [thing.animation_data.action for thing in objects if thing.animation_data and thing.animation_data.action]
+    bpy.data.batch_remove([*objects, *collection.children_recursive, collection])
+    bpy.data.batch_remove([thing for thing in {*data, *actions} if thing.users == 0])
+
+
+def _provenance(human: HumanFile) -> str:
+    most = most_overlapping(human.position, human.rotation, human.half_extent)
+    return json.dumps({**human.meta, "betas": np.round(human.betas, 6).tolist(), "most_overlapping": most})
+
+
+@contextmanager
+def _nothing_left_on_failure() -> Iterator[None]:
+    """When the block fails, remove every datablock made in it."""
+    before = {kind: set(getattr(bpy.data, kind)) for kind in _KINDS}
+    try:
+        yield
+    except BaseException:
+        new = [thing for kind in _KINDS for thing in getattr(bpy.data, kind) if thing not in before[kind]]
+        bpy.data.batch_remove(new)
+        raise

@@ -1,0 +1,159 @@
+"""human.npz, the backend's result: read without pickle and checked before anything in the scene is touched."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+FORMAT_VERSION = 1
+VOXELS = 8
+"""Voxels along a side of a primitive."""
+JOINT_NAMES: tuple[str, ...] = (
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle", "spine3",
+    "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder", "right_shoulder",
+    "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand",
+)  # fmt: skip
+"""SMPL's 24 joints in the order and with the names of the smplx package."""
+PARENTS: tuple[int, ...] = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
+"""Parent of every joint; -1 for the pelvis."""
+
+
+class HumanFileError(ValueError):
+    """A human.npz cannot be used; the message is one sentence with the remedy."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HumanFile:
+    """A generated person at rest, in the backend's axes (y up, metres); see `convention` for Blender's."""
+
+    meta: dict[str, object]
+    """Provenance: seed, steps, checkpoint, full_density, version."""
+    betas: NDArray[np.float64]
+    """Body shape [10]."""
+    joints: NDArray[np.float64]
+    """Rest joints [24, 3]."""
+    vertices: NDArray[np.float64]
+    """Shaped rest surface [V, 3]."""
+    faces: NDArray[np.int64]
+    """Triangles [F, 3]."""
+    uv_corner: NDArray[np.float64]
+    """Texture coordinates of each triangle corner [F, 3, 2], v up."""
+    skin_weights: NDArray[np.float64]
+    """Rows sum to one [V, 24]."""
+    position: NDArray[np.float64]
+    """Primitive centres [K, 3]."""
+    rotation: NDArray[np.float64]
+    """Local to world [K, 3, 3]; columns T, B, N."""
+    half_extent: NDArray[np.float64]
+    """Half sides along T, B, N [K, 3]."""
+    primitive_weights: NDArray[np.float64]
+    """Skinning of each primitive [K, 24]; rows sum to one."""
+    rgb: NDArray[np.float32]
+    """Linear colour [K, D, H, W, 3]; D along N, H along B, W along T."""
+    density: NDArray[np.float32]
+    """Opacity per metre [K, D, H, W], before the marcher's window."""
+
+
+_SHAPES: dict[str, tuple[int | str, ...]] = {
+    "betas": (10,), "joints": (24, 3), "vertices": ("V", 3), "faces": ("F", 3), "uv_corner": ("F", 3, 2),
+    "skin_weights": ("V", 24), "position": ("K", 3), "rotation": ("K", 3, 3), "half_extent": ("K", 3),
+    "primitive_weights": ("K", 24), "rgb": ("K", VOXELS, VOXELS, VOXELS, 3), "density": ("K", VOXELS, VOXELS, VOXELS),
+}  # fmt: skip
+_DTYPES: dict[str, type] = {"faces": np.int64, "rgb": np.float32, "density": np.float32}
+_REMEDY = "generate the person again"
+
+
+def read_human(path: str | Path) -> HumanFile:
+    """Read and check a human.npz.
+
+    Raises HumanFileError when the file is missing, truncated, of another version, or holds arrays of the wrong shape, NaN,
+    weights that do not sum to one, or frames that are not rotations.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise HumanFileError(f"there is no human file at {str(path)!r}; {_REMEDY}")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise HumanFileError(f"{path.name!r} is damaged or no human file ({error}); {_REMEDY}") from error
+    version = int(_plain(arrays, "format_version", path))
+    if version != FORMAT_VERSION:
+        raise HumanFileError(
+            f"{path.name!r} has format version {version}, this add-on reads {FORMAT_VERSION}; "
+            "use an add-on and a backend of the same release"
+        )
+    try:
+        meta = json.loads(str(_plain(arrays, "meta", path)))
+    except json.JSONDecodeError as error:
+        raise HumanFileError(f"the field 'meta' of {path.name!r} is not JSON ({error}); {_REMEDY}") from error
+    _check_skeleton(arrays, path)
+    return _checked_values(HumanFile(meta=meta, **_shaped_fields(arrays, path)), path)
+
+
+def _plain(arrays: dict[str, NDArray], name: str, path: Path) -> object:
+    value = _field(arrays, name, path)
+    if value.size != 1:
+        raise HumanFileError(f"the field {name!r} of {path.name!r} holds {value.size} values instead of one; {_REMEDY}")
+    return value.reshape(())[()]
+
+
+def _field(arrays: dict[str, NDArray], name: str, path: Path) -> NDArray:
+    if name not in arrays:
+        raise HumanFileError(f"{path.name!r} has no field {name!r}; {_REMEDY}")
+    return arrays[name]
+
+
+def _check_skeleton(arrays: dict[str, NDArray], path: Path) -> None:
+    names = tuple(str(name) for name in _field(arrays, "joint_names", path).ravel())
+    parents = tuple(int(parent) for parent in _field(arrays, "parents", path).ravel())
+    if names != JOINT_NAMES or parents != PARENTS:
+        raise HumanFileError(f"the skeleton of {path.name!r} is not SMPL's 24 joints; choose a body in SMPL format")
+
+
+def _shaped_fields(arrays: dict[str, NDArray], path: Path) -> dict[str, NDArray]:
+    """Every array of _SHAPES with its dtype, sizes named by letters being equal among the fields."""
+    sizes: dict[str, int] = {}
+    fields: dict[str, NDArray] = {}
+    for name, shape in _SHAPES.items():
+        value = _field(arrays, name, path)
+        fits = value.ndim == len(shape) and value.dtype.kind in "fiu"
+        for wanted, given in zip(shape, value.shape, strict=False):
+            fits = fits and given == (sizes.setdefault(wanted, given) if isinstance(wanted, str) else wanted)
+        if not fits or value.size == 0:
+            want = tuple(sizes.get(s, s) if isinstance(s, str) else s for s in shape)
+            raise HumanFileError(
+                f"the field {name!r} of {path.name!r} is {value.dtype} {value.shape} instead of numbers of shape {want}; "
+                f"{_REMEDY}"
+            )
+        fields[name] = value.astype(_DTYPES.get(name, np.float64))
+    return fields
+
+
+def _checked_values(human: HumanFile, path: Path) -> HumanFile:
+    for name in _SHAPES:
+        if not np.isfinite(getattr(human, name)).all():
+            raise HumanFileError(f"the field {name!r} of {path.name!r} holds NaN or infinite values; {_REMEDY}")
+    gram = np.swapaxes(human.rotation, -1, -2) @ human.rotation
+    faults = {
+        "faces": human.faces.min() < 0 or human.faces.max() >= len(human.vertices),
+        "half_extent": human.half_extent.min() <= 0,
+        "density": human.density.min() < 0,
+        "rotation": np.abs(gram - np.eye(3)).max() > 1e-3 or np.linalg.det(human.rotation).min() < 0,
+        "skin_weights": not _rows_are_weights(human.skin_weights),
+        "primitive_weights": not _rows_are_weights(human.primitive_weights),
+    }
+    for name, faulty in faults.items():
+        if faulty:
+            raise HumanFileError(f"the field {name!r} of {path.name!r} holds impossible values; {_REMEDY}")
+    return human
+
+
+def _rows_are_weights(weights: NDArray) -> bool:
+    return bool(weights.min() >= 0 and np.abs(weights.sum(-1) - 1).max() < 1e-3)

@@ -1,0 +1,128 @@
+"""A person for tests: a stick figure of ellipsoid blobs around SMPL's skeleton, with a human.npz as the backend writes it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+NAMES = (
+    "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot right_foot neck "
+    "left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist left_hand "
+    "right_hand"
+).split()
+PARENTS = np.array([-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21])
+_LEFT = {
+    "hip": (0.09, -0.09, 0.0), "knee": (0.11, -0.48, 0.0), "ankle": (0.11, -0.9, -0.03), "foot": (0.12, -0.96, 0.1),
+    "collar": (0.07, 0.4, 0.0), "shoulder": (0.17, 0.42, -0.01), "elbow": (0.43, 0.42, -0.02), "wrist": (0.68, 0.42, -0.02),
+    "hand": (0.76, 0.42, -0.02),
+}  # fmt: skip
+_MIDDLE = {"pelvis": 0.0, "spine1": 0.1, "spine2": 0.23, "spine3": 0.3, "neck": 0.48, "head": 0.56}
+
+
+def joints() -> np.ndarray:
+    """Rest joints [24, 3] of a T-pose, y up, facing +z, the left at +x."""
+    rows = []
+    for name in NAMES:
+        side, _, part = name.partition("_")
+        if name in _MIDDLE:
+            rows.append((0.0, _MIDDLE[name], 0.0))
+        else:
+            x, y, z = _LEFT[part]
+            rows.append((x if side == "left" else -x, y, z))
+    return np.array(rows)
+
+
+def random_rotations(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Rotations [count, 3, 3], uniform."""
+    q = rng.normal(size=(count, 4))
+    w, x, y, z = (q / np.linalg.norm(q, axis=-1, keepdims=True)).T
+    return np.stack(
+        [
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ],
+        -1,
+    ).reshape(count, 3, 3)  # fmt: skip
+
+
+def axis_angle(vector: np.ndarray) -> np.ndarray:
+    """Rotations [..., 3, 3] of axis-angle vectors [..., 3] (Rodrigues)."""
+    vector = np.asarray(vector, np.float64)
+    angle = np.linalg.norm(vector, axis=-1)[..., None, None]
+    x, y, z = np.moveaxis(vector / np.maximum(angle[..., 0], 1e-12), -1, 0)
+    o = np.zeros_like(x)
+    cross = np.stack([o, -z, y, z, o, -x, -y, x, o], -1).reshape(*x.shape, 3, 3)
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def skinning(rest_joints: np.ndarray, rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """SMPL's world <- rest transforms [24, 4, 4], written from its definition: each joint turns its subtree about itself."""
+    out = np.zeros((24, 4, 4))
+    for j, parent in enumerate(PARENTS):
+        about = np.eye(4)
+        about[:3, :3] = rotations[j]
+        about[:3, 3] = rest_joints[j] - rotations[j] @ rest_joints[j]
+        if parent < 0:
+            about[:3, 3] += translation
+        out[j] = about if parent < 0 else out[parent] @ about
+    return out
+
+
+def arrays(count: int = 48, seed: int = 0) -> dict[str, np.ndarray]:
+    """The fields of a human.npz with `count` primitives spread along the bones, weights over up to four joints."""
+    rng = np.random.default_rng(seed)
+    rest = joints()
+    bone = np.arange(count) % 23 + 1
+    along = rng.uniform(0, 1, count)[:, None]
+    position = rest[PARENTS[bone]] * (1 - along) + rest[bone] * along + rng.normal(0, 0.03, (count, 3))
+    weights = np.zeros((count, 24))
+    np.put_along_axis(weights, bone[:, None], 1 - along, 1)
+    np.put_along_axis(weights, PARENTS[bone][:, None], along, 1)
+    weights += np.where(rng.uniform(size=weights.shape) < 0.05, 0.3, 0.0)
+    axis = np.linspace(-1, 1, 8)
+    inside = (axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2) < 1.1
+    density = np.where(inside, rng.uniform(20, 90, (count, 1, 1, 1)), 0.0) * rng.uniform(0.7, 1, (count, 8, 8, 8))
+    hue = np.stack([bone % 3 == 0, bone % 3 == 1, bone % 3 == 2], -1) * 0.7 + 0.1
+    rgb = np.clip(hue[:, None, None, None] + rng.normal(0, 0.03, (count, 8, 8, 8, 3)), 0, 1)
+
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 9)[:-1], np.linspace(0, 1, 4))
+    ring = np.stack([0.06 * np.cos(u), 0.06 * np.sin(u), np.zeros_like(u)], -1).reshape(-1, 3)
+    vertices, skin, faces = [], [], []
+    for j in range(1, 24):
+        start = len(vertices) * len(ring)
+        line = rest[PARENTS[j]] * (1 - v.reshape(-1, 1)) + rest[j] * v.reshape(-1, 1)
+        vertices.append(line + ring)
+        part = np.zeros((len(ring), 24))
+        part[:, j], part[:, PARENTS[j]] = v.ravel(), 1 - v.ravel()
+        skin.append(part)
+        for r in range(3):
+            for c in range(8):
+                a, b = start + r * 8 + c, start + r * 8 + (c + 1) % 8
+                faces += [(a, b, a + 8), (b, b + 8, a + 8)]
+    return {
+        "format_version": np.array(1),
+        "meta": np.array(json.dumps({"seed": seed, "steps": 5, "checkpoint": "synthetic", "full_density": 100.0, "version": "0"})),
+        "betas": rng.normal(size=10),
+        "parents": PARENTS,
+        "joint_names": np.array(NAMES),
+        "joints": rest,
+        "vertices": np.concatenate(vertices),
+        "faces": np.array(faces),
+        "uv_corner": rng.uniform(size=(len(faces), 3, 2)),
+        "skin_weights": np.concatenate(skin),
+        "position": position,
+        "rotation": random_rotations(rng, count),
+        "half_extent": rng.uniform(0.02, 0.05, (count, 3)),
+        "primitive_weights": weights / weights.sum(-1, keepdims=True),
+        "rgb": rgb.astype(np.float16),
+        "density": density.astype(np.float32),
+    }  # fmt: skip
+
+
+def write(path: Path, count: int = 48, seed: int = 0, **changes: np.ndarray) -> Path:
+    """Save a synthetic human.npz, with fields replaced by `changes`."""
+    np.savez(path, **{**arrays(count, seed), **changes})
+    return path
