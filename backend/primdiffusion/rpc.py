@@ -1,6 +1,6 @@
 """JSON-RPC 2.0, one message a line: framing, errors and typed parameters. Knows pipes and JSON, nothing of people.
 
-A line is UTF-8 JSON without line breaks inside (json escapes them), ended by a newline. Batches are not part of this protocol.
+A line is UTF-8 JSON without line breaks inside (json escapes them), ended by a newline. There are no batches.
 """
 
 from __future__ import annotations

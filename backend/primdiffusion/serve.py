@@ -6,8 +6,7 @@
 
 `hello` answers before torch is loaded: `device` is null until a `ready` notification brings it (or `problem`, a
 sentence, where the environment is broken). A second job while one runs fails with kind "busy". The child ends when its
-stdin does, because then its parent is gone. Stray prints go to stderr: file descriptor 1 is moved away before anything else.
-docs: docs/protocol.md.
+stdin does, because then its parent is gone. Stray prints go to stderr: file descriptor 1 is moved away first of all.
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ from primdiffusion.rpc import (
     DOMAIN_ERROR,
     INTERNAL_ERROR,
     METHOD_NOT_FOUND,
-    JsonId,
     MalformedRequest,
     Request,
     RpcError,
@@ -45,7 +43,7 @@ if TYPE_CHECKING:
 PROTOCOL = 1
 HEARTBEAT_S = 0.5
 GRACE_S = 3.0
-"""After the parent is gone a job may take this long to reach its next step and tidy up; then the process ends anyway."""
+"""After the parent is gone a job has this long to reach its next step and tidy up; then the process ends anyway."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -253,7 +251,7 @@ def _data(failure: Failure) -> dict[str, str]:
 def guard_streams() -> tuple[BinaryIO, BinaryIO]:
     """Moves the conversation away from file descriptors 0 and 1, so that no print, and no C library, can disturb it.
 
-    Afterwards descriptor 1 leads to stderr and descriptor 0 to nothing. Returns the conversation's source and sink, binary.
+    Afterwards descriptor 1 leads to stderr and descriptor 0 to nothing. Returns the conversation's source and sink.
     """
     sys.stdout.flush()
     source, sink = os.dup(0), os.dup(1)

@@ -16,7 +16,7 @@ STAGING_PREFIX = ".primdiffusion-partial-"
 
 @contextlib.contextmanager
 def staged(folder: str | Path) -> Iterator[Path]:
-    """A folder to write into; on a good end its files move to `folder`, on an error all of it (and a new `folder`) goes.
+    """A folder to write into; on a good end its files move to `folder`, on an error all of it goes, a new `folder` too.
 
     Yields a new folder inside `folder`, so that a folder that cannot be written to fails here, before any work is done.
     Files of the same names in `folder` are replaced. Raises OSError.
@@ -65,3 +65,15 @@ def _remove_leftovers(folder: Path) -> None:
         pid = path.name.removeprefix(STAGING_PREFIX)
         if not (pid.isdecimal() and int(pid) != os.getpid() and psutil.pid_exists(int(pid))):
             shutil.rmtree(path, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def written_whole(path: str | Path) -> Iterator[Path]:
+    """A temporary name beside `path` to write to; renamed on a good end, removed on an error. Raises OSError."""
+    path = Path(path)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        yield unfinished
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)

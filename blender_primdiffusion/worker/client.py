@@ -1,4 +1,4 @@
-"""The child process and the conversation with it: JSON-RPC 2.0, a message a line. Nothing here ever waits for the child.
+"""The child process and the conversation with it: JSON-RPC 2.0, a message a line. Nothing here waits for the child.
 
 Threads read the child's two outputs and write its input; `poll` hands over what has arrived and notices a death or a
 silence. All public methods are for one thread (Blender's main thread).
@@ -32,7 +32,7 @@ STUCK_AT_EXIT_S = 1.0
 class Response:
     """A request went well."""
 
-    id: int
+    id: int | None
     result: Any
 
 
@@ -77,8 +77,8 @@ Event = Response | Failure | Notification | Died | Silent
 def child_environment(module_path: Path | None, cache_dir: Path | None, extra: Mapping[str, str]) -> dict[str, str]:
     """The environment of a backend process: this one's, without what would lead its Python astray.
 
-    `module_path` is the folder that holds the package `primdiffusion` (the zip's bundled `backend`); it goes before anything
-    installed. `cache_dir` takes byte code and compiled kernels, so that nothing is written into the extension's folder.
+    `module_path` is the folder that holds the package `primdiffusion` (the zip's bundled `backend`); it goes before
+    anything installed. `cache_dir` takes byte code and compiled kernels, so that the extension's folder stays as it is.
     """
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONHOME", "PYTHONSTARTUP")}
     environment.update(PYTHONUTF8="1", PYTHONUNBUFFERED="1", PYTHONFAULTHANDLER="1")
@@ -121,10 +121,10 @@ class BackendClient:
         """What the child said of itself: version, python, memory, and device once torch is loaded (`ready`)."""
 
     def start(self) -> None:
-        """Starts the child and asks it who it is; `info` fills as it answers. Raises OSError if there is no such Python."""
+        """Starts the child and asks it who it is; `info` fills as it answers. Raises OSError without such a Python."""
         if self._process is not None:
             raise RuntimeError("this client has been started before: make a new one")
-        self._process = subprocess.Popen(
+        process = subprocess.Popen(
             self._command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -132,13 +132,12 @@ class BackendClient:
             env=self._environment,
             creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
         )
-        stdin, stdout, stderr = self._process.stdin, self._process.stdout, self._process.stderr
-        assert stdin is not None and stdout is not None and stderr is not None  # noqa: S101  all three are PIPE
+        self._process = process
         self._polled_at = time.monotonic()
-        threading.Thread(target=self._write, args=(stdin,), name="primdiffusion stdin", daemon=True).start()
-        threading.Thread(target=self._read, args=(stdout,), name="primdiffusion stdout", daemon=True).start()
+        threading.Thread(target=self._write, args=(process.stdin,), name="primdiffusion stdin", daemon=True).start()
+        threading.Thread(target=self._read, args=(process.stdout,), name="primdiffusion stdout", daemon=True).start()
         self._stderr_thread = threading.Thread(
-            target=self._listen, args=(stderr,), name="primdiffusion stderr", daemon=True
+            target=self._listen, args=(process.stderr,), name="primdiffusion stderr", daemon=True
         )
         self._stderr_thread.start()
         self._hello = self.request("hello", {})

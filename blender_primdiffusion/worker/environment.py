@@ -16,8 +16,8 @@ VARIABLE = "PRIMDIFFUSION_PYTHON"
 TRIAL_S = 90.0
 """A first import of torch from a slow disk, with a virus scanner, takes most of a minute."""
 TRIAL = (
-    "import json, sys, primdiffusion, torch; "
-    "print(json.dumps({'version': primdiffusion.__version__, 'torch': torch.__version__, 'python': sys.version.split()[0]}))"
+    "import json, sys, primdiffusion, torch; print(json.dumps({'version': primdiffusion.__version__, "
+    "'torch': torch.__version__, 'python': sys.version.split()[0]}))"
 )
 
 

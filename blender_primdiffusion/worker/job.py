@@ -30,7 +30,7 @@ class Backend:
     """The child that jobs share: started at first use, kept warm, started anew after it died."""
 
     def __init__(self, make_client: Callable[[], BackendClient]):
-        """`make_client` finds a Python and returns a client not yet started; it runs in a thread, so it must not touch bpy."""
+        """`make_client` finds a Python and returns a client not yet started, in a thread: it must not touch bpy."""
         self._make_client = make_client
         self._lock = threading.Lock()
         self._client: BackendClient | None = None

@@ -1,0 +1,133 @@
+"""A person on one page: generate, pose, look.
+
+    model = load_checkpoint()                          # diffusion: noise -> payload and betas
+    human = generate(model, seed=7)
+    primitives = place(human, BodyPose.from_axis_angle(theta))   # body: betas, theta -> mesh -> frames; payload in them
+    rendering = march(primitives, framing(primitives, yaw=0.5))
+
+Frames are computed on the posed mesh for every pose, as in the paper (sec. 3.1): the mesh drives the primitives.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from primdiffusion import __version__
+from primdiffusion.body.model import BodyModel, BodyPose, PosedBody, default_body
+from primdiffusion.diffusion.model import DiffusionModel, sample
+from primdiffusion.diffusion.samplers import Step
+from primdiffusion.geometry.camera import Camera, look_at
+from primdiffusion.geometry.records import TensorRecord
+from primdiffusion.primitives.anchors import Anchors, attach, default_anchors
+from primdiffusion.primitives.primitives import Payload, Primitives
+from primdiffusion.render.march import MarchSettings, Rendering, march
+
+DEFAULT_SETTINGS = MarchSettings()
+VERTICAL_FOV = math.radians(30)
+FRAMING_MARGIN = 1.04
+"""How much farther than just filling the picture the camera stands."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Human(TensorRecord):
+    """One person, independent of pose: what fills the primitives, and the body they sit on."""
+
+    payload: Payload
+    """Unbatched."""
+    betas: Float[Tensor, "n"]
+    """Shape coefficients of the default body."""
+    provenance: Mapping[str, Any]
+    """Where the person comes from; JSON values. Of a generated one: seed, steps, sampler, checkpoint, full_density."""
+
+    def validate(self) -> Human:
+        """Itself, if it is one whole person with finite values; otherwise ValueError that names what is wrong."""
+        self.payload.validate()
+        if self.payload.density.ndim != 4:
+            raise ValueError(
+                f"a human holds one person, not a batch {tuple(self.payload.density.shape[:-4])}: pick one"
+            )
+        if self.betas.ndim != 1 or not torch.isfinite(self.betas).all():
+            raise ValueError(f"betas must be one row of finite numbers, not {self.betas!r}: generate the person again")
+        return self
+
+
+def generate(
+    model: DiffusionModel,
+    seed: int,
+    steps: int = 30,
+    sampler: str = "ddim",
+    on_step: Callable[[Step], None] | None = None,
+) -> Human:
+    """A new person, on the CPU; the same for the same model, seed, steps, sampler and device.
+
+    `on_step` sees each step after it is done; an exception it raises ends the work (that is how cancelling works).
+    Raises ValueError for an unknown sampler, a number of steps outside 1 ... T, or a seed outside 0 ... 2^63-1.
+    """
+    final = None
+    for step in sample(model, seed, steps, sampler):
+        if on_step is not None:
+            on_step(step)
+        final = step.x0
+    assert final is not None, "a sampler yields at least one step"
+    payload = model.decode(final).map(lambda values: values[0])
+    provenance = {
+        "seed": seed,
+        "steps": steps,
+        "sampler": sampler,
+        "checkpoint": model.card.get("name", "unnamed"),
+        "full_density": model.full_density,
+        "version": __version__,
+    }
+    return Human(payload, model.betas(final, seed)[0], provenance).to("cpu").validate()
+
+
+def pose_body(betas: Float[Tensor, "n"], pose: BodyPose | None = None, body: BodyModel | None = None) -> PosedBody:
+    """The body with this shape in this pose; None stands for the T pose and the default body."""
+    body = default_body() if body is None else body
+    return body.shape(betas).pose(BodyPose.rest() if pose is None else pose)
+
+
+def place(
+    human: Human, pose: BodyPose | None = None, body: BodyModel | None = None, anchors: Anchors | None = None
+) -> Primitives:
+    """The person's primitives in the world; None stands for the T pose, the default body and its anchors.
+
+    Anchors belong to a body: give both or neither. Differentiable in the pose and the human.
+    """
+    if (body is None) != (anchors is None):
+        raise ValueError("a body and its anchors go together: give both, or neither for the default body")
+    body = default_body() if body is None else body
+    anchors = default_anchors() if anchors is None else anchors
+    frames = attach(anchors, pose_body(human.betas, pose, body).vertices, body.faces)
+    return Primitives.place(frames, human.payload)
+
+
+def framing(primitives: Primitives, yaw: float = 0.0, width: int = 512, height: int = 512) -> Camera:
+    """A level camera that just sees all of `primitives`: yaw 0 looks at the person's face, pi/2 (radians) at their left.
+
+    Stands at the height of their middle, 30 degrees of view from top to bottom.
+    """
+    reach = primitives.rotation.abs() @ primitives.half_extent[..., None]
+    corners = torch.cat([primitives.position - reach[..., 0], primitives.position + reach[..., 0]]).detach()
+    middle = (corners.amin(0) + corners.amax(0)) / 2
+    towards_camera = middle.new_tensor([math.sin(yaw), 0.0, math.cos(yaw)])
+    right = middle.new_tensor([math.cos(yaw), 0.0, -math.sin(yaw)])
+    offset = corners - middle
+    slope = math.tan(VERTICAL_FOV / 2)
+    needed = torch.maximum(offset[:, 1].abs() / slope, (offset @ right).abs() / (slope * width / height))
+    distance = FRAMING_MARGIN * float((needed + offset @ towards_camera).amax())
+    return look_at(middle + distance * towards_camera, middle, vertical_fov=VERTICAL_FOV, width=width, height=height)
+
+
+def render(
+    human: Human, camera: Camera, pose: BodyPose | None = None, settings: MarchSettings = DEFAULT_SETTINGS
+) -> Rendering:
+    """The person in a pose (None: T pose) as the camera sees them."""
+    return march(place(human, pose), camera, settings)

@@ -1,0 +1,103 @@
+"""The work of the child: generate and render. Imports torch, so the server loads it in its own time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.diffusion.samplers import Step
+from primdiffusion.human import framing, generate, place
+from primdiffusion.human_file import load_human
+from primdiffusion.job_params import GenerateParams, RenderParams
+from primdiffusion.machine import best_device, device_info, peak_memory_gb
+from primdiffusion.person_folder import FILES, write_person
+from primdiffusion.pose_file import pose_from_numbers, read_pose
+from primdiffusion.render.image import depth_to_png, to_png
+from primdiffusion.render.march import march
+from primdiffusion.staging import staged
+from primdiffusion.training.checkpoint import load_checkpoint
+
+Report = Callable[[str, int, int, float | None], None]
+"""Told (stage, step, total, seconds left); raises to end the job."""
+
+
+class Jobs:
+    """Runs jobs one after the other and keeps the model of the last one in memory."""
+
+    def __init__(self) -> None:
+        self._device = best_device()
+        self._loaded: tuple[str | None, DiffusionModel] | None = None
+
+    def device_info(self) -> dict[str, Any]:
+        """As `ready` and `hello` state it."""
+        return device_info(self._device)
+
+    def generate(self, params: GenerateParams, report: Report) -> dict[str, Any]:
+        """Samples a person and writes it to `out_dir`, all files or none; returns their paths and what it took.
+
+        Raises OSError before any work if the folder cannot be written to; what load_checkpoint and generate raise.
+        """
+        began = time.perf_counter()
+        out = Path(params.out_dir)
+        with staged(out) as folder:
+            report("load", 0, params.steps, None)
+            model = self._model(params.checkpoint)
+            report("sample", 0, params.steps, None)
+            human = generate(model, params.seed, params.steps, params.sampler, _step_reporter(report))
+            sampled = time.perf_counter()
+            report("write", params.steps, params.steps, None)
+            write_person(folder, human)
+            report("write", params.steps, params.steps, 0.0)  # the last chance to cancel
+        return {
+            "human": str(out / FILES.blender),
+            "person": str(out / FILES.human),
+            "preview": str(out / FILES.front),
+            "side": str(out / FILES.side),
+            "depth": str(out / FILES.depth),
+            "seed": params.seed,
+            "steps": params.steps,
+            "seconds": round(time.perf_counter() - began, 3),
+            "seconds_sampling": round(sampled - began, 3),
+            "peak_gb": round(peak_memory_gb(), 3),
+        }
+
+    def render(self, params: RenderParams, report: Report) -> dict[str, Any]:
+        """Draws a saved person; returns the picture's path. Raises what load_human and read_pose do, and OSError."""
+        began = time.perf_counter()
+        report("load", 0, 1, None)
+        human = load_human(params.human)
+        pose = None
+        if params.pose is not None:
+            by_path = params.pose if isinstance(params.pose, str) else None
+            pose = read_pose(by_path) if by_path else pose_from_numbers(params.pose, "the parameter pose")
+        primitives = place(human, pose)
+        report("render", 0, 1, None)
+        rendering = march(primitives, framing(primitives, params.yaw, params.width, params.height))
+        report("write", 1, 1, 0.0)
+        to_png(params.out, rendering)
+        if params.depth is not None:
+            depth_to_png(params.depth, rendering)
+        return {"out": params.out, "depth": params.depth, "seconds": round(time.perf_counter() - began, 3)}
+
+    def _model(self, checkpoint: str | None) -> DiffusionModel:
+        if self._loaded is None or self._loaded[0] != checkpoint:
+            self._loaded = None  # frees the old one first
+            self._loaded = (checkpoint, load_checkpoint(checkpoint, self._device))
+        return self._loaded[1]
+
+
+def _step_reporter(report: Report) -> Callable[[Step], None]:
+    """Reports each step with the seconds left, from the mean of the steps after the first (which warms up)."""
+    times: list[float] = []
+
+    def on_step(step: Step) -> None:
+        times.append(time.perf_counter())
+        done, eta = step.index + 1, None
+        if len(times) > 1:
+            eta = round((times[-1] - times[0]) / (len(times) - 1) * (step.total - done), 2)
+        report("sample", done, step.total, eta)
+
+    return on_step
