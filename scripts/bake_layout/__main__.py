@@ -15,11 +15,10 @@ from grid import Body, chart_of_cells, draw
 from half_body import left_half
 from metrics import measure
 from picture import draw_figure
-from regions import cut_into_regions
-
 from primdiffusion.geometry.uv_atlas import UvRaster
 from primdiffusion.primitives.anchors import footprint_anchors
 from primdiffusion.primitives.primitives import S
+from regions import cut_into_regions
 
 ROOT = pathlib.Path(__file__).parents[2]
 LAYOUT = ROOT / "backend/primdiffusion/body/data/layout.npz"

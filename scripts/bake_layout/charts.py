@@ -38,7 +38,7 @@ class Place:
             1: (self.height - t, s),
             2: (self.width - s, self.height - t),
         }[self.quarter_turns]
-        return np.stack(turned, -1) + (self.column, self.row)
+        return np.stack(turned, -1) + np.array([self.column, self.row])
 
     def from_grid(self, point: Array) -> Array:
         """Half-grid coordinates to chart coordinates, the inverse of to_grid."""
@@ -60,7 +60,7 @@ PLACES = {
     "foot": Place(6, 7, 10, 8, 2),
 }
 SMOOTHING = {"torso": 0.012, "head": 0.020, "arm": 0.012, "leg": 0.012, "foot": 0.005}
-"""Radius in metres of the smoothed copy each region is flattened on: the face's features vanish, the toes stay apart."""
+"""Metres, of the smoothed copy each region is flattened on: the face's features vanish, the toes stay apart."""
 EMPHASIS = {"torso": 1.0, "head": 0.0, "arm": 1.0, "leg": 1.0, "foot": 0.0}
 """See rectangle.flatten. The head is a near-hemisphere with equal cells either way."""
 
@@ -123,8 +123,8 @@ def _torso(regions: _Regions) -> Flat:
     path = cheapest_path(p, regions.faces("torso"), start, top, avoid=[*neck, *armhole])
     disc, loop, origin = regions.open("torso", path)
     front, back = sorted(runs(loop, midline[origin]), key=lambda run: -disc.points[run, 2].mean())
-    # The rectangle's upper corners lie on the neck's sides, so its sides take part of the neck's arc: the upper side with
-    # the armhole is far longer than any other row, and its cells would be 8 cm wide.
+    # The rectangle's upper corners lie on the neck, so that its sides take the neck's arc: the upper side, with the
+    # armhole, is far longer than any other row, and its cells would be 8 cm wide.
     forward = loop[loop.index(back[-1]) :] + loop[: loop.index(back[-1])]
     upper = forward[: forward.index(front[0]) + 1]
     at_seam = [i for i, v in enumerate(upper) if origin[v] == start]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
@@ -38,9 +39,9 @@ def cheapest_path(
 
 
 def cut_along(faces: Array, path: Sequence[int]) -> tuple[Array, Array]:
-    """The faces with vertices renumbered so that the sides of the path come apart, and the old number of each new vertex."""
+    """The faces renumbered so that the two sides of the path come apart, and the old number of each new vertex."""
     count = len(faces)
-    blocked = {tuple(sorted(edge)) for edge in zip(path, path[1:], strict=False)}
+    blocked = {tuple(sorted(edge)) for edge in pairwise(path)}
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     owner = np.repeat(np.arange(count), 3)
     order = np.lexsort(edges.T)

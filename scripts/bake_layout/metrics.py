@@ -1,16 +1,15 @@
-"""How good a layout is, in numbers: is it on the body, even, symmetric, and do its boxes hold the surface and clothes."""
+"""How good a layout is, in numbers: on the body, even, symmetric, and do its boxes hold the surface and clothes."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 from numpy import ndarray as Array
-from scipy.spatial import cKDTree
-
 from primdiffusion.geometry.surface import surface_points, vertex_normals
 from primdiffusion.geometry.uv_atlas import UvRaster
 from primdiffusion.primitives.anchors import CHARTS, Anchors, attach, tangent_plane
 from primdiffusion.primitives.primitives import GRID, Frames
+from scipy.spatial import cKDTree
 
 SAMPLES = 20_000
 PUSHED_OUT = (0.0, 0.02, 0.04, 0.06)

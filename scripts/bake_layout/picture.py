@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from numpy import ndarray as Array
 from PIL import Image
-
 from primdiffusion.body.model import JOINT_NAMES, BodyPose, default_body
+from primdiffusion.geometry.surface import vertex_normals
 from primdiffusion.geometry.uv_atlas import UvRaster, rasterise_uv
 from primdiffusion.primitives.anchors import CHARTS, Anchors, attach
 from primdiffusion.primitives.primitives import GRID, Frames
@@ -80,7 +80,7 @@ def boxes_of(frames: Frames, colours: Array, share: float = 1.0) -> tuple[Array,
 
 
 def cells_on_skin(vertices: Array, faces: Array, texels: UvRaster, colours: Array) -> tuple[Array, Array]:
-    """The texel map as little squares, coloured by cell, on a dark body that shows between cells: triangles, colours."""
+    """The texel map as little squares, coloured by cell, on a dark body that shows between: triangles, colours."""
     points = (vertices[faces[texels.face]] * texels.barycentric[..., None]).sum(2)
     side = len(points) // GRID
     row, column = np.mgrid[: len(points) - 1, : len(points) - 1]
@@ -90,20 +90,17 @@ def cells_on_skin(vertices: Array, faces: Array, texels: UvRaster, colours: Arra
         [points[row, column], points[row, column + 1], points[row + 1, column + 1], points[row + 1, column]], 1
     )
     colour = colours[row // side * GRID + column // side]
-    lifted = square + 0.004 * _unit(np.cross(square[:, 1] - square[:, 0], square[:, 2] - square[:, 0]))[:, None]
-    skin = np.full((len(faces), 3), 0.25)
+    normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
+    # Drawn thinner: painting whole triangles from far to near would let neighbouring faces show through the squares.
+    inside = (vertices - 0.008 * normals)[faces]
     return (
-        np.concatenate([vertices[faces], lifted[:, [0, 1, 2]], lifted[:, [0, 2, 3]]]),
-        np.concatenate([skin, colour, colour]),
+        np.concatenate([inside, square[:, [0, 1, 2]], square[:, [0, 2, 3]]]),
+        np.concatenate([np.full((len(faces), 3), 0.25), colour, colour]),
     )
 
 
-def _unit(v: Array) -> Array:
-    return v / (np.linalg.norm(v, axis=-1, keepdims=True) + 1e-12)
-
-
 def grid_picture(anchors: Anchors, size: int) -> Array:
-    """[size, size, 3] the UV square, v upward, in the same colours; cells that face the front in the rest pose are dotted."""
+    """[size, size, 3] the UV square, v upward, in the same colours."""
     index = (np.arange(size) * GRID) // size
     row = GRID - 1 - index[:, None]
     colours = colour_of_cells(anchors.chart).reshape(GRID, GRID, 3)
@@ -121,19 +118,21 @@ def posed(vertices: torch.Tensor) -> torch.Tensor:
 
 
 def draw_figure(anchors: Anchors, texels: UvRaster, vertices: torch.Tensor, faces: torch.Tensor) -> bytes:
-    """PNG: the cells on the body from the front, the side and the back, the UV square, and the boxes on a posed body."""
+    """PNG: the cells on the body from three sides, the UV square, the cells as plates, and the boxes in a pose."""
     colours = colour_of_cells(anchors.chart)
     frames = attach(anchors, vertices, faces)
     skin = cells_on_skin(vertices.numpy(), faces.numpy(), texels, colours)
     thin = dataclasses.replace(frames, half_extent=frames.half_extent * torch.tensor([0.5, 0.5, 0.1]))
     in_pose = attach(anchors, posed(vertices), faces)
-    size, middle = (430, 400), (0.0, -0.28, 0.03)
+    size, middle = 430, (0.0, -0.28, 0.03)
     views = ((0, 430), (90, 150), (180, 430))
-    above = [look_at(*skin, yaw, middle, 1.85, (size[0], width)) for yaw, width in views]
-    below = [look_at(*boxes_of(thin, colours), 0, middle, 1.85, (size[0], 430))]
-    below += [look_at(*boxes_of(in_pose, colours), yaw, (0.0, -0.35, 0.05), 1.95, (size[0], 290)) for yaw in (0, 50)]
-    square = np.ones((size[0], size[0], 3))
-    square[15:-15, 15:-15] = grid_picture(anchors, size[0] - 30)
+    above = [look_at(*skin, yaw, middle, 1.85, (size, width)) for yaw, width in views]
+    below = [look_at(*boxes_of(thin, colours), 0, middle, 1.85, (size, 430))]
+    left_hand, left_foot = (0.8, 0.25, 0.05), (0.15, -1.1, 0.05)
+    below += [np.concatenate([look_at(*skin, 30, spot, 0.4, (size // 2, 215)) for spot in (left_hand, left_foot)])]
+    below += [look_at(*boxes_of(in_pose, colours), yaw, (0.0, -0.27, 0.05), 2.1, (size, 380)) for yaw in (0, 50)]
+    square = np.ones((size, size, 3))
+    square[15:-15, 15:-15] = grid_picture(anchors, size - 30)
     rows = [np.concatenate([*above, square], 1), np.concatenate(below, 1)]
     width = max(row.shape[1] for row in rows)
     padded = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=1) for row in rows]

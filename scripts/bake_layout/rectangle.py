@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
@@ -48,12 +49,12 @@ def sides_of(loop: Sequence[int], corners: Sequence[int]) -> list[list[int]]:
     first = loop.index(corners[0])
     turned = [*loop[first:], *loop[:first], loop[first]]
     stops = [0, *(turned.index(corner) for corner in corners[1:]), len(loop)]
-    return [turned[a : b + 1] for a, b in zip(stops, stops[1:], strict=False)]
+    return [turned[a : b + 1] for a, b in pairwise(stops)]
 
 
 def split_chords(disc: Disc, sides: Sequence[Sequence[int]]) -> Disc:
     """The disc with every inner edge halved that joins two vertices of one side: on a straight side it has no area."""
-    outline = {tuple(sorted(edge)) for side in sides for edge in zip(side, side[1:], strict=False)}
+    outline = {tuple(sorted(edge)) for side in sides for edge in pairwise(side)}
     on_side = [set(side) for side in sides]
     edges = {tuple(sorted((face[k], face[(k + 1) % 3]))) for face in disc.faces.tolist() for k in range(3)}
     chords = [e for e in sorted(edges - outline) if any(e[0] in side and e[1] in side for side in on_side)]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy import ndarray as Array
-
 from half_body import Sheet
+from numpy import ndarray as Array
 
 REGIONS = ("torso", "head", "arm", "hand", "leg", "foot")
 SNAP = 0.2
