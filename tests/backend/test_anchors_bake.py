@@ -1,0 +1,186 @@
+"""The script that makes the layout: its parts on meshes with known answers, its product against the shipped file."""
+
+import math
+import pathlib
+import runpy
+import sys
+
+import numpy as np
+import pytest
+import torch
+from primdiffusion.body.model import default_body
+from primdiffusion.primitives.anchors import attach, default_anchors
+from primdiffusion.primitives.primitives import GRID
+
+pytest.importorskip("igl", reason="libigl comes with the `bake` extra")
+SCRIPT = pathlib.Path(__file__).parents[2] / "scripts/bake_layout"
+sys.path.append(str(SCRIPT))
+
+from charts import PLACES, Place, lay_out  # noqa: E402
+from cutting import cheapest_path, cut_along, outline, runs  # noqa: E402
+from grid import chart_of_cells, draw  # noqa: E402
+from half_body import FILLED, Sheet, boundary_edges, left_half, mirror_vertices, smoothed  # noqa: E402
+from rectangle import Disc, flatten  # noqa: E402
+from regions import _split, cut_into_regions  # noqa: E402
+
+
+def sheet_of(columns: int, rows: int, place=lambda s, t: (s, t, 0 * s)) -> tuple[np.ndarray, np.ndarray]:
+    """A grid of triangles over [0, columns] x [0, rows], put into space by `place`."""
+    s, t = (a.ravel().astype(float) for a in np.meshgrid(np.arange(columns + 1), np.arange(rows + 1)))
+    row, column = (a.ravel() for a in np.mgrid[:rows, :columns])
+    a = row * (columns + 1) + column
+    b, c, d = a + 1, a + columns + 2, a + columns + 1
+    return np.stack(place(s, t), -1), np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
+def area(points: np.ndarray, faces: np.ndarray) -> float:
+    p = points[faces]
+    return float(np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1).sum() / 2)
+
+
+def test_a_developable_sheet_is_flattened_without_distortion():
+    """A quarter of a tube of radius 1 and length 3, on a rectangle of its own proportions."""
+    width, height = 8 * 2 * math.sin(math.pi / 32), 3.0
+
+    def bent(s, t):
+        angle = s / 8 * math.pi / 2
+        return np.sin(angle), t / 6 * height, np.cos(angle)
+
+    points, faces = sheet_of(8, 6, bent)
+    disc = Disc(points, points, faces, np.arange(len(faces)))
+    loop = outline(faces)
+    flat = flatten(disc, loop, (0, 8, 62, 54), width, height)
+    s, t = (a.ravel() for a in np.meshgrid(np.arange(9), np.arange(7)))
+    expected = np.stack([s / 8 * width, t / 6 * height], -1)
+    np.testing.assert_allclose(flat.uv[: len(points)], expected, atol=2e-3)
+
+
+def distortion(points: np.ndarray, uv: np.ndarray, faces: np.ndarray) -> float:
+    """Mean symmetric Dirichlet energy, 4 for an isometry: singular values of edges in space -> edges in the plane."""
+    edges = points[faces[:, 1:]] - points[faces[:, :1]]
+    _, r = np.linalg.qr(edges.transpose(0, 2, 1))
+    flat_edges = (uv[faces[:, 1:]] - uv[faces[:, :1]]).transpose(0, 2, 1)
+    values = np.linalg.svd(flat_edges @ np.linalg.inv(r), compute_uv=False)
+    areas = np.abs(np.linalg.det(r))
+    return float(((values**2 + values**-2).sum(1) * areas).sum() / areas.sum())
+
+
+def test_flattening_a_bump_ends_in_a_minimum_of_distortion_and_flips_nothing():
+    points, faces = sheet_of(10, 10, lambda s, t: (s, t, 3 * np.exp(-((s - 5) ** 2 + (t - 5) ** 2) / 4)))
+    side = math.sqrt(area(points, faces))
+    flat = flatten(Disc(points, points, faces, np.arange(len(faces))), outline(faces), (0, 10, 120, 110), side, side)
+    a, b, c = (flat.uv[flat.disc.faces[:, k]] for k in range(3))
+    assert ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]).min() > 0
+    shadow = distortion(points, points[:, :2] * side / 10, faces) - 4
+    reached = distortion(flat.disc.points, flat.uv, flat.disc.faces)
+    assert reached - 4 < 0.6 * shadow
+    generator = np.random.default_rng(0)
+    inner = np.setdiff1d(np.arange(len(flat.uv)), boundary_edges(flat.disc.faces))
+    for _ in range(200):
+        moved = flat.uv.copy()
+        moved[generator.choice(inner)] += 0.05 * generator.standard_normal(2)
+        assert distortion(flat.disc.points, moved, flat.disc.faces) > reached - 1e-5
+
+
+def test_sides_stay_on_the_rectangle():
+    points, faces = sheet_of(6, 4)
+    flat = flatten(Disc(points, points, faces, np.arange(len(faces))), outline(faces), (0, 6, 34, 28), 3.0, 5.0)
+    np.testing.assert_allclose(flat.uv[:7, 1], 0)
+    np.testing.assert_allclose(flat.uv[28:35, 1], 5)
+    np.testing.assert_allclose(flat.uv[:35:7, 0], 0)
+    np.testing.assert_allclose(flat.uv[6:35:7, 0], 3)
+
+
+def test_a_cut_doubles_the_vertices_inside_it_and_the_loop_passes_both_copies():
+    _, faces = sheet_of(4, 4)
+    path = [2, 7, 12]
+    opened, origin = cut_along(faces, path)
+    assert len(origin) == 25 + 2
+    loop = outline(opened)
+    assert sorted(origin[loop]).count(7) == 2
+    assert sorted(origin[loop]).count(12) == 1
+    np.testing.assert_array_equal(origin[opened], faces)
+
+
+def test_a_ring_is_no_disc():
+    _, faces = sheet_of(3, 3)
+    inner = np.isin(faces, [5, 6, 9, 10]).sum(1) == 3
+    with pytest.raises(ValueError, match="not a disc"):
+        outline(faces[~inner])
+
+
+def test_the_cheapest_path_goes_round_what_it_must_avoid():
+    points, faces = sheet_of(4, 4)
+    straight = cheapest_path(points, faces, 10, 14)
+    detour = cheapest_path(points, faces, 10, 14, avoid=[12])
+    assert straight == [10, 11, 12, 13, 14]
+    assert 12 not in detour
+    assert detour[0] == 10
+    assert detour[-1] == 14
+
+
+def test_runs_are_found_across_the_end_of_the_loop():
+    marked = np.array([True, True, False, False, True])
+    assert runs([0, 1, 2, 3, 4], marked) == [[4, 0, 1]]
+
+
+def test_splitting_keeps_area_orientation_and_parents():
+    points, faces = sheet_of(5, 5)
+    sheet = Sheet(points, faces, np.arange(len(faces)), np.zeros(len(points), bool))
+    value = points[:, 0] - 0.4 * points[:, 1] - 1.37
+    cut, region, positive = _split(sheet, np.zeros(len(faces), int), value, 0)
+    assert len(cut.faces) > len(faces)
+    assert len(region) == len(positive) == len(cut.parent) == len(cut.faces)
+    assert area(cut.points, cut.faces) == pytest.approx(25)
+    normal = np.cross(*(cut.points[cut.faces[:, k]] - cut.points[cut.faces[:, 0]] for k in (1, 2)))
+    assert normal[:, 2].min() > 0
+    for parent in range(0, len(faces), 7):
+        assert area(cut.points, cut.faces[cut.parent == parent]) == pytest.approx(0.5)
+    middle = cut.points[cut.faces].mean(1)
+    clear = np.abs(middle[:, 0] - 0.4 * middle[:, 1] - 1.37) > 0.3
+    np.testing.assert_array_equal(positive[clear], (middle[:, 0] - 0.4 * middle[:, 1] - 1.37 > 0)[clear])
+
+
+def test_smoothing_flattens_a_spike_and_keeps_the_midline_in_its_plane():
+    points, faces = sheet_of(8, 8, lambda s, t: (0.01 * s, 0.01 * t, 0.02 * ((s == 4) & (t == 4))))
+    sheet = Sheet(points, faces, np.arange(len(faces)), points[:, 0] == 0)
+    smooth = smoothed(sheet, 0.02)
+    assert smooth[40, 2] < 0.008
+    assert (smooth[sheet.midline, 0] == 0).all()
+
+
+@pytest.mark.parametrize("quarter_turns", [0, 1, 2])
+def test_places_and_grid_coordinates_are_inverse(quarter_turns):
+    place = Place(3, 5, 2, 7, quarter_turns)
+    uv = np.random.default_rng(0).random((20, 2)) * (3, 5)
+    on_grid = place.to_grid(uv)
+    columns, rows = place.extent
+    assert (on_grid >= (2, 7)).all()
+    assert (on_grid <= (2 + columns, 7 + rows)).all()
+    np.testing.assert_allclose(place.from_grid(on_grid), uv)
+
+
+def test_the_charts_tile_the_grid():
+    assert sum(place.width * place.height for place in PLACES.values()) == GRID * GRID // 2
+    assert (chart_of_cells() >= 0).all()
+
+
+def test_a_lopsided_body_is_refused():
+    with pytest.raises(ValueError, match="mirror symmetry"):
+        mirror_vertices(np.array([[0.1, 0, 0], [-0.2, 0, 0]]))
+
+
+def test_the_shipped_layout_is_what_the_script_makes():
+    """Positions within half a millimetre: SLIM's last digits depend on the linear algebra library."""
+    body = runpy.run_path(str(SCRIPT / "__main__.py"))["read_body"]()
+    half = left_half(body.vertices, body.faces)
+    assert (half.parent == FILLED).any()
+    on_midline = half.midline[boundary_edges(half.faces)]
+    assert on_midline.all()
+    sheet, region = cut_into_regions(half, body.joints)
+    cells = draw(body, sheet, region, lay_out(sheet, region), 1)
+    made = (body.vertices[body.faces[cells.face]] * cells.barycentric[..., None]).sum(2)
+    default = default_body()
+    shipped = attach(default_anchors(), default.template, default.faces).position.reshape(GRID, GRID, 3)
+    np.testing.assert_allclose(made, shipped.numpy(), atol=5e-4)
+    assert torch.equal(default_anchors().chart, torch.from_numpy(chart_of_cells().ravel()))
