@@ -28,7 +28,7 @@ class PeopleCommand:
     seed: int = 0
     """Seed of the first person; the next has the next."""
     workers: int = os.cpu_count() or 1
-    """Processes; each takes a core and about 0.7 GB."""
+    """Processes; each takes a core and about 1 GB."""
 
 
 def run(command: PeopleCommand) -> None:

@@ -79,7 +79,7 @@ def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
             light = np.where(here, _blurred(light, seen), light)
         if kind.trim and original is not None:
             lab = lab_from_bytes(original[..., :3])
-            distance = np.linalg.norm((lab - np.median(lab[seen], axis=0)) * np.float32([0.8, 1, 1]), axis=-1)
+            distance = np.linalg.norm((lab - np.median(lab[seen], axis=0)) * np.array([0.8, 1, 1], np.float32), axis=-1)
             trim |= here & (distance > TRIM_DISTANCE)
         for region in (here & ~trim, here & trim):
             if (region & texels.inside).any():

@@ -45,7 +45,7 @@ def make_payloads(
 ) -> list[Path]:
     """Make the people of seeds seed ... seed + count - 1 into `out_dir`, those that are not there yet.
 
-    A person takes about 3 s and each further variant about half a second of one core. `report` is told of finished
+    A person takes about 1.5 s and each further variant about 0.4 s of one core. `report` is told of finished
     people and of their total.
 
     Raises:

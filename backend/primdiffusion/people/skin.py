@@ -73,7 +73,7 @@ def skin_texture(assets: Assets, skin: SkinColours) -> UInt8[np.ndarray, "H W 4"
     """The texture of a skin."""
     distance = skin.tone if "lightskinned" in skin.base else 1 - skin.tone
     means = _local_mean(assets, skin.other) - _local_mean(assets, skin.base)
-    move = np.float32(distance) * means + np.float32(skin.shift)
+    move = np.float32(distance) * means + np.array(skin.shift, np.float32)
     lab = _lab(assets, skin.base).astype(np.float32)
     height, width = lab.shape[:2]
     for channel in range(3):

@@ -68,8 +68,8 @@ def texel_map(corner_uv: Float[np.ndarray, "F 3 2"], size: int) -> TexelMap:
     inside = face >= 0
     if not inside.any():
         raise ValueError(f"No texel of a {size} x {size} picture is covered; the mesh has no texture coordinates.")
-    rows, columns = distance_transform_edt(~inside, return_distances=False, return_indices=True)
-    return TexelMap(face[rows, columns], barycentric[rows, columns], inside)
+    nearest = np.asarray(distance_transform_edt(~inside, return_distances=False, return_indices=True))
+    return TexelMap(face[tuple(nearest)], barycentric[tuple(nearest)], inside)
 
 
 def connected_faces(faces: Int[np.ndarray, "F 3"], vertex_count: int) -> Int[np.ndarray, " F"]:

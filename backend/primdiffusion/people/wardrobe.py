@@ -49,22 +49,27 @@ TRIMMED_TOP, SMOOTHED_TOP, PLAIN_TOP = Piece("top", trim=True), Piece("top", smo
 DENIM, DETAIL = Piece("denim"), Piece("detail")
 INNER_SHIRT = Piece("shirt", smooth=True)
 
+UNISEX = (
+    Garment("male_casualsuit03", (SMOOTHED_TOP, DENIM)),
+    Garment("male_casualsuit05", (Piece("jacket"), DENIM, INNER_SHIRT, INNER_SHIRT)),
+    Garment("male_casualsuit06", (SMOOTHED_TOP, DENIM)),
+    Garment("male_worksuit01", (Piece("overall"), PLAIN_TOP, DETAIL, DETAIL, DETAIL, DETAIL)),
+)
+"""Made for men, and worn by women too, of whose clothes the pack has few; they sit well on both."""
 OUTFITS: dict[Sex, tuple[Garment, ...]] = {
     "female": (
         Garment("female_casualsuit01", (TRIMMED_TOP, DENIM)),
         Garment("female_casualsuit02", (DENIM, PLAIN_TOP, DETAIL)),
         Garment("female_elegantsuit01", (SMOOTHED_TOP, Piece("skirt"))),
         Garment("female_sportsuit01", (TRIMMED_TOP, Piece("tights", trim=True))),
+        *UNISEX,
     ),
     "male": (
         Garment("male_casualsuit01", (DENIM, PLAIN_TOP, DENIM, PLAIN_TOP, PLAIN_TOP, PLAIN_TOP), by_island=True),
         Garment("male_casualsuit02", (TRIMMED_TOP, DENIM)),
-        Garment("male_casualsuit03", (SMOOTHED_TOP, DENIM)),
         Garment("male_casualsuit04", (DENIM, TRIMMED_TOP)),
-        Garment("male_casualsuit05", (Piece("jacket"), DENIM, INNER_SHIRT, INNER_SHIRT)),
-        Garment("male_casualsuit06", (SMOOTHED_TOP, DENIM)),
         Garment("male_elegantsuit01", (Piece("suit", trim=True), Piece("suit"))),
-        Garment("male_worksuit01", (Piece("overall"), PLAIN_TOP, DETAIL, DETAIL, DETAIL, DETAIL)),
+        *UNISEX,
     ),
 }
 
