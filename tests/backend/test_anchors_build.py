@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyModel, default_body
+from primdiffusion.geometry.uv_atlas import rasterise_uv
 from primdiffusion.primitives.anchors import (
     CHARTS,
     JOINT_REGION,
     attach,
     build_anchors,
+    footprint_anchors,
     released_half_extent,
     tangent_plane,
 )
@@ -125,6 +127,30 @@ def test_a_face_without_area_in_uv_still_has_a_frame():
     squeezed = dataclasses.replace(body, uv=uv)
     frames = attach(build_anchors(squeezed), squeezed.template, squeezed.faces)
     assert torch.allclose(torch.linalg.det(frames.rotation), torch.ones(K, dtype=torch.float64))
+
+
+def test_a_footprint_is_the_whole_cell_and_agrees_with_the_uv_gradient_on_a_cylinder():
+    """Footprints smooth over one cell, 11 degrees wide: directions agree, a chord is shorter than its arc."""
+    body = cylinder()
+    gradient = build_anchors(body)
+    texels = rasterise_uv(body.uv[body.uv_faces].numpy(), 256, 256)
+    footprint = footprint_anchors(
+        body.template,
+        body.faces,
+        gradient.face,
+        gradient.barycentric,
+        gradient.chart,
+        torch.from_numpy(texels.face),
+        torch.from_numpy(texels.barycentric),
+    )
+    du, dv = tangent_plane(footprint, body.template)
+    width = 2 * math.pi * RADIUS / GRID
+    assert torch.allclose(du.norm(dim=-1), torch.full((K,), width, dtype=torch.float64), rtol=1e-2)
+    assert torch.allclose(dv.norm(dim=-1), torch.full((K,), HEIGHT / GRID, dtype=torch.float64), rtol=1e-6)
+    by_cell = attach(footprint, body.template, body.faces).rotation
+    by_face = attach(gradient, body.template, body.faces).rotation
+    angle = ((by_cell.mT @ by_face).diagonal(dim1=-2, dim2=-1).sum(-1) / 2 - 0.5).clamp(-1, 1).arccos()
+    assert float(angle.max()) < math.pi / SEGMENTS + 1e-3
 
 
 def test_charts_come_from_the_joints_that_move_the_skin():
