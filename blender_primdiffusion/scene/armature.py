@@ -94,8 +94,10 @@ def bone_bases(rest: NDArray, rotations: NDArray, translation: NDArray) -> tuple
     return matrix_to_quaternion(local), points_to_blender(translation) @ rest[0]
 
 
-def pose_from_joint_rotations(armature: bpy.types.Object, rotations: NDArray, translation: NDArray | None = None) -> None:
-    """Pose the bones by SMPL joint rotations [24, 3, 3] and a translation [3] in metres, in the backend's axes (y up)."""
+def pose_from_joint_rotations(
+    armature: bpy.types.Object, rotations: NDArray, translation: NDArray | None = None
+) -> None:
+    """Pose the bones by SMPL joint rotations [24, 3, 3] and a translation [3] in metres, y up."""
     shift = np.zeros(3) if translation is None else translation
     quaternions, location = bone_bases(rest_rotations(armature), np.asarray(rotations), shift)
     for name, quaternion in zip(JOINT_NAMES, quaternions, strict=True):

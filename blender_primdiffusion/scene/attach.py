@@ -27,9 +27,9 @@ def attach_volumes(
 ) -> list[bpy.types.Object]:
     """A Volume object for each file, in `collection`, at rest where position [K, 3] and rotation [K, 3, 3] (z up) say.
 
-    Parented to the armature, with an Armature constraint of one target per non-zero weight [K, 24] and preserve volume off:
-    the evaluated matrix is A (sum_j w_j G_j) [rotation | position], with the armature object's matrix A and SMPL's skinning
-    transforms G_j. It shears where joints bend, as linear blending does.
+    Parented to the armature, with an Armature constraint of one target per non-zero weight [K, 24] and preserve volume
+    off: the evaluated matrix is A (sum_j w_j G_j) [rotation | position], with the armature object's matrix A and SMPL's
+    skinning transforms G_j. It shears where joints bend, as linear blending does.
     """
     quaternions = matrix_to_quaternion(rotation)
     objects = []

@@ -19,8 +19,8 @@ def build_body_mesh(
 ) -> bpy.types.Object:
     """A mesh object, linked to no collection: vertices [V, 3] z up in the armature's space, faces [F, 3], uv [F, 3, 2].
 
-    Vertex groups carry skin_weights [V, 24]; the Armature modifier blends matrices linearly (preserve volume off), as SMPL
-    does. It is hidden in renders and in the viewport: the volumes are what one looks at.
+    Vertex groups carry skin_weights [V, 24]; the Armature modifier blends matrices linearly (preserve volume off), as
+    SMPL does. It is hidden in renders and in the viewport: the volumes are what one looks at.
     """
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(vertices))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -25,12 +25,16 @@ _NAME_LENGTH = 40
 _KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials")
 
 
-def build_human(context: bpy.types.Context, human_npz: str | Path, name: str = "Human") -> bpy.types.Collection:
+def build_human(
+    context: bpy.types.Context, human_npz: str | Path, name: str = "Human", keep: Sequence[Path] = ()
+) -> bpy.types.Collection:
     """Build the person of a human.npz in the scene: armature, hidden body mesh and a volume for every primitive.
 
     The person faces -y with the soles on z = 0 at the world's origin: the armature object is lifted, its space is the
-    backend's turned z up. Volumes are written to `humans_folder()/<collection name>`. Raises HumanFileError or
-    VolumeWriteError, and then leaves neither data nor files. Takes several seconds; makes no undo step, its caller does.
+    backend's turned z up. Volumes are written to `folder_of(collection)`, and the files in `keep` are copied
+    beside them. Raises HumanFileError or
+    VolumeWriteError, and then leaves neither data nor files. Takes several seconds; makes no undo step, its caller
+    does.
     """
     human = read_human(human_npz)
     with _nothing_left_on_failure():
@@ -46,7 +50,7 @@ def build_human(context: bpy.types.Context, human_npz: str | Path, name: str = "
         collection.children.link(primitives)
         rotation = frames_to_blender(human.rotation)
         grids = volumes.bake(human.density, human.rgb, human.half_extent)
-        with volumes.written(grids, volumes.humans_folder() / bpy.path.clean_name(label)) as files:
+        with volumes.written(grids, folder_of(collection), keep) as files:
             attach_volumes(
                 label,
                 armature,
@@ -60,6 +64,11 @@ def build_human(context: bpy.types.Context, human_npz: str | Path, name: str = "
         collection[MARK] = _provenance(human)
         context.scene.collection.children.link(collection)
     return collection
+
+
+def folder_of(collection: bpy.types.Collection) -> Path:
+    """Where a person's files live: `<blendname>_humans/<collection name>` (see `humans_folder`)."""
+    return volumes.humans_folder() / bpy.path.clean_name(collection.name)
 
 
 def overlap_warning(collection: bpy.types.Collection) -> str | None:

@@ -15,8 +15,8 @@ FORMAT_VERSION = 1
 VOXELS = 8
 """Voxels along a side of a primitive."""
 JOINT_NAMES: tuple[str, ...] = (
-    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle", "spine3",
-    "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder", "right_shoulder",
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
+    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder", "right_shoulder",
     "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand",
 )  # fmt: skip
 """SMPL's 24 joints in the order and with the names of the smplx package."""
@@ -72,8 +72,8 @@ _REMEDY = "generate the person again"
 def read_human(path: str | Path) -> HumanFile:
     """Read and check a human.npz.
 
-    Raises HumanFileError when the file is missing, truncated, of another version, or holds arrays of the wrong shape, NaN,
-    weights that do not sum to one, or frames that are not rotations.
+    Raises HumanFileError when the file is missing, truncated, of another version, or holds arrays of the wrong shape,
+    NaN, weights that do not sum to one, or frames that are not rotations.
     """
     path = Path(path)
     if not path.is_file():
@@ -129,8 +129,8 @@ def _shaped_fields(arrays: dict[str, NDArray], path: Path) -> dict[str, NDArray]
         if not fits or value.size == 0:
             want = tuple(sizes.get(s, s) if isinstance(s, str) else s for s in shape)
             raise HumanFileError(
-                f"the field {name!r} of {path.name!r} is {value.dtype} {value.shape} instead of numbers of shape {want}; "
-                f"{_REMEDY}"
+                f"the field {name!r} of {path.name!r} is {value.dtype} {value.shape} instead of numbers of shape "
+                f"{want}; {_REMEDY}"
             )
         fields[name] = value.astype(_DTYPES.get(name, np.float64))
     return fields

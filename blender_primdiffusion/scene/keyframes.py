@@ -1,4 +1,4 @@
-"""Many poses at once as keyframes: an action with one layer, one strip and one slot (the same in Blender 4.5 to 5.2)."""
+"""Many poses at once as keyframes: an action of one layer, strip and slot (the same in Blender 4.5 to 5.2)."""
 
 from __future__ import annotations
 
@@ -17,17 +17,19 @@ _LINEAR = 1
 def keyframe_poses(
     armature: bpy.types.Object, frames: NDArray, rotations: NDArray, translations: NDArray, name: str = "Motion"
 ) -> bpy.types.Action:
-    """A new action on the armature: SMPL joint rotations [F, 24, 3, 3] and translations [F, 3] (y up, metres) at `frames` [F].
+    """A new action on the armature: SMPL joint rotations [F, 24, 3, 3] and translations [F, 3] (y up, metres) at
+    `frames` [F].
 
-    Frames may be fractional and must increase. Keys are linear, so that motion sampled every frame is met exactly; between
-    keys quaternions are interpolated by component. Raises ValueError when the lengths differ or frames do not increase.
+    Frames may be fractional and must increase. Keys are linear, so that motion sampled every frame is met exactly;
+    between keys quaternions are interpolated by component. Raises ValueError when the lengths differ or frames do not
+    increase.
     """
     times = np.asarray(frames, np.float64)
     shapes = (times.shape[0], len(JOINT_NAMES), 3, 3), (times.shape[0], 3)
     if times.ndim != 1 or np.shape(rotations) != shapes[0] or np.shape(translations) != shapes[1]:
         raise ValueError(
-            f"poses have shapes {np.shape(rotations)} and {np.shape(translations)}; {times.shape[0]} frames need {shapes[0]} "
-            f"and {shapes[1]}"
+            f"poses have shapes {np.shape(rotations)} and {np.shape(translations)}; {times.shape[0]} frames "
+            f"need {shapes[0]} and {shapes[1]}"
         )
     if times.size == 0 or np.any(np.diff(times) <= 0):
         raise ValueError("frame numbers must increase from key to key; sort them and drop doubles")

@@ -6,8 +6,8 @@ import bpy
 
 MATERIAL_NAME = "PrimDiffusion Volume"
 DENSITY_GAIN = 2.2
-"""Cycles absorbs exponentially, the paper's marcher adds and clamps; this factor on density matches their alpha best (fitted
-on one scene: mean difference .004 with it, .022 without)."""
+"""Cycles absorbs exponentially, the paper's marcher adds and clamps; this factor on density matches their alpha best
+(fitted on one scene: mean difference .004 with it, .022 without)."""
 GAIN_NODE = "Density Gain"
 
 

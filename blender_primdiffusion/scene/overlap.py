@@ -11,7 +11,7 @@ _PADDED = 1.0 + 2.0 / 7.0
 
 
 def most_overlapping(position: NDArray, rotation: NDArray, half_extent: NDArray) -> int:
-    """The largest number of boxes [K] covering one point, over 27 points in each box (centre, faces, edges, near corners)."""
+    """The largest number of boxes [K] covering one point, tried at 27 points of each."""
     half = np.asarray(half_extent) * _PADDED
     radius = np.linalg.norm(half, axis=-1)
     lattice = np.stack(np.meshgrid(*[[-0.8, 0.0, 0.8]] * 3, indexing="ij"), -1).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Primitives as VDB files: the marcher's window baked into density, one small file a primitive, named by its content."""
+"""Primitives as VDB files: the marcher's window baked into density, a small file each, named by its content."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -50,14 +50,16 @@ def bake(density: NDArray, rgb: NDArray, half_extent: NDArray) -> Grids:
     windowed = np.pad(np.asarray(density, np.float64) * window(), pad).transpose(0, 3, 2, 1)
     colour = np.pad(rgb, [*pad, (0, 0)], mode="edge").transpose(0, 3, 2, 1, 4)
     largest = float(np.finfo(np.float16).max)
-    return Grids(np.clip(windowed, 0, largest).astype(np.float16), colour.astype(np.float16), np.asarray(half_extent, np.float64))
+    return Grids(
+        np.clip(windowed, 0, largest).astype(np.float16), colour.astype(np.float16), np.asarray(half_extent, np.float64)
+    )
 
 
 def index_to_local(half_extent: NDArray, blender_version: tuple[int, ...]) -> NDArray[np.float64]:
     """VDB's row-vector index-to-object transform [4, 4] of a padded box with half sides [3] in metres.
 
-    Voxel i of the unpadded eight has its centre at half_extent * (-1 + 2 i / 7). Cycles before 5.0 draws every voxel half
-    a voxel too high on each axis, so its files are shifted down.
+    Voxel i of the unpadded eight has its centre at half_extent * (-1 + 2 i / 7). Cycles before 5.0 draws every voxel
+    half a voxel too high on each axis, so its files are shifted down.
     """
     step = 2.0 * np.asarray(half_extent) / (VOXELS - 1)
     shift = -0.5 * step if blender_version < (5, 0) else 0.0
@@ -76,11 +78,12 @@ def file_name(grids: Grids, k: int, blender_version: tuple[int, ...]) -> str:
 
 
 @contextmanager
-def written(grids: Grids, folder: Path) -> Iterator[list[Path]]:
-    """Write the VDBs beside `folder`, and move them into it when the block ends well.
+def written(grids: Grids, folder: Path, keep: Sequence[Path] = ()) -> Iterator[list[Path]]:
+    """Write the VDBs in a hidden part of `folder`, and move them into it when the block ends well.
 
-    Yields the final paths [K], which exist only after the block. When the block or a write fails, neither the files nor
-    folders made for them remain. Raises VolumeWriteError when the folder cannot be written or the disk is full.
+    Files in `keep` are copied there too. Yields the final paths [K], which exist only after the block. When the block
+    or a write fails, neither the files nor folders made for them remain. Raises VolumeWriteError when the folder cannot
+    be written or the disk is full.
     """
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     try:
@@ -93,10 +96,11 @@ def written(grids: Grids, folder: Path) -> Iterator[list[Path]]:
     try:
         try:
             names = _write_files(grids, staging)
+            kept = [Path(shutil.copyfile(path, staging / path.name)).name for path in keep]
         except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
             raise _write_error(folder, error) from error
         yield [folder / name for name in names]
-        for name in names:
+        for name in [*names, *kept]:
             if not (folder / name).exists():
                 published.append(folder / name)
             try:
@@ -134,8 +138,8 @@ def _write_files(grids: Grids, folder: Path) -> list[str]:
 
 def _write_error(folder: Path, error: BaseException) -> VolumeWriteError:
     return VolumeWriteError(
-        f"the volumes could not be written to {str(folder)!r} ({error}); save the .blend in a folder with write permission "
-        "and free space"
+        f"the volumes could not be written to {str(folder)!r} ({error}); save the .blend in a folder with "
+        "write permission and free space"
     )
 
 
@@ -148,7 +152,7 @@ def _remove_empty(folder: Path, existing: Path) -> None:
 
 
 def humans_folder(blend_path: str | None = None) -> Path:
-    """Where the volumes of a .blend's people live: `<blendname>_humans` beside it, a temporary folder while it is unsaved."""
+    """Where the people of a .blend live: `<blendname>_humans` beside it, a temporary folder while it is unsaved."""
     blend = Path(blend_path if blend_path is not None else bpy.data.filepath)
     if blend.name:
         return blend.resolve().parent / f"{blend.stem}_humans"

@@ -1,4 +1,4 @@
-"""A person for tests: a stick figure of ellipsoid blobs around SMPL's skeleton, with a human.npz as the backend writes it."""
+"""A person for tests: blobs along the bones of SMPL's skeleton, in a human.npz as the backend writes it."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-NAMES = (
-    "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot right_foot neck "
-    "left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist left_hand "
-    "right_hand"
-).split()
+NAMES = [
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
+    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
+    "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand",
+]  # fmt: skip
 PARENTS = np.array([-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21])
 _LEFT = {
     "hip": (0.09, -0.09, 0.0), "knee": (0.11, -0.48, 0.0), "ankle": (0.11, -0.9, -0.03), "foot": (0.12, -0.96, 0.1),
-    "collar": (0.07, 0.4, 0.0), "shoulder": (0.17, 0.42, -0.01), "elbow": (0.43, 0.42, -0.02), "wrist": (0.68, 0.42, -0.02),
-    "hand": (0.76, 0.42, -0.02),
+    "collar": (0.07, 0.4, 0.0), "shoulder": (0.17, 0.42, -0.01), "elbow": (0.43, 0.42, -0.02),
+    "wrist": (0.68, 0.42, -0.02), "hand": (0.76, 0.42, -0.02),
 }  # fmt: skip
 _MIDDLE = {"pelvis": 0.0, "spine1": 0.1, "spine2": 0.23, "spine3": 0.3, "neck": 0.48, "head": 0.56}
 
@@ -59,7 +59,7 @@ def axis_angle(vector: np.ndarray) -> np.ndarray:
 
 
 def skinning(rest_joints: np.ndarray, rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """SMPL's world <- rest transforms [24, 4, 4], written from its definition: each joint turns its subtree about itself."""
+    """SMPL's world <- rest transforms [24, 4, 4] by definition: each joint turns its subtree about itself."""
     out = np.zeros((24, 4, 4))
     for j, parent in enumerate(PARENTS):
         about = np.eye(4)
@@ -104,7 +104,7 @@ def arrays(count: int = 48, seed: int = 0) -> dict[str, np.ndarray]:
                 faces += [(a, b, a + 8), (b, b + 8, a + 8)]
     return {
         "format_version": np.array(1),
-        "meta": np.array(json.dumps({"seed": seed, "steps": 5, "checkpoint": "synthetic", "full_density": 100.0, "version": "0"})),
+        "meta": np.array(json.dumps({"seed": seed, "steps": 5, "checkpoint": "synthetic", "full_density": 100.0})),
         "betas": rng.normal(size=10),
         "parents": PARENTS,
         "joint_names": np.array(NAMES),

@@ -1,0 +1,96 @@
+"""Generate and Cancel. Neither is redoable: moving a redo slider must not start an expensive job again."""
+
+from __future__ import annotations
+
+import time
+
+import bpy
+
+from .session import TICK_S, Busy, GenerationFailed, session
+
+_OFFERED_S = 1.0
+"""Between lines of progress on the console in background mode."""
+
+
+class PRIMDIFFUSION_OT_generate(bpy.types.Operator):
+    """Generate a person from the seed, and add it to the scene with an armature"""
+
+    bl_idname = "primdiffusion.generate"
+    bl_label = "Generate Human"
+    bl_options: set[str] = set()  # noqa: RUF012  bpy wants a plain set; neither REGISTER (redo) nor UNDO (session pushes one)
+
+    seed: bpy.props.IntProperty(name="Seed", default=-1, min=-1, description="-1: the panel's")
+    steps: bpy.props.IntProperty(name="Steps", default=0, min=0, description="0: the panel's")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Start; with a window a timer follows the job, in background mode this waits for it."""
+        settings = context.scene.primdiffusion
+        try:
+            session.start(self.seed if self.seed >= 0 else settings.seed, self.steps or settings.steps)
+        except (Busy, OSError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        if bpy.app.background:
+            return self._wait(context)
+        bpy.app.timers.register(follow, first_interval=TICK_S, persistent=True)
+        return {"FINISHED"}
+
+    def _wait(self, context: bpy.types.Context) -> set[str]:
+        told = 0.0
+        while not session.job.finished:
+            if session.tick() and time.monotonic() - told > _OFFERED_S:
+                told = time.monotonic()
+                print(f"PrimDiffusion: {session.job.message}", flush=True)
+            time.sleep(TICK_S / 4)
+        try:
+            session.finish(context)
+        except GenerationFailed as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        print(f"PrimDiffusion: {session.notice}", flush=True)
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_cancel(bpy.types.Operator):
+    """Stop generating; nothing is added to the scene"""
+
+    bl_idname = "primdiffusion.cancel"
+    bl_label = "Cancel"
+    bl_options: set[str] = set()  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        """Only while something runs."""
+        return session.busy
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        """Ask; the timer sees it through."""
+        session.cancel()
+        return {"FINISHED"}
+
+
+def follow() -> float | None:
+    """The timer: one tick of the job; builds the person when it is done, unless a render is reading the scene."""
+    if session.job is None:
+        return None
+    if session.tick():
+        redraw()
+    if not session.job.finished or bpy.app.is_job_running("RENDER"):
+        return TICK_S
+    windows = bpy.context.window_manager.windows
+    try:
+        with bpy.context.temp_override(window=bpy.context.window or windows[0]):  # timers have no window of their own
+            session.finish(bpy.context)
+    except GenerationFailed as error:
+        print(f"PrimDiffusion: {error}")  # the panel's error line shows it
+    finally:
+        redraw()
+    return None
+
+
+def redraw() -> None:
+    """Draw the sidebars anew: nothing else tells them that the job has moved on."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                area.tag_redraw()

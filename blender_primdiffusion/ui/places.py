@@ -1,0 +1,34 @@
+"""Where the extension finds and keeps things: its own backend, its preferences, its folder for caches."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+EXTENSION = __package__.rpartition(".")[0]
+"""The extension's full module name; `bl_ext.<repository>.primdiffusion` once installed."""
+
+
+def backend_module_path() -> Path | None:
+    """The folder that holds the package `primdiffusion`: bundled in the zip, or beside us in a checkout, else None."""
+    root = Path(__file__).resolve().parent.parent
+    for folder in (root / "backend", root.parent / "backend"):
+        if (folder / "primdiffusion" / "serve.py").is_file():
+            return folder
+    return None
+
+
+def own_folder() -> Path:
+    """A writable folder of the extension's own; a temporary one when it runs from a checkout."""
+    try:
+        return Path(bpy.utils.extension_path_user(EXTENSION, create=True))
+    except ValueError:  # not installed as an extension
+        return Path(bpy.app.tempdir) / "primdiffusion"
+
+
+def preference(name: str) -> str:
+    """A path from the add-on's preferences, absolute; empty when unset or when the add-on is not enabled."""
+    addon = bpy.context.preferences.addons.get(EXTENSION)
+    value = getattr(addon.preferences, name, "") if addon is not None else ""
+    return bpy.path.abspath(value) if value else ""

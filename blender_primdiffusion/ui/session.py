@@ -1,0 +1,159 @@
+"""The one generation that may run at a time, and what becomes of it in the scene."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+import bpy
+
+from ..scene.human import build_human, overlap_warning
+from ..scene.human_file import HumanFileError
+from ..scene.volumes import VolumeWriteError
+from ..worker.client import BackendClient
+from ..worker.environment import find_backend_python
+from ..worker.job import Backend, GenerateJob
+from .places import backend_module_path, own_folder, preference
+
+TICK_S = 0.1
+_KEPT = "person.human.safetensors"
+
+
+class Busy(RuntimeError):
+    """A person is being generated already."""
+
+
+class GenerationFailed(RuntimeError):
+    """No person; the message is for the user."""
+
+
+class Session:
+    """Owns the child process and the running job. All methods are for Blender's main thread."""
+
+    def __init__(self) -> None:
+        self.job: GenerateJob | None = None
+        """The job under way, None when idle."""
+        self.error = ""
+        """Why the last generation failed, in a sentence; empty when it went well."""
+        self.notice = ""
+        """How the last generation ended otherwise."""
+        self.device = ""
+        """What the backend computes on, once it has said so."""
+        self._backend: Backend | None = None
+        self._backend_python = ""
+        self._folder: Path | None = None
+
+    @property
+    def busy(self) -> bool:
+        """A generation is under way."""
+        return self.job is not None
+
+    def start(self, seed: int, steps: int) -> None:
+        """Begin a generation. Raises Busy, or OSError when there is no folder to work in."""
+        if self.busy:
+            raise Busy("a person is being generated; wait for it or press Cancel")
+        self.error = self.notice = ""
+        self._folder = Path(tempfile.mkdtemp(prefix="generate_", dir=bpy.app.tempdir or None))
+        checkpoint = preference("checkpoint")
+        self.job = GenerateJob(
+            self._backend_for(preference("backend_python")),
+            seed=seed,
+            steps=steps,
+            out_dir=self._folder,
+            checkpoint=Path(checkpoint) if checkpoint else None,
+        )
+
+    def tick(self) -> bool:
+        """Take in news of the job; True when something visible changed. When it has finished, see `finish`."""
+        if self.job is None:
+            return False
+        changed = self.job.tick()
+        self.device = device_line(self.job.info) or self.device
+        return changed
+
+    def finish(self, context: bpy.types.Context) -> bpy.types.Collection | None:
+        """End the finished job: build its person as one undo step, or keep its error; None when it was cancelled.
+
+        Raises GenerationFailed with the sentence that `error` also holds. The session is idle afterwards in any case.
+        """
+        job, folder = self.job, self._folder
+        self.job = self._folder = None
+        if job is None or not job.finished:
+            raise RuntimeError("there is no finished job; call tick until job.finished")
+        try:
+            if job.state == "cancelled":
+                self.notice = job.message
+                return None
+            if job.state == "failed":
+                raise GenerationFailed(str(job.error))
+            return self._build(context, job)
+        except (GenerationFailed, HumanFileError, VolumeWriteError) as error:
+            self.error = _sentence(error)
+            raise GenerationFailed(self.error) from error
+        except Exception as error:
+            self.error = f"The person could not be built: {_sentence(error)}"
+            raise
+        finally:
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+
+    def cancel(self) -> None:
+        """Ask the job to stop; it ends within a step of the sampler."""
+        if self.job is not None:
+            self.job.cancel()
+
+    def close(self) -> None:
+        """Drop the job and end the child: the extension is going, or another file is loaded."""
+        self.job = None
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._folder = None
+        if self._backend is not None:
+            self._backend.shutdown()
+            self._backend = None
+
+    def _build(self, context: bpy.types.Context, job: GenerateJob) -> bpy.types.Collection:
+        started = time.monotonic()
+        human_npz = Path(job.result["human"])
+        keep = [path for path in (human_npz.parent / _KEPT,) if path.is_file()]
+        collection = build_human(context, human_npz, "Human", keep)
+        seconds = time.monotonic() - started
+        self.notice = overlap_warning(collection) or f"{job.message}, built in {seconds:.1f} s"
+        bpy.ops.ed.undo_push(message="Generate Human")
+        return collection
+
+    def _backend_for(self, python: str) -> Backend:
+        """The child of this interpreter; changing the preference ends the former one."""
+        if self._backend is not None and python == self._backend_python:
+            return self._backend
+        if self._backend is not None:
+            self._backend.shutdown()
+        module_path, cache = backend_module_path(), own_folder() / "cache"  # read here: the thread must not touch bpy
+        own_environment = own_folder() / "environment"
+
+        def make_client() -> BackendClient:
+            found = find_backend_python(python or None, own_environment, module_path, cache_dir=cache)
+            return BackendClient(found.path, module_path, cache_dir=cache)
+
+        self._backend, self._backend_python = Backend(make_client), python
+        return self._backend
+
+
+def device_line(info: dict) -> str:
+    """What the backend computes on, as the panel shows it; empty until known."""
+    device = info.get("device")
+    if isinstance(device, dict):
+        device = device.get("name") or device.get("kind")
+    return str(device) if device else ""
+
+
+def _sentence(error: BaseException) -> str:
+    text = str(error).strip() or type(error).__name__
+    text = text[:1].upper() + text[1:]
+    return text if text.endswith(".") else f"{text}."
+
+
+session = Session()
+"""Blender has one main thread and one user: one session."""

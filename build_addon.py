@@ -1,0 +1,92 @@
+"""Build the extension as one zip: the add-on, the backend as data, the default checkpoint.
+
+    python build_addon.py [--out dist]
+
+The same tree gives the same bytes. When `bpy` is installed, Blender's own extension tool validates the result.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import os
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent
+ADDON = ROOT / "blender_primdiffusion"
+BACKEND = ROOT / "backend" / "primdiffusion"
+FIXED_TIME = (1980, 1, 1, 0, 0, 0)
+LEFT_OUT_SUFFIXES = {".pyc", ".nbi", ".nbc", ".part"}
+STORED_SUFFIXES = {".safetensors", ".npz"}
+"""Compressed already, or not compressible: kept as they are, for a fast build and a fast install."""
+
+
+class BuildError(RuntimeError):
+    """The zip was not made or is not valid; the message says why."""
+
+
+def contents(addon: Path = ADDON, backend: Path = BACKEND) -> dict[str, Path]:
+    """Names in the zip to files, sorted by name: the add-on at the top, the backend under backend/primdiffusion."""
+    files = {"LICENSE": ROOT / "LICENSE"}
+    for root, prefix in ((addon, ""), (backend, "backend/primdiffusion/")):
+        for path in root.rglob("*"):
+            inside = path.relative_to(root)
+            hidden = any(part == "__pycache__" or part.startswith(".") for part in inside.parts)
+            if path.is_file() and not hidden and path.suffix not in LEFT_OUT_SUFFIXES:
+                files[prefix + inside.as_posix()] = path
+    return dict(sorted(files.items()))
+
+
+def build(out: Path) -> Path:
+    """Write `primdiffusion-<version>.zip` into `out` and return its path. Raises BuildError when a part is missing."""
+    manifest = tomllib.loads((ADDON / "blender_manifest.toml").read_text(encoding="utf-8"))
+    files = contents()
+    if "backend/primdiffusion/serve.py" not in files:
+        raise BuildError(f"the backend is missing in {BACKEND}; build from a complete checkout")
+    out.mkdir(parents=True, exist_ok=True)
+    target = out / f"{manifest['id']}-{manifest['version']}.zip"
+    unfinished = target.with_suffix(".zip.part")
+    with zipfile.ZipFile(unfinished, "w") as archive:
+        for name, path in files.items():
+            entry = zipfile.ZipInfo(name, FIXED_TIME)
+            entry.external_attr = 0o644 << 16
+            entry.compress_type = zipfile.ZIP_STORED if path.suffix in STORED_SUFFIXES else zipfile.ZIP_DEFLATED
+            archive.writestr(entry, path.read_bytes())
+    os.replace(unfinished, target)
+    return target
+
+
+def blender_extension_tool() -> Path | None:
+    """Blender's command line tool for extensions inside the installed `bpy`, or None without `bpy`."""
+    spec = importlib.util.find_spec("bpy")
+    if spec is None or spec.origin is None:
+        return None
+    return next(Path(spec.origin).parent.glob("*/scripts/addons_core/bl_pkg/cli/blender_ext.py"), None)
+
+
+def validate(archive: Path, tool: Path) -> None:
+    """Raises BuildError with the tool's words when Blender would refuse the zip."""
+    command = [sys.executable, str(tool), "validate", "--valid-tags", "", str(archive)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise BuildError(f"Blender's extension tool refuses {archive.name}: {(done.stdout + done.stderr).strip()}")
+
+
+def main() -> None:
+    """Build, validate, print the size."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder for the zip")
+    archive = build(parser.parse_args().out)
+    tool = blender_extension_tool()
+    if tool is not None:
+        validate(archive, tool)
+    checked = "valid" if tool is not None else "not validated: bpy is not installed"
+    print(f"{archive} ({archive.stat().st_size / 1e6:.1f} MB, {len(contents())} files, {checked})")
+
+
+if __name__ == "__main__":
+    main()
