@@ -241,3 +241,18 @@ def test_counts_that_make_nothing_are_refused(tmp_path):
 def test_person_is_frozen(people):
     with pytest.raises(dataclasses.FrozenInstanceError):
         people[0].betas = None
+
+
+@pytest.mark.slow
+def test_processes_make_the_same_files_as_one(assets, tmp_path):
+    environment = dict(os.environ)
+    alone = make_payloads(assets, tmp_path / "one", 3, 1, 11, 1)
+    reports = []
+    together = make_payloads(assets, tmp_path / "two", 3, 1, 11, 2, lambda done, total: reports.append(done))
+    assert [path.name for path in together] == [path.name for path in alone]
+    assert reports[0] == 0
+    assert reports[-1] == 3
+    assert dict(os.environ) == environment
+    for first, second in zip(alone, together, strict=True):
+        with np.load(first) as a, np.load(second) as b:
+            assert np.array_equal(a["voxels"], b["voxels"])

@@ -40,7 +40,7 @@ class BaseMesh:
     sample_betas: Float[np.ndarray, "N 10"]
     """Betas of the adults the shape space was fitted to; mean 0, standard deviation 1 in each component."""
     sample_phenotypes: Float[np.ndarray, "N 11"]
-    """What they were made from, each in [0, 1]; columns named by `phenotype_names` (gender 1 is male)."""
+    """What they were made from, each in [0, 1]; columns named by `phenotype_names` (gender 1 is female)."""
     phenotype_names: tuple[str, ...]
 
     def vertices(self, betas: Float[np.ndarray, "10"]) -> Float[np.ndarray, "19158 3"]:

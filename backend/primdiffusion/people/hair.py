@@ -82,7 +82,7 @@ def _curls(texels: TexelMap, island: Int[np.ndarray, " F"]) -> Strands:
     curls, tufts = _unit(gaussian_filter(noise[0], 2.0)), _unit(gaussian_filter(noise[1], 7.0))
     edge = gaussian_filter(texels.inside.astype(np.float32), 5)
     there = (island < 2)[texels.face] | (curls + tufts + 6 * (edge - 0.6) > 0)
-    return Strands(np.exp(0.3 * (curls + 0.5 * tufts)).astype(np.float32), np.where(there, 255, 0).astype(np.uint8))
+    return Strands(np.exp(0.2 * (curls + 0.5 * tufts)).astype(np.float32), np.where(there, 255, 0).astype(np.uint8))
 
 
 def _unit(field: np.ndarray) -> np.ndarray:

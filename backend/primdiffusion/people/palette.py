@@ -24,6 +24,7 @@ CLOTHES: dict[str, str] = {
     "detail": "9a9a94 c0a050 3a3a3c 2a2420",
     "shirt": "f2f2ee f2f2ee dfe6ee c9d8e8 e6d8dc 22242a 3f5f8f 7a2637 6b7a45 8d9196",
 }
+SOBER = ("trousers", "tights", "skirt", "suit", "shoe", "sock", "hat")
 HAIR: dict[str, str] = {
     "black": "14110f",
     "darkbrown": "2a1c14",
@@ -36,14 +37,15 @@ HAIR: dict[str, str] = {
     "grey": "8a8783",
     "white": "cfccc6",
 }
-CLOTHES_SPREAD, HAIR_SPREAD = (5.0, 4.0, 4.0), (2.5, 0.7, 1.2)
+CLOTHES_SPREAD, SOBER_SPREAD, HAIR_SPREAD = (5.0, 4.0, 4.0), (4.0, 1.5, 2.0), (2.5, 0.7, 1.2)
 """Standard deviations in Lab of colours about their palette entries."""
 
 
 def garment_colour(kind: str, draws: np.random.Generator) -> Float[np.ndarray, "3"]:
     """A linear colour that suits a kind of garment."""
     codes = CLOTHES[kind].split()
-    return _near(codes[draws.integers(len(codes))], draws, CLOTHES_SPREAD)
+    spread = SOBER_SPREAD if kind in SOBER else CLOTHES_SPREAD
+    return _near(codes[draws.integers(len(codes))], draws, spread)
 
 
 def contrasting(colour: Float[np.ndarray, "3"], kind: str, draws: np.random.Generator) -> Float[np.ndarray, "3"]:

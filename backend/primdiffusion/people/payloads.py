@@ -8,11 +8,12 @@ at all; a second run keeps the whole ones.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import multiprocessing
 import os
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from pathlib import Path
 
@@ -31,6 +32,7 @@ from primdiffusion.primitives.primitives import Frames, K, Payload, S
 
 VARIANT_STRIDE = 1 << 32
 """Variant j of the person with seed s is coloured with seed s + j * VARIANT_STRIDE."""
+THREAD_COUNTS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 KEYS = ("voxels", "betas", "attributes", "full_density", "seed")
 
 
@@ -70,7 +72,8 @@ def make_payloads(
             done += 1
             report(done, count)
         return paths
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _one_thread) as pool:
+    context = multiprocessing.get_context("spawn")
+    with _single_threaded_children(), ProcessPoolExecutor(workers, context, _one_thread) as pool:
         waiting = {pool.submit(write_person, assets, path, variants, person_seed) for path, person_seed in jobs}
         while waiting:
             finished, waiting = wait(waiting, timeout=1.0, return_when=FIRST_EXCEPTION)
@@ -132,6 +135,21 @@ def is_complete(path: Path, variants: int, seed: int) -> bool:
         return False
 
 
+@contextlib.contextmanager
+def _single_threaded_children() -> Iterator[None]:
+    """Processes started meanwhile keep numpy and numba to one thread: there are as many processes as cores."""
+    before = {name: os.environ.get(name) for name in THREAD_COUNTS}
+    os.environ.update(dict.fromkeys(THREAD_COUNTS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
 def _one_thread() -> None:
-    """Every process keeps to one core: there are as many processes as cores."""
+    """Keep torch, which does not heed all of the environment, to one thread."""
     torch.set_num_threads(1)

@@ -138,7 +138,7 @@ def _coloured(assets: Assets, base: BaseMesh, choice: Choice, mesh: TexturedMesh
     textures: dict[str, UInt8[np.ndarray, "H W 4"]] = {
         "body": skin.skin_texture(assets, complexion),
         "eyes": assets.picture(eyes, EYE_SIZE),
-        "eyebrows": hair.tinted_cutout(assets.picture(choice.eyebrows, BROW_SIZE), 0.5 * hair_linear),
+        "eyebrows": hair.tinted_cutout(assets.picture(choice.eyebrows, BROW_SIZE), 0.35 * hair_linear),
         "eyelashes": hair.tinted_cutout(assets.picture(choice.eyelashes, BROW_SIZE), np.full(3, 0.006)),
         "outfit": garments.coloured(garments.cloth(assets, base, choice.outfit), outfit),
         "shoes": garments.coloured(garments.cloth(assets, base, choice.shoes), shoes),

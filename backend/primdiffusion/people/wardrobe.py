@@ -89,8 +89,8 @@ HAIR: dict[Sex, tuple[str, ...]] = {
     "male": ("short01", "short02", "short04", "short03", "afro01"),
 }
 HAT_HAIR: dict[Sex, tuple[str, ...]] = {
-    "female": ("bob02", "long01", "short03"),
-    "male": ("short02", "short04", "short03"),
+    "female": ("bob02", "long01"),
+    "male": ("short02", "short04"),
 }
 EYEBROWS = tuple(f"eyebrows/eyebrow{number:03d}/eyebrow{number:03d}" for number in range(1, 13))
 EYELASHES = tuple(f"eyelashes/eyelashes{number:02d}/eyelashes{number:02d}" for number in range(1, 5))
