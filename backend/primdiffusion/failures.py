@@ -7,6 +7,7 @@ its traceback. Imports no torch: the child answers `hello` before torch is there
 from __future__ import annotations
 
 import dataclasses
+import re
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,8 +26,10 @@ def describe(error: BaseException) -> Failure | None:
     """The failure `error` stands for, or None where it is no domain error but a defect."""
     sentence = " ".join(str(error).split()) or type(error).__name__
     if _out_of_memory(error):
-        first = sentence.split(". ")[0]
-        return Failure("out_of_memory", f"the machine ran out of memory: {first[:200]}", MEMORY_REMEDY)
+        amount = re.search(r"[Tt]ried to allocate ([\d.]+ \w+)", sentence, re.ASCII)
+        wanted = f" when it asked for {amount[1]} more" if amount else ""
+        where = "graphics card" if "CUDA" in sentence else "machine"
+        return Failure("out_of_memory", f"the {where} ran out of memory{wanted}", MEMORY_REMEDY)
     if isinstance(error, ImportError):
         remedy = "install the backend's packages into the Python that runs it, or choose another Python"
         return Failure("environment", f"a package of the backend could not be loaded: {sentence}", remedy)

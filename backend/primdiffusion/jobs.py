@@ -97,7 +97,7 @@ def _step_reporter(report: Report) -> Callable[[Step], None]:
         times.append(time.perf_counter())
         done, eta = step.index + 1, None
         if len(times) > 1:
-            eta = round((times[-1] - times[0]) / (len(times) - 1) * (step.total - done), 2)
+            eta = round((times[-1] - times[0]) / (len(times) - 1) * (step.total - done), 3)
         report("sample", done, step.total, eta)
 
     return on_step

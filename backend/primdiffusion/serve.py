@@ -19,7 +19,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
 from primdiffusion import __version__
 from primdiffusion.failures import Failure, describe
@@ -157,12 +157,14 @@ class Server:
         self._queue.put(job)
 
     def _end(self) -> None:
+        """A job at work may tidy up first; with none there is nothing to wait for, not even torch being loaded."""
         self._ended.set()
         with self._lock:
-            if self._job is not None:
-                self._job.cancelled.set()
+            if self._job is None:
+                _leave(0)
+            self._job.cancelled.set()
         self._queue.put(None)
-        threading.Timer(GRACE_S, os._exit, [0]).start()
+        threading.Timer(GRACE_S, _leave, [0]).start()
 
     # heartbeat thread
 
@@ -272,8 +274,13 @@ def main() -> None:
         status = 130
     except OSError as e:
         print(f"the other end of the pipe is gone: {e}", file=sys.stderr)
+    _leave(status)
+
+
+def _leave(status: int) -> NoReturn:
+    """Ends the process from any thread. An ordinary exit would wait for the lock of a reader blocked on the pipe."""
     sys.stderr.flush()
-    os._exit(status)  # the reader may still be blocked on the pipe, and an ordinary exit would wait for its lock
+    os._exit(status)
 
 
 if __name__ == "__main__":

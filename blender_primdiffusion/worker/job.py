@@ -34,6 +34,14 @@ class Backend:
         self._make_client = make_client
         self._lock = threading.Lock()
         self._client: BackendClient | None = None
+        self._job: GenerateJob | None = None
+
+    def admit(self, job: GenerateJob) -> bool:
+        """Takes `job` as the one at work; False while another is."""
+        if self._job is not None and not self._job.finished:
+            return False
+        self._job = job
+        return True
 
     @property
     def client(self) -> BackendClient | None:
@@ -106,9 +114,13 @@ class GenerateJob:
         self.result: dict[str, Any] | None = None
         """Of generate: human, preview (paths), seed, steps, seconds."""
         self.error: JobError | None = None
-        self._connect_error: BaseException | None = None
+        self._connected: BackendClient | None = None
+        self._connect_error: Exception | None = None
         self._connecting = threading.Thread(target=self._connect, name="primdiffusion start", daemon=True)
-        self._connecting.start()
+        if backend.admit(self):
+            self._connecting.start()
+        else:
+            self._fail(JobError("a person is being generated already", "wait for it, or cancel it first", "busy"))
 
     @property
     def finished(self) -> bool:
@@ -160,19 +172,18 @@ class GenerateJob:
     def _tick_start(self) -> None:
         if self._connecting.is_alive():
             return
-        if self._connect_error is not None:
-            if self._cancel_asked_at is not None:
-                self._end("cancelled", "Cancelled")
-                return
-            sentence = str(self._connect_error).rstrip(".") or type(self._connect_error).__name__
-            self._fail(JobError(sentence, "", "environment"))
-            return
         self._client = self._connected
         if self._cancel_asked_at is not None:
             self._end("cancelled", "Cancelled")
-            return
-        self._request = self._client.request("generate", self._params)
-        if not self._client.info.get("ready"):
+        elif self._client is None:
+            sentence = str(self._connect_error).rstrip(".") or type(self._connect_error).__name__
+            self._fail(JobError(sentence, "", "environment"))
+        else:
+            self._ask(self._client)
+
+    def _ask(self, client: BackendClient) -> None:
+        self._request = client.request("generate", self._params)
+        if not client.info.get("ready"):
             self.message = "Loading PyTorch"
 
     # following

@@ -1,0 +1,288 @@
+"""The child as the protocol promises it to anyone: lines in, lines out."""
+
+import json
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from conversation import BUSY_STEPS, Conversation
+from PIL import Image
+from primdiffusion import __version__
+
+CANCELLED, DOMAIN_ERROR = -32001, -32002
+
+
+@pytest.fixture(scope="module")
+def child():
+    child = Conversation()
+    yield child
+    child.close()
+
+
+@pytest.fixture
+def own_child():
+    child = Conversation()
+    yield child
+    child.close()
+
+
+def test_hello_answers_before_torch_is_there_and_ready_names_the_device(own_child):
+    own_child.send(1, "hello")
+    hello = own_child.until(lambda m: True)
+    assert hello["id"] == 1, "hello comes before ready"
+    assert hello["result"]["version"] == __version__
+    assert hello["result"]["protocol"] == 1
+    assert hello["result"]["pid"] == own_child.process.pid
+    assert hello["result"]["memory_gb"] >= hello["result"]["memory_free_gb"] > 0
+    assert not hello["result"]["ready"]
+    assert hello["result"]["device"] is None
+    ready = own_child.until(lambda m: m.get("method") == "ready")["params"]
+    assert ready["ready"]
+    assert ready["problem"] is None
+    assert ready["device"] in ("cpu", "cuda")
+    assert own_child.ask(2, "hello")["result"]["device"] == ready["device"]
+
+
+def test_heartbeats_come_twice_a_second_while_the_child_is_idle(child):
+    child.ask(900, "hello")
+    child.until(lambda m: m.get("method") == "heartbeat")
+    began = time.monotonic()
+    for _ in range(4):
+        child.until(lambda m: m.get("method") == "heartbeat")
+    assert 1.5 < time.monotonic() - began < 3.0
+
+
+def test_generate_reports_every_step_and_leaves_whole_files(child, checkpoint, tmp_path):
+    out = tmp_path / "new" / "person ü"
+    child.send(10, "generate", seed=5, steps=6, out_dir=str(out), checkpoint=str(checkpoint))
+    steps = []
+
+    def collect(message):
+        if message.get("method") == "progress" and message["params"]["stage"] == "sample":
+            assert message["params"]["id"] == 10
+            steps.append((message["params"]["step"], message["params"]["total"], message["params"]["eta_s"]))
+        return message.get("id") == 10 and "method" not in message
+
+    result = child.until(collect)["result"]
+    assert [step for step, _, _ in steps] == list(range(7))
+    assert {total for _, total, _ in steps} == {6}
+    assert steps[-1][2] == 0
+    assert all(eta is not None for _, _, eta in steps[2:])
+    assert (result["seed"], result["steps"]) == (5, 6)
+    assert 0 < result["seconds_sampling"] < result["seconds"]
+    assert result["peak_gb"] > 0.1
+    assert sorted(path.name for path in out.iterdir()) == [
+        "depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png",
+    ]  # fmt: skip
+    with np.load(result["human"], allow_pickle=False) as human:
+        assert json.loads(str(human["meta"]))["seed"] == 5
+    with Image.open(result["preview"]) as picture:
+        assert picture.size == (512, 512)
+        assert np.asarray(picture).max() > 60
+
+
+def test_the_same_seed_gives_the_same_person_and_another_seed_another(child, checkpoint, tmp_path):
+    def rgb(id, seed, name):
+        out = tmp_path / name
+        child.ask(id, "generate", seed=seed, steps=2, out_dir=str(out), checkpoint=str(checkpoint))
+        with np.load(out / "human.npz") as human:
+            return human["rgb"]
+
+    first = rgb(20, 3, "a")
+    assert np.array_equal(first, rgb(21, 3, "b"))
+    assert not np.array_equal(first, rgb(22, 4, "c"))
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "id"),
+    [
+        (b"{", -32700, None),
+        (b"\xff\xfe", -32700, None),
+        (b"[" * 100_000, -32700, None),
+        (b"[]", -32600, None),
+        (b"3", -32600, None),
+        (b'{"jsonrpc": "2.0", "id": [1], "method": "hello"}', -32600, None),
+        (b'{"id": 31, "method": "hello"}', -32600, 31),
+        (b'{"jsonrpc": "2.0", "id": 32}', -32600, 32),
+        (b'{"jsonrpc": "2.0", "id": 33, "method": "hello", "params": [1]}', -32602, 33),
+        (b'{"jsonrpc": "2.0", "id": 34, "method": "dance"}', -32601, 34),
+        (b'{"jsonrpc": "2.0", "id": 35, "method": "hello", "params": {"x": 1}}', -32602, 35),
+        (b'{"jsonrpc": "2.0", "id": 36, "method": "generate", "params": {"seed": 1}}', -32602, 36),
+        (b'{"jsonrpc": "2.0", "id": 37, "method": "generate", "params": {"seed": true, "out_dir": "x"}}', -32602, 37),
+        (b'{"jsonrpc": "2.0", "id": 38, "method": "generate", "params": {"seed": -1, "out_dir": "x"}}', -32602, 38),
+        (b'{"jsonrpc":"2.0","id":39,"method":"generate","params":{"seed":1,"steps":0,"out_dir":"x"}}', -32602, 39),
+        (b'{"jsonrpc":"2.0","id":40,"method":"generate","params":{"seed":1,"steps":2.5,"out_dir":"x"}}', -32602, 40),
+        (b'{"jsonrpc":"2.0","id":41,"method":"render","params":{"human":"h","out":"o","width":0}}', -32602, 41),
+        (b'{"jsonrpc":"2.0","id":42,"method":"render","params":{"human":"h","out":"o","yaw":NaN}}', -32602, 42),
+        (b'{"jsonrpc": "2.0", "id": 43, "method": "cancel"}', -32602, 43),
+    ],
+)
+def test_a_malformed_line_gets_one_error_and_the_conversation_goes_on(child, line, code, id):
+    child.send_line(line)
+    error = child.answer(id)["error"]
+    assert error["code"] == code
+    assert "\n" not in error["message"]
+    assert child.ask(50, "hello")["result"]["name"] == "primdiffusion"
+
+
+def test_notifications_and_blank_lines_are_not_answered(child):
+    child.send_line(b"")
+    child.send_line(b'{"jsonrpc": "2.0", "method": "dance"}')
+    child.send(60, "hello")
+    assert child.until(lambda m: "method" not in m)["id"] == 60
+
+
+def test_a_second_generate_is_refused_while_one_runs_and_cancel_stops_the_first_within_a_step(
+    child, checkpoint, tmp_path
+):
+    first, second = tmp_path / "first", tmp_path / "second"
+    child.busy(70, first, checkpoint)
+    refusal = child.ask(71, "generate", seed=1, out_dir=str(second), checkpoint=str(checkpoint))["error"]
+    assert refusal["code"] == DOMAIN_ERROR
+    assert refusal["data"]["kind"] == "busy"
+    assert "70" in refusal["message"]
+    assert not second.exists()
+
+    assert child.ask(72, "cancel", id=999)["result"] == {"cancelled": False}
+    assert child.ask(73, "cancel", id=70)["result"] == {"cancelled": True}
+    after = []
+    end = child.until(lambda m: after.append(m) or m.get("id") == 70)
+    assert end["error"]["code"] == CANCELLED
+    assert sum(m.get("method") == "progress" for m in after) <= 1
+    assert not first.exists(), "a folder the cancelled job made is gone again"
+
+    done = child.ask(74, "generate", seed=1, steps=1, out_dir=str(second), checkpoint=str(checkpoint))
+    assert done["result"]["steps"] == 1
+
+
+def test_cancelling_in_a_folder_that_was_there_keeps_what_was_in_it(child, checkpoint, tmp_path):
+    (tmp_path / "human.npz").write_bytes(b"an older person")
+    child.busy(80, tmp_path, checkpoint)
+    child.ask(81, "cancel", id=80)
+    child.answer(80)
+    assert [path.name for path in tmp_path.iterdir()] == ["human.npz"]
+    assert (tmp_path / "human.npz").read_bytes() == b"an older person"
+
+
+def test_render_draws_a_saved_person_in_a_pose(child, checkpoint, tmp_path):
+    person = child.ask(90, "generate", seed=2, steps=2, out_dir=str(tmp_path), checkpoint=str(checkpoint))["result"]
+
+    def picture(id, name, **params):
+        out = tmp_path / name
+        child.ask(id, "render", human=person["person"], out=str(out), width=96, height=64, **params)
+        with Image.open(out) as image:
+            assert image.size == (96, 64)
+            return np.asarray(image).astype(float)
+
+    raised = [[0.0, 0.0, 0.0]] * 24
+    raised[16] = [0.0, 0.0, 1.2]
+    rest, posed, turned = picture(91, "r.png"), picture(92, "p.png", pose=raised), picture(93, "t.png", yaw=1.57)
+    assert np.abs(rest - posed).mean() > 1
+    width = [(image.sum((0, 2)) > 0).sum() for image in (rest, turned)]
+    assert width[1] < 0.5 * width[0], "from the side a T pose is narrow"
+    error = child.ask(94, "render", human=person["person"], out=str(tmp_path / "x.png"), pose=[1, 2])["error"]
+    assert error["code"] == DOMAIN_ERROR
+    assert "72" in error["message"]
+    assert not (tmp_path / "x.png").exists()
+
+
+@pytest.mark.parametrize("what", ["missing", "truncated", "text"])
+def test_a_bad_checkpoint_is_one_sentence_and_leaves_no_folder(child, checkpoint, tmp_path, what):
+    bad = tmp_path / "bad.safetensors"
+    if what == "truncated":
+        bad.write_bytes(checkpoint.read_bytes()[:5000])
+    elif what == "text":
+        bad.write_text("no tensors here")
+    out = tmp_path / "out"
+    error = child.ask(100, "generate", seed=1, steps=1, out_dir=str(out), checkpoint=str(bad))["error"]
+    assert error["code"] == DOMAIN_ERROR
+    assert error["data"]["kind"] == ("missing_file" if what == "missing" else "bad_input")
+    assert str(bad) in error["message"]
+    assert error["data"]["remedy"]
+    assert not out.exists()
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused_before_any_step(child, checkpoint, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("no folder")
+    for id, out in ((110, blocked), (111, blocked / "below")):
+        child.send(id, "generate", seed=1, steps=BUSY_STEPS, out_dir=str(out), checkpoint=str(checkpoint))
+        seen = []
+        error = child.until(lambda m, id=id, seen=seen: seen.append(m) or m.get("id") == id)["error"]
+        assert (error["code"], error["data"]["kind"]) == (DOMAIN_ERROR, "unwritable")
+        assert str(blocked) in error["message"]
+        assert not any(m.get("method") == "progress" for m in seen)
+
+
+def test_the_child_ends_when_its_input_does(own_child):
+    own_child.until(lambda m: m.get("method") == "ready")
+    own_child.process.stdin.close()
+    assert own_child.process.wait(1.0) == 0
+
+
+def test_the_child_ends_within_a_step_and_tidies_up_when_its_parent_goes_while_it_samples(
+    own_child, checkpoint, tmp_path
+):
+    out = tmp_path / "out"
+    own_child.busy(1, out, checkpoint)
+    own_child.process.stdin.close()
+    assert own_child.process.wait(1.0) == 0
+    assert not out.exists()
+
+
+def test_the_child_ends_when_nobody_reads_its_output(tmp_path):
+    process = subprocess.Popen([sys.executable, "-m", "primdiffusion.serve"], stdin=-1, stdout=-1, stderr=-1)
+    process.stdout.close()
+    assert process.wait(10) == 0
+    process.stdin.close()
+    process.stderr.close()
+
+
+def test_shutdown_is_answered_and_ends_the_child(own_child):
+    assert own_child.ask(1, "shutdown")["result"] == {}
+    assert own_child.process.wait(3.0) == 0
+
+
+NOISY = """
+import os, threading, time
+import primdiffusion.serve as serve
+
+def babble():
+    while True:
+        print("stray print")
+        os.write(1, b"stray write\\n")
+        time.sleep(0.002)
+
+guard = serve.guard_streams
+def guard_then_babble():
+    streams = guard()
+    threading.Thread(target=babble, daemon=True).start()
+    return streams
+serve.guard_streams = guard_then_babble
+serve.main()
+"""
+
+
+def test_stray_prints_and_writes_go_to_stderr_and_never_into_the_conversation(checkpoint, tmp_path):
+    child = Conversation(("-c", NOISY))
+    child.send(1, "generate", seed=1, steps=3, out_dir=str(tmp_path / "out"), checkpoint=str(checkpoint))
+    assert child.answer(1)["result"]["steps"] == 3
+    child.close()
+    assert child.stray_lines == []
+    assert child.stderr.count(b"stray print") > 10
+    assert child.stderr.count(b"stray write") > 10
+
+
+def test_a_broken_environment_still_says_hello_and_names_the_problem(tmp_path):
+    breaking = "import sys; sys.modules['torch'] = None; import primdiffusion.serve as serve; serve.main()"
+    child = Conversation(("-c", breaking))
+    assert child.ask(1, "hello")["result"]["name"] == "primdiffusion"
+    problem = child.until(lambda m: m.get("method") == "ready")["params"]["problem"]
+    assert problem is not None
+    assert "torch" in problem
+    error = child.ask(2, "generate", seed=1, out_dir=str(tmp_path / "out"))["error"]
+    assert error["data"]["kind"] == "environment"
+    assert not (tmp_path / "out").exists()
+    child.close()

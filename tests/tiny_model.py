@@ -1,0 +1,47 @@
+"""A checkpoint small enough to make in a test: person prior without networks, a codec of four numbers a primitive."""
+
+from pathlib import Path
+
+import torch
+from primdiffusion.diffusion.codec import LinearCodec
+from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
+from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.diffusion.model import STANDARD_SHAPES, CellCodec, DiffusionModel
+from primdiffusion.diffusion.schedule import SCHEDULES
+from primdiffusion.primitives.primitives import GRID, K, S
+from primdiffusion.training.checkpoint import save_checkpoint
+
+FULL_DENSITY = 100.0
+CHANNELS = 4
+COMPONENTS = 3
+
+
+def tiny_model() -> DiffusionModel:
+    """Grey people, solid below the skin, whose garment colours (red, green, blue as a whole) vary."""
+    voxels = torch.full((4, S, S, S), 0.5)
+    voxels[3] = torch.linspace(1.0, 0.0, S)[:, None, None]
+    basis = torch.zeros(CHANNELS, 4, S**3)
+    basis[torch.arange(CHANNELS), torch.arange(CHANNELS)] = S**-1.5
+    codec = LinearCodec(voxels.flatten().expand(K, -1).contiguous(), basis.flatten(1), torch.ones(CHANNELS), 0.5)
+    person = torch.zeros(COMPONENTS, CHANNELS, GRID * GRID)
+    person[torch.arange(COMPONENTS), torch.arange(COMPONENTS)] = 1 / GRID
+    prior = PersonPrior(
+        mean=torch.zeros(CHANNELS, GRID, GRID),
+        basis=person.flatten(1),
+        parity=torch.ones(COMPONENTS),
+        rest_variance=torch.full((CHANNELS, GRID, GRID), 0.01),
+        weight=torch.ones(1),
+        centre=torch.zeros(1, COMPONENTS),
+        axes=torch.eye(COMPONENTS)[None],
+        variance=torch.full((1, COMPONENTS), (1.5 * GRID) ** 2),
+    )
+    schedule = SCHEDULES["linear"]()
+    denoiser = PersonDenoiser(DenoiserConfig(person=None, local=None), prior, schedule)
+    card = {"name": "tiny", "full_density": FULL_DENSITY}
+    return DiffusionModel(denoiser, schedule, CellCodec(codec), STANDARD_SHAPES, FULL_DENSITY, card)
+
+
+def save_tiny_checkpoint(path: Path) -> Path:
+    """Writes `tiny_model` as a checkpoint file."""
+    save_checkpoint(path, tiny_model(), "linear")
+    return path
