@@ -61,8 +61,8 @@ def build_human(
                 human.primitive_weights,
                 volume_material(),
             )
-        collection[MARK] = _provenance(human)
-        context.scene.collection.children.link(collection)
+            collection[MARK] = _provenance(human)
+            context.scene.collection.children.link(collection)
     return collection
 
 

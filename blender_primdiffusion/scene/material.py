@@ -14,8 +14,8 @@ GAIN_NODE = "Density Gain"
 def volume_material(gain: float = DENSITY_GAIN) -> bpy.types.Material:
     """The shared material, made on first use.
 
-    With s = gain * density: Emission of strength s and colour Cd, and Absorption of density s in black, so a ray gathers the
-    integral of Cd s exp(-integral of s): premultiplied colour.
+    With s = gain * density: Emission of strength s and colour Cd, Absorption of density s in black; so a ray gathers
+    the integral of Cd s exp(-integral of s): premultiplied colour.
     """
     existing = bpy.data.materials.get(MATERIAL_NAME)
     if existing is not None and existing.node_tree is not None and GAIN_NODE in existing.node_tree.nodes:

@@ -18,7 +18,6 @@ from ..worker.job import Backend, GenerateJob
 from .places import backend_module_path, own_folder, preference
 
 TICK_S = 0.1
-_KEPT = "person.human.safetensors"
 
 
 class Busy(RuntimeError):
@@ -117,7 +116,7 @@ class Session:
     def _build(self, context: bpy.types.Context, job: GenerateJob) -> bpy.types.Collection:
         started = time.monotonic()
         human_npz = Path(job.result["human"])
-        keep = [path for path in (human_npz.parent / _KEPT,) if path.is_file()]
+        keep = [Path(job.result["person"])] if "person" in job.result else []  # for the exact marcher, later
         collection = build_human(context, human_npz, "Human", keep)
         seconds = time.monotonic() - started
         self.notice = overlap_warning(collection) or f"{job.message}, built in {seconds:.1f} s"

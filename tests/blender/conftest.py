@@ -1,0 +1,35 @@
+"""Blender as a module: one process, a user folder of its own, an empty scene for each test."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_blender_"))
+sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parent)]
+
+bpy = pytest.importorskip("bpy", reason="bpy is not installed: pip install -e .[blender]")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if Path(__file__).parent in item.path.parents:
+            item.add_marker("blender")
+
+
+@pytest.fixture
+def empty_scene():
+    """A context with an empty, unsaved file."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    return bpy.context
+
+
+@pytest.fixture
+def saved_scene(empty_scene, tmp_path):
+    """A context with an empty file saved as shot.blend."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    return empty_scene

@@ -1,0 +1,33 @@
+"""What Blender must show, computed with numpy alone."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+from synthetic import skinning
+
+Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""Blender from backend, written out by hand: forward +z becomes -y, up +y becomes +z."""
+TOLERANCE_M = 1e-5
+
+
+def blended_frames(human: dict, rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Rest frames moved by linear blend skinning [K, 4, 4], z up: (sum_j w_j G_j) [R | x]."""
+    frames = np.tile(np.eye(4), (len(human["position"]), 1, 1))
+    frames[:, :3, :3], frames[:, :3, 3] = human["rotation"], human["position"]
+    transforms = skinning(human["joints"], rotations, translation)
+    return Z_UP @ np.einsum("kj,jab->kab", human["primitive_weights"], transforms) @ frames
+
+
+def blended_vertices(human: dict, rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Rest vertices moved by linear blend skinning [V, 3], z up."""
+    transforms = np.einsum("vj,jab->vab", human["skin_weights"], skinning(human["joints"], rotations, translation))
+    homogeneous = np.concatenate([human["vertices"], np.ones((len(human["vertices"]), 1))], -1)
+    return np.einsum("ab,vbc,vc->va", Z_UP, transforms, homogeneous)[:, :3]
+
+
+def evaluated_matrices(collection: bpy.types.Collection) -> np.ndarray:
+    """World matrices [K, 4, 4] of a person's volumes, in the order of their names."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    volumes = sorted((o for o in collection.all_objects if o.type == "VOLUME"), key=lambda o: o.name)
+    return np.array([np.array(o.evaluated_get(depsgraph).matrix_world) for o in volumes])

@@ -1,0 +1,214 @@
+"""The whole person in the scene: follows linear blend skinning, survives saving, undo and removal, fails cleanly."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import bpy
+import numpy as np
+import pytest
+import synthetic
+from oracle import TOLERANCE_M, blended_frames, evaluated_matrices
+
+from blender_primdiffusion.scene import human as human_module
+from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.collect import collect_before_saving
+from blender_primdiffusion.scene.human import (
+    MARK,
+    armature_of,
+    build_human,
+    folder_of,
+    humans,
+    overlap_warning,
+    remove_human,
+)
+from blender_primdiffusion.scene.human_file import HumanFileError
+from blender_primdiffusion.scene.keyframes import keyframe_poses
+from blender_primdiffusion.scene.volumes import VolumeWriteError
+
+KINDS = ("objects", "collections", "volumes", "meshes", "armatures", "materials", "actions")
+
+
+def datablocks() -> dict[str, list[str]]:
+    return {kind: sorted(thing.name for thing in getattr(bpy.data, kind)) for kind in KINDS}
+
+
+def volume_files() -> list[str]:
+    return sorted(bpy.path.abspath(volume.filepath) for volume in bpy.data.volumes)
+
+
+@pytest.fixture
+def person(saved_scene, tmp_path):
+    """The synthetic person in shot.blend, as (collection, arrays)."""
+    return build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 48)), synthetic.arrays(48)
+
+
+def strong_pose(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return synthetic.axis_angle(rng.normal(0, 0.7, (24, 3))), rng.normal(0, 0.5, 3)
+
+
+def expected_matrices(collection, arrays, rotations, translation) -> np.ndarray:
+    bpy.context.view_layer.update()
+    return np.array(armature_of(collection).matrix_world) @ blended_frames(arrays, rotations, translation)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_volumes_follow_linear_blend_skinning_to_a_hundredth_of_a_millimetre(person, seed):
+    collection, arrays = person
+    rotations, translation = strong_pose(seed)
+    armature = armature_of(collection)
+    pose_from_joint_rotations(armature, rotations, translation)
+    armature.location, armature.rotation_euler, armature.scale = (1, -2, 0.5), (0.4, -0.3, 2.0), (1.2, 1.2, 1.2)
+    expected = expected_matrices(collection, arrays, rotations, translation)
+    corners = np.array([[x, y, z, 1] for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
+    error = np.abs((evaluated_matrices(collection) - expected) @ corners.T)[:, :3].max()
+    assert error < TOLERANCE_M
+
+
+def test_1024_volumes_follow_a_keyframed_walk(saved_scene, tmp_path):
+    arrays = synthetic.arrays(1024)
+    collection = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 1024))
+    assert sum(o.type == "VOLUME" for o in collection.all_objects) == 1024
+    assert len(list(folder_of(collection).glob("prim_*.vdb"))) == 1024
+    frames = np.arange(1, 9)
+    swing = np.zeros((8, 24, 3))
+    swing[:, 1, 0], swing[:, 2, 0] = 0.5 * np.sin(frames), -0.5 * np.sin(frames)
+    swing[:, 18, 1], swing[:, 16, 2] = 0.8 * np.cos(frames), -1.0
+    rotations, translations = synthetic.axis_angle(swing), np.stack([0 * frames, 0 * frames, 0.1 * frames], -1)
+    keyframe_poses(armature_of(collection), frames, rotations, translations)
+    for index in (0, 3, 7):
+        bpy.context.scene.frame_set(int(frames[index]))
+        expected = expected_matrices(collection, arrays, rotations[index], translations[index])
+        np.testing.assert_allclose(evaluated_matrices(collection)[:, :3, 3], expected[:, :3, 3], atol=TOLERANCE_M)
+        np.testing.assert_allclose(evaluated_matrices(collection), expected, atol=2e-5)
+
+
+def test_soles_stand_on_the_floor_and_the_person_faces_minus_y(person):
+    collection, arrays = person
+    assert armature_of(collection).location.z == pytest.approx(-arrays["vertices"][:, 1].min(), abs=1e-6)
+    bones = armature_of(collection).data.bones
+    assert bones["left_foot"].head_local.y < bones["left_ankle"].head_local.y
+    assert bones["left_hip"].head_local.x > 0
+
+
+def test_a_volume_covers_its_box_in_the_world(person):
+    collection, arrays = person
+    bpy.context.view_layer.update()
+    volume = next(o for o in collection.all_objects if o.type == "VOLUME" and o.name.endswith("prim_0007"))
+    low = np.min([list(corner) for corner in volume.bound_box], 0)
+    half = arrays["half_extent"][7]
+    step = 2 * half / 7
+    shift = step / 2 if bpy.app.version < (5, 0) else 0
+    np.testing.assert_allclose(low + shift, -half - 1.5 * step, rtol=1e-5)  # one voxel of padding, half a voxel of cell
+
+
+def test_one_material_serves_all_people(person, saved_scene, tmp_path):
+    build_human(saved_scene, synthetic.write(tmp_path / "second.npz", 8, seed=1))
+    assert len(bpy.data.materials) == 1
+    assert {volume.materials[0].name for volume in bpy.data.volumes} == {"PrimDiffusion Volume"}
+    assert len(humans(bpy.context.scene)) == 2
+
+
+def test_provenance_and_overlaps_are_kept_on_the_collection(person):
+    collection, arrays = person
+    stored = json.loads(collection[MARK])
+    assert stored["seed"] == 0
+    np.testing.assert_allclose(stored["betas"], arrays["betas"], atol=1e-6)
+    assert overlap_warning(collection) is None
+    collection[MARK] = json.dumps({**stored, "most_overlapping": 40})
+    assert "draws only 31" in overlap_warning(collection)
+
+
+def test_saving_and_loading_keeps_volumes_pose_and_relative_paths(person, tmp_path):
+    collection, arrays = person
+    rotations, translation = strong_pose(1)
+    pose_from_joint_rotations(armature_of(collection), rotations, translation)
+    assert all(v.filepath.startswith("//shot_humans/Human/prim_") for v in bpy.data.volumes)
+    bpy.ops.wm.save_mainfile()
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    shutil.move(tmp_path / "shot.blend", moved)
+    shutil.move(tmp_path / "shot_humans", moved)
+    bpy.ops.wm.open_mainfile(filepath=str(moved / "shot.blend"))
+    collection = humans(bpy.context.scene)[0]
+    expected = expected_matrices(collection, arrays, rotations, translation)
+    np.testing.assert_allclose(evaluated_matrices(collection), expected, atol=1e-5)
+    for volume in bpy.data.volumes:
+        assert volume.grids.load(), volume.grids.error_message
+        assert {grid.name for grid in volume.grids} == {"density", "Cd"}
+
+
+def test_a_person_built_before_the_first_save_is_collected_beside_the_blend(empty_scene, tmp_path):
+    keep = tmp_path / "person.human.safetensors"
+    keep.write_bytes(b"kept")
+    build_human(empty_scene, synthetic.write(tmp_path / "human.npz", 8), keep=[keep])
+    assert all(path.startswith(bpy.app.tempdir) for path in volume_files())
+    bpy.app.handlers.save_pre.append(collect_before_saving)
+    try:
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    finally:
+        bpy.app.handlers.save_pre.remove(collect_before_saving)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "shot.blend"))
+    assert all(volume.filepath.startswith("//shot_humans/Human/prim_") for volume in bpy.data.volumes)
+    assert all(volume.grids.load() for volume in bpy.data.volumes)
+    assert (tmp_path / "shot_humans" / "Human" / keep.name).read_bytes() == b"kept"
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_removal_takes_everything_but_the_files(person):
+    collection, _ = person
+    keyframe_poses(armature_of(collection), np.array([1]), np.tile(np.eye(3), (1, 24, 1, 1)), np.zeros((1, 3)))
+    files = volume_files()
+    remove_human(collection)
+    left = datablocks()
+    assert left.pop("materials") == ["PrimDiffusion Volume"]
+    assert not any(left.values())
+    assert all(shutil.os.path.exists(path) for path in files)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "NaN"])
+def test_a_corrupted_file_leaves_scene_and_disk_as_they_were(saved_scene, tmp_path, damage):
+    path = synthetic.write(tmp_path / "human.npz", 8)
+    if damage == "truncated":
+        path.write_bytes(path.read_bytes()[:5000])
+    else:
+        synthetic.write(path, 8, position=np.full((8, 3), np.nan))
+    files = sorted(tmp_path.rglob("*"))
+    with pytest.raises(HumanFileError):
+        build_human(saved_scene, path)
+    assert not any(datablocks().values())
+    assert sorted(tmp_path.rglob("*")) == files
+
+
+def test_an_unwritable_folder_leaves_the_scene_as_it_was(saved_scene, tmp_path):
+    (tmp_path / "shot_humans").write_text("in the way")
+    with pytest.raises(VolumeWriteError, match="write permission"):
+        build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 8))
+    assert not any(datablocks().values())
+
+
+def test_a_failure_in_the_middle_of_building_leaves_scene_and_disk_as_they_were(
+    person, saved_scene, tmp_path, monkeypatch
+):
+    before, files = datablocks(), volume_files()
+
+    def failing(*_):
+        raise MemoryError("no memory for the volumes")
+
+    monkeypatch.setattr(human_module, "_provenance", failing)
+    with pytest.raises(MemoryError):
+        build_human(saved_scene, synthetic.write(tmp_path / "second.npz", 8, seed=3))
+    assert datablocks() == before
+    assert sorted(str(path) for path in tmp_path.rglob("*.vdb")) == files
+    assert [path.name for path in (tmp_path / "shot_humans").iterdir()] == ["Human"]
+
+
+def test_building_from_edit_mode_works(saved_scene, tmp_path):
+    mesh = bpy.data.objects.new("cube", bpy.data.meshes.new("cube"))
+    saved_scene.scene.collection.objects.link(mesh)
+    saved_scene.view_layer.objects.active = mesh
+    bpy.ops.object.mode_set(mode="EDIT")
+    collection = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 8))
+    assert armature_of(collection).mode == "OBJECT"

@@ -1,0 +1,127 @@
+"""VDB files: their content, where it lies, their names, and that a failed write leaves nothing."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+import synthetic
+
+from blender_primdiffusion.scene import volumes
+from blender_primdiffusion.scene.overlap import most_overlapping
+from blender_primdiffusion.scene.volumes import VolumeWriteError, bake, file_name, index_to_local, window, written
+
+bpy.utils.expose_bundled_modules()
+import openvdb  # noqa: E402
+
+
+@pytest.fixture
+def human() -> dict:
+    return synthetic.arrays(6)
+
+
+@pytest.fixture
+def grids(human):
+    return bake(human["density"], human["rgb"], human["half_extent"])
+
+
+def test_the_window_is_the_marchers():
+    y = [-1 + 2 * i / 7 for i in range(8)]
+    assert window()[1, 2, 6] == pytest.approx(np.exp(-8 * (y[1] ** 8 + y[2] ** 8 + y[6] ** 8)), rel=1e-12)
+    assert window().max() > 0.999
+
+
+def test_files_hold_the_windowed_payload_at_half_precision_with_x_along_t(human, grids, tmp_path):
+    with written(grids, tmp_path / "h") as files:
+        pass
+    for k, path in enumerate(files):
+        read, _ = openvdb.readAll(str(path))
+        density, colour = sorted(read, key=lambda grid: grid.name, reverse=True)
+        assert (density.name, colour.name) == ("density", "Cd")
+        assert density.gridClass == openvdb.GridClass.FOG_VOLUME
+        values, colours = np.zeros((10, 10, 10), np.float32), np.zeros((10, 10, 10, 3), np.float32)
+        density.copyToArray(values)
+        colour.copyToArray(colours)
+        expected = human["density"][k] * window()
+        for d, h, w in ((0, 3, 5), (4, 4, 4), (7, 1, 2), (2, 6, 3)):
+            assert values[w + 1, h + 1, d + 1] == pytest.approx(expected[d, h, w], rel=1e-3, abs=1e-6)
+            np.testing.assert_allclose(colours[w + 1, h + 1, d + 1], human["rgb"][k][d, h, w], atol=1e-3)
+        assert values[1:9, 1:9, 1:9].sum() == pytest.approx(expected.sum(), rel=1e-3)
+        assert values.sum() == values[1:9, 1:9, 1:9].sum()
+        np.testing.assert_array_equal(colours[0], colours[1])
+
+
+def test_voxels_lie_corner_aligned_in_the_box(human, grids, tmp_path):
+    with written(grids, tmp_path / "h") as files:
+        pass
+    for k, path in enumerate(files):
+        transform = openvdb.read(str(path), "density").transform
+        half = human["half_extent"][k]
+        step = 2 * half / 7
+        drawn_too_high = 0.5 * step if bpy.app.version < (5, 0) else 0
+        np.testing.assert_allclose(np.add(transform.indexToWorld((1, 1, 1)), drawn_too_high), -half, atol=1e-7)
+        np.testing.assert_allclose(np.add(transform.indexToWorld((8, 8, 8)), drawn_too_high), half, atol=1e-7)
+
+
+def test_blender_before_5_gets_grids_half_a_voxel_lower():
+    half = np.array([0.07, 0.14, 0.21])
+    shift = index_to_local(half, (5, 0, 1))[3, :3] - index_to_local(half, (4, 5, 15))[3, :3]
+    np.testing.assert_allclose(shift, half / 7, atol=1e-15)
+
+
+def test_other_content_or_size_has_another_name(human, grids):
+    name = file_name(grids, 2, bpy.app.version)
+    assert name == file_name(bake(human["density"], human["rgb"], human["half_extent"]), 2, bpy.app.version)
+    changed = human["density"].copy()
+    changed[2, 4, 4, 4] += 1
+    assert name != file_name(bake(changed, human["rgb"], human["half_extent"]), 2, bpy.app.version)
+    assert name != file_name(bake(human["density"], human["rgb"] * 0.5, human["half_extent"]), 2, bpy.app.version)
+    assert name != file_name(bake(human["density"], human["rgb"], human["half_extent"] * 1.01), 2, bpy.app.version)
+
+
+def test_density_beyond_half_precision_is_clamped_not_infinite(human):
+    baked = bake(human["density"] * 1e6, human["rgb"], human["half_extent"])
+    assert np.isfinite(baked.density).all()
+
+
+def test_a_failure_inside_the_block_leaves_no_files_and_no_folders(grids, tmp_path):
+    with pytest.raises(KeyError), written(grids, tmp_path / "shot_humans" / "Human"):
+        raise KeyError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_made_is_named_and_nothing_is_left(grids, tmp_path):
+    (tmp_path / "shot_humans").write_text("a file where the folder should be")
+    with (
+        pytest.raises(VolumeWriteError, match=r"shot_humans.*write permission"),
+        written(grids, tmp_path / "shot_humans" / "H"),
+    ):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["shot_humans"]
+
+
+def test_a_full_disk_half_way_keeps_earlier_files_and_drops_the_new(human, grids, tmp_path, monkeypatch):
+    folder = tmp_path / "Human"
+    with written(grids, folder):
+        pass
+    before = sorted(folder.iterdir())
+    other = bake(human["density"] * 0.5, human["rgb"], human["half_extent"])
+    replace, calls = volumes.os.replace, []
+
+    def failing(source, target):
+        calls.append(target)
+        if len(calls) == 4:
+            raise OSError(28, "No space left on device")
+        replace(source, target)
+
+    monkeypatch.setattr(volumes.os, "replace", failing)
+    with pytest.raises(VolumeWriteError, match="No space left"), written(other, folder):
+        pass
+    assert sorted(folder.iterdir()) == before
+
+
+def test_overlaps_are_counted():
+    turned = synthetic.random_rotations(np.random.default_rng(0), 40)
+    assert most_overlapping(np.zeros((40, 3)), turned, np.full((40, 3), 0.03)) == 40
+    far = np.arange(40)[:, None] * np.array([1.0, 0, 0])
+    assert most_overlapping(far, turned, np.full((40, 3), 0.03)) == 1
