@@ -11,6 +11,7 @@ from primdiffusion.primitives.anchors import (
     CHARTS,
     LARGEST_IN_PLANE,
     NORMAL_HALF_EXTENT,
+    SPACING_TO_HALF_EXTENT,
     Anchors,
     anchor_skin_weights,
     attach,
@@ -114,7 +115,9 @@ def test_half_extents_follow_the_spacing_and_the_region():
         region = name.split("_")[-1]
         cells = ANCHORS.chart == index
         assert torch.allclose(extent[cells, 2], torch.tensor(NORMAL_HALF_EXTENT[region]))
-        expected = (0.9 * torch.stack([du[cells], dv[cells]], -1)).clamp(0.008, LARGEST_IN_PLANE[region])
+        expected = (SPACING_TO_HALF_EXTENT * torch.stack([du[cells], dv[cells]], -1)).clamp(
+            0.008, LARGEST_IN_PLANE[region]
+        )
         assert torch.allclose(extent[cells, :2], expected)
 
 

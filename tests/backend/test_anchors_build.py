@@ -11,6 +11,8 @@ from primdiffusion.geometry.uv_atlas import rasterise_uv
 from primdiffusion.primitives.anchors import (
     CHARTS,
     JOINT_REGION,
+    NORMAL_HALF_EXTENT,
+    SPACING_TO_HALF_EXTENT,
     attach,
     build_anchors,
     footprint_anchors,
@@ -70,7 +72,9 @@ def test_in_plane_sizes_come_from_the_uv_gradient():
     chord = SEGMENTS * 2 * RADIUS * math.sin(math.pi / SEGMENTS)
     assert torch.allclose(du.norm(dim=-1), torch.full((K,), chord / GRID, dtype=torch.float64))
     assert torch.allclose(dv.norm(dim=-1), torch.full((K,), HEIGHT / GRID, dtype=torch.float64))
-    expected = torch.tensor([0.05, 0.9 * HEIGHT / GRID, 0.05], dtype=torch.float64)
+    expected = torch.tensor(
+        [0.05, SPACING_TO_HALF_EXTENT * HEIGHT / GRID, NORMAL_HALF_EXTENT["arm"]], dtype=torch.float64
+    )
     assert torch.allclose(anchors.rest_half_extent, expected.expand(K, 3))
 
 
