@@ -171,29 +171,30 @@ def _gather(chunk, begin, first, last, k, direction, to_local, start, voxels, st
     for i in range((last - first) // stride[k] + 1):
         along = np.float32(i)
         lx, ly, lz = x + along * dx, y + along * dy, z + along * dz
-        x4, y4, z4 = lx * lx * lx * lx, ly * ly * ly * ly, lz * lz * lz * lz
-        fade = math.exp(sharpness * (x4 * x4 + y4 * y4 + z4 * z4))
         u, v, w = (lx + one) * half_range, (ly + one) * half_range, (lz + one) * half_range
         iu = min(max(np.int32(u), np.int32(0)), last_cell)
         iv = min(max(np.int32(v), np.int32(0)), last_cell)
         iw = min(max(np.int32(w), np.int32(0)), last_cell)
         fu, fv, fw = u - np.float32(iu), v - np.float32(iv), w - np.float32(iw)
-        near_u, near_v, near_w = np.uint32(iu), np.uint32(iv), np.uint32(iw)
-        far_u, far_v, far_w = np.uint32(iu + 1), np.uint32(iv + 1), np.uint32(iw + 1)
+        gu, gv, gw = one - fu, one - fv, one - fw
+        a0, b0, c0 = np.uint32(iu), np.uint32(iv), np.uint32(iw)
+        a1, b1, c1 = np.uint32(iu + 1), np.uint32(iv + 1), np.uint32(iw + 1)
+        d00 = box[c0, b0, a0, 3] * gu + box[c0, b0, a1, 3] * fu
+        d01 = box[c0, b1, a0, 3] * gu + box[c0, b1, a1, 3] * fu
+        d10 = box[c1, b0, a0, 3] * gu + box[c1, b0, a1, 3] * fu
+        d11 = box[c1, b1, a0, 3] * gu + box[c1, b1, a1, 3] * fu
+        density = (d00 * gv + d01 * fv) * gw + (d10 * gv + d11 * fv) * fw
+        if density == 0:  # the outer part of a person's boxes is empty
+            continue
+        x4, y4, z4 = lx * lx * lx * lx, ly * ly * ly * ly, lz * lz * lz * lz
+        opacity = density * math.exp(sharpness * (x4 * x4 + y4 * y4 + z4 * z4)) * length
         slot = np.uint32(first + i * stride[k] - begin)
-        red, green, blue, density = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-        for d, weight_d in ((near_w, one - fw), (far_w, fw)):
-            for h, weight_h in ((near_v, one - fv), (far_v, fv)):
-                for t, weight_t in ((near_u, one - fu), (far_u, fu)):
-                    weight = weight_d * weight_h * weight_t
-                    red += weight * box[d, h, t, 0]
-                    green += weight * box[d, h, t, 1]
-                    blue += weight * box[d, h, t, 2]
-                    density += weight * box[d, h, t, 3]
-        opacity = density * fade * length
-        chunk[slot, 0] += opacity * red
-        chunk[slot, 1] += opacity * green
-        chunk[slot, 2] += opacity * blue
+        for channel in range(3):
+            e00 = box[c0, b0, a0, channel] * gu + box[c0, b0, a1, channel] * fu
+            e01 = box[c0, b1, a0, channel] * gu + box[c0, b1, a1, channel] * fu
+            e10 = box[c1, b0, a0, channel] * gu + box[c1, b0, a1, channel] * fu
+            e11 = box[c1, b1, a0, channel] * gu + box[c1, b1, a1, channel] * fu
+            chunk[slot, channel] += opacity * ((e00 * gv + e01 * fv) * gw + (e10 * gv + e11 * fv) * fw)
         chunk[slot, 3] += opacity
 
 
