@@ -7,7 +7,7 @@ from bpy.app.handlers import persistent
 
 from ..scene.collect import collect_before_saving
 from . import operators, panel, preferences, properties
-from .session import session
+from .generation import session
 
 CLASSES = (
     preferences.PRIMDIFFUSION_AP_preferences,

@@ -6,7 +6,7 @@ import time
 
 import bpy
 
-from .session import TICK_S, Busy, GenerationFailed, session
+from .generation import TICK_S, Busy, GenerationFailed, session
 
 _OFFERED_S = 1.0
 """Between lines of progress on the console in background mode."""

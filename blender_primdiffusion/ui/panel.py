@@ -6,7 +6,7 @@ import textwrap
 
 import bpy
 
-from .session import session
+from .generation import session
 
 _LINE = 46
 

@@ -100,8 +100,7 @@ def test_a_volume_covers_its_box_in_the_world(person):
     low = np.min([list(corner) for corner in volume.bound_box], 0)
     half = arrays["half_extent"][7]
     step = 2 * half / 7
-    shift = step / 2 if bpy.app.version < (5, 0) else 0
-    np.testing.assert_allclose(low + shift, -half - 1.5 * step, rtol=1e-5)  # one voxel of padding, half a voxel of cell
+    np.testing.assert_allclose(low, -half - 1.5 * step, rtol=1e-5)  # one voxel of padding, half a voxel of cell
 
 
 def test_one_material_serves_all_people(person, saved_scene, tmp_path):

@@ -1,0 +1,187 @@
+"""Generate and Cancel as the user meets them, with the real client and a child that can be told to misbehave."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import bpy
+import pytest
+import synthetic
+
+import blender_primdiffusion
+from blender_primdiffusion.scene.human import folder_of, humans
+from blender_primdiffusion.ui import generation, operators
+from blender_primdiffusion.ui.generation import session
+from blender_primdiffusion.ui.operators import follow
+from blender_primdiffusion.ui.panel import PRIMDIFFUSION_PT_generate
+from blender_primdiffusion.worker.environment import BackendPython
+
+DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
+"""Seeds that the fake child takes as orders."""
+FAKE = Path(__file__).parent / "fake_backend"
+
+
+@pytest.fixture
+def addon(saved_scene, tmp_path, monkeypatch):
+    """The add-on registered from the checkout, on an interpreter that runs the fake child."""
+    monkeypatch.setenv("FAKE_HUMAN", str(synthetic.write(tmp_path / "prepared.npz", 8)))
+    python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
+    monkeypatch.setattr(generation, "find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr(generation, "backend_module_path", lambda: FAKE)
+    session.error = session.notice = session.device = ""
+    blender_primdiffusion.register()
+    yield saved_scene
+    blender_primdiffusion.unregister()
+
+
+def drive(seconds: float = 30.0) -> None:
+    """The timer's part, by hand: background mode runs no timers."""
+    end = time.monotonic() + seconds
+    while follow() is not None:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def panel_texts(context) -> list[str]:
+    layout = MagicMock()
+    PRIMDIFFUSION_PT_generate.draw(SimpleNamespace(layout=layout), context)
+    labels = [call.kwargs["text"] for call in layout.label.call_args_list]
+    buttons = [call.args[0] for call in layout.operator.call_args_list]
+    return labels + buttons + [call.kwargs["text"] for call in layout.progress.call_args_list]
+
+
+def test_generate_builds_a_person_and_keeps_the_backends_file_beside_its_volumes(addon):
+    assert bpy.ops.primdiffusion.generate(seed=7, steps=3) == {"FINISHED"}
+    (person,) = humans(addon.scene)
+    assert sum(o.type == "VOLUME" for o in person.all_objects) == 8
+    assert (folder_of(person) / "person.human.safetensors").read_bytes() == b"person"
+    assert not session.busy
+    assert session.error == ""
+    assert session.device == "fake device"
+
+
+def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_job(addon):
+    bpy.ops.ed.undo_push(message="before")
+    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    assert len(bpy.data.volumes) == 8
+    bpy.ops.ed.undo()
+    assert not humans(bpy.context.scene)
+    assert not bpy.data.volumes
+    bpy.ops.ed.redo()
+    assert len(humans(bpy.context.scene)) == 1
+    assert all(volume.grids.load() for volume in bpy.data.volumes)
+    assert not session.busy
+
+
+def test_generate_cannot_be_redone_with_a_slider():
+    assert not {"REGISTER", "UNDO"} & operators.PRIMDIFFUSION_OT_generate.bl_options
+
+
+@pytest.mark.parametrize(
+    ("seed", "sentence"), [(DIES, "ended by itself"), (FAILS, "checkpoint is damaged"), (GIVES_GARBAGE, "is damaged")]
+)
+def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, tmp_path, seed, sentence):
+    objects = len(bpy.data.objects)
+    with pytest.raises(RuntimeError, match=sentence) as caught:
+        bpy.ops.primdiffusion.generate(seed=seed, steps=1)
+    assert str(caught.value).count("Error:") == 1
+    assert len(bpy.data.objects) == objects
+    assert not (tmp_path / "shot_humans").exists()
+    assert not list(Path(bpy.app.tempdir).glob("generate_*"))
+    assert any(sentence in text for text in (" ".join(panel_texts(addon)),))
+
+
+def test_after_a_death_the_next_generation_works(addon):
+    with pytest.raises(RuntimeError):
+        bpy.ops.primdiffusion.generate(seed=DIES, steps=1)
+    assert bpy.ops.primdiffusion.generate(seed=7, steps=1) == {"FINISHED"}
+    assert session.error == ""
+
+
+def test_a_killed_child_is_reported_within_a_second(addon):
+    session.start(TAKES_LONG, 50)
+    while session.job.state != "running":
+        session.tick()
+        time.sleep(0.01)
+    session.job._client._process.kill()
+    killed = time.monotonic()
+    drive()
+    assert time.monotonic() - killed < 1.0
+    assert "killed by the system" in session.error
+    assert not humans(addon.scene)
+
+
+def test_a_second_click_is_one_clear_error_and_does_not_disturb_the_first(addon):
+    session.start(7, 2)
+    with pytest.raises(RuntimeError, match="being generated; wait for it or press Cancel"):
+        bpy.ops.primdiffusion.generate(seed=8, steps=1)
+    drive()
+    assert len(humans(addon.scene)) == 1
+
+
+def test_the_timer_builds_the_person_and_the_panel_shows_progress_then_the_result(addon):
+    assert "primdiffusion.generate" in panel_texts(addon)
+    session.start(TAKES_LONG, 2)
+    seen = []
+    while follow() is not None:
+        seen += panel_texts(addon)
+        time.sleep(0.05)
+        if len(seen) > 100:
+            bpy.ops.primdiffusion.cancel()
+    assert "primdiffusion.cancel" in seen
+    assert any("step" in text for text in seen)
+    session.start(7, 2)
+    drive()
+    assert len(humans(addon.scene)) == 1
+    assert any("built in" in text for text in panel_texts(addon))
+
+
+def test_cancel_ends_the_job_and_adds_nothing(addon):
+    assert not bpy.ops.primdiffusion.cancel.poll()
+    session.start(TAKES_LONG, 50)
+    for _ in range(20):
+        follow()
+        time.sleep(0.01)
+    assert bpy.ops.primdiffusion.cancel() == {"FINISHED"}
+    asked = time.monotonic()
+    drive()
+    assert time.monotonic() - asked < 2.0
+    assert (session.error, session.notice) == ("", "Cancelled")
+    assert not humans(addon.scene)
+
+
+def test_loading_another_file_drops_the_job(addon):
+    session.start(TAKES_LONG, 50)
+    follow()
+    bpy.ops.wm.read_homefile(use_empty=True)
+    assert not session.busy
+    assert follow() is None
+
+
+def test_an_interpreter_that_does_not_exist_is_named(saved_scene, monkeypatch):
+    monkeypatch.setattr(generation, "preference", lambda name: "/nowhere/python" if name == "backend_python" else "")
+    blender_primdiffusion.register()
+    try:
+        with pytest.raises(RuntimeError, match=r"/nowhere/python.*does not exist"):
+            bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    finally:
+        blender_primdiffusion.unregister()
+
+
+def test_registering_is_quick_and_imports_nothing_heavy():
+    program = (
+        "import bpy, sys, time; before = set(sys.modules); start = time.perf_counter();"
+        "import blender_primdiffusion as b;"
+        "b.register(); took = time.perf_counter() - start; heavy = {'torch', 'openvdb', 'scipy', 'primdiffusion'};"
+        "print(took, sorted(heavy & (set(sys.modules) - before))); b.unregister()"
+    )
+    root = Path(__file__).parents[2]
+    done = subprocess.run([sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=True)
+    took, heavy = done.stdout.split(maxsplit=1)
+    assert heavy.strip() == "[]"
+    assert float(took) < 0.1
