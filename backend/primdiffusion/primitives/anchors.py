@@ -42,7 +42,7 @@ JOINT_REGION = (
     "right_arm", "left_arm", "right_arm", "left_hand", "right_hand", "left_hand", "right_hand",
 )  # fmt: skip
 """Region of each of SMPL's 24 joints, in their order."""
-SPACING_TO_HALF_EXTENT = 0.9
+SPACING_TO_HALF_EXTENT = 1.0
 """In-plane half extent as a share of the distance to the next cell; 0.5 would tile. The marcher's window fades the
 outer fifth of a box, and boxes fan out where cloth hangs off the skin: of the surface of eight dressed people 94 %
 lies in the unfaded part of some box at 0.75, 97 % at 0.9, 97.6 % at 1.0 with coarser voxels."""
@@ -50,7 +50,7 @@ SMALLEST_IN_PLANE = 0.008
 """Metres; voxels finer than 2 mm are finer than any picture needs."""
 LARGEST_IN_PLANE = {"torso": 0.050, "head": 0.050, "arm": 0.050, "hand": 0.035, "leg": 0.050, "foot": 0.050}
 """Metres, by region. The cells at the thumb span the gap to the fingers and would fill it with one coarse box."""
-NORMAL_HALF_EXTENT = {"torso": 0.070, "head": 0.060, "arm": 0.050, "hand": 0.025, "leg": 0.070, "foot": 0.045}
+NORMAL_HALF_EXTENT = {"torso": 0.055, "head": 0.055, "arm": 0.045, "hand": 0.025, "leg": 0.060, "foot": 0.040}
 """Metres along the normal, by region. Jackets, skirts and hair stand 4-6 cm off the skin; a surface outside every box
 is a hole. Sleeves and shoes stand off less, and a hand's eight voxels must resolve fingers 2 cm thick."""
 RELEASED_NEIGHBOURS = 23
