@@ -69,7 +69,7 @@ class Session:
         if self.job is None:
             return False
         changed = self.job.tick()
-        self.device = device_line(self.job.info) or self.device
+        self.device = self.job.info.get("device_name") or self.device
         return changed
 
     def finish(self, context: bpy.types.Context) -> bpy.types.Collection | None:
@@ -138,14 +138,6 @@ class Session:
 
         self._backend, self._backend_python = Backend(make_client), python
         return self._backend
-
-
-def device_line(info: dict) -> str:
-    """What the backend computes on, as the panel shows it; empty until known."""
-    device = info.get("device")
-    if isinstance(device, dict):
-        device = device.get("name") or device.get("kind")
-    return str(device) if device else ""
 
 
 def _sentence(error: BaseException) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -108,7 +110,7 @@ def test_a_killed_child_is_reported_within_a_second(addon):
     while session.job.state != "running":
         session.tick()
         time.sleep(0.01)
-    session.job._client._process.kill()
+    os.kill(session._backend.client.pid, signal.SIGKILL)
     killed = time.monotonic()
     drive()
     assert time.monotonic() - killed < 1.0

@@ -48,7 +48,7 @@ for line in sys.stdin:
     request = json.loads(line)
     id, method = request["id"], request["method"]
     if method == "hello":
-        say(id=id, result={"version": "0-fake", "ready": True, "device": {"name": "fake device"}})
+        say(id=id, result={"version": "0-fake", "ready": True, "device": "cpu", "device_name": "fake device"})
     elif method == "generate":
         cancelled.clear()
         threading.Thread(target=generate, args=(id, request["params"], cancelled), daemon=True).start()

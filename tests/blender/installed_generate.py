@@ -1,0 +1,42 @@
+"""Run by test_addon_zip in a Blender of its own: install the zip, generate a person through the operator, report as
+JSON.
+
+python installed_generate.py ZIP CHECKPOINT_OR_EMPTY BLEND SEED STEPS
+"""
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import bpy
+
+archive, checkpoint, blend, seed, steps = sys.argv[1:]
+bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)
+(module,) = [name for name in bpy.context.preferences.addons.keys() if name.endswith(".primdiffusion")]  # noqa: SIM118
+addon = bpy.context.preferences.addons[module].preferences
+addon.backend_python, addon.checkpoint = sys.executable, checkpoint
+bpy.ops.wm.save_as_mainfile(filepath=blend)
+
+started = time.perf_counter()
+outcome = bpy.ops.primdiffusion.generate(seed=int(seed), steps=int(steps))
+seconds = time.perf_counter() - started
+bpy.ops.wm.save_mainfile()
+bpy.ops.wm.open_mainfile(filepath=blend)
+volumes = [o for o in bpy.context.scene.objects if o.type == "VOLUME"]
+armature = next(o for o in bpy.context.scene.objects if o.type == "ARMATURE")
+installed = Path(sys.modules[module].__file__).parent
+report = {
+    "outcome": sorted(outcome),
+    "module": module,
+    "volumes": len(volumes),
+    "loaded": sum(o.data.grids.load() for o in volumes),
+    "bones": len(armature.data.bones),
+    "files": len(list(Path(blend).parent.rglob("*.vdb"))),
+    "written_into_the_addon": [p.name for p in installed.rglob("*") if p.suffix in (".nbi", ".nbc")]
+    + [str(p) for p in (installed / "backend").rglob("*.pyc")],
+    "backend_in_zip": (installed / "backend" / "primdiffusion" / "serve.py").is_file(),
+    "seconds": seconds,
+}
+bpy.ops.preferences.addon_disable(module=module)
+print("REPORT " + json.dumps(report), flush=True)

@@ -1,0 +1,75 @@
+"""The zip a user installs: complete, reproducible, accepted by Blender; it generates with the real child."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import build_addon
+
+ROOT = Path(__file__).resolve().parents[2]
+WEIGHTS = ROOT / "backend" / "primdiffusion" / "weights" / "default.safetensors"
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory) -> Path:
+    return build_addon.build(tmp_path_factory.mktemp("dist"))
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory) -> str:
+    """Empty, for the checkpoint in the zip; until there is one, a tiny one."""
+    if WEIGHTS.is_file():
+        return ""
+    from tiny_model import save_tiny_checkpoint
+
+    return str(save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "tiny.safetensors"))
+
+
+def test_the_same_tree_gives_the_same_bytes(archive, tmp_path):
+    assert build_addon.build(tmp_path).read_bytes() == archive.read_bytes()
+
+
+def test_the_zip_holds_addon_backend_and_licence_and_nothing_stray(archive):
+    names = zipfile.ZipFile(archive).namelist()
+    assert names == sorted(names)
+    wanted = {"blender_manifest.toml", "__init__.py", "LICENSE", "worker/client.py", "scene/human.py"}
+    wanted |= {"backend/primdiffusion/serve.py", "backend/primdiffusion/body/data/body.npz"}
+    assert wanted <= set(names)
+    assert not [name for name in names if "__pycache__" in name or name.endswith((".pyc", ".nbi", ".nbc"))]
+    assert WEIGHTS.is_file() == ("backend/primdiffusion/weights/default.safetensors" in names)
+
+
+def test_blenders_own_tool_accepts_the_zip_and_refuses_one_without_a_licence(archive, tmp_path):
+    tool = build_addon.blender_extension_tool()
+    assert tool is not None
+    build_addon.validate(archive, tool)
+    spoiled = tmp_path / "spoiled.zip"
+    with zipfile.ZipFile(archive) as source, zipfile.ZipFile(spoiled, "w") as target:
+        manifest = source.read("blender_manifest.toml").decode()
+        target.writestr("blender_manifest.toml", manifest.replace("license", "licence"))
+        target.writestr("__init__.py", source.read("__init__.py"))
+    with pytest.raises(build_addon.BuildError, match="licen"):
+        build_addon.validate(spoiled, tool)
+
+
+def test_the_installed_zip_generates_a_person_through_its_operator(archive, checkpoint, tmp_path):
+    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
+    (tmp_path / "user").mkdir()
+    program = Path(__file__).parent / "installed_generate.py"
+    command = [sys.executable, str(program), str(archive), checkpoint, str(tmp_path / "shot.blend"), "7", "3"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, cwd=tmp_path)
+    reports = [line for line in done.stdout.splitlines() if line.startswith("REPORT ")]
+    assert reports, done.stdout[-3000:] + done.stderr[-3000:]
+    report = json.loads(reports[0].removeprefix("REPORT "))
+    assert report["outcome"] == ["FINISHED"]
+    assert report["module"] == "bl_ext.user_default.primdiffusion"
+    assert (report["volumes"], report["loaded"], report["bones"], report["files"]) == (1024, 1024, 24, 1024)
+    assert report["backend_in_zip"]
+    assert report["written_into_the_addon"] == []
