@@ -14,13 +14,13 @@ from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.primitives.primitives import Frames, Payload, S
 from primdiffusion.primitives.surface_points import carve, look_around, nearest, visible_points
 
-FULL_DENSITY = 200.0
+FULL_DENSITY = 100.0
 """Opacity per metre of solid matter; one over this is the depth at which solid matter hides what is behind it."""
-RAMP = 0.010
+RAMP = 0.020
 """Depth below the surface at which density is full, metres. A ramp centred on the surface would fatten silhouettes."""
-INSET = 0.35
+INSET = 0.2
 """Depth at which the ramp starts, in voxel spacings across the surface: between an outer voxel and an inner one density
-is interpolated, and without this the figure grows by several millimetres."""
+is interpolated, and without this the figure grows by about 3 mm."""
 REACH = 0.030
 """Voxels farther than this from the surface have no colour of their own, metres."""
 MIP_LEVELS = 6
