@@ -17,6 +17,10 @@ class Failure:
     kind: str
     sentence: str
     remedy: str
+    """What to do next; empty where the sentence, being ours, says it already."""
+
+    def __str__(self) -> str:
+        return f"{self.sentence}: {self.remedy}" if self.remedy else self.sentence
 
 
 MEMORY_REMEDY = "close other programs, or choose a smaller checkpoint or picture, then try again"
@@ -36,11 +40,11 @@ def describe(error: BaseException) -> Failure | None:
     if isinstance(error, PermissionError | NotADirectoryError | IsADirectoryError):
         return Failure("unwritable", _of_file(error), "choose a folder and files that you may read and write")
     if isinstance(error, FileNotFoundError):
-        return Failure("missing_file", _of_file(error), "check the path, or make the file first")
+        return Failure("missing_file", _of_file(error), "check the path" if error.strerror else "")
     if isinstance(error, OSError):
         return Failure("file_system", _of_file(error), "check the disk's free space and the path, then try again")
     if isinstance(error, ValueError):
-        return Failure("bad_input", sentence, "correct what the sentence names and try again")
+        return Failure("bad_input", sentence, "")
     return None
 
 

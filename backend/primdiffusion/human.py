@@ -110,9 +110,9 @@ def place(
 
 
 def framing(primitives: Primitives, yaw: float = 0.0, width: int = 512, height: int = 512) -> Camera:
-    """A level camera that just sees all of `primitives`: yaw 0 looks at the person's face, pi/2 (radians) at their left.
+    """A level camera that just sees all of `primitives`; it stands at the height of their middle.
 
-    Stands at the height of their middle, 30 degrees of view from top to bottom.
+    `yaw` in radians: 0 looks at the person's face, pi/2 at their left side. 30 degrees of view from top to bottom.
     """
     reach = primitives.rotation.abs() @ primitives.half_extent[..., None]
     corners = torch.cat([primitives.position - reach[..., 0], primitives.position + reach[..., 0]]).detach()

@@ -77,7 +77,11 @@ class JobError:
     log: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        return f"{self.message}. {self.remedy[:1].upper()}{self.remedy[1:]}." if self.remedy else f"{self.message}."
+        return " ".join(_sentence(part) for part in (self.message, self.remedy) if part)
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
 class GenerateJob:
@@ -176,7 +180,7 @@ class GenerateJob:
         if self._cancel_asked_at is not None:
             self._end("cancelled", "Cancelled")
         elif self._client is None:
-            sentence = str(self._connect_error).rstrip(".") or type(self._connect_error).__name__
+            sentence = str(self._connect_error) or type(self._connect_error).__name__
             self._fail(JobError(sentence, "", "environment"))
         else:
             self._ask(self._client)
@@ -249,4 +253,4 @@ class GenerateJob:
         self._end("failed", str(error))
 
     def _end(self, state: State, message: str) -> None:
-        self.state, self.message, self.eta_s = state, message[:1].upper() + message[1:], None
+        self.state, self.message, self.eta_s = state, message, None

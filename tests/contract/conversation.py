@@ -65,7 +65,9 @@ class Conversation:
     def busy(self, id: int, out_dir: Path, checkpoint: Path, steps: int = BUSY_STEPS) -> None:
         """Starts a long generate and returns when it has taken three steps."""
         self.send(id, "generate", seed=1, steps=steps, out_dir=str(out_dir), checkpoint=str(checkpoint))
-        self.until(lambda m: m.get("method") == "progress" and m["params"]["stage"] == "sample" and m["params"]["step"] > 2)
+        self.until(
+            lambda m: m.get("method") == "progress" and m["params"]["stage"] == "sample" and m["params"]["step"] > 2
+        )
 
     def close(self) -> None:
         with contextlib.suppress(OSError):

@@ -1,0 +1,215 @@
+"""The command line, for people who never open Blender: `primdiffusion generate --seed 7 --out DIR`.
+
+Exit codes: 0 done, 1 an error of input, files or memory (one sentence on stderr), 2 wrong usage, 70 a defect of ours
+(with its traceback), 130 interrupted. Results are printed on stdout, progress on stderr. torch is imported by the
+commands that need it, so `--help` is quick.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import sys
+import time
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from primdiffusion import __version__
+from primdiffusion.failures import describe
+from primdiffusion.job_params import LARGEST_PICTURE, LARGEST_SEED
+
+TRACEBACK = "--traceback"
+DEFECT = 70
+INTERRUPTED = 130
+DESCRIPTION = f"""PrimDiffusion {__version__}: people as 1024 small volumes, from noise to pictures.
+
+{TRACEBACK}, anywhere on the line, shows where an error came from."""
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
+
+
+@dataclasses.dataclass(frozen=True)
+class Generate:
+    """Generate people: human.npz for Blender, person.human.safetensors to keep, and pictures."""
+
+    out: Path
+    """Folder to write to; with --count above 1, a folder for each person in it."""
+    seed: int = 0
+    """Which person: the same seed gives the same one."""
+    steps: int = 30
+    """Sampler steps, 1 to 1000."""
+    sampler: Literal["ddim", "ddpm"] = "ddim"
+    """ddim: few steps; ddpm: the paper's, wants hundreds."""
+    checkpoint: Path | None = None
+    """Trained model (.safetensors); without it the one that comes with the package."""
+    count: int = 1
+    """How many people, with seeds following on each other."""
+
+    def run(self) -> None:
+        """Generates, and prints the folder of each person."""
+        if self.count < 1 or not 0 <= self.seed <= LARGEST_SEED + 1 - self.count:
+            raise ValueError(f"seed {self.seed} with count {self.count}: seeds run from 0 to 2^63-1, counts from 1")
+        from tqdm import tqdm
+
+        from primdiffusion.human import generate
+        from primdiffusion.machine import best_device
+        from primdiffusion.person_folder import write_person
+        from primdiffusion.staging import staged
+        from primdiffusion.training.checkpoint import load_checkpoint
+
+        model = None
+        for seed in range(self.seed, self.seed + self.count):
+            began = time.perf_counter()
+            folder = self.out if self.count == 1 else self.out / f"seed_{seed:06d}"
+            with staged(folder) as unfinished:
+                model = load_checkpoint(self.checkpoint, best_device()) if model is None else model
+                with tqdm(total=self.steps, desc=f"seed {seed}", unit="step", disable=None) as bar:
+                    human = generate(model, seed, self.steps, self.sampler, lambda _, bar=bar: bar.update())
+                write_person(unfinished, human)
+            print(f"{folder}  seed {seed}, {self.steps} steps, {time.perf_counter() - began:.1f} s")
+
+
+@dataclasses.dataclass(frozen=True)
+class Render:
+    """Draw a person in a pose."""
+
+    human: tyro.conf.Positional[Path]
+    """A .human.safetensors file."""
+    out: Path
+    """PNG to write."""
+    yaw: float = 0.0
+    """Degrees around the person: 0 the face, 90 their left side."""
+    pose: Path | None = None
+    """.json or .npz with 72 axis-angle numbers (24 joints x 3, radians); without it the T pose."""
+    frame: int = 0
+    """Which frame of a pose file that holds several."""
+    size: int = 512
+    """Width and height, pixels."""
+    background: Literal["black", "white", "transparent"] = "black"
+    """What is behind the person."""
+    depth: Path | None = None
+    """A second PNG: depth in colours, bright where near."""
+
+    def run(self) -> None:
+        """Draws, and prints the picture's path."""
+        if not 1 <= self.size <= LARGEST_PICTURE:
+            raise ValueError(f"size {self.size} is outside 1 ... {LARGEST_PICTURE} pixels: choose another")
+        from primdiffusion.human import framing, place
+        from primdiffusion.human_file import load_human
+        from primdiffusion.pose_file import read_pose
+        from primdiffusion.render.image import depth_to_png, to_png
+        from primdiffusion.render.march import march
+
+        human = load_human(self.human)
+        primitives = place(human, None if self.pose is None else read_pose(self.pose, self.frame))
+        rendering = march(primitives, framing(primitives, math.radians(self.yaw), self.size, self.size))
+        to_png(self.out, rendering, BACKGROUNDS[self.background])
+        if self.depth is not None:
+            depth_to_png(self.depth, rendering)
+        print(self.out)
+
+
+@dataclasses.dataclass(frozen=True)
+class Info:
+    """Say what this installation, a checkpoint or a person is, as JSON."""
+
+    file: tyro.conf.Positional[Path | None] = None
+    """A .human.safetensors or a checkpoint; without it versions, device, memory and the default checkpoint's card."""
+
+    def run(self) -> None:
+        """Prints one JSON object."""
+        import torch
+
+        from primdiffusion.human_file import HumanFileError, load_human
+        from primdiffusion.machine import best_device, device_info, memory
+        from primdiffusion.training.checkpoint import default_checkpoint, read_card
+
+        if self.file is None:
+            path = default_checkpoint()
+            card = read_card(path) if path.exists() else None
+            about = {"version": __version__, "torch": torch.__version__, **device_info(best_device()), **memory()}
+            print(json.dumps({**about, "checkpoint": card}, indent=2))
+            return
+        try:
+            human = load_human(self.file)
+        except HumanFileError:
+            print(json.dumps(dict(read_card(self.file)), indent=2))
+        else:
+            print(
+                json.dumps({**human.provenance, "betas": [round(beta, 4) for beta in human.betas.tolist()]}, indent=2)
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class People:
+    """Make dressed people from a MakeHuman asset folder, as training data (own --help)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train the diffusion model on such people (own --help)."""
+
+
+Command = (
+    Annotated[Generate, tyro.conf.subcommand("generate")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Info, tyro.conf.subcommand("info")]
+    | Annotated[People, tyro.conf.subcommand("people")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
+)
+
+
+def _people(arguments: Sequence[str]) -> None:
+    from primdiffusion.people.command import PeopleCommand, run
+
+    run(tyro.cli(PeopleCommand, args=arguments, prog="primdiffusion people"))
+
+
+def _train(arguments: Sequence[str]) -> None:
+    import logging
+
+    from primdiffusion.training.config import TrainingConfig
+    from primdiffusion.training.diffuse import train
+
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    train(tyro.cli(TrainingConfig, args=arguments, prog="primdiffusion train"))
+
+
+FORWARDED = {"people": _people, "train": _train}
+"""Commands whose parameters their own modules state; importing these takes a second, so only when asked for."""
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parses and runs one command line, errors as exceptions."""
+    if arguments and arguments[0] in FORWARDED:
+        FORWARDED[arguments[0]](arguments[1:])
+        return
+    command = tyro.cli(Command, args=arguments or ["--help"], prog="primdiffusion", description=DESCRIPTION)
+    assert isinstance(command, Generate | Render | Info), "people and train are forwarded"
+    command.run()
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The console script; ends the process with the exit codes above."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        run([argument for argument in given if argument != TRACEBACK])
+    except KeyboardInterrupt:
+        print("primdiffusion: interrupted", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    except Exception as e:
+        failure = describe(e)
+        if failure is None or TRACEBACK in given:
+            traceback.print_exc()
+        if failure is None:
+            sys.exit(DEFECT)
+        print(f"primdiffusion: {failure}", file=sys.stderr)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

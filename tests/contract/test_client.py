@@ -1,0 +1,239 @@
+"""Blender's side of the pipe with the real child, and with children that misbehave."""
+
+import os
+import signal
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+from conversation import BUSY_STEPS
+from worker.client import (
+    BackendClient,
+    Died,
+    Failure,
+    Notification,
+    Response,
+    Silent,
+    child_environment,
+    death_sentence,
+)
+
+PYTHON = Path(sys.executable)
+
+
+def wait_for(client: BackendClient, wanted, timeout_s: float = 60, into: list | None = None):
+    """The first event that `wanted` accepts; all events seen go `into` a list."""
+    seen = into if into is not None else []
+    end = time.monotonic() + timeout_s
+    while time.monotonic() < end:
+        for event in client.poll():
+            seen.append(event)
+            if wanted(event):
+                return event
+        time.sleep(0.005)
+    raise AssertionError(f"not within {timeout_s} s; seen {seen}; stderr {client.stderr}")
+
+
+def sampling(event) -> bool:
+    return isinstance(event, Notification) and event.params.get("stage") == "sample" and event.params["step"] > 2
+
+
+@pytest.fixture
+def client():
+    client = BackendClient(PYTHON)
+    client.start()
+    yield client
+    client.kill()
+
+
+@pytest.fixture
+def fake_child(tmp_path):
+    """A client whose child is a script of a few lines in place of the backend."""
+    clients = []
+
+    def make(script: str, **settings) -> BackendClient:
+        package = tmp_path / "backend" / "primdiffusion"
+        package.mkdir(parents=True)
+        (package / "__init__.py").touch()
+        (package / "serve.py").write_text("import json, os, sys, time\n" + textwrap.dedent(script), encoding="utf-8")
+        client = BackendClient(PYTHON, tmp_path / "backend", **settings)
+        clients.append(client)
+        client.start()
+        return client
+
+    yield make
+    for client in clients:
+        client.kill()
+
+
+def test_info_fills_from_hello_and_then_from_ready(client):
+    assert client.info == {}
+    wait_for(client, lambda e: isinstance(e, Response))
+    assert client.info["protocol"] == 1
+    assert client.info["pid"] == client.pid
+    wait_for(client, lambda e: isinstance(e, Notification) and e.method == "ready")
+    assert client.info["ready"]
+    assert client.info["device"] in ("cpu", "cuda")
+    assert client.alive
+
+
+def test_a_killed_child_is_one_clear_event_within_a_second(client, checkpoint, tmp_path):
+    out = tmp_path / "out"
+    client.request("generate", {"seed": 1, "steps": BUSY_STEPS, "out_dir": str(out), "checkpoint": str(checkpoint)})
+    wait_for(client, sampling)
+    os.kill(client.pid, signal.SIGKILL)
+    began = time.monotonic()
+    died = wait_for(client, lambda e: isinstance(e, Died), 5)
+    assert time.monotonic() - began < 1.0
+    assert died.exit_code == -signal.SIGKILL
+    assert "killed" in died.message
+    assert not client.alive
+    time.sleep(0.3)
+    assert client.poll() == []
+    assert not (out / "human.npz").exists()
+
+
+def test_a_request_to_a_dead_child_is_no_error_of_its_own(client):
+    os.kill(client.pid, signal.SIGKILL)
+    wait_for(client, lambda e: isinstance(e, Died))
+    client.request("hello", {})
+    assert client.poll() == []
+
+
+def test_shutdown_ends_the_child_without_a_died_event(client):
+    wait_for(client, lambda e: isinstance(e, Response))
+    pid = client.pid
+    client.shutdown()
+    assert not client.alive
+    assert not any(isinstance(event, Died) for event in client.poll())
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+    client.shutdown()
+
+
+def test_a_cancel_fails_the_request_with_its_code(client, checkpoint, tmp_path):
+    out = tmp_path / "out"
+    params = {"seed": 1, "steps": BUSY_STEPS, "out_dir": str(out), "checkpoint": str(checkpoint)}
+    id = client.request("generate", params)
+    wait_for(client, sampling)
+    client.cancel(id)
+    failure = wait_for(client, lambda e: isinstance(e, Failure))
+    assert (failure.id, failure.code) == (id, -32001)
+    assert not out.exists()
+
+
+def test_starting_a_python_that_is_not_there_raises(tmp_path):
+    with pytest.raises(OSError, match="no-such-python"):
+        BackendClient(tmp_path / "no-such-python").start()
+
+
+def test_a_child_that_dies_at_once_reports_its_exit_code_and_last_words(fake_child):
+    client = fake_child("""
+        print("libtorch is missing", file=sys.stderr)
+        sys.exit(3)
+    """)
+    died = wait_for(client, lambda e: isinstance(e, Died))
+    assert died.exit_code == 3
+    assert died.stderr == ("libtorch is missing",)
+
+
+def test_the_last_messages_of_a_dying_child_come_before_its_death(fake_child):
+    client = fake_child("""
+        for i in range(500):
+            print(json.dumps({"jsonrpc": "2.0", "method": "progress", "params": {"i": i}}))
+    """)
+    seen = []
+    wait_for(client, lambda e: isinstance(e, Died), into=seen)
+    assert [e.params["i"] for e in seen[:-1]] == list(range(500))
+    assert isinstance(seen[-1], Died)
+
+
+def test_lines_that_are_no_messages_are_kept_for_the_log_and_disturb_nothing(fake_child):
+    client = fake_child("""
+        print("Welcome to torch!")
+        sys.stdout.buffer.write(b"\\xff\\xfe\\n")
+        print("[1, 2]")
+        print(json.dumps({"jsonrpc": "2.0", "id": 1, "result": {"version": "x"}}), flush=True)
+        time.sleep(60)
+    """)
+    wait_for(client, lambda e: isinstance(e, Response))
+    assert client.info["version"] == "x"
+    assert any("Welcome to torch!" in line for line in client.stderr)
+
+
+def test_silence_is_reported_once(fake_child):
+    client = fake_child("time.sleep(60)", silence_s=0.4)
+    silent = wait_for(client, lambda e: isinstance(e, Silent), 10)
+    assert silent.seconds >= 0.4
+    time.sleep(0.6)
+    assert client.poll() == []
+    assert client.alive, "what to do about it is the caller's choice"
+
+
+def test_heartbeats_are_no_events_but_end_the_silence(fake_child):
+    client = fake_child(
+        """
+        while True:
+            print(json.dumps({"jsonrpc": "2.0", "method": "heartbeat", "params": {}}), flush=True)
+            time.sleep(0.1)
+        """,
+        silence_s=1.5,
+    )
+    end = time.monotonic() + 2.5
+    while time.monotonic() < end:
+        assert client.poll() == []
+        time.sleep(0.05)
+
+
+def test_time_in_which_nobody_polled_is_no_silence_of_the_child(fake_child):
+    client = fake_child("time.sleep(60)", silence_s=1.5)
+    client.poll()
+    time.sleep(2.0)  # a suspended laptop, a modal dialogue of the system
+    assert client.poll() == []
+
+
+def test_a_child_that_closes_its_output_and_hangs_is_ended(fake_child):
+    client = fake_child("os.close(1); time.sleep(60)")
+    died = wait_for(client, lambda e: isinstance(e, Died), 10)
+    assert "hung" in died.message
+    assert not client.alive
+
+
+def test_polling_a_child_that_reads_nothing_never_waits(fake_child):
+    client = fake_child("time.sleep(60)")
+    began = time.monotonic()
+    for _ in range(200):
+        client.request("generate", {"padding": "x" * 10_000})  # far more than a pipe holds
+    client.poll()
+    assert time.monotonic() - began < 1.0
+
+
+def test_the_bundled_package_goes_before_an_installed_one(fake_child):
+    client = fake_child("""
+        import primdiffusion
+        print(json.dumps({"jsonrpc": "2.0", "method": "where", "params": {"file": primdiffusion.__file__}}), flush=True)
+        time.sleep(60)
+    """)
+    where = wait_for(client, lambda e: isinstance(e, Notification)).params["file"]
+    assert "backend" in Path(where).parts
+    assert Path(where).is_relative_to(client._environment["PYTHONPATH"])
+
+
+def test_the_environment_leads_the_childs_python_nowhere_else(monkeypatch, tmp_path):
+    monkeypatch.setenv("PYTHONHOME", "/blender/python")
+    monkeypatch.setenv("PYTHONPATH", "/blender/scripts")
+    environment = child_environment(tmp_path, tmp_path / "cache", {"EXTRA": "1"})
+    assert "PYTHONHOME" not in environment
+    assert environment["PYTHONPATH"] == str(tmp_path)
+    assert Path(environment["NUMBA_CACHE_DIR"]).is_relative_to(tmp_path / "cache")
+    assert Path(environment["PYTHONPYCACHEPREFIX"]).is_relative_to(tmp_path / "cache")
+    assert environment["EXTRA"] == "1"
+
+
+def test_every_way_to_die_has_a_sentence():
+    assert "memory" in death_sentence(-9)
+    assert "signal 11" in death_sentence(-11)
+    assert "0xc0000005" in death_sentence(0xC0000005)
+    assert "exit code 1" in death_sentence(1)

@@ -1,0 +1,82 @@
+"""Which Python runs the backend."""
+
+import os
+import stat
+import sys
+from pathlib import Path
+
+import pytest
+from worker.environment import VARIABLE, BackendNotFound, candidates, find_backend_python, python_of_environment
+
+PYTHON = Path(sys.executable)
+
+
+def script(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def no_variable(monkeypatch):
+    monkeypatch.delenv(VARIABLE, raising=False)
+
+
+def test_the_running_python_will_do_where_it_has_torch():
+    found = find_backend_python()
+    assert found.path == PYTHON
+    assert found.source == "Blender's own Python"
+    assert found.torch[0].isdigit()
+    assert found.version
+
+
+def test_the_preference_goes_before_the_variable_and_that_before_the_extensions_own(monkeypatch, tmp_path):
+    own = python_of_environment(tmp_path)
+    own.parent.mkdir()
+    own.touch()
+    assert [path for _, path in candidates(None, tmp_path)] == [own, PYTHON]
+    monkeypatch.setenv(VARIABLE, "/by/variable")
+    assert [path for _, path in candidates("", tmp_path)] == [Path("/by/variable")]
+    assert [path for _, path in candidates("/by/preference", tmp_path)] == [Path("/by/preference")]
+
+
+def test_a_wish_that_fails_is_an_error_and_not_replaced_by_another_python(tmp_path):
+    with pytest.raises(BackendNotFound, match=r"no-python \(the extension's preferences\) does not exist"):
+        find_backend_python(tmp_path / "no-python")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="shell scripts")
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("echo \"ModuleNotFoundError: No module named 'torch'\" >&2; exit 1", "No module named 'torch'"),
+        ("exec sleep 30", "did not import torch within 1 s"),
+        ("echo hello", "no Python interpreter"),
+    ],
+)
+def test_a_python_that_will_not_do_is_named_with_its_reason_and_what_to_do(tmp_path, text, reason):
+    python = script(tmp_path / "python", text)
+    with pytest.raises(BackendNotFound) as error:
+        find_backend_python(python, timeout_s=1.0)
+    assert reason in str(error.value)
+    assert str(python) in str(error.value)
+    assert "preferences" in str(error.value)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="shell scripts")
+def test_a_broken_environment_of_the_extension_is_passed_over(tmp_path):
+    script(python_of_environment(tmp_path), "exit 1")
+    assert find_backend_python(own_environment=tmp_path).path == PYTHON
+
+
+def test_a_folder_is_no_python(tmp_path):
+    with pytest.raises(BackendNotFound, match="cannot be run"):
+        find_backend_python(tmp_path)
+
+
+def test_the_bundled_package_is_the_one_that_is_tried(tmp_path):
+    package = tmp_path / "primdiffusion"
+    package.mkdir()
+    (package / "__init__.py").write_text("__version__ = 'bundled'")
+    assert find_backend_python(PYTHON, module_path=tmp_path).version == "bundled"
