@@ -46,9 +46,9 @@ class BodyPose(TensorRecord):
 
     @classmethod
     def from_axis_angle(
-        cls, theta: Float[Tensor, "*b 72"], translation: Float[Tensor, "*b 3"] | None = None
+        cls, theta: Float[Tensor, "*b n"], translation: Float[Tensor, "*b 3"] | None = None
     ) -> BodyPose:
-        """From SMPL's pose vector: 24 axis-angle vectors in radians, the pelvis first.
+        """From SMPL's pose vector of n = 72 numbers: 24 axis-angle vectors in radians, the pelvis first.
 
         Raises:
             ValueError: theta does not end in 72 values.
@@ -115,14 +115,12 @@ class ShapedBody(TensorRecord):
     def pose(self, pose: BodyPose) -> PosedBody:
         """The person in a pose (SMPL eqs. 2-4, 7 and 9); batches of bodies and poses broadcast."""
         vertices, joints = self.vertices, self.joints
+        identity = torch.eye(3, dtype=joints.dtype, device=joints.device)
         if self.model.pose_basis.numel() > 0:
-            identity = torch.eye(3, dtype=pose.joint_rotation.dtype, device=pose.joint_rotation.device)
             feature = (pose.joint_rotation[..., 1:, :, :] - identity).flatten(-3)
             vertices = vertices + torch.einsum("vcp,...p->...vc", self.model.pose_basis, feature)
         world_from_joint = world_from_joints(pose.joint_rotation, joints, self.model.parents.tolist())
-        identity = torch.eye(3, dtype=joints.dtype, device=joints.device)
-        shift = rigid_matrix(identity.expand(*pose.translation.shape[:-1], 3, 3), pose.translation)[..., None, :, :]
-        world_from_joint = shift @ world_from_joint
+        world_from_joint = rigid_matrix(identity, pose.translation)[..., None, :, :] @ world_from_joint
         skinning = world_from_rest(world_from_joint, joints)
         return PosedBody(skin(vertices, self.model.skin_weights, skinning), world_from_joint, skinning)
 

@@ -9,16 +9,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def rigid_matrix(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
-    """The 4x4 matrix of x -> rotation @ x + translation."""
-    top = torch.cat([rotation, translation[..., None]], dim=-1)
-    last_row = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+def rigid_matrix(rotation: Float[Tensor, "*#b 3 3"], translation: Float[Tensor, "*#b 3"]) -> Float[Tensor, "... 4 4"]:
+    """The 4x4 matrix of x -> rotation @ x + translation; batches broadcast."""
+    batch = torch.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    top = torch.cat([rotation.expand(*batch, 3, 3), translation.expand(*batch, 3)[..., None]], dim=-1)
+    last_row = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*batch, 1, 4)
     return torch.cat([top, last_row], dim=-2)
 
 
 def world_from_joints(
-    joint_rotation: Float[Tensor, "*b J 3 3"], rest_joints: Float[Tensor, "*b J 3"], parents: Sequence[int]
-) -> Float[Tensor, "*b J 4 4"]:
+    joint_rotation: Float[Tensor, "*#b J 3 3"], rest_joints: Float[Tensor, "*#b J 3"], parents: Sequence[int]
+) -> Float[Tensor, "... J 4 4"]:
     """Chain each joint's rotation, relative to its parent, down the skeleton; a parent comes before its children.
 
     In the rest pose a joint's axes are the world's, so its matrix is a pure translation.
@@ -35,8 +36,8 @@ def world_from_joints(
 
 
 def world_from_rest(
-    world_from_joint: Float[Tensor, "*b J 4 4"], rest_joints: Float[Tensor, "*b J 3"]
-) -> Float[Tensor, "*b J 4 4"]:
+    world_from_joint: Float[Tensor, "*#b J 4 4"], rest_joints: Float[Tensor, "*#b J 3"]
+) -> Float[Tensor, "... J 4 4"]:
     """What each joint does to points given in the rest pose: move the joint to the origin first."""
     rotation = world_from_joint[..., :3, :3]
     moved_rest = (rotation @ rest_joints[..., None])[..., 0]
@@ -44,8 +45,8 @@ def world_from_rest(
 
 
 def skin(
-    points: Float[Tensor, "*b V 3"], weights: Float[Tensor, "V J"], skinning: Float[Tensor, "*b J 4 4"]
-) -> Float[Tensor, "*b V 3"]:
+    points: Float[Tensor, "*#b V 3"], weights: Float[Tensor, "V J"], skinning: Float[Tensor, "*#b J 4 4"]
+) -> Float[Tensor, "... V 3"]:
     """Points moved by the weighted mean of the joints' matrices (linear blend skinning)."""
     blended = torch.einsum("vj,...jrc->...vrc", weights, skinning[..., :3, :])
     return (blended[..., :3] @ points[..., None])[..., 0] + blended[..., 3]

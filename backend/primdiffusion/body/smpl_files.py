@@ -183,16 +183,18 @@ def _numpy_file(path: pathlib.Path) -> np.ndarray:
 
 def _obj_texture_coordinates(path: pathlib.Path, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Texture coordinates of an OBJ whose triangles are the body's, in any order."""
-    coordinates, corner_of_face = [], {}
+    coordinates: list[list[float]] = []
+    corner_of_face: dict[frozenset[int], dict[int, int]] = {}
     try:
         for line in path.read_text(encoding="latin1").splitlines():
             key, _, rest = line.partition(" ")
             if key == "vt":
                 coordinates.append([float(number) for number in rest.split()[:2]])
             elif key == "f":
-                corners = dict(tuple(int(number) - 1 for number in corner.split("/")[:2]) for corner in rest.split())
+                corner_numbers = [[int(number) - 1 for number in corner.split("/")[:2]] for corner in rest.split()]
+                corners = {vertex: coordinate for vertex, coordinate in corner_numbers}
                 corner_of_face[frozenset(corners)] = corners
-        numbers = [[corner_of_face[frozenset(face)][v] for v in face] for face in faces.tolist()]
+        coordinate_faces = [[corner_of_face[frozenset(face)][v] for v in face] for face in faces.tolist()]
     except (ValueError, TypeError) as error:
         raise BodyFileError(f"{path} is not an OBJ with texture coordinates in every face ({error}).") from error
     except KeyError as error:
@@ -200,4 +202,4 @@ def _obj_texture_coordinates(path: pathlib.Path, faces: np.ndarray) -> tuple[np.
             f"{path} lacks a face of the body (vertices {sorted(error.args[0])}, counted from 0); "
             "use the OBJ made for this body."
         ) from error
-    return np.array(coordinates), np.array(numbers)
+    return np.array(coordinates), np.array(coordinate_faces)

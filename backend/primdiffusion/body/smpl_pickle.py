@@ -188,11 +188,10 @@ def _as_array(value: object, nesting: int) -> np.ndarray:
 
 
 def _number_type(kind: object) -> np.dtype:
-    text = kind.arguments[0] if isinstance(kind, _NumberType) and kind.arguments else None
-    if not isinstance(text, str) or not _NUMBER_TYPE.fullmatch(text):
-        raise ValueError(f"an array holds elements of kind {text!r} where numbers belong")
+    if not isinstance(kind, _NumberType) or not kind.arguments or not _NUMBER_TYPE.fullmatch(str(kind.arguments[0])):
+        raise ValueError("an array holds elements that are not numbers")
     order = kind.state[1] if isinstance(kind.state, tuple) else "|"
-    return np.dtype(text).newbyteorder(order if order in ("<", ">") else "=")
+    return np.dtype(str(kind.arguments[0])).newbyteorder(order if order in ("<", ">") else "=")
 
 
 def _raw_bytes(raw: object) -> bytes | bytearray:
