@@ -114,8 +114,10 @@ def framing(primitives: Primitives, yaw: float = 0.0, width: int = 512, height: 
 
     `yaw` in radians: 0 looks at the person's face, pi/2 at their left side. 30 degrees of view from top to bottom.
     """
-    reach = primitives.rotation.abs() @ primitives.half_extent[..., None]
-    corners = torch.cat([primitives.position - reach[..., 0], primitives.position + reach[..., 0]]).detach()
+    signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3).to(primitives.position)
+    local = primitives.half_extent[:, None] * signs
+    corners = primitives.position[:, None] + (primitives.rotation[:, None] @ local[..., None])[..., 0]
+    corners = corners.detach().flatten(0, 1)
     middle = (corners.amin(0) + corners.amax(0)) / 2
     towards_camera = middle.new_tensor([math.sin(yaw), 0.0, math.cos(yaw)])
     right = middle.new_tensor([math.cos(yaw), 0.0, -math.sin(yaw)])

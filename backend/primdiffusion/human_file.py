@@ -13,13 +13,14 @@ import torch
 from primdiffusion.body.model import JOINT_NAMES, default_body
 from primdiffusion.human import Human
 from primdiffusion.primitives.anchors import anchor_skin_weights, attach, default_anchors
-from primdiffusion.primitives.primitives import Payload
+from primdiffusion.primitives.primitives import K, Payload, S
 from primdiffusion.staging import written_whole
 
 FORMAT = "primdiffusion.human"
 FORMAT_VERSION = 1
 """Of both files; readers refuse a higher one."""
-FIELDS = ("rgb", "density", "delta_scale", "betas")
+SHAPES = {"rgb": (K, 3, S, S, S), "density": (K, S, S, S), "delta_scale": (K, 3), "betas": (10,)}
+"""What a .human.safetensors file holds."""
 
 
 class HumanFileError(ValueError):
@@ -55,11 +56,15 @@ def load_human(path: str | Path) -> Human:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  safe_open is no mapping
     except safetensors.SafetensorError as e:
         raise HumanFileError(f"{path} is damaged or no safetensors file ({e}): generate the person again") from e
-    if metadata.get("format") != FORMAT or not set(FIELDS) <= set(tensors):
+    if metadata.get("format") != FORMAT or not set(SHAPES) <= set(tensors):
         raise HumanFileError(f"{path} is a safetensors file but holds no person: choose a .human.safetensors file")
     if metadata.get("format_version") != str(FORMAT_VERSION):
         given = metadata.get("format_version")
         raise HumanFileError(f"{path} has format {given}, this version reads {FORMAT_VERSION}: update PrimDiffusion")
+    for name, shape in SHAPES.items():
+        if tuple(tensors[name].shape) != shape or not tensors[name].is_floating_point():
+            given = f"{tensors[name].dtype} {tuple(tensors[name].shape)}"
+            raise HumanFileError(f"{path} holds no whole person ({name} is {given}, not {shape}): generate it again")
     payload = Payload(tensors["rgb"], tensors["density"], tensors["delta_scale"])
     try:
         return Human(payload, tensors["betas"], json.loads(metadata["provenance"])).validate()

@@ -1,0 +1,154 @@
+"""The command line as a user meets it."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+from primdiffusion import cli
+from tiny_model import save_tiny_checkpoint
+
+FILES = ["depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"]
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    return save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "tiny.safetensors")
+
+
+@pytest.fixture(scope="module")
+def person(checkpoint, tmp_path_factory):
+    out = tmp_path_factory.mktemp("person")
+    cli.run(["generate", "--seed", "5", "--steps", "2", "--out", str(out), "--checkpoint", str(checkpoint)])
+    return out
+
+
+def fails(capsys, *arguments) -> tuple[int, str]:
+    """Exit code and stderr of a line that must fail."""
+    with pytest.raises(SystemExit) as end:
+        cli.main([str(argument) for argument in arguments])
+    return end.value.code, capsys.readouterr().err
+
+
+def test_generate_writes_the_person_and_its_pictures(person):
+    assert sorted(path.name for path in person.iterdir()) == FILES
+    with np.load(person / "human.npz") as human:
+        assert json.loads(str(human["meta"]))["seed"] == 5
+
+
+def test_count_writes_a_folder_for_each_seed(checkpoint, tmp_path, capsys):
+    line = ["generate", "--seed", "5", "--count", "2", "--steps", "1", "--out", str(tmp_path)]
+    cli.main([*line, "--checkpoint", str(checkpoint)])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["seed_000005", "seed_000006"]
+    assert all(sorted(p.name for p in folder.iterdir()) == FILES for folder in tmp_path.iterdir())
+    assert capsys.readouterr().out.splitlines()[1].startswith(f"{tmp_path / 'seed_000006'}  seed 6, 1 steps")
+
+
+def test_render_draws_a_pose_at_the_asked_size(person, tmp_path):
+    theta = np.zeros((24, 3))
+    theta[16, 2] = 1.2
+    (tmp_path / "pose.json").write_text(json.dumps(theta.tolist()))
+    pictures = {}
+    human = str(person / "person.human.safetensors")
+    for name, options in {
+        "rest": [],
+        "posed": ["--pose", str(tmp_path / "pose.json")],
+        "side": ["--yaw", "90"],
+        "clear": ["--background", "transparent"],
+        "white": ["--background", "white", "--depth", str(tmp_path / "depth.png")],
+    }.items():
+        out = tmp_path / f"{name}.png"
+        cli.run(["render", human, "--out", str(out), "--size", "64", *options])
+        pictures[name] = np.asarray(Image.open(out)).astype(int)
+    assert pictures["rest"].shape == (64, 64, 3)
+    assert np.abs(pictures["rest"] - pictures["posed"]).mean() > 1
+    assert np.ptp(pictures["side"].sum((0, 2)).nonzero()[0]) < 40 < np.ptp(pictures["rest"].sum((0, 2)).nonzero()[0])
+    assert pictures["clear"].shape == (64, 64, 4)
+    assert pictures["clear"][0, 0, 3] == 0
+    assert (pictures["white"][0, 0] == 255).all()
+    assert (tmp_path / "depth.png").exists()
+
+
+def test_info_tells_what_a_file_is(person, checkpoint, capsys):
+    cli.run(["info", str(person / "person.human.safetensors")])
+    assert json.loads(capsys.readouterr().out)["seed"] == 5
+    cli.run(["info", str(checkpoint)])
+    assert json.loads(capsys.readouterr().out)["name"] == "tiny"
+    cli.run(["info"])
+    assert json.loads(capsys.readouterr().out)["device"] in ("cpu", "cuda")
+
+
+def test_a_domain_error_is_one_sentence_and_exit_code_1(tmp_path, capsys):
+    code, stderr = fails(capsys, "generate", "--out", tmp_path / "out", "--checkpoint", tmp_path / "none.safetensors")
+    assert code == 1
+    assert stderr.startswith("primdiffusion: ")
+    assert "none.safetensors" in stderr
+    assert stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_traceback_shows_where_an_error_came_from(tmp_path, capsys):
+    line = ("generate", "--out", tmp_path / "out", "--checkpoint", tmp_path / "none.safetensors", "--traceback")
+    code, stderr = fails(capsys, *line)
+    assert code == 1
+    assert "Traceback" in stderr
+    assert stderr.splitlines()[-1].startswith("primdiffusion: ")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        ["generate", "--out", "x", "--count", "0"],
+        ["generate", "--out", "x", "--seed", "-1"],
+        ["render", "nobody.human.safetensors", "--out", "x.png"],
+        ["render", "nobody.human.safetensors", "--out", "x.png", "--size", "0"],
+        ["info", "nothing.safetensors"],
+    ],
+)
+def test_wrong_values_fail_with_code_1_and_leave_nothing(line, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    code, stderr = fails(capsys, *line)
+    assert (code, stderr.count("\n")) == (1, 1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_usage_is_code_2(capsys):
+    assert fails(capsys, "generate", "--stepz", "3")[0] == 2
+    assert fails(capsys, "dance")[0] == 2
+
+
+def test_a_defect_keeps_its_traceback_and_has_a_code_of_its_own(monkeypatch, capsys):
+    def broken(self):
+        raise KeyError("a defect")
+
+    monkeypatch.setattr(cli.Info, "run", broken)
+    code, stderr = fails(capsys, "info")
+    assert code == cli.DEFECT
+    assert "Traceback" in stderr
+
+
+def test_an_interrupt_is_130_without_a_traceback_and_leaves_nothing(monkeypatch, checkpoint, tmp_path, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("primdiffusion.human.generate", interrupted)
+    code, stderr = fails(capsys, "generate", "--out", tmp_path / "out", "--checkpoint", checkpoint)
+    assert (code, stderr) == (cli.INTERRUPTED, "primdiffusion: interrupted\n")
+    assert not (tmp_path / "out").exists()
+
+
+def test_people_and_train_are_forwarded_to_their_own_parameters(capsys):
+    for command, parameter in (("people", "--variants"), ("train", "--data")):
+        with pytest.raises(SystemExit):
+            cli.main([command, "--help"])
+        assert parameter in capsys.readouterr().out
+
+
+def test_help_does_not_load_torch():
+    run = "import sys\nfrom primdiffusion import cli\ntry:\n    cli.main(['--help'])\nfinally:\n    "
+    code = f"{run}print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert done.stdout.splitlines()[-1] == "False"

@@ -1,0 +1,53 @@
+"""What users are told of exceptions."""
+
+import pytest
+import torch
+from primdiffusion.failures import describe
+
+
+def test_torch_out_of_memory_on_the_cpu_is_named():
+    with pytest.raises(RuntimeError) as error:
+        torch.empty(10**15)
+    failure = describe(error.value)
+    assert failure.kind == "out_of_memory"
+    assert failure.sentence == "the machine ran out of memory when it asked for 4000000000000000 bytes more"
+
+
+def test_cuda_out_of_memory_is_named():
+    error = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total capacity of ...")
+    failure = describe(error)
+    assert failure.kind == "out_of_memory"
+    assert failure.sentence == "the graphics card ran out of memory when it asked for 20.00 GiB more"
+    assert failure.remedy
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "text"),
+    [
+        (MemoryError(), "out_of_memory", "ran out of memory"),
+        (
+            ValueError("seed -1 is out of range:\nchoose another"),
+            "bad_input",
+            "seed -1 is out of range: choose another",
+        ),
+        (
+            FileNotFoundError(2, "No such file or directory", "x.npz"),
+            "missing_file",
+            "x.npz: no such file or directory",
+        ),
+        (FileNotFoundError("there is no checkpoint at x: train one"), "missing_file", "no checkpoint at x: train one"),
+        (PermissionError(13, "Permission denied", "/out"), "unwritable", "/out: permission denied"),
+        (OSError(28, "No space left on device", "/out/a"), "file_system", "/out/a: no space left on device"),
+        (ModuleNotFoundError("No module named 'torch'"), "environment", "No module named 'torch'"),
+    ],
+)
+def test_a_domain_error_is_one_sentence_of_its_kind(error, kind, text):
+    failure = describe(error)
+    assert failure.kind == kind
+    assert text in failure.sentence
+    assert "\n" not in str(failure)
+
+
+@pytest.mark.parametrize("error", [KeyError("x"), RuntimeError("shape mismatch"), TypeError(), AssertionError()])
+def test_a_defect_is_not_dressed_up_as_the_users_mistake(error):
+    assert describe(error) is None

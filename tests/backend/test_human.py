@@ -1,0 +1,154 @@
+"""A person from noise to a picture, with a checkpoint small enough to make here."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.human import Human, framing, generate, place, pose_body, render
+from primdiffusion.primitives.anchors import default_anchors
+from primdiffusion.primitives.primitives import K
+from tiny_model import FULL_DENSITY, tiny_model
+
+
+@pytest.fixture(scope="module")
+def human() -> Human:
+    return generate(tiny_model(), seed=3, steps=5)
+
+
+def bent(joint: int, angle: float) -> BodyPose:
+    theta = torch.zeros(24, 3)
+    theta[joint, 2] = angle
+    return BodyPose.from_axis_angle(theta.flatten())
+
+
+def test_a_seed_is_a_person(human):
+    again, other = generate(tiny_model(), seed=3, steps=5), generate(tiny_model(), seed=4, steps=5)
+    assert torch.equal(human.payload.rgb, again.payload.rgb)
+    assert torch.equal(human.betas, again.betas)
+    assert not torch.allclose(human.payload.rgb, other.payload.rgb)
+    assert not torch.allclose(human.betas, other.betas)
+
+
+def test_a_person_knows_where_it_comes_from(human):
+    assert human.provenance["seed"] == 3
+    assert human.provenance["steps"] == 5
+    assert human.provenance["sampler"] == "ddim"
+    assert human.provenance["checkpoint"] == "tiny"
+    assert human.provenance["full_density"] == FULL_DENSITY
+
+
+def test_every_step_is_seen_in_order_and_the_last_is_the_person():
+    steps = []
+    model = tiny_model()
+    person = generate(model, seed=3, steps=5, on_step=steps.append)
+    assert [(step.index, step.total) for step in steps] == [(i, 5) for i in range(5)]
+    assert torch.equal(model.decode(steps[-1].x0).rgb[0], person.payload.rgb)
+
+
+def test_an_exception_of_the_watcher_ends_the_sampling():
+    class Stop(Exception):
+        pass
+
+    seen = []
+
+    def stop_at_third(step):
+        seen.append(step.index)
+        if step.index == 2:
+            raise Stop
+
+    with pytest.raises(Stop):
+        generate(tiny_model(), seed=3, steps=100, on_step=stop_at_third)
+    assert seen == [0, 1, 2]
+
+
+@pytest.mark.parametrize("wrong", [{"seed": -1}, {"steps": 0}, {"steps": 1001}, {"sampler": "magic"}])
+def test_settings_out_of_range_are_refused(wrong):
+    with pytest.raises(ValueError, match="|".join(str(value) for value in wrong.values())):
+        generate(tiny_model(), **{"seed": 1, **wrong})
+
+
+def test_without_a_pose_the_primitives_sit_on_the_t_pose(human):
+    primitives = place(human)
+    assert primitives.position.shape == (K, 3)
+    posed = place(human, BodyPose.rest())
+    assert torch.equal(primitives.position, posed.position)
+    vertices = pose_body(human.betas).vertices
+    distance = torch.cdist(primitives.position, vertices).amin(-1)
+    assert distance.max() < 0.03, "anchors lie on the surface, at most an edge length from a vertex"
+
+
+def test_frames_follow_the_posed_mesh_and_are_not_blended(human):
+    """Bending the elbow by 90 degrees turns the frames of the forearm by it and leaves those of the legs alone."""
+    anchors = default_anchors()
+    rest, posed = place(human), place(human, bent(18, math.pi / 2))
+    weights = default_body().skin_weights[default_body().faces[anchors.face, 0]]
+    forearm = (weights[:, [18, 20, 22]].sum(-1) > 0.999) & (weights[:, 18] > 0.999)
+    legs = weights[:, [1, 2, 4, 5, 7, 8, 10, 11]].sum(-1) > 0.999
+    assert forearm.sum() > 5
+    assert legs.sum() > 100
+    assert torch.allclose(posed.position[legs], rest.position[legs], atol=1e-6)
+    turn = posed.rotation @ rest.rotation.mT
+    angle = torch.acos(((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1))
+    assert (angle[forearm].median() - math.pi / 2).abs() < 0.02
+    identity = posed.rotation @ posed.rotation.mT
+    assert torch.allclose(identity, torch.eye(3).expand_as(identity), atol=1e-5)
+
+
+def test_moving_the_body_moves_the_primitives_rigidly(human):
+    shift = torch.tensor([0.3, -1.0, 2.0])
+    moved = place(human, dataclasses.replace(BodyPose.rest(), translation=shift))
+    rest = place(human)
+    assert torch.allclose(moved.position, rest.position + shift, atol=1e-6)
+    assert torch.allclose(moved.rotation, rest.rotation, atol=1e-4)
+
+
+def test_a_body_without_its_anchors_is_refused(human):
+    with pytest.raises(ValueError, match="go together"):
+        place(human, body=default_body())
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, math.pi / 2, math.pi])
+@pytest.mark.parametrize("size", [(64, 64), (40, 80), (96, 32)])
+def test_the_framing_just_contains_the_person(human, yaw, size):
+    primitives = place(human, bent(16, 1.0))
+    camera = framing(primitives, yaw, *size)
+    signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
+    offsets = (primitives.rotation[:, None] @ (primitives.half_extent[:, None] * signs)[..., None])[..., 0]
+    pixels, depth = camera.project((primitives.position[:, None] + offsets).reshape(-1, 3))
+    assert depth.min() > 0
+    assert pixels.min() >= 0
+    assert (pixels[:, 0] <= size[0]).all()
+    assert (pixels[:, 1] <= size[1]).all()
+    filled = (pixels.amax(0) - pixels.amin(0)) / torch.tensor(size)
+    assert filled.max() > 0.8, "and wastes little of the picture"
+
+
+def test_yaw_zero_looks_at_the_face_and_a_quarter_turn_at_the_persons_left(human):
+    primitives = place(human)
+    front, left = framing(primitives, 0.0).position, framing(primitives, math.pi / 2).position
+    assert front[2] > 2
+    assert front[0].abs() < 0.1
+    assert left[0] > 2
+    assert left[2].abs() < 0.1
+
+
+def test_the_person_is_drawn_whole_and_opaque(human):
+    rendering = render(human, framing(place(human), width=64, height=64))
+    assert 0.1 < (rendering.alpha > 0.5).float().mean() < 0.5
+    assert rendering.alpha[:, 32].max() > 0.99
+    colour = rendering.rgb[rendering.alpha > 0.99].mean(0)
+    assert torch.allclose(colour, human.payload.rgb.mean((0, 2, 3, 4)), atol=0.1)
+
+
+def test_a_batch_or_a_wrong_number_is_no_human(human):
+    batch = dataclasses.replace(human, payload=human.payload.map(lambda values: values[None]))
+    with pytest.raises(ValueError, match="batch"):
+        batch.validate()
+    broken = human.payload.rgb.clone()
+    broken[5, 0, 0, 0, 0] = math.nan
+    with pytest.raises(ValueError, match="rgb"):
+        dataclasses.replace(human, payload=dataclasses.replace(human.payload, rgb=broken)).validate()
+    with pytest.raises(ValueError, match="betas"):
+        dataclasses.replace(human, betas=torch.tensor([math.inf] * 10)).validate()

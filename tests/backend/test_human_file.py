@@ -1,0 +1,130 @@
+"""People on disk: whole, exact, and refused with a sentence where they are not."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from primdiffusion.body.model import JOINT_NAMES, default_body
+from primdiffusion.human import Human, generate, place
+from primdiffusion.human_file import HumanFileError, export_for_blender, load_human, save_human
+from primdiffusion.primitives.primitives import K
+from tiny_model import tiny_model
+
+
+@pytest.fixture(scope="module")
+def human() -> Human:
+    person = generate(tiny_model(), seed=3, steps=3)
+    scale = torch.linspace(0.8, 1.3, K * 3).reshape(K, 3)
+    return dataclasses.replace(person, payload=dataclasses.replace(person.payload, delta_scale=scale))
+
+
+def test_a_saved_person_comes_back_bit_for_bit(human, tmp_path):
+    path = tmp_path / "person.human.safetensors"
+    save_human(path, human)
+    back = load_human(path)
+    for name in ("rgb", "density", "delta_scale"):
+        assert torch.equal(getattr(back.payload, name), getattr(human.payload, name))
+    assert torch.equal(back.betas, human.betas)
+    assert back.provenance == human.provenance
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_person_with_nan_is_not_written(human, tmp_path):
+    broken = dataclasses.replace(human, betas=torch.full((10,), float("nan")))
+    for write in (save_human, export_for_blender):
+        with pytest.raises(ValueError, match="betas"):
+            write(tmp_path / "file", broken)
+    assert list(tmp_path.iterdir()) == []
+
+
+def damage(path, human, how):
+    save_human(path, human)
+    content = safetensors.torch.load_file(path)
+    meta = {"format": "primdiffusion.human", "format_version": "1", "provenance": "{}"}
+    if how == "truncated":
+        path.write_bytes(path.read_bytes()[:-1000])
+    elif how == "text":
+        path.write_text("hello")
+    elif how == "no metadata":
+        safetensors.torch.save_file(content, path)
+    elif how == "newer":
+        safetensors.torch.save_file(content, path, {**meta, "format_version": "2"})
+    elif how == "no density":
+        del content["density"]
+        safetensors.torch.save_file(content, path, meta)
+    elif how == "wrong shape":
+        safetensors.torch.save_file({**content, "rgb": content["rgb"][..., :4].contiguous()}, path, meta)
+    elif how == "NaN":
+        content["density"][3, 0, 0, 0] = float("nan")
+        safetensors.torch.save_file(content, path, meta)
+    elif how == "bad provenance":
+        safetensors.torch.save_file(content, path, {**meta, "provenance": "{"})
+
+
+@pytest.mark.parametrize(
+    "how", ["truncated", "text", "no metadata", "newer", "no density", "wrong shape", "NaN", "bad provenance"]
+)
+def test_a_damaged_file_is_refused_by_name(human, tmp_path, how):
+    path = tmp_path / "bad.human.safetensors"
+    damage(path, human, how)
+    with pytest.raises(HumanFileError, match=r"bad\.human\.safetensors"):
+        load_human(path)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nobody"):
+        load_human(tmp_path / "nobody.human.safetensors")
+
+
+@pytest.fixture(scope="module")
+def exported(human, tmp_path_factory) -> dict[str, np.ndarray]:
+    path = tmp_path_factory.mktemp("export") / "human.npz"
+    export_for_blender(path, human)
+    with np.load(path, allow_pickle=False) as stored:
+        return dict(stored)
+
+
+def test_the_export_has_the_shapes_blender_expects(exported):
+    body = default_body()
+    v, f = len(body.template), len(body.faces)
+    shapes = {
+        "format_version": (), "meta": (), "betas": (10,), "parents": (24,), "joint_names": (24,), "joints": (24, 3),
+        "vertices": (v, 3), "faces": (f, 3), "uv_corner": (f, 3, 2), "skin_weights": (v, 24), "position": (K, 3),
+        "rotation": (K, 3, 3), "half_extent": (K, 3), "primitive_weights": (K, 24), "rgb": (K, 8, 8, 8, 3),
+        "density": (K, 8, 8, 8),
+    }  # fmt: skip
+    assert {name: array.shape for name, array in exported.items()} == shapes
+    assert tuple(exported["joint_names"]) == JOINT_NAMES
+    assert exported["parents"][0] == -1
+    assert exported["rgb"].dtype == np.float16
+    assert json.loads(str(exported["meta"]))["seed"] == 3
+    assert exported["format_version"] == 1
+
+
+def test_the_export_is_the_person_in_the_t_pose_with_delta_scale_in_the_boxes(exported, human):
+    primitives = place(human)
+    assert np.allclose(exported["position"], primitives.position, atol=1e-6)
+    assert np.allclose(exported["half_extent"], primitives.half_extent, atol=1e-7)
+    assert not np.allclose(exported["half_extent"], primitives.half_extent / human.payload.delta_scale, atol=1e-3)
+    assert np.allclose(exported["rotation"], primitives.rotation, atol=1e-4)
+    assert np.allclose(np.linalg.det(exported["rotation"]), 1, atol=1e-5)
+
+
+def test_voxels_are_exported_in_the_order_d_h_w_colour(exported, human):
+    k, d, h, w = 700, 1, 2, 5
+    assert np.allclose(exported["rgb"][k, d, h, w], human.payload.rgb[k, :, d, h, w], atol=1e-3)
+    assert exported["density"][k, d, h, w] == human.payload.density[k, d, h, w]
+    inner, outer = exported["density"][:, 0].mean(), exported["density"][:, 7].mean()
+    assert inner > outer + 50, "the tiny person is solid below the skin, which is small D"
+
+
+def test_weights_are_convex_and_move_a_primitive_with_the_skin_under_it(exported):
+    weights = exported["primitive_weights"]
+    assert (weights >= 0).all()
+    assert np.allclose(weights.sum(1), 1, atol=1e-5)
+    head = weights[:, JOINT_NAMES.index("head")] > 0.99
+    assert head.sum() > 20
+    assert (exported["position"][head, 1] > exported["joints"][JOINT_NAMES.index("neck"), 1]).all()

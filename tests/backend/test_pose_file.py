@@ -1,0 +1,71 @@
+"""Poses from users' files."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from primdiffusion.body.model import BodyPose
+from primdiffusion.pose_file import PoseFileError, pose_from_numbers, read_pose
+
+THETA = np.linspace(-1, 1, 72).astype(np.float32)
+
+
+def assert_same(pose: BodyPose, theta=THETA, translation=(0.0, 0.0, 0.0)):
+    expected = BodyPose.from_axis_angle(torch.as_tensor(theta))
+    assert torch.allclose(pose.joint_rotation, expected.joint_rotation, atol=1e-6)
+    assert torch.allclose(pose.translation, torch.tensor(translation))
+
+
+def test_a_list_of_72_rows_of_3_and_an_object_are_the_same_pose(tmp_path):
+    for content in (THETA.tolist(), THETA.reshape(24, 3).tolist(), {"pose": THETA.tolist()}):
+        path = tmp_path / "pose.json"
+        path.write_text(json.dumps(content))
+        assert_same(read_pose(path))
+
+
+def test_a_translation_comes_along(tmp_path):
+    path = tmp_path / "pose.json"
+    path.write_text(json.dumps({"pose": THETA.tolist(), "translation": [1, 2, 3]}))
+    assert_same(read_pose(path), translation=(1.0, 2.0, 3.0))
+
+
+def test_a_frame_of_an_amass_file_is_read_without_its_hands(tmp_path):
+    path = tmp_path / "amass.npz"
+    poses, trans = np.zeros((7, 156)), np.zeros((7, 3))
+    poses[4, :72], poses[4, 72:], trans[4] = THETA, 9.0, (0.1, 0.2, 0.3)
+    np.savez(path, poses=poses, trans=trans, gender=np.array("neutral"))
+    assert_same(read_pose(path, frame=4), translation=(0.1, 0.2, 0.3))
+
+
+def test_an_npz_that_would_run_code_is_refused(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (open, (str(tmp_path / "trapped"), "w"))
+
+    path = tmp_path / "trap.npz"
+    np.savez(path, poses=np.array([Trap()], dtype=object))
+    with pytest.raises(PoseFileError, match=r"trap\.npz"):
+        read_pose(path)
+    assert not (tmp_path / "trapped").exists()
+
+
+@pytest.mark.parametrize(
+    "content", [[1, 2, 3], {"theta": None}, {"pose": "up"}, {}, [[0, 0, 0]] * 23, [math.nan] * 72, None, {"pose": []}]
+)
+def test_numbers_that_are_no_pose_are_refused_by_name(content):
+    with pytest.raises(PoseFileError, match=r"my pose"):
+        pose_from_numbers(content, "my pose")
+
+
+def test_a_frame_beyond_the_end_and_a_missing_file_are_errors(tmp_path):
+    path = tmp_path / "one.npz"
+    np.savez(path, poses=np.zeros((2, 72)))
+    with pytest.raises(PoseFileError):
+        read_pose(path, frame=2)
+    with pytest.raises(FileNotFoundError, match="none"):
+        read_pose(tmp_path / "none.json")
+    (tmp_path / "text.json").write_text("{")
+    with pytest.raises(PoseFileError):
+        read_pose(tmp_path / "text.json")
