@@ -1,8 +1,8 @@
 """A frozen orthonormal linear codec per primitive: the first and last layer of slab diffusion, in closed form.
 
-A primitive's 4 x 8^3 values (sRGB-encoded colour, density / full density; the slab's values, SPEC 3) become C numbers in
-one basis that all primitives share. Noise of the slab projected on orthonormal rows is standard normal again, and what
-the basis leaves out never feeds back, so diffusing latents is diffusing the slab with these two layers fixed.
+A primitive's 4 x 8^3 values (sRGB-encoded colour, density / full density; the slab's values, SPEC 3) become C numbers
+in one basis that all primitives share. Noise of the slab projected on orthonormal rows is standard normal again, and
+what the basis leaves out never feeds back, so diffusing latents is diffusing the slab with these two layers fixed.
 The delta scales of these people are all 1 and are not diffused.
 """
 
@@ -47,7 +47,7 @@ class LinearCodec(TensorRecord):
         return latents.flatten(-2).transpose(-1, -2) @ self.basis / self.scale + self.mean
 
     def mirror(self, latents: Float[Tensor, "*b c 32 32"]) -> Float[Tensor, "*b c 32 32"]:
-        """The person seen in a mirror: grid columns reversed, each cell reversed along W (the layout is mirror symmetric)."""
+        """The person seen in a mirror: columns reversed, each cell reversed along W (the layout is symmetric)."""
         return latents.flip(-1) * self.parity[:, None, None]
 
 
@@ -73,7 +73,7 @@ def payload_from_cells(cells: Float[Tensor, "*b k v"], full_density: float) -> P
 def mirror_cells(cells: Float[Tensor, "*b k v"]) -> Float[Tensor, "*b k v"]:
     """Cells of the mirrored person; what `LinearCodec.mirror` does to latents."""
     grid = cells.unflatten(-2, (GRID, GRID)).unflatten(-1, (4, S, S, S))
-    return grid.flip(-6).flip(-1).flatten(-4).flatten(-3, -2)
+    return grid.flip(-5).flip(-1).flatten(-4).flatten(-3, -2)
 
 
 def fit_codec(
@@ -83,9 +83,10 @@ def fit_codec(
     cells_each: int = 128,
     latent_std: float = 1.0,
 ) -> LinearCodec:
-    """Per-cell mean and shared principal components of `cells_each` random cells of every person and their mirror images.
+    """Per-cell mean, and shared principal components of `cells_each` random cells of every person and their mirrors.
 
-    `latent_std` is the root mean square that latents of these people get. Raises ValueError for fewer samples than channels.
+    `latent_std` is the root mean square that latents of these people get. Raises ValueError for fewer samples than
+    channels.
     """
     if cells.shape[0] * cells_each < channels or tuple(cells.shape[1:]) != (K, VALUES):
         raise ValueError(

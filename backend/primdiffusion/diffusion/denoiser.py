@@ -17,23 +17,24 @@ from primdiffusion.diffusion.schedule import Schedule
 class DenoiserConfig:
     """Networks of the default denoiser; None leaves a part to the closed form."""
 
-    person: PersonNetworkConfig | None = PersonNetworkConfig()
+    person: PersonNetworkConfig | None = dataclasses.field(default_factory=PersonNetworkConfig)
     """Network over the person components."""
-    local: LocalUNetConfig | None = LocalUNetConfig()
+    local: LocalUNetConfig | None = dataclasses.field(default_factory=LocalUNetConfig)
     """Network over the grid."""
 
 
 class PersonDenoiser(nn.Module):
     """x0 guess of noisy latents: E[c | .] and E[r | .] of the prior plus learned corrections.
 
-    Corrections are in units of the closed form's own posterior standard deviation, so they are of order 1 at every noise
-    level and vanish with the noise. They start at 0: an untrained denoiser is the prior's. The two parts are orthogonal, so
-    the squared error is the sum of theirs and each can be trained alone.
+    Corrections are in units of the closed form's own posterior standard deviation, so they are of order 1 at every
+    noise level and vanish with the noise. They start at 0: an untrained denoiser is the prior's. The two parts are
+    orthogonal, so the squared error is the sum of theirs and each can be trained alone.
     """
 
     def __init__(self, config: DenoiserConfig, prior: PersonPrior, schedule: Schedule):
         super().__init__()
         self.config, self.schedule = config, schedule
+        self.network_dtype = torch.float32
         for field in dataclasses.fields(PersonPrior):
             self.register_buffer(f"prior_{field.name}", getattr(prior, field.name))
         component_std = prior.marginal_variance().sqrt()
@@ -54,7 +55,7 @@ class PersonDenoiser(nn.Module):
 
     def forward(self, x: Float[Tensor, "b c h w"], t: Int[Tensor, "b"]) -> Float[Tensor, "b c h w"]:
         """The x0 guess of latents x at steps t."""
-        signal, noise = self.schedule.levels(t, x)
+        signal, _ = self.schedule.levels(t, x)
         prior = self.prior
         y, rest = prior.split(x, signal)
         coefficients = self.coefficients(y, t)
@@ -68,7 +69,9 @@ class PersonDenoiser(nn.Module):
             return guess
         std = self.component_std
         total = (signal**2 * std**2 + noise**2).sqrt()
-        return guess + std * noise / total * self.person(y / total, guess / std, t)
+        with self._precision(y):
+            correction = self.person(y / total, guess / std, t)
+        return guess + std * noise / total * correction
 
     def rest(self, rest: Float[Tensor, "b c h w"], coefficients: Float[Tensor, "b r"], t: Int[Tensor, "b"]) -> Tensor:
         """The guess of the clean rest of a noisy one, for guessed person coefficients."""
@@ -79,8 +82,13 @@ class PersonDenoiser(nn.Module):
             return guess
         total = (signal**2 * prior.rest_variance + noise**2).sqrt()
         picture = (coefficients @ prior.basis).unflatten(1, prior.mean.shape) / self.picture_std[:, None, None]
-        correction = self.local(rest / total, picture, coefficients / self.component_std, t)
+        with self._precision(rest):
+            correction = self.local(rest / total, picture, coefficients / self.component_std, t)
         return guess + prior.rest_variance.sqrt() * noise / total * correction
+
+    def _precision(self, like: Tensor) -> torch.autocast:
+        """Networks may compute in `network_dtype`; the closed form never does."""
+        return torch.autocast(like.device.type, self.network_dtype, enabled=self.network_dtype != torch.float32)
 
 
 def _picture_std(prior: PersonPrior, component_std: Float[Tensor, "r"]) -> Float[Tensor, "c"]:

@@ -1,9 +1,9 @@
 """What is known of people in closed form: Gaussian person components, a mixture of them, and their exact denoiser.
 
-A latent is z = mean + sum_i c_i u_i + r with orthonormal person components u and a rest r orthogonal to them. White noise
-splits the same way, so the c and r parts of a noisy person are diffusions of their own, each with its own denoiser. For
-c ~ sum_m weight_m N(centre_m, cov_m) and r of independent entries, the posterior means below are exact up to the
-projection of r. They are the yardstick a network has to beat and the base it starts from.
+A latent is z = mean + sum_i c_i u_i + r with orthonormal person components u and a rest r orthogonal to them. White
+noise splits the same way, so the c and r parts of a noisy person are diffusions of their own, each with its own
+denoiser. For c ~ sum_m weight_m N(centre_m, cov_m) and r of independent entries, the posterior means below are exact
+up to the projection of r. They are the yardstick a network has to beat and the base it starts from.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The light networks of the default denoiser: one for the whole person, one for its 32 x 32 neighbourhoods.
 
-A local network is slow to learn what correlates over the whole body, such as one shirt's colour on 300 primitives. So a
-multilayer perceptron denoises the person components, which are few, and a small U-Net over the grid what they leave out.
+A local network is slow to learn what correlates over the whole body, such as one shirt's colour on 300 primitives. So
+a multilayer perceptron denoises the person components, which are few, and a small U-Net over the grid what they leave
+out.
 """
 
 from __future__ import annotations
@@ -125,7 +126,7 @@ class LocalAttention(nn.Module):
 
 
 class LocalUNet(nn.Module):
-    """Correction of the closed-form guess of what the person components leave out, in standard deviations; starts at 0."""
+    """Correction of the closed-form guess of what person components leave out, in standard deviations; starts at 0."""
 
     def __init__(self, channels: int, components: int, grid: int, config: LocalUNetConfig):
         super().__init__()
@@ -158,7 +159,7 @@ class LocalUNet(nn.Module):
         person: Float[Tensor, "b r"],
         t: Int[Tensor, "b"],
     ) -> Float[Tensor, "b c h w"]:
-        """Correction for a noisy rest, beside the picture that the guessed person components draw, and the components."""
+        """Correction for a noisy rest, beside the picture that guessed person components draw, and the components."""
         condition = functional.silu(self.time(t) + self.person(person))
         position = self.position.expand(len(noisy), -1, -1, -1)
         x = self.inner(torch.cat([noisy, picture, position], dim=1).contiguous(memory_format=torch.channels_last))

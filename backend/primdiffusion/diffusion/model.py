@@ -118,8 +118,9 @@ class DiffusionModel:
     def start(self, count: int, generator: torch.Generator, t: int) -> Float[Tensor, "count c h w"]:
         """Samples at step t to start from: signal * (a draw of the person prior) + noise * eps.
 
-        The paper starts from noise alone. People correlate so strongly that their first components still show at T-1, and
-        a start without them loses variety; the prior's draw is exact there to second order. Without a prior: noise alone.
+        The paper starts from noise alone. People correlate so strongly that their first components still show at T-1,
+        and a start without them loses variety; the prior's draw is exact there to second order. Without a prior: noise
+        alone.
         """
         noise = torch.randn((count, *self.codec.shape), generator=generator, device=generator.device)
         x = self.schedule.noise(t) * noise

@@ -101,7 +101,7 @@ def trailing_steps(length: int, steps: int) -> list[int]:
 
 
 def leading_steps(length: int, steps: int, offset: int = 1) -> list[int]:
-    """Descending t = offset + i * (T // steps), the released code's spacing (offset 1: 991, 981, ... 1 for 100 of 1000)."""
+    """Descending t = offset + i * (T // steps), as released: 991, 981, ... 1 for 100 of 1000."""
     _check_steps(length, steps)
     return [i * (length // steps) + offset for i in reversed(range(steps))]
 

@@ -1,4 +1,4 @@
-"""The paper's denoiser: a U-Net over the whole slab, with the parameter names of the ADM / latent-diffusion family (SPEC 3).
+"""The paper's denoiser: a U-Net over the whole slab, with the parameter names of the ADM family (SPEC 3).
 
 The names and shapes are those of the released checkpoints' `diffusion.*` keys, so such weights load as they are.
 956 GFLOP a call for one person: a network for GPUs. `local_unet` is the light one.

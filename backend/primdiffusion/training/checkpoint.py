@@ -1,4 +1,4 @@
-"""The file a trained model is handed on as: one safetensors file with weights, codec, prior and a card that says what it is."""
+"""The file of a trained model: weights, codec, prior and a card that says what it is, as one safetensors file."""
 
 from __future__ import annotations
 

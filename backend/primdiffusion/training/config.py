@@ -52,7 +52,7 @@ class PhaseConfig:
     ema: float = 0.999
     """Decay of the average of weights that is evaluated and shipped."""
     error_power: float = 1.0
-    """Errors count in units of posterior std s as s^power: 0 whitened, 2 the paper's plain squares, normalised per level."""
+    """Errors in units of posterior std s are weighted by s^power: 0 whitened, 2 the paper's plain squares."""
     blend: float = 0.3
     """Share of people that are blends of the colour variants of one geometry."""
     evaluate_every: int = 500
@@ -98,13 +98,12 @@ def to_json(config: TrainingConfig) -> str:
 
 
 def check_resumable(saved: str, config: TrainingConfig) -> None:
-    """ValueError that names the settings in which a saved run differs from `config`, other than when and where to stop."""
+    """ValueError that names the settings in which a saved run differs from `config`, except when to stop."""
     before, now = (_comparable(json.loads(text)) for text in (saved, to_json(config)))
     changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     if changed:
-        raise ValueError(
-            f"the run in {config.run} was begun with other settings ({', '.join(changed)}): give the same, or a new --run folder"
-        )
+        differing = ", ".join(changed)
+        raise ValueError(f"the run in {config.run} was begun with another {differing}: give the same, or a new folder")
 
 
 def _comparable(tree: dict, prefix: str = "") -> dict[str, object]:

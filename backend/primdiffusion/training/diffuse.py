@@ -127,8 +127,7 @@ def fit(
     mean_loss = 0.0
     while state.step < config.steps and not interrupt.due():
         state.network.train()
-        with torch.autocast("cpu", torch.bfloat16, enabled=config.bfloat16):
-            loss = objective.loss(state.generator)
+        loss = objective.loss(state.generator)
         state.update(loss)
         mean_loss += (float(loss.detach()) - mean_loss) / min(state.step, 200)
         if state.step % config.evaluate_every == 0 or state.step == config.steps:
@@ -185,13 +184,14 @@ def _train_phase(
     denoiser: PersonDenoiser,
     interrupt: Interrupt,
 ) -> int:
-    """Train one network of the denoiser as far as time allows, leave its averaged weights in place; returns its steps."""
+    """Train one network as far as time allows and leave its averaged weights in place; returns its steps."""
     network = getattr(denoiser, name)
     state = TrainingState(network.requires_grad_(True), phase, config.seed + 1)
     path = config.run / f"{name}.state.safetensors"
     if path.exists():
         state.load(path)
     objective = _objective(name, phase, prepared, denoiser)
+    denoiser.network_dtype = torch.bfloat16 if phase.bfloat16 else torch.float32
 
     def evaluate(state: TrainingState) -> dict[str, float]:
         setattr(denoiser, name, state.average)
@@ -208,6 +208,7 @@ def _train_phase(
 
     fit(objective, state, path, interrupt, config.save_every, evaluate, record)
     setattr(denoiser, name, state.average)
+    denoiser.network_dtype = torch.float32
     return state.step
 
 
@@ -215,6 +216,8 @@ def _objective(name: str, phase: PhaseConfig, prepared: Prepared, denoiser: Pers
     if name == "local":
         return RestObjective(denoiser, prepared.train, prepared.codec, phase)
     coefficients = torch.cat([prepared.prior.split(chunk.float())[0] for chunk in prepared.train.latents.split(128)])
+    # Components are fitted to these people and vary more over them than over new ones; the prior knows by how much.
+    coefficients *= denoiser.component_std / coefficients.square().mean(0).sqrt()
     return PersonObjective(denoiser, coefficients, prepared.train.geometry, phase)
 
 

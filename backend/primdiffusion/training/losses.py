@@ -20,7 +20,7 @@ LEVELS = (50, 100, 300, 500, 700, 900)
 
 
 def weighted_error(error: Float[Tensor, "b n"], std: Float[Tensor, "b n"], power: float) -> Tensor:
-    """Mean square of `error` given in units of `std`, each entry weighted by std^power; every level's weights have mean 1.
+    """Mean square of `error`, given in units of `std`, weighted by std^power; every level's weights have mean 1.
 
     power 2 is the paper's unweighted x0 error (eq. 9) divided by the error of the closed form at the same level.
     """

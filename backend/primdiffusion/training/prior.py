@@ -16,14 +16,14 @@ from primdiffusion.training.latents import LatentSet
 def fit_prior(people: LatentSet, codec: LinearCodec, config: PriorConfig) -> PersonPrior:
     """Principal components of people and their mirror images, and a mixture of Gaussians over them.
 
-    Components are found from Gram matrices of the even and the odd parts of people, so that each is even or odd under the
-    mirror. Variances of trailing components fitted to few people are too large for new people and those of the rest too
-    small: both are corrected by leaving `config.folds` parts of the geometries out in turn.
+    Components are found from Gram matrices of the even and the odd parts of people, so that each is even or odd under
+    the mirror. Variances of trailing components fitted to few people are too large for new people and those of the rest
+    too small: both are corrected by leaving `config.folds` parts of the geometries out in turn.
     """
     parts = _mirror_parts(people, codec)
     grams = [part @ part.T for _, part in parts]
     vectors = [_principal(gram, config.components) for gram in grams]
-    components, signs, order = _merge([variance for variance, _ in vectors], config.components)
+    signs, order = _merge([variance for variance, _ in vectors], config.components)
     rows = [
         (vector.T @ part) / (variance * len(people)).sqrt()[:, None]
         for (_, part), (variance, vector) in zip(parts, vectors, strict=True)
@@ -65,16 +65,16 @@ def _principal(gram: Float[Tensor, "n n"], components: int) -> tuple[Tensor, Ten
     return (value / len(gram)).clamp_min(1e-12).float(), vector.float()
 
 
-def _merge(variances: list[Tensor], components: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The largest of even and odd variances, their signs, and their places in the concatenation."""
+def _merge(variances: list[Tensor], components: int) -> tuple[Tensor, Tensor]:
+    """Signs and places in the concatenation of the largest of even and odd variances."""
     joined = torch.cat(variances)
     order = joined.argsort(descending=True)[:components]
     signs = torch.cat([torch.full_like(v, s) for v, s in zip(variances, (1.0, -1.0), strict=True)])
-    return joined[order], signs[order], order
+    return signs[order], order
 
 
 def _held_out_ratios(grams: list[Tensor], geometry: Int[Tensor, "n"], config: PriorConfig) -> tuple[Tensor, float]:
-    """Variance of new people over variance of fitted people: along each component (of the same rank) and of the rest."""
+    """Variance of new people over that of fitted people: along each component (by rank) and of the rest."""
     fold = geometry % config.folds
     fitted_all, held_all, rest_fitted, rest_held = 0.0, 0.0, 0.0, 0.0
     for index in range(config.folds):
@@ -107,7 +107,7 @@ def _smooth(values: Float[Tensor, "r"], width: int = 9) -> Float[Tensor, "r"]:
 def _mixture(
     c: Float[Tensor, "n r"], label: Int[Tensor, "n"], shrink: float = 1.0
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Weight, centre, axes and variances of each label's Gaussian; small groups lean on the mean within-group covariance."""
+    """Weight, centre, axes and variances of each label's Gaussian; small groups lean on the mean covariance."""
     groups = [c[label == value] for value in label.unique()]
     within = sum((g - g.mean(0)).T @ (g - g.mean(0)) for g in groups) / len(c)
     pull = shrink * c.shape[1]

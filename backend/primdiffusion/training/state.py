@@ -28,7 +28,7 @@ class TrainingState:
         self.step, self.seconds = 0, 0.0
 
     def update(self, loss: Tensor) -> float:
-        """One optimiser step and one step of the average; returns the gradient's norm. FloatingPointError if not finite."""
+        """One optimiser step and one step of the average; returns the gradient norm. FloatingPointError if infinite."""
         rate = self.config.learning_rate * learning_rate_factor(self.step, self.config.steps)
         for group in self.optimiser.param_groups:
             group["lr"] = rate

@@ -1,0 +1,93 @@
+import numpy as np
+import pytest
+import torch
+from diffusers import DDPMScheduler
+from diffusers.schedulers.scheduling_ddim import rescale_zero_terminal_snr
+from scipy.stats import kstest
+
+from primdiffusion.diffusion.schedule import (
+    CLEAN,
+    leading_steps,
+    linear,
+    sqrt_linear,
+    trailing_steps,
+    zero_terminal_snr,
+)
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [(linear, "linear"), (sqrt_linear, "scaled_linear")])
+def test_schedules_are_those_of_diffusers(ours, theirs):
+    expected = DDPMScheduler(1000, beta_start=1e-4, beta_end=2e-2, beta_schedule=theirs).alphas_cumprod
+    assert torch.allclose(ours().alpha_bar.float(), expected, rtol=2e-5, atol=0)
+
+
+def test_the_two_linear_schedules_end_at_different_noise():
+    # sqrt(alpha_bar_T): 0.0064 against 0.027, so a start from noise alone is four times further off in the released one
+    assert linear().signal(999) == pytest.approx(0.00635, abs=1e-4)
+    assert sqrt_linear().signal(999) == pytest.approx(0.0272, abs=3e-4)
+
+
+def test_q_sample_has_the_schedule_s_mean_and_spread():
+    schedule, generator = linear(), torch.Generator().manual_seed(0)
+    x0 = torch.full((20_000, 1), 3.0, dtype=torch.float64)
+    noise = torch.randn(x0.shape, generator=generator, dtype=torch.float64)
+    x = schedule.q_sample(x0, torch.full((20_000,), 400), noise)
+    standard = (x - schedule.signal(400) * 3.0) / schedule.noise(400)
+    assert kstest(standard.numpy()[:, 0], "norm").pvalue > 1e-3
+
+
+def test_one_step_posterior_follows_from_bayes_rule():
+    # q(x_prev | x, x0) ~ q(x | x_prev) q(x_prev | x0): precisions add
+    schedule, t = linear(), 300
+    alpha = (schedule.signal(t) / schedule.signal(t - 1)) ** 2
+    precision = alpha / (1 - alpha) + 1 / schedule.noise(t - 1) ** 2
+    x, x0 = torch.tensor(0.7, dtype=torch.float64), torch.tensor(-0.4, dtype=torch.float64)
+    mean = (alpha**0.5 * x / (1 - alpha) + schedule.signal(t - 1) * x0 / schedule.noise(t - 1) ** 2) / precision
+    assert schedule.posterior_mean(x, x0, t, t - 1).item() == pytest.approx(mean.item(), abs=1e-12)
+    assert schedule.posterior_std(t, t - 1) == pytest.approx(precision**-0.5, abs=1e-12)
+
+
+def test_last_step_back_is_the_guess_itself():
+    x0 = torch.randn(4)
+    assert torch.equal(linear().posterior_mean(torch.randn(4), x0, 5, CLEAN), x0)
+    assert linear().posterior_std(5, CLEAN) == 0
+
+
+def test_epsilon_inverts_q_sample():
+    schedule, noise, x0 = linear(), torch.randn(3, 2, dtype=torch.float64), torch.randn(3, 2, dtype=torch.float64)
+    x = schedule.q_sample(x0, torch.full((3,), 700), noise)
+    assert torch.allclose(schedule.epsilon(x, x0, 700), noise, atol=1e-12)
+
+
+def test_zero_terminal_snr_is_that_of_diffusers_and_keeps_the_first_step():
+    ours, betas = zero_terminal_snr(linear()), torch.linspace(1e-4, 2e-2, 1000, dtype=torch.float64)
+    theirs = torch.cumprod(1 - rescale_zero_terminal_snr(betas), 0)
+    assert torch.allclose(ours.alpha_bar, theirs, atol=1e-12)
+    assert ours.signal(999) == 0
+    assert ours.signal(0) == pytest.approx(linear().signal(0), abs=1e-12)
+
+
+def test_trailing_steps_begin_at_the_end_and_leading_steps_are_the_released_ones():
+    assert trailing_steps(1000, 4) == [999, 749, 499, 249]
+    assert leading_steps(1000, 100)[:2] == [991, 981]
+    assert leading_steps(1000, 100)[-1] == 1
+    assert trailing_steps(1000, 1000) == list(range(999, -1, -1))
+    assert np.all(np.diff(trailing_steps(1000, 30)) < 0)
+
+
+@pytest.mark.parametrize("steps", [0, 1001, -3])
+def test_impossible_numbers_of_steps_are_refused(steps):
+    with pytest.raises(ValueError, match=str(steps)):
+        trailing_steps(1000, steps)
+
+
+def test_steps_forward_and_noise_of_a_clean_sample_are_refused():
+    with pytest.raises(ValueError, match="t_prev=5"):
+        linear().posterior_std(5, 5)
+    with pytest.raises(ValueError, match="clean"):
+        linear().epsilon(torch.zeros(1), torch.zeros(1), CLEAN)
+
+
+def test_betas_outside_their_range_are_refused():
+    with pytest.raises(ValueError, match="beta"):
+        linear(last=1.5)
