@@ -15,13 +15,15 @@ import time
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from primdiffusion import __version__
 from primdiffusion.failures import describe
-from primdiffusion.job_params import LARGEST_PICTURE, LARGEST_SEED
+
+if TYPE_CHECKING:
+    from primdiffusion.diffusion.samplers import Step
 
 TRACEBACK = "--traceback"
 DEFECT = 70
@@ -51,8 +53,8 @@ class Generate:
 
     def run(self) -> None:
         """Generates, and prints the folder of each person."""
-        if self.count < 1 or not 0 <= self.seed <= LARGEST_SEED + 1 - self.count:
-            raise ValueError(f"seed {self.seed} with count {self.count}: seeds run from 0 to 2^63-1, counts from 1")
+        if self.count < 1:
+            raise ValueError(f"count is {self.count}: ask for one person or more")
         from tqdm import tqdm
 
         from primdiffusion.human import generate
@@ -68,7 +70,11 @@ class Generate:
             with staged(folder) as unfinished:
                 model = load_checkpoint(self.checkpoint, best_device()) if model is None else model
                 with tqdm(total=self.steps, desc=f"seed {seed}", unit="step", disable=None) as bar:
-                    human = generate(model, seed, self.steps, self.sampler, lambda _, bar=bar: bar.update())
+
+                    def on_step(step: Step, bar: tqdm = bar) -> None:
+                        bar.update()
+
+                    human = generate(model, seed, self.steps, self.sampler, on_step)
                 write_person(unfinished, human)
             print(f"{folder}  seed {seed}, {self.steps} steps, {time.perf_counter() - began:.1f} s")
 
@@ -96,8 +102,6 @@ class Render:
 
     def run(self) -> None:
         """Draws, and prints the picture's path."""
-        if not 1 <= self.size <= LARGEST_PICTURE:
-            raise ValueError(f"size {self.size} is outside 1 ... {LARGEST_PICTURE} pixels: choose another")
         from primdiffusion.human import framing, place
         from primdiffusion.human_file import load_human
         from primdiffusion.pose_file import read_pose

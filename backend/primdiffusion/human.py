@@ -31,6 +31,8 @@ from primdiffusion.render.march import MarchSettings, Rendering, march
 
 DEFAULT_SETTINGS = MarchSettings()
 VERTICAL_FOV = math.radians(30)
+LARGEST_PICTURE = 8192
+"""Pixels a side; beyond, a slip of the finger takes all memory."""
 FRAMING_MARGIN = 1.04
 """How much farther than just filling the picture the camera stands."""
 
@@ -113,7 +115,12 @@ def framing(primitives: Primitives, yaw: float = 0.0, width: int = 512, height: 
     """A level camera that just sees all of `primitives`; it stands at the height of their middle.
 
     `yaw` in radians: 0 looks at the person's face, pi/2 at their left side. 30 degrees of view from top to bottom.
+    Raises ValueError for sides outside 1 ... LARGEST_PICTURE pixels.
     """
+    if not 1 <= min(width, height) <= max(width, height) <= LARGEST_PICTURE:
+        raise ValueError(
+            f"a picture of {width} x {height} pixels was asked for: choose sides of 1 to {LARGEST_PICTURE}"
+        )
     signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3).to(primitives.position)
     local = primitives.half_extent[:, None] * signs
     corners = primitives.position[:, None] + (primitives.rotation[:, None] @ local[..., None])[..., 0]

@@ -114,6 +114,7 @@ class BackendClient:
         self._expected_to_end = False
         self._output_ended_at: float | None = None
         self._reported_end = False
+        self._heard = threading.Event()
         self._silence = 0.0
         self._reported_silence = False
         self._polled_at = time.monotonic()
@@ -173,11 +174,11 @@ class BackendClient:
         now = time.monotonic()
         self._silence += min(now - self._polled_at, LONGEST_POLL_GAP_S)
         self._polled_at = now
-        for message in self._arrived():
+        if self._heard.is_set():
+            self._heard.clear()
             self._silence, self._reported_silence = 0.0, False
-            event = self._event(message)
-            if event is not None:
-                events.append(event)
+        for message in self._arrived():
+            events.append(self._event(message))
         events.extend(self._ending(now))
         if self.alive and self._silence > self._silence_s and not self._reported_silence:
             self._reported_silence = True
@@ -216,10 +217,8 @@ class BackendClient:
                 else:
                     yield message
 
-    def _event(self, message: dict[str, Any]) -> Event | None:
+    def _event(self, message: dict[str, Any]) -> Event:
         method, params, id = message.get("method"), message.get("params") or {}, message.get("id")
-        if method == "heartbeat":
-            return None
         if isinstance(method, str):
             if method == "ready":
                 self.info = {**self.info, **params}
@@ -274,7 +273,9 @@ class BackendClient:
             message = _parse(line)
             if message is None:
                 self._stderr.append(f"[not a message] {line[:300].decode('utf-8', 'replace').rstrip()}")
-            else:
+                continue
+            self._heard.set()
+            if message.get("method") != "heartbeat":  # nobody may poll for hours: let nothing pile up
                 self._incoming.put(message)
         self._incoming.put(None)
 

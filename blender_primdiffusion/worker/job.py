@@ -34,6 +34,7 @@ class Backend:
         self._make_client = make_client
         self._lock = threading.Lock()
         self._client: BackendClient | None = None
+        self._closed = False
         self._job: GenerateJob | None = None
 
     def admit(self, job: GenerateJob) -> bool:
@@ -58,13 +59,16 @@ class Backend:
             client = self._make_client()
             client.start()
             self._client = client
+            if self._closed:
+                client.shutdown()
+                raise RuntimeError("the backend was shut down while it was starting")
             return client
 
     def shutdown(self) -> None:
-        """Ends the child; the next `connect` starts another."""
+        """Ends the child for good, also one that is just being started."""
+        self._closed = True
         if self._client is not None:
             self._client.shutdown()
-        self._client = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -63,6 +63,21 @@ def test_a_job_runs_from_a_cold_start_to_its_files(start):
     assert not job.tick(), "a finished job stays as it is"
 
 
+def test_a_child_that_was_being_started_when_all_was_shut_down_is_ended_too(checkpoint, tmp_path):
+    clients = []
+
+    def slowly() -> BackendClient:
+        time.sleep(0.3)
+        clients.append(BackendClient(PYTHON))
+        return clients[0]
+
+    backend = Backend(slowly)
+    job = GenerateJob(backend, seed=1, steps=1, out_dir=tmp_path / "out", checkpoint=checkpoint)
+    backend.shutdown()
+    assert follow(job)[-1] == "failed"
+    assert not clients[0].alive
+
+
 def test_a_second_job_uses_the_same_child(start, backend):
     first = backend.connect()
     follow(start(1))

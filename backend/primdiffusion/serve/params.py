@@ -6,8 +6,6 @@ import dataclasses
 import math
 
 LARGEST_SEED = 2**63 - 1
-LARGEST_PICTURE = 4096
-"""Pixels a side."""
 STEP_LIMIT = 1000
 """The schedule's length: a sampler cannot take more steps."""
 
@@ -51,8 +49,7 @@ class RenderParams:
     """A second PNG, of depth."""
 
     def __post_init__(self) -> None:
-        for name in ("width", "height"):
-            if not 1 <= getattr(self, name) <= LARGEST_PICTURE:
-                raise ValueError(f"{name} {getattr(self, name)} is outside 1 ... {LARGEST_PICTURE} pixels")
+        if min(self.width, self.height) < 1:
+            raise ValueError(f"a picture of {self.width} x {self.height} pixels: choose sides of 1 or more")
         if not math.isfinite(self.yaw):
             raise ValueError(f"yaw is {self.yaw}: give an angle in radians")

@@ -11,12 +11,12 @@ from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import Step
 from primdiffusion.human import framing, generate, place
 from primdiffusion.human_file import load_human
-from primdiffusion.job_params import GenerateParams, RenderParams
 from primdiffusion.machine import best_device, device_info, peak_memory_gb
 from primdiffusion.person_folder import FILES, write_person
 from primdiffusion.pose_file import pose_from_numbers, read_pose
 from primdiffusion.render.image import depth_to_png, to_png
 from primdiffusion.render.march import march
+from primdiffusion.serve.params import GenerateParams, RenderParams
 from primdiffusion.staging import staged
 from primdiffusion.training.checkpoint import load_checkpoint
 

@@ -1,4 +1,4 @@
-"""The backend as a child process: JSON-RPC 2.0 on stdin and stdout, a message a line (`python -m primdiffusion.serve`).
+"""The child's side of the conversation: JSON-RPC 2.0 on stdin and stdout, a message a line (docs/protocol.md).
 
     reader thread     parses lines; answers hello, cancel and shutdown itself, so they work while a person is sampled
     main thread       loads torch, then runs one job at a time (generate, render)
@@ -24,7 +24,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 from primdiffusion import __version__
 from primdiffusion.failures import Failure, describe
 from primdiffusion.machine import memory
-from primdiffusion.rpc import (
+from primdiffusion.serve.params import GenerateParams, RenderParams
+from primdiffusion.serve.rpc import (
     CANCELLED,
     DOMAIN_ERROR,
     INTERNAL_ERROR,
@@ -38,7 +39,7 @@ from primdiffusion.rpc import (
 )
 
 if TYPE_CHECKING:
-    from primdiffusion.jobs import Jobs
+    from primdiffusion.serve.jobs import Jobs
 
 PROTOCOL = 1
 HEARTBEAT_S = 0.5
@@ -145,8 +146,6 @@ class Server:
         self._end()
 
     def _accept(self, request: Request) -> None:
-        from primdiffusion.job_params import GenerateParams, RenderParams
-
         record = GenerateParams if request.method == "generate" else RenderParams
         job = Job(request, read_params(record, request.params, request.method))
         with self._lock:
@@ -180,7 +179,7 @@ class Server:
     def _warm_up(self) -> Jobs | RpcError:
         """Imports torch and all that needs it; a broken environment becomes the error of every later job."""
         try:
-            from primdiffusion.jobs import Jobs
+            from primdiffusion.serve.jobs import Jobs
 
             jobs = Jobs()
         except Exception as e:
@@ -281,7 +280,3 @@ def _leave(status: int) -> NoReturn:
     """Ends the process from any thread. An ordinary exit would wait for the lock of a reader blocked on the pipe."""
     sys.stderr.flush()
     os._exit(status)
-
-
-if __name__ == "__main__":
-    main()

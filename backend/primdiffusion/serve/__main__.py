@@ -1,0 +1,5 @@
+"""`python -m primdiffusion.serve`."""
+
+from primdiffusion.serve.server import main
+
+main()
