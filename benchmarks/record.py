@@ -1,0 +1,117 @@
+"""Figures as the benchmarks write them: one flat JSON object with device, versions and commit beside the numbers."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import datetime
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import subprocess
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import psutil
+
+SAMPLING_S = 0.02
+PACKAGES = ("primdiffusion", "torch", "numpy", "numba", "bpy")
+
+
+def write_record(path: str | Path, figures: Mapping[str, float | int | bool | str | None]) -> None:
+    """Writes `figures` (None: not measured here) with device, versions, commit and date, whole or not at all.
+
+    Raises ValueError for a figure that is not finite, or has the name of one of those facts: JSON has no NaN, and a
+    failed measurement is no figure.
+    """
+    about = surroundings()
+    if clash := sorted(set(about) & set(figures)):
+        raise ValueError(f"the figure {clash[0]!r} has the name of a fact about the machine: rename it")
+    for name, value in figures.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ValueError(f"the figure {name!r} is {value}: measure it again, or record None")
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    unfinished.write_text(json.dumps({**figures, **about}, indent=2) + "\n", encoding="utf-8")
+    os.replace(unfinished, path)
+
+
+def surroundings() -> dict[str, str | int | float]:
+    """Device, cores, memory, versions, commit ("+" behind it: with changes) and date of a measurement."""
+    facts: dict[str, str | int | float] = {
+        "device": device(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
+        "python": platform.python_version(),
+        "commit": commit(),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+    for package in PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            facts[f"version_{package}"] = importlib.metadata.version(package)
+    return facts
+
+
+def device() -> str:
+    """The graphics card torch uses, otherwise the processor."""
+    import torch
+
+    if torch.cuda.is_available():
+        return torch.cuda.get_device_name()
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def commit() -> str:
+    """The checkout's commit, "unknown" outside one."""
+    here = Path(__file__).parent
+    try:
+        return subprocess.run(
+            ["git", "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"],
+            cwd=here,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+@dataclasses.dataclass
+class Measurement:
+    """What a block of code took; complete when the block is left."""
+
+    seconds: float = math.nan
+    peak_gb: float = math.nan
+    """Largest resident memory of this process meanwhile, 10^9 bytes, sampled every 20 ms."""
+
+
+@contextlib.contextmanager
+def measured() -> Iterator[Measurement]:
+    """Measures the block: `with measured() as took: ...`, then took.seconds and took.peak_gb."""
+    measurement, done, process = Measurement(), threading.Event(), psutil.Process()
+    highest = process.memory_info().rss
+
+    def watch() -> None:
+        nonlocal highest
+        while not done.wait(SAMPLING_S):
+            highest = max(highest, process.memory_info().rss)
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    began = time.perf_counter()
+    try:
+        yield measurement
+    finally:
+        measurement.seconds = time.perf_counter() - began
+        done.set()
+        watcher.join()
+        measurement.peak_gb = max(highest, process.memory_info().rss) / 1e9
