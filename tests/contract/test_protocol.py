@@ -286,3 +286,33 @@ def test_a_broken_environment_still_says_hello_and_names_the_problem(tmp_path):
     assert error["data"]["kind"] == "environment"
     assert not (tmp_path / "out").exists()
     child.close()
+
+
+FAILING = """
+import torch
+import primdiffusion.serve.jobs as jobs, primdiffusion.serve.server as server
+
+def fail(model, seed, *_):
+    if seed == 1:
+        torch.empty(10**15)
+    raise KeyError("a defect")
+
+jobs.generate = fail
+server.main()
+"""
+
+
+def test_out_of_memory_and_a_defect_fail_their_job_and_not_the_child(checkpoint, tmp_path):
+    child = Conversation(("-c", FAILING))
+    params = {"out_dir": str(tmp_path / "out"), "checkpoint": str(checkpoint)}
+    memory = child.ask(1, "generate", seed=1, **params)["error"]
+    assert (memory["code"], memory["data"]["kind"]) == (DOMAIN_ERROR, "out_of_memory")
+    assert "4000000000000000 bytes" in memory["message"]
+    assert memory["data"]["remedy"]
+    defect = child.ask(2, "generate", seed=2, **params)["error"]
+    assert (defect["code"], defect["data"]["kind"]) == (-32603, "defect")
+    assert child.ask(3, "hello")["result"]["ready"]
+    assert not (tmp_path / "out").exists()
+    child.close()
+    assert b"Traceback" in child.stderr
+    assert child.process.returncode == 0

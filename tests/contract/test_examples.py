@@ -1,0 +1,31 @@
+"""The examples do what they say."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.mark.parametrize(
+    ("script", "options", "files"),
+    [
+        ("generate_pose_render.py", ["--size", "48"], {"yaw_000.png", "yaw_270.png", "person.human.safetensors"}),
+        ("drive_the_child.py", ["--steps", "2"], {"human.npz", "front.png"}),
+    ],
+)
+def test_an_example_leaves_its_files(script, options, files, checkpoint, tmp_path):
+    out = tmp_path / "out"
+    command = [sys.executable, EXAMPLES / script, "--out", out, "--checkpoint", checkpoint, *options]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    assert files <= {path.name for path in out.iterdir()}
+
+
+def test_the_example_of_the_child_passes_its_sentence_on(tmp_path):
+    command = [sys.executable, EXAMPLES / "drive_the_child.py", "--out", tmp_path / "out", "--checkpoint", "nowhere"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1
+    assert "nowhere" in done.stderr.splitlines()[-1]
