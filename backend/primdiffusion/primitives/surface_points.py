@@ -6,7 +6,7 @@ import dataclasses
 
 import numba
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Bool, Float32, Float64, Int32
 
 from primdiffusion.capture.rasterise import Fragments, draw
 from primdiffusion.capture.soup import Soup
@@ -31,10 +31,16 @@ as outside, and hems would become holes."""
 PIXEL = 0.003
 """Side of a pixel of these views, metres."""
 
+FACING = 0.5
+"""Cosine of the largest angle at which a view can tell whether a point is covered."""
+COVER = (0.005, 0.030)
+"""A surface this far above a point (metres) covers it: farther than the views' depth is uncertain, nearer than the next
+limb."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points of the surface that at least one view sees, about one for each pixel of area."""
+    """Points of the outer surface that at least one view sees, about one for each pixel of area."""
 
     position: Float32[np.ndarray, "n 3"]
     """Metres."""
@@ -70,13 +76,39 @@ def visible_points(soup: Soup, views: list[OrthographicView], drawn: list[Fragme
     key = (cell[:, 0] << 42) + (cell[:, 1] << 21) + cell[:, 2]
     order = np.lexsort((-np.abs(towards), key))
     keep = order[np.concatenate([[True], np.diff(key[order]) != 0])]
-    sign = np.where(towards[keep] < 0, -1.0, 1.0)[:, None]
+    outward = normals[face[keep]] * np.where(towards[keep] < 0, -1.0, 1.0)[:, None]
+    bare = ~_covered(position[keep], outward, views, drawn)
+    if not bare.any():
+        bare[:] = True
+    keep, outward = keep[bare], outward[bare]
     return SurfacePoints(
         position=position[keep].astype(np.float32),
-        normal=(normals[face[keep]] * sign).astype(np.float32),
+        normal=outward.astype(np.float32),
         face=face[keep],
         barycentric=barycentric[keep],
     )
+
+
+def _covered(
+    position: Float64[np.ndarray, "n 3"],
+    normal: Float64[np.ndarray, "n 3"],
+    views: list[OrthographicView],
+    drawn: list[Fragments],
+) -> Bool[np.ndarray, "n"]:
+    """Which points lie closely under another surface, as the view that looks straightest at them shows.
+
+    A view down a collar sees skin under cloth; its colour must not spread into the cloth.
+    """
+    facing = -(normal @ np.stack([view.direction for view in views]).T)
+    best = facing.argmax(1)
+    covered = np.zeros(len(position), bool)
+    for number, (view, fragments) in enumerate(zip(views, drawn, strict=True)):
+        at = np.flatnonzero((best == number) & (facing[:, number] > FACING))
+        in_view = position[at] @ view.world_to_view[:, :3].T + view.world_to_view[:, 3]
+        column, row = (in_view[:, :2] / view.pixel_size).astype(np.int64).T
+        gap = in_view[:, 2] - fragments.depth[row, column]
+        covered[at] = (gap > COVER[0]) & (gap < COVER[1])
+    return covered
 
 
 def nearest(

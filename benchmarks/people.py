@@ -1,0 +1,177 @@
+"""How much of a dressed person survives becoming primitives: marched payloads against the rasterised meshes.
+
+`python benchmarks/people.py --assets DIR --json people.json` makes people of seeds that no training set uses and draws
+each from directions that `from_mesh` did not look from, at rest and in a pose (the mesh moved by skinning,
+primitives that ride on the posed body). `iou` is of the silhouettes (alpha over one half); `psnr` is of sRGB-encoded
+pictures on black, inside the bounding box of the mesh, `psnr_whole` over the whole picture and `psnr_shared` over the
+pixels of both silhouettes. `--quick` takes 4 people from 2 sides. `--pictures DIR` keeps mesh and payload side by side.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from PIL import Image
+from primdiffusion.body.model import JOINT_NAMES, BodyPose, J, default_body
+from primdiffusion.capture.rasterise import Picture, rasterise
+from primdiffusion.geometry.camera import Camera, look_at
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.textured_mesh import TexturedMesh
+from primdiffusion.people.assets import Assets, open_assets
+from primdiffusion.people.base_mesh import load_base_mesh
+from primdiffusion.people.person import make_person
+from primdiffusion.primitives.anchors import attach, default_anchors
+from primdiffusion.primitives.from_mesh import colour, surface_field
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render.compositing import Rendering
+from primdiffusion.render.march import march
+
+Result = TypeVar("Result")
+FIRST_SEED = 10_000_000
+"""Training sets count from 0."""
+DIRECTIONS = ((20, 10), (110, 5), (200, 15), (290, -10))
+"""Yaw and pitch of the cameras, degrees; none is a direction that from_mesh looks from."""
+SIZE = 512
+FIELD_OF_VIEW = math.radians(30)
+BENDS = {
+    "left_collar": (0, 0, -0.3),
+    "right_collar": (0, 0, 0.3),
+    "left_shoulder": (0, 0, -0.7),
+    "right_shoulder": (0, 0.4, 0.7),
+    "left_elbow": (0, -0.8, 0),
+    "right_elbow": (0, 0.6, 0),
+    "left_hip": (-0.5, 0, 0.05),
+    "right_hip": (0.3, 0, -0.05),
+    "left_knee": (0.7, 0, 0),
+    "right_knee": (0.4, 0, 0),
+    "spine2": (0, 0.2, 0),
+    "head": (0.1, 0.3, 0),
+}
+"""The pose: axis-angle (radians) by joint; arms lowered and bent, a step forward, the upper body and head turned."""
+
+
+def camera_at(bounds: np.ndarray, yaw: float, pitch: float) -> Camera:
+    """A camera in degrees around the middle of `bounds`, which fit its picture with a tenth to spare."""
+    middle = bounds.mean(0)
+    distance = 1.1 * (bounds[1] - bounds[0]).max() / 2 / math.tan(FIELD_OF_VIEW / 2)
+    yaw, pitch = math.radians(yaw), math.radians(pitch)
+    way = np.array([math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch)])
+    position, target = (torch.from_numpy(point).float() for point in (middle + distance * way, middle))
+    return look_at(position, target, vertical_fov=FIELD_OF_VIEW, width=SIZE, height=SIZE)
+
+
+def compare(drawn: Picture, marched: Rendering) -> dict[str, float]:
+    """Figures of one picture."""
+    first, second = drawn.alpha > 0.5, marched.alpha.numpy() > 0.5
+    squared = (displayed(drawn.rgb) - displayed(marched.rgb.numpy())) ** 2
+    rows, columns = np.nonzero(first)
+    box = squared[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    return {
+        "iou": (first & second).sum() / (first | second).sum(),
+        "psnr": psnr(box),
+        "psnr_whole": psnr(squared),
+        "psnr_shared": psnr(squared[first & second]),
+        "missing": (first & ~second).sum() / first.sum(),
+        "surplus": (second & ~first).sum() / first.sum(),
+    }
+
+
+def displayed(rgb: np.ndarray) -> np.ndarray:
+    """Linear colours as a screen's values, 0 ... 1."""
+    return encode_srgb(np.clip(rgb, 0, 1))
+
+
+def psnr(squared: np.ndarray) -> float:
+    """Decibels, of squared differences of values in 0 ... 1."""
+    return float(-10 * np.log10(squared.mean()))
+
+
+def bent() -> BodyPose:
+    """The pose of BENDS."""
+    theta = torch.zeros(J, 3)
+    for joint, axis_angle in BENDS.items():
+        theta[JOINT_NAMES.index(joint)] = torch.tensor(axis_angle, dtype=torch.float32)
+    return BodyPose.from_axis_angle(theta.flatten())
+
+
+def measure(assets: Assets, people: int, directions: int, pictures: Path | None) -> dict[str, float | int]:
+    """All figures by name; `posed_` figures are of the pose, `seconds_` are medians."""
+    body, anchors, base = default_body(), default_anchors(), load_base_mesh()
+    figures: dict[str, list[dict[str, float]]] = {"people": [], "posed": []}
+    seconds: dict[str, list[float]] = {"person": [], "surface_field": [], "colour": []}
+    for seed in range(FIRST_SEED, FIRST_SEED + people):
+        person, seconds_person = timed(lambda seed=seed: make_person(assets, base, seed))
+        shaped = body.shape(torch.from_numpy(person.betas).float())
+        frames = attach(anchors, shaped.vertices, body.faces)
+        field, seconds_field = timed(lambda mesh=person.mesh, frames=frames: surface_field(mesh, frames))
+        payload, seconds_colour = timed(lambda field=field, mesh=person.mesh: colour(field, mesh))
+        for name, value in zip(seconds, (seconds_person, seconds_field, seconds_colour), strict=True):
+            seconds[name].append(value)
+        posed = shaped.pose(bent())
+        scenes = {
+            "people": (person.mesh, frames),
+            "posed": (person.mesh.posed(posed.skinning.numpy()), attach(anchors, posed.vertices, body.faces)),
+        }
+        for name, (mesh, placed) in scenes.items():
+            primitives = Primitives.place(placed, payload)
+            for yaw, pitch in DIRECTIONS[:directions]:
+                path = pictures and pictures / f"{name}_{seed}_{yaw}.png"
+                figures[name].append(picture_of(mesh, primitives, yaw, pitch, path))
+    result: dict[str, float | int] = {"people": people, "directions": directions}
+    for name, rows in figures.items():
+        for figure in rows[0]:
+            values = [row[figure] for row in rows]
+            result[f"{name}_{figure}_mean"] = float(np.mean(values))
+        result[f"{name}_iou_min"] = float(min(row["iou"] for row in rows))
+        result[f"{name}_psnr_min"] = float(min(row["psnr"] for row in rows))
+    return result | {f"seconds_{name}": float(np.median(values)) for name, values in seconds.items()}
+
+
+def picture_of(
+    mesh: TexturedMesh, primitives: Primitives, yaw: float, pitch: float, path: Path | None
+) -> dict[str, float]:
+    """The figures of one view; writes mesh and payload side by side to `path`."""
+    camera = camera_at(mesh.bounds, yaw, pitch)
+    drawn, marched = rasterise(mesh, camera, supersample=2), march(primitives, camera)
+    if path:
+        pair = np.concatenate([displayed(drawn.rgb), displayed(marched.rgb.numpy())], axis=1)
+        Image.fromarray(np.rint(pair * 255).astype(np.uint8)).save(path)
+    return compare(drawn, marched)
+
+
+def timed(call: Callable[[], Result]) -> tuple[Result, float]:
+    """What `call` returns, and its seconds."""
+    begin = time.perf_counter()
+    result = call()
+    return result, time.perf_counter() - begin
+
+
+def main() -> None:
+    """Measures, prints and, if asked, writes the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--pictures", type=Path, help="folder for mesh and payload side by side")
+    parser.add_argument("--quick", action="store_true", help="4 people from 2 directions, under a minute")
+    arguments = parser.parse_args()
+    if arguments.pictures:
+        arguments.pictures.mkdir(parents=True, exist_ok=True)
+    people, directions = (4, 2) if arguments.quick else (16, len(DIRECTIONS))
+    figures = measure(open_assets(arguments.assets), people, directions, arguments.pictures)
+    text = json.dumps(figures, indent=2)
+    if arguments.json:
+        arguments.json.write_text(text + "\n")
+    sys.stdout.write(text + "\n")
+
+
+if __name__ == "__main__":
+    main()
