@@ -61,7 +61,7 @@ def build_human(
                 human.primitive_weights,
                 volume_material(),
             )
-            collection[MARK] = _provenance(human)
+            collection[MARK] = _provenance(human, grids)
             context.scene.collection.children.link(collection)
     return collection
 
@@ -107,8 +107,10 @@ def remove_human(collection: bpy.types.Collection) -> None:
     bpy.data.batch_remove([thing for thing in {*data, *actions} if thing.users == 0])
 
 
-def _provenance(human: HumanFile) -> str:
-    most = most_overlapping(human.position, human.rotation, human.half_extent)
+def _provenance(human: HumanFile, grids: volumes.Grids) -> str:
+    offset, half = grids.drawn_box()
+    centre = human.position + np.einsum("kij,kj->ki", human.rotation, offset)
+    most = most_overlapping(centre, human.rotation, half)
     return json.dumps({**human.meta, "betas": np.round(human.betas, 6).tolist(), "most_overlapping": most})
 
 

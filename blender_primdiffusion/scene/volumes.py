@@ -18,8 +18,15 @@ from numpy.typing import NDArray
 from .human_file import VOXELS
 
 WINDOW_EXPONENT = 8
+FAINTEST = 0.05
+"""Opacity per metre below which a voxel counts as empty; half a percent of alpha over a whole box. The window leaves
+less than this on the outermost voxels."""
 PAD = 1
-"""Empty voxels around the box: without them Cycles cuts half a voxel off every side."""
+"""Empty voxels kept all round those that are not: Cycles draws a grid only half a voxel beyond its last one."""
+
+
+_ALL_ACTIVE = -1.0
+"""A tolerance no difference from the background is below: zeros become active voxels too."""
 
 
 class VolumeWriteError(OSError):
@@ -28,14 +35,25 @@ class VolumeWriteError(OSError):
 
 @dataclasses.dataclass(frozen=True)
 class Grids:
-    """Voxels of all primitives in the index order of VDB, x along T, y along B, z along N, padded."""
+    """Voxels of all primitives in the index order of VDB: x along T, y along B, z along N; padded by PAD all round."""
 
     density: NDArray[np.float16]
-    """Opacity per metre with the window [K, X, Y, Z]; zero in the padding."""
+    """Opacity per metre with the window [K, X, Y, Z]; zero where empty and in the padding."""
     colour: NDArray[np.float16]
     """Linear RGB [K, X, Y, Z, 3]; the padding repeats the edge, so that interpolation does not darken the rim."""
     half_extent: NDArray[np.float64]
-    """Half sides in metres [K, 3]."""
+    """Half sides of the whole box in metres [K, 3]."""
+    first: NDArray[np.int64]
+    """First index of each axis that is written [K, 3]: the voxels that are not empty, and PAD before them."""
+    last: NDArray[np.int64]
+    """Last index that is written, inclusive [K, 3]."""
+
+    def drawn_box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Centre and half sides [K, 3] of what Cycles takes for the volume, in the primitive's axes, metres."""
+        step = 2.0 * self.half_extent / (VOXELS - 1)
+        low = -self.half_extent + (self.first - PAD - 0.5) * step
+        high = -self.half_extent + (self.last - PAD + 0.5) * step
+        return (low + high) / 2, (high - low) / 2
 
 
 def window() -> NDArray[np.float64]:
@@ -45,26 +63,36 @@ def window() -> NDArray[np.float64]:
 
 
 def bake(density: NDArray, rgb: NDArray, half_extent: NDArray) -> Grids:
-    """Voxels as the files hold them, from density [K, D, H, W] and rgb [K, D, H, W, 3] (D, H, W along N, B, T)."""
+    """Voxels as the files hold them, from density [K, D, H, W] and rgb [K, D, H, W, 3] (D, H, W along N, B, T).
+
+    A box is mostly empty outside the skin: only the part that is not gets written, and a ray meets fewer volumes.
+    """
     pad = [(0, 0)] + [(PAD, PAD)] * 3
     windowed = np.pad(np.asarray(density, np.float64) * window(), pad).transpose(0, 3, 2, 1)
+    windowed = np.where(windowed < FAINTEST, 0.0, np.minimum(windowed, float(np.finfo(np.float16).max)))
     colour = np.pad(rgb, [*pad, (0, 0)], mode="edge").transpose(0, 3, 2, 1, 4)
-    largest = float(np.finfo(np.float16).max)
+    first, last = np.empty((2, len(windowed), 3), np.int64)
+    for axis in range(3):
+        full = (windowed > 0).any(tuple(other + 1 for other in range(3) if other != axis))
+        first[:, axis] = np.argmax(full, -1) - PAD
+        last[:, axis] = full.shape[-1] - 1 - np.argmax(full[:, ::-1], -1) + PAD
+    empty = ~(windowed > 0).any((1, 2, 3))
+    first[empty] = last[empty] = VOXELS // 2  # a grid needs a voxel, if an empty one
     return Grids(
-        np.clip(windowed, 0, largest).astype(np.float16), colour.astype(np.float16), np.asarray(half_extent, np.float64)
+        windowed.astype(np.float16), colour.astype(np.float16), np.asarray(half_extent, np.float64), first, last
     )
 
 
 def index_to_local(half_extent: NDArray, blender_version: tuple[int, ...]) -> NDArray[np.float64]:
-    """VDB's row-vector index-to-object transform [4, 4] of a padded box with half sides [3] in metres.
+    """VDB's row-vector index-to-object transform [4, 4] of a box with half sides [3] in metres.
 
-    Voxel i of the unpadded eight has its centre at half_extent * (-1 + 2 i / 7). Cycles before 5.0 draws every voxel
-    half a voxel too high on each axis, so its files are shifted down.
+    Voxel i of the eight (the padding has -1 and 8) has its centre at half_extent * (-1 + 2 i / 7). Cycles before 5.0
+    draws every voxel half a voxel too high on each axis, so its files are shifted down.
     """
     step = 2.0 * np.asarray(half_extent) / (VOXELS - 1)
     shift = -0.5 * step if blender_version < (5, 0) else 0.0
     transform = np.diag([*step, 1.0])
-    transform[3, :3] = -half_extent - PAD * step + shift
+    transform[3, :3] = -half_extent + shift
     return transform
 
 
@@ -123,11 +151,17 @@ def _write_files(grids: Grids, folder: Path) -> list[str]:
     names = []
     for k in range(len(grids.density)):
         transform = openvdb.createLinearTransform(index_to_local(grids.half_extent[k], bpy.app.version).tolist())
+        written_part = tuple(slice(a, b + 1) for a, b in zip(grids.first[k], grids.last[k], strict=True))
+        start = tuple((grids.first[k] - PAD).tolist())
         density, colour = openvdb.FloatGrid(), openvdb.Vec3SGrid()
         density.name, density.gridClass = "density", openvdb.GridClass.FOG_VOLUME
         colour.name = "Cd"
-        for grid, values in ((density, grids.density[k]), (colour, grids.colour[k])):
-            grid.copyFromArray(np.ascontiguousarray(values, dtype=np.float32))
+        for grid, values, tolerance in (
+            (density, grids.density[k], _ALL_ACTIVE),
+            (colour, grids.colour[k], (_ALL_ACTIVE,) * 3),
+        ):
+            part = np.ascontiguousarray(values[written_part], dtype=np.float32)
+            grid.copyFromArray(part, ijk=start, tolerance=tolerance)
             grid.transform = transform
             grid.saveFloatAsHalf = True
         name = file_name(grids, k, bpy.app.version)

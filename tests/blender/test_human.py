@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 
@@ -9,6 +10,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+from mathutils import Vector
 from oracle import TOLERANCE_M, blended_frames, evaluated_matrices
 
 from blender_primdiffusion.scene import human as human_module
@@ -97,10 +99,13 @@ def test_a_volume_covers_its_box_in_the_world(person):
     collection, arrays = person
     bpy.context.view_layer.update()
     volume = next(o for o in collection.all_objects if o.type == "VOLUME" and o.name.endswith("prim_0007"))
-    low = np.min([list(corner) for corner in volume.bound_box], 0)
+    corners = np.array([volume.matrix_world @ Vector(corner) for corner in volume.bound_box])
     half = arrays["half_extent"][7]
-    step = 2 * half / 7
-    np.testing.assert_allclose(low, -half - 1.5 * step, rtol=1e-5)  # one voxel of padding, half a voxel of cell
+    edge = half * 8 / 7  # half a voxel beyond the centres of the outermost
+    local = np.array(list(itertools.product(*[(-e, e) for e in edge])))
+    box = blended_frames(arrays, np.tile(np.eye(3), (24, 1, 1)), np.zeros(3))[7]
+    expected = local @ box[:3, :3].T + box[:3, 3] + np.array(armature_of(collection).location)
+    np.testing.assert_allclose(sorted(corners.tolist()), sorted(expected.tolist()), atol=1e-5)
 
 
 def test_one_material_serves_all_people(person, saved_scene, tmp_path):

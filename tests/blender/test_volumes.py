@@ -9,7 +9,15 @@ import synthetic
 
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.overlap import most_overlapping
-from blender_primdiffusion.scene.volumes import VolumeWriteError, bake, file_name, index_to_local, window, written
+from blender_primdiffusion.scene.volumes import (
+    FAINTEST,
+    VolumeWriteError,
+    bake,
+    file_name,
+    index_to_local,
+    window,
+    written,
+)
 
 bpy.utils.expose_bundled_modules()
 import openvdb  # noqa: E402
@@ -39,16 +47,36 @@ def test_files_hold_the_windowed_payload_at_half_precision_with_x_along_t(human,
         density, colour = sorted(read, key=lambda grid: grid.name, reverse=True)
         assert (density.name, colour.name) == ("density", "Cd")
         assert density.gridClass == openvdb.GridClass.FOG_VOLUME
-        values, colours = np.zeros((10, 10, 10), np.float32), np.zeros((10, 10, 10, 3), np.float32)
-        density.copyToArray(values)
-        colour.copyToArray(colours)
-        expected = human["density"][k] * window()
-        for d, h, w in ((0, 3, 5), (4, 4, 4), (7, 1, 2), (2, 6, 3)):
-            assert values[w + 1, h + 1, d + 1] == pytest.approx(expected[d, h, w], rel=1e-3, abs=1e-6)
-            np.testing.assert_allclose(colours[w + 1, h + 1, d + 1], human["rgb"][k][d, h, w], atol=1e-3)
-        assert values[1:9, 1:9, 1:9].sum() == pytest.approx(expected.sum(), rel=1e-3)
-        assert values.sum() == values[1:9, 1:9, 1:9].sum()
-        np.testing.assert_array_equal(colours[0], colours[1])
+        values, colours = np.zeros((12, 12, 12), np.float32), np.zeros((12, 12, 12, 3), np.float32)
+        density.copyToArray(values, ijk=(-2, -2, -2))
+        colour.copyToArray(colours, ijk=(-2, -2, -2))
+        expected = (human["density"][k] * window()).transpose(2, 1, 0)  # D, H, W along N, B, T -> x, y, z along T, B, N
+        expected[expected < FAINTEST] = 0
+        inside = values[2:10, 2:10, 2:10]
+        np.testing.assert_allclose(inside, expected, rtol=1e-3)
+        assert values.sum() == inside.sum()
+        full = expected > 0
+        assert full.sum() > 100
+        np.testing.assert_allclose(
+            colours[2:10, 2:10, 2:10][full], human["rgb"][k].transpose(2, 1, 0, 3)[full], rtol=1e-3, atol=1e-4
+        )
+
+
+def test_one_empty_voxel_lies_round_what_is_not_empty_and_nothing_more_is_drawn(human, tmp_path):
+    density = np.zeros((3, 8, 8, 8), np.float32)
+    density[0, 3:5, 2, 1:6] = 50  # D, H, W
+    density[1] = 1e4  # reaches the rim in spite of the window
+    grids = bake(density, human["rgb"][:3], human["half_extent"][:3])
+    with written(grids, tmp_path / "h") as files:
+        pass
+    boxes = [openvdb.read(str(path), "density").evalActiveVoxelBoundingBox() for path in files]
+    assert boxes[0] == ((0, 1, 2), (6, 3, 5))
+    assert boxes[1] == ((-1, -1, -1), (8, 8, 8))
+    assert boxes[2] == ((3, 3, 3), (3, 3, 3))  # an empty primitive
+    centre, half = grids.drawn_box()
+    step = 2 * human["half_extent"][0] / 7
+    np.testing.assert_allclose(centre[0] - half[0], -human["half_extent"][0] + (np.array([0, 1, 2]) - 0.5) * step)
+    np.testing.assert_allclose(centre[0] + half[0], -human["half_extent"][0] + (np.array([6, 3, 5]) + 0.5) * step)
 
 
 def test_voxels_lie_corner_aligned_in_the_box(human, grids, tmp_path):
@@ -59,8 +87,8 @@ def test_voxels_lie_corner_aligned_in_the_box(human, grids, tmp_path):
         half = human["half_extent"][k]
         step = 2 * half / 7
         drawn_too_high = 0.5 * step if bpy.app.version < (5, 0) else 0
-        np.testing.assert_allclose(np.add(transform.indexToWorld((1, 1, 1)), drawn_too_high), -half, atol=1e-7)
-        np.testing.assert_allclose(np.add(transform.indexToWorld((8, 8, 8)), drawn_too_high), half, atol=1e-7)
+        np.testing.assert_allclose(np.add(transform.indexToWorld((0, 0, 0)), drawn_too_high), -half, atol=1e-7)
+        np.testing.assert_allclose(np.add(transform.indexToWorld((7, 7, 7)), drawn_too_high), half, atol=1e-7)
 
 
 def test_blender_before_5_gets_grids_half_a_voxel_lower():
@@ -125,3 +153,5 @@ def test_overlaps_are_counted():
     assert most_overlapping(np.zeros((40, 3)), turned, np.full((40, 3), 0.03)) == 40
     far = np.arange(40)[:, None] * np.array([1.0, 0, 0])
     assert most_overlapping(far, turned, np.full((40, 3), 0.03)) == 1
+    pairs = np.repeat(far[:20], 2, 0) + np.tile([[0.0, 0, 0], [0, 0.04, 0]], (20, 1))
+    assert most_overlapping(pairs, np.tile(np.eye(3), (40, 1, 1)), np.full((40, 3), 0.03)) == 2
