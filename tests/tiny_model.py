@@ -22,7 +22,7 @@ def tiny_model() -> DiffusionModel:
     voxels[3] = torch.linspace(1.0, 0.0, S)[:, None, None]
     basis = torch.zeros(CHANNELS, 4, S**3)
     basis[torch.arange(CHANNELS), torch.arange(CHANNELS)] = S**-1.5
-    codec = LinearCodec(voxels.flatten().expand(K, -1).contiguous(), basis.flatten(1), torch.ones(CHANNELS), 0.5)
+    codec = LinearCodec(voxels.flatten().expand(K, -1).contiguous(), basis.flatten(1), torch.ones(CHANNELS))
     person = torch.zeros(COMPONENTS, CHANNELS, GRID * GRID)
     person[torch.arange(COMPONENTS), torch.arange(COMPONENTS)] = 1 / GRID
     prior = PersonPrior(
@@ -33,7 +33,7 @@ def tiny_model() -> DiffusionModel:
         weight=torch.ones(1),
         centre=torch.zeros(1, COMPONENTS),
         axes=torch.eye(COMPONENTS)[None],
-        variance=torch.full((1, COMPONENTS), (1.5 * GRID) ** 2),
+        variance=torch.full((1, COMPONENTS), (1.2 * GRID) ** 2),
     )
     schedule = SCHEDULES["linear"]()
     denoiser = PersonDenoiser(DenoiserConfig(person=None, local=None), prior, schedule)

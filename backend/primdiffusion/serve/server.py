@@ -134,11 +134,11 @@ class Server:
 
     def _cancel(self, request: Request) -> None:
         params = read_params(CancelParams, request.params, "cancel")
-        with self._lock:
+        with self._lock:  # also while answering, so that the answer comes before the end of the job
             found = self._job is not None and self._job.request.id == params.id
             if found and self._job is not None:
                 self._job.cancelled.set()
-        self._respond(request, {"cancelled": found})
+            self._respond(request, {"cancelled": found})
 
     def _shutdown(self, request: Request) -> None:
         read_params(NoParams, request.params, "shutdown")
