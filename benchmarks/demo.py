@@ -1,0 +1,72 @@
+"""The whole road in one command: zip, install, generate, walk, save, render, march, contact sheet, and a table.
+
+Each stage is a process of its own, measured from outside. `--json FILE` also writes the figures of DESIGN.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+import record
+import stages
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+FRAMES, SHOWN = 48, 31
+
+
+def main() -> None:
+    """Runs the stages one after the other; a failed one ends the demo with its last lines."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=ROOT / "demo_out")
+    parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
+    parser.add_argument("--quick", action="store_true", help="no Cycles frame, a small contact sheet")
+    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--assets", type=Path, help="MakeHuman asset folder: also compare 16 people with their meshes")
+    arguments = parser.parse_args()
+    out, logs = arguments.out.resolve(), arguments.out.resolve() / "logs"
+    logs.mkdir(parents=True, exist_ok=True)
+    blend, human = out / "human.blend", out / "person.human.safetensors"
+    begun = time.perf_counter()
+    rows: list[stages.Stage] = []
+    figures: dict[str, float | None] = {"people_iou_mean": None, "people_psnr_mean": None}
+
+    def stage(name: str, script: str, *options: str | Path, figures_file: bool = True) -> None:
+        report = logs / f"{len(rows)}.json"
+        told = ["--json", report] if figures_file else []
+        print(f"{name} ...", flush=True)
+        rows.append(stages.run_stage(name, [sys.executable, ROOT / script, *options, *told], logs / f"{len(rows)}.log"))
+        if figures_file:
+            figures.update(json.loads(report.read_text()))
+
+    stage("build the extension", "build_addon.py", "--out", out, figures_file=False)
+    archive = next(out.glob("primdiffusion-*.zip"))
+    stage("generate a person in Blender", "benchmarks/demo_blender.py", "person", "--zip", archive, "--blend", blend,
+          "--human", human, "--seed", str(arguments.seed), "--frames", str(FRAMES), "--shown", str(SHOWN))  # fmt: skip
+    if not arguments.quick:
+        frame = out / "cycles.png"
+        stage("Cycles, 384 x 384", "benchmarks/demo_blender.py", "cycles", "--blend", blend, "--out", frame)
+    walk = ("--frames", str(FRAMES), "--frame", str(SHOWN))
+    stage("march five pictures", "benchmarks/demo_march.py", "--human", human, *walk, "--out", out)
+    count = "4" if arguments.quick else "12"
+    stage("contact sheet", "benchmarks/contact_sheet.py", "--count", count, "--out", out / "contact_sheet.png")
+    if arguments.assets is not None:
+        options = ["--quick"] if arguments.quick else []
+        stage("people against meshes", "benchmarks/people.py", "--assets", arguments.assets, *options)
+
+    figures["seconds_setup_excluded_total"] = time.perf_counter() - begun
+    figures["peak_gb"] = max(row.took.peak_gb for row in rows)
+    print(f"\n{stages.table(rows)}\n")
+    print(f"from the button to a person in the scene: {figures['seconds_pressed_to_standing']:.1f} s")
+    print(f"volumes follow linear blend skinning to {figures['lbs_error_mm_max']:.5f} mm")
+    print(f"look at {out}: human.blend, cycles.png, march_*.png, contact_sheet.png")
+    if arguments.json is not None:
+        record.write_record(arguments.json, figures)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,137 @@
+"""The demo inside Blender: install the zip, press the button, walk, measure the volumes' motion, save, render.
+
+`person` installs the extension and generates through its own operator and the real child process; `cycles` opens
+the saved file anew and renders one frame. Blender's settings live in a temporary folder: an installed Blender keeps
+its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_demo_"))
+
+import bpy
+import numpy as np
+import torch
+from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.human_file import load_human
+from primdiffusion.primitives.anchors import anchor_skin_weights, attach, default_anchors
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "examples"))
+from walk import walk_and_wave  # noqa: E402
+
+MODULE = "bl_ext.user_default.primdiffusion"
+SEED = 7
+
+
+def person(arguments: argparse.Namespace) -> dict[str, float]:
+    """Install, generate, keyframe, measure, save; the figures of these."""
+    bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)
+    bpy.ops.extensions.package_install_files(
+        filepath=str(arguments.zip), repo="user_default", enable_on_install=True, overwrite=True
+    )
+    bpy.context.preferences.addons[MODULE].preferences.backend_python = sys.executable
+    bpy.ops.wm.save_as_mainfile(filepath=str(arguments.blend))
+
+    start = time.perf_counter()
+    bpy.ops.primdiffusion.generate(seed=arguments.seed, steps=arguments.steps)
+    pressed = time.perf_counter() - start
+
+    scene_human = sys.modules[f"{MODULE}.scene.human"]
+    collection = scene_human.humans(bpy.context.scene)[0]
+    armature = scene_human.armature_of(collection)
+    spent = sys.modules[f"{MODULE}.ui.session"].session.seconds
+    rotations = walk_and_wave(arguments.frames)
+    numbers = np.arange(1, arguments.frames + 1)
+    start = time.perf_counter()
+    sys.modules[f"{MODULE}.scene.keyframes"].keyframe_poses(
+        armature, numbers, rotations, np.zeros((arguments.frames, 3)), "Walk"
+    )
+    keyframed = time.perf_counter() - start
+    bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, arguments.frames
+
+    human_file = next(arguments.blend.parent.rglob("*.human.safetensors"))
+    shutil.copyfile(human_file, arguments.human)
+    checked = [1, 1 + arguments.frames // 3, arguments.shown + 1, arguments.frames]
+    error = max(lbs_error_mm(armature, arguments.human, rotations[number - 1], number) for number in checked)
+    bpy.context.scene.frame_set(arguments.shown + 1)
+    bpy.ops.wm.save_as_mainfile(filepath=str(arguments.blend))
+    return {
+        "seconds_pressed_to_standing": pressed,
+        "seconds_generate": spent["generate"],
+        "seconds_build_scene": spent["build"],
+        "seconds_keyframes": keyframed,
+        "lbs_error_mm_max": error,
+    }
+
+
+def lbs_error_mm(armature: bpy.types.Object, human_file: Path, rotation: np.ndarray, number: int) -> float:
+    """How far the farthest volume's centre is from linear blend skinning of its anchor as the backend computes it."""
+    bpy.context.scene.frame_set(number)
+    human = load_human(human_file)
+    body, anchors = default_body().to(dtype=torch.float64), default_anchors().to(dtype=torch.float64)
+    shaped = body.shape(human.betas.double())
+    posed = shaped.pose(BodyPose(torch.from_numpy(rotation), torch.zeros(3, dtype=torch.float64)))
+    rest = attach(anchors, shaped.vertices, body.faces).position
+    blended = torch.einsum("kj,jab->kab", anchor_skin_weights(anchors, body), posed.skinning)
+    expected = (blended[:, :3, :3] @ rest[:, :, None])[:, :, 0] + blended[:, :3, 3]
+    upright = np.stack([expected[:, 0], -expected[:, 2], expected[:, 1]], -1)  # y up to z up
+    world = np.array(armature.matrix_world)
+    expected_world = upright @ world[:3, :3].T + world[:3, 3]
+    graph = bpy.context.evaluated_depsgraph_get()
+    volumes = sorted((o for o in armature.children if o.type == "VOLUME"), key=lambda o: o.name)
+    found = np.array([o.evaluated_get(graph).matrix_world.translation for o in volumes])
+    return float(np.linalg.norm(found - expected_world, axis=-1).max() * 1e3)
+
+
+def cycles(arguments: argparse.Namespace) -> dict[str, float]:
+    """Open the saved file, check that its volumes are there, and render the current frame in Cycles."""
+    bpy.ops.wm.open_mainfile(filepath=str(arguments.blend))
+    scene = bpy.context.scene
+    missing = [v.name for v in bpy.data.volumes if not Path(bpy.path.abspath(v.filepath)).is_file()]
+    if missing or not bpy.data.volumes:
+        count = len(bpy.data.volumes)
+        raise SystemExit(f"{arguments.blend} reopened with {count} volumes, {len(missing)} without a file")
+    sys.path.insert(0, str(ROOT))
+    from blender_primdiffusion.scene.preview import setup_cycles_preview
+
+    setup_cycles_preview(scene, size=arguments.size, samples=arguments.samples)
+    scene.render.filepath = str(arguments.out)
+    start = time.perf_counter()
+    bpy.ops.render.render(write_still=True)
+    return {"seconds_cycles": time.perf_counter() - start, "volumes": float(len(bpy.data.volumes))}
+
+
+def main() -> None:
+    """One stage, its figures into a JSON file."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    stages = parser.add_subparsers(required=True)
+    making = stages.add_parser("person")
+    making.set_defaults(stage=person)
+    for name in ("zip", "blend", "human", "json"):
+        making.add_argument(f"--{name}", type=Path, required=True)
+    making.add_argument("--seed", type=int, default=SEED)
+    making.add_argument("--steps", type=int, default=30)
+    making.add_argument("--frames", type=int, default=48)
+    making.add_argument("--shown", type=int, default=31, help="frame of the walk that is shown, counted from 0")
+    drawing = stages.add_parser("cycles")
+    drawing.set_defaults(stage=cycles)
+    for name in ("blend", "out", "json"):
+        drawing.add_argument(f"--{name}", type=Path, required=True)
+    drawing.add_argument("--size", type=int, default=384)
+    drawing.add_argument("--samples", type=int, default=1)
+    arguments = parser.parse_args()
+    arguments.json.write_text(json.dumps(arguments.stage(arguments)))
+
+
+if __name__ == "__main__":
+    main()
