@@ -78,7 +78,7 @@ def validate(archive: Path, tool: Path) -> None:
 
 def main() -> None:
     """Build, validate, print the size."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder for the zip")
     archive = build(parser.parse_args().out)
     tool = blender_extension_tool()

@@ -7,6 +7,7 @@ import json
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,7 +98,7 @@ def read_human(path: str | Path) -> HumanFile:
     return _checked_values(HumanFile(meta=meta, **_shaped_fields(arrays, path)), path)
 
 
-def _plain(arrays: dict[str, NDArray], name: str, path: Path) -> object:
+def _plain(arrays: dict[str, NDArray], name: str, path: Path) -> Any:
     value = _field(arrays, name, path)
     if value.size != 1:
         raise HumanFileError(f"the field {name!r} of {path.name!r} holds {value.size} values instead of one; {_REMEDY}")

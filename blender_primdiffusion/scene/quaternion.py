@@ -25,9 +25,9 @@ def matrix_to_quaternion(rotation: NDArray) -> NDArray[np.float64]:
         -2,
     )
     largest = np.argmax(np.diagonal(products, axis1=-2, axis2=-1), -1)
-    best = np.take_along_axis(products, largest[..., None, None], -2)[..., 0, :]
+    best: NDArray[np.float64] = np.take_along_axis(products, largest[..., None, None], -2)[..., 0, :]
     best = best / np.linalg.norm(best, axis=-1, keepdims=True)
-    return np.where(best[..., :1] < 0, -best, best)
+    return best * np.where(best[..., :1] < 0, -1.0, 1.0)
 
 
 def continuous_quaternions(quaternions: NDArray) -> NDArray[np.float64]:

@@ -58,7 +58,7 @@ class Grids:
 
 def window() -> NDArray[np.float64]:
     """exp(-8 sum |y|^8) at the voxel centres y = -1 + 2 i / 7 (SPEC 4), [8, 8, 8]; symmetric in its axes."""
-    axis = np.exp(-8.0 * np.abs(np.linspace(-1.0, 1.0, VOXELS)) ** WINDOW_EXPONENT)
+    axis: NDArray[np.float64] = np.exp(-8.0 * np.abs(np.linspace(-1.0, 1.0, VOXELS)) ** WINDOW_EXPONENT)
     return axis[:, None, None] * axis[None, :, None] * axis[None, None, :]
 
 

@@ -34,9 +34,9 @@ class Session:
     def __init__(self) -> None:
         self.job: GenerateJob | None = None
         """The job under way, None when idle."""
-        self.error = ""
+        self.error: str = ""
         """Why the last generation failed, in a sentence; empty when it went well."""
-        self.notice = ""
+        self.notice: str = ""
         """How the last generation ended otherwise."""
         self.device = ""
         """What the backend computes on, once it has said so."""
@@ -83,7 +83,7 @@ class Session:
             raise RuntimeError("there is no finished job; call tick until job.finished")
         try:
             if job.state == "cancelled":
-                self.notice = job.message
+                self.notice = job.message or ""
                 return None
             if job.state == "failed":
                 raise GenerationFailed(str(job.error))
@@ -115,8 +115,9 @@ class Session:
 
     def _build(self, context: bpy.types.Context, job: GenerateJob) -> bpy.types.Collection:
         started = time.monotonic()
-        human_npz = Path(job.result["human"])
-        keep = [Path(job.result["person"])] if "person" in job.result else []  # for the exact marcher, later
+        result = job.result or {}
+        human_npz = Path(result["human"])
+        keep = [Path(result["person"])] if "person" in result else []  # for the exact marcher, later
         collection = build_human(context, human_npz, "Human", keep)
         seconds = time.monotonic() - started
         self.notice = overlap_warning(collection) or f"{job.message}, built in {seconds:.1f} s"

@@ -8,7 +8,7 @@ import bpy
 
 from .generation import TICK_S, Busy, GenerationFailed, session
 
-_OFFERED_S = 1.0
+_TOLD_S = 1.0
 """Between lines of progress on the console in background mode."""
 
 
@@ -37,10 +37,10 @@ class PRIMDIFFUSION_OT_generate(bpy.types.Operator):
 
     def _wait(self, context: bpy.types.Context) -> set[str]:
         told = 0.0
-        while not session.job.finished:
-            if session.tick() and time.monotonic() - told > _OFFERED_S:
+        while (job := session.job) is not None and not job.finished:
+            if session.tick() and time.monotonic() - told > _TOLD_S:
                 told = time.monotonic()
-                print(f"PrimDiffusion: {session.job.message}", flush=True)
+                print(f"PrimDiffusion: {job.message}", flush=True)
             time.sleep(TICK_S / 4)
         try:
             session.finish(context)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-EXTENSION = __package__.rpartition(".")[0]
+EXTENSION = str(__package__).rpartition(".")[0]
 """The extension's full module name; `bl_ext.<repository>.primdiffusion` once installed."""
 
 
