@@ -50,6 +50,8 @@ class Generate:
     """Trained model (.safetensors); without it the one that comes with the package."""
     count: int = 1
     """How many people, with seeds following on each other."""
+    size: int = 512
+    """Pixels a side of the pictures."""
 
     def run(self) -> None:
         """Generates, and prints the folder of each person."""
@@ -75,7 +77,7 @@ class Generate:
                         bar.update()
 
                     human = generate(model, seed, self.steps, self.sampler, on_step)
-                write_person(unfinished, human)
+                write_person(unfinished, human, self.size)
             print(f"{folder}  seed {seed}, {self.steps} steps, {time.perf_counter() - began:.1f} s")
 
 

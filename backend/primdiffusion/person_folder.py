@@ -11,8 +11,6 @@ from primdiffusion.human_file import export_for_blender, save_human
 from primdiffusion.render.image import depth_to_png, to_png
 from primdiffusion.render.march import march
 
-PREVIEW_SIZE = 512
-
 
 @dataclasses.dataclass(frozen=True)
 class PersonFiles:
@@ -28,7 +26,7 @@ class PersonFiles:
 FILES = PersonFiles()
 
 
-def write_person(folder: Path, human: Human, size: int = PREVIEW_SIZE) -> None:
+def write_person(folder: Path, human: Human, size: int) -> None:
     """Writes all of FILES: the person for Blender, the person to keep, and pictures in the T pose.
 
     The first picture on a machine takes some seconds longer: the marcher is compiled and kept.

@@ -21,7 +21,10 @@ def checkpoint(tmp_path_factory):
 @pytest.fixture(scope="module")
 def person(checkpoint, tmp_path_factory):
     out = tmp_path_factory.mktemp("person")
-    cli.run(["generate", "--seed", "5", "--steps", "2", "--out", str(out), "--checkpoint", str(checkpoint)])
+    line = ["generate", "--seed", "5", "--steps", "2", "--out", str(out), "--size", "48"]
+    cli.run([*line, "--checkpoint", str(checkpoint)])
+    with Image.open(out / "front.png") as picture:
+        assert picture.size == (48, 48)
     return out
 
 
@@ -39,7 +42,7 @@ def test_generate_writes_the_person_and_its_pictures(person):
 
 
 def test_count_writes_a_folder_for_each_seed(checkpoint, tmp_path, capsys):
-    line = ["generate", "--seed", "5", "--count", "2", "--steps", "1", "--out", str(tmp_path)]
+    line = ["generate", "--seed", "5", "--count", "2", "--steps", "1", "--size", "32", "--out", str(tmp_path)]
     cli.main([*line, "--checkpoint", str(checkpoint)])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["seed_000005", "seed_000006"]
     assert all(sorted(p.name for p in folder.iterdir()) == FILES for folder in tmp_path.iterdir())

@@ -17,7 +17,7 @@ def checkpoint(tmp_path_factory) -> str:
 @pytest.fixture
 def only_sampling(monkeypatch):
     """Leaves out files and pictures."""
-    monkeypatch.setattr(jobs, "write_person", lambda folder, human: None)
+    monkeypatch.setattr(jobs, "write_person", lambda *_: None)
 
 
 def test_time_left_is_the_mean_of_the_warm_steps_times_the_steps_left(checkpoint, tmp_path, monkeypatch, only_sampling):
@@ -49,7 +49,7 @@ def test_a_job_can_be_ended_at_every_report(checkpoint, tmp_path):
     class Stop(Exception):
         pass
 
-    params = GenerateParams(1, str(tmp_path / "out"), 2, checkpoint=checkpoint)
+    params = GenerateParams(1, str(tmp_path / "out"), 2, checkpoint=checkpoint, size=32)
     reports = []
     Jobs().generate(params, lambda *report: reports.append(report))
     assert [report[0] for report in reports] == ["load", "sample", "sample", "sample", "write", "write"]

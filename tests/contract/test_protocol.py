@@ -86,7 +86,7 @@ def test_generate_reports_every_step_and_leaves_whole_files(child, checkpoint, t
 def test_the_same_seed_gives_the_same_person_and_another_seed_another(child, checkpoint, tmp_path):
     def rgb(id, seed, name):
         out = tmp_path / name
-        child.ask(id, "generate", seed=seed, steps=2, out_dir=str(out), checkpoint=str(checkpoint))
+        child.ask(id, "generate", seed=seed, steps=2, size=32, out_dir=str(out), checkpoint=str(checkpoint))
         with np.load(out / "human.npz") as human:
             return human["rgb"]
 
@@ -114,6 +114,7 @@ def test_the_same_seed_gives_the_same_person_and_another_seed_another(child, che
         (b'{"jsonrpc": "2.0", "id": 38, "method": "generate", "params": {"seed": -1, "out_dir": "x"}}', -32602, 38),
         (b'{"jsonrpc":"2.0","id":39,"method":"generate","params":{"seed":1,"steps":0,"out_dir":"x"}}', -32602, 39),
         (b'{"jsonrpc":"2.0","id":40,"method":"generate","params":{"seed":1,"steps":2.5,"out_dir":"x"}}', -32602, 40),
+        (b'{"jsonrpc":"2.0","id":44,"method":"generate","params":{"seed":1,"size":0,"out_dir":"x"}}', -32602, 44),
         (b'{"jsonrpc":"2.0","id":41,"method":"render","params":{"human":"h","out":"o","width":0}}', -32602, 41),
         (b'{"jsonrpc":"2.0","id":42,"method":"render","params":{"human":"h","out":"o","yaw":NaN}}', -32602, 42),
         (b'{"jsonrpc": "2.0", "id": 43, "method": "cancel"}', -32602, 43),
@@ -153,7 +154,7 @@ def test_a_second_generate_is_refused_while_one_runs_and_cancel_stops_the_first_
     assert sum(m.get("method") == "progress" for m in after) <= 1
     assert not first.exists(), "a folder the cancelled job made is gone again"
 
-    done = child.ask(74, "generate", seed=1, steps=1, out_dir=str(second), checkpoint=str(checkpoint))
+    done = child.ask(74, "generate", seed=1, steps=1, size=32, out_dir=str(second), checkpoint=str(checkpoint))
     assert done["result"]["steps"] == 1
 
 
@@ -167,7 +168,9 @@ def test_cancelling_in_a_folder_that_was_there_keeps_what_was_in_it(child, check
 
 
 def test_render_draws_a_saved_person_in_a_pose(child, checkpoint, tmp_path):
-    person = child.ask(90, "generate", seed=2, steps=2, out_dir=str(tmp_path), checkpoint=str(checkpoint))["result"]
+    person = child.ask(90, "generate", seed=2, steps=2, size=32, out_dir=str(tmp_path), checkpoint=str(checkpoint))[
+        "result"
+    ]
 
     def picture(id, name, **params):
         out = tmp_path / name
@@ -267,7 +270,7 @@ serve.main()
 
 def test_stray_prints_and_writes_go_to_stderr_and_never_into_the_conversation(checkpoint, tmp_path):
     child = Conversation(("-c", NOISY))
-    child.send(1, "generate", seed=1, steps=3, out_dir=str(tmp_path / "out"), checkpoint=str(checkpoint))
+    child.send(1, "generate", seed=1, steps=3, size=32, out_dir=str(tmp_path / "out"), checkpoint=str(checkpoint))
     assert child.answer(1)["result"]["steps"] == 3
     child.close()
     assert child.stray_lines == []

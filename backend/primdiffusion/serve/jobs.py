@@ -49,7 +49,7 @@ class Jobs:
             human = generate(model, params.seed, params.steps, params.sampler, _step_reporter(report))
             sampled = time.perf_counter()
             report("write", params.steps, params.steps, None)
-            write_person(folder, human)
+            write_person(folder, human, params.size)
             report("write", params.steps, params.steps, 0.0)  # the last chance to cancel
         return {
             "human": str(out / FILES.blender),

@@ -21,12 +21,16 @@ class GenerateParams:
     sampler: str = "ddim"
     checkpoint: str | None = None
     """A .safetensors file; None for the one that ships with the package."""
+    size: int = 512
+    """Pixels a side of the pictures."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed <= LARGEST_SEED:
             raise ValueError(f"seed {self.seed} is outside 0 ... 2^63-1")
         if not 1 <= self.steps <= STEP_LIMIT:
             raise ValueError(f"{self.steps} steps were asked for: choose 1 to {STEP_LIMIT}")
+        if self.size < 1:
+            raise ValueError(f"pictures of {self.size} pixels a side: choose 1 or more")
         if not self.out_dir:
             raise ValueError("out_dir is empty: name a folder")
 
