@@ -182,14 +182,33 @@ def test_nearest_agrees_with_a_search_through_all_points():
     generator = np.random.default_rng(3)
     points = generator.random((3000, 3)).astype(np.float32)
     queries = (1.4 * generator.random((2000, 3)) - 0.2).astype(np.float32)
-    index, distance = nearest(points, queries, 0.06)
-    every = np.linalg.norm(queries[:, None].astype(np.float64) - points[None], axis=-1)
+    axes = generator.normal(size=(2000, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    found = nearest(points, queries, axes.astype(np.float32), 0.5, 0.06)
+    offset = points[None].astype(np.float64) - queries[:, None]
+    every = np.linalg.norm(offset, axis=-1)
     within = every.min(1) < 0.06
     assert 0.1 < within.mean() < 0.9
-    np.testing.assert_array_equal(index >= 0, within)
-    np.testing.assert_array_equal(index[within], every.argmin(1)[within])
-    np.testing.assert_allclose(distance[within], every.min(1)[within], rtol=1e-5)
-    assert np.isinf(distance[~within]).all()
+    np.testing.assert_array_equal(found.index >= 0, within)
+    np.testing.assert_array_equal(found.index[within], every.argmin(1)[within])
+    np.testing.assert_allclose(found.distance[within], every.min(1)[within], rtol=1e-5)
+    assert np.isinf(found.distance[~within]).all()
+    along = np.einsum("qni,qi->qn", offset, axes)
+    cost = np.where(every < 0.06, every**2 - along**2 + (0.5 * along) ** 2, np.inf)
+    np.testing.assert_array_equal(found.along[within], cost.argmin(1)[within])
+    assert (found.along != found.index)[within].mean() > 0.05
+
+
+def test_what_bulges_out_keeps_its_colour():
+    """A small dark dome on a light plate, like an iris on an eye: below the dome, voxels are dark and not light."""
+    plate = trimesh.creation.box((0.3, 0.3, 0.1)).apply_translation([0, 0, -0.05])
+    dome = trimesh.creation.icosphere(subdivisions=4, radius=0.015)
+    parts = textured(plate, plain(255, 255, 255), name="plate"), textured(dome, plain(0, 0, 0), name="dome")
+    frames = frames_on(np.zeros((1, 3)), np.array([[0, 0, 1.0]]), [0.03, 0.03, 0.03])
+    centres = voxel_centres(frames)
+    below = (np.hypot(centres[..., 0], centres[..., 1]) < 0.007) & (np.abs(centres[..., 2] + 0.013) < 0.005)
+    assert below.any()
+    assert from_mesh(TexturedMesh(parts), frames).rgb[:, 0].numpy()[below].max() < 0.1
 
 
 def test_unusable_input_is_refused_in_words():

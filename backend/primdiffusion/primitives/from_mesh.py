@@ -23,6 +23,9 @@ INSET = 0.2
 is interpolated, and without this the figure grows by about 3 mm."""
 REACH = 0.030
 """Voxels farther than this from the surface have no colour of their own, metres."""
+STRETCH = 0.3
+"""What way along a primitive's normal counts for the choice of a voxel's colour. In plain distance the points that lie
+deepest win below the surface: the corners of an eye, not its iris."""
 MIP_LEVELS = 6
 
 
@@ -66,20 +69,23 @@ def surface_field(mesh: TexturedMesh, frames: Frames) -> SurfaceField:
     centres = voxel_centres(frames)
     views, drawn = look_around(soup)
     points = visible_points(soup, views, drawn)
-    index, distance = nearest(points.position, centres.reshape(-1, 3), REACH)
-    behind = carve(centres.reshape(-1, 3), views, drawn)
+    queries, shape = centres.reshape(-1, 3), centres.shape[:-1]
+    axes = np.repeat(frames.rotation[:, :, 2].detach().cpu().numpy().astype(np.float32), S**3, axis=0)
+    found = nearest(points.position, queries, axes, STRETCH, REACH)
 
-    shape, within, chosen = centres.shape[:-1], index >= 0, np.maximum(index, 0)
-    through, along = _spacing(frames, points.normal[chosen].reshape(len(centres), -1, 3))
-    depth = np.where(within, distance - INSET * through, REACH)
-    density = np.where(behind > 0, FULL_DENSITY * np.clip(depth / RAMP, 0, 1), 0)
+    normals = points.normal[np.maximum(found.index, 0)].reshape(len(centres), -1, 3)
+    through, across = _spacing(frames, normals)
+    depth = np.where(found.index >= 0, found.distance - INSET * through, REACH)
+    solid = carve(queries, views, drawn) > 0
+    density = np.where(solid, FULL_DENSITY * np.clip(depth / RAMP, 0, 1), 0)
     point_uv, point_footprint = _texture_coordinates(soup, points.face, points.barycentric)
+    chosen = np.maximum(found.along, 0)
     return SurfaceField(
         density=density.reshape(shape).astype(np.float32),
-        part=np.where(within, soup.part[points.face[chosen]], -1).astype(np.int32).reshape(shape),
+        part=np.where(found.along >= 0, soup.part[points.face[chosen]], -1).astype(np.int32).reshape(shape),
         uv=point_uv[chosen].reshape(*shape, 2),
-        footprint=(point_footprint[chosen] * along).reshape(shape).astype(np.float32),
-        own=np.clip(2 - 2 * distance / REACH, 0, 1).reshape(shape).astype(np.float32),
+        footprint=(point_footprint[chosen] * across).reshape(shape).astype(np.float32),
+        own=np.clip(2 - 2 * found.distance / REACH, 0, 1).reshape(shape).astype(np.float32),
     )
 
 

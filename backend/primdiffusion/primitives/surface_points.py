@@ -111,10 +111,26 @@ def _covered(
     return covered
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Nearest:
+    """For each query the point nearest to it, in two senses; -1 where no point is within reach."""
+
+    index: Int32[np.ndarray, "q"]
+    """The nearest point."""
+    distance: Float32[np.ndarray, "q"]
+    """To that point, metres; inf where there is none."""
+    along: Int32[np.ndarray, "q"]
+    """The nearest where way along the query's axis counts less; among the same points."""
+
+
 def nearest(
-    points: Float32[np.ndarray, "n 3"], queries: Float32[np.ndarray, "q 3"], reach: float
-) -> tuple[Int32[np.ndarray, "q"], Float32[np.ndarray, "q"]]:
-    """The nearest point to each query within `reach` metres and its distance; -1 and inf where there is none.
+    points: Float32[np.ndarray, "n 3"],
+    queries: Float32[np.ndarray, "q 3"],
+    axes: Float32[np.ndarray, "q 3"],
+    stretch: float,
+    reach: float,
+) -> Nearest:
+    """The nearest points within `reach` metres; way along a query's unit axis counts `stretch` (0 ... 1) for `along`.
 
     Points are sorted into cubes of side `reach`, so a query looks at 27 of them.
     """
@@ -124,19 +140,28 @@ def nearest(
     number = (cube[:, 0] * shape[1] + cube[:, 1]) * shape[2] + cube[:, 2]
     order = np.argsort(number, kind="stable")
     start = np.searchsorted(number[order], np.arange(shape.prod() + 1))
-    found = np.full(len(queries), -1, np.int32)
-    distance = np.full(len(queries), np.inf, np.float32)
-    _nearest(points[order], order, start, shape, low, np.float32(reach), queries, found, distance)
-    return found, distance
+    result = Nearest(
+        np.full(len(queries), -1, np.int32),
+        np.full(len(queries), np.inf, np.float32),
+        np.full(len(queries), -1, np.int32),
+    )
+    gain = np.float32(1 - stretch * stretch)
+    _nearest(
+        points[order], order, start, shape, low, np.float32(reach), queries, axes, gain,
+        result.index, result.distance, result.along,
+    )  # fmt: skip
+    return result
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _nearest(points, order, start, shape, low, reach, queries, found, distance):
+def _nearest(points, order, start, shape, low, reach, queries, axes, gain, found, distance, along):
     for q in range(queries.shape[0]):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
         cx, cy = int(np.floor((x - low[0]) / reach)), int(np.floor((y - low[1]) / reach))
         cz = int(np.floor((z - low[2]) / reach))
+        ax, ay, az = axes[q, 0], axes[q, 1], axes[q, 2]
         best, best_squared = -1, reach * reach
+        best_along, best_cost = -1, reach * reach
         z_from, z_to = max(cz - 1, 0), min(cz + 2, shape[2])
         if z_from >= z_to:
             continue
@@ -148,9 +173,15 @@ def _nearest(points, order, start, shape, low, reach, queries, found, distance):
                     squared = dx * dx + dy * dy + dz * dz
                     if squared < best_squared:
                         best, best_squared = n, squared
+                    if squared < reach * reach:
+                        way = dx * ax + dy * ay + dz * az
+                        cost = squared - gain * way * way
+                        if cost < best_cost:
+                            best_along, best_cost = n, cost
         if best >= 0:
             found[q] = order[best]
             distance[q] = np.sqrt(best_squared)
+            along[q] = order[best_along]
 
 
 def carve(
