@@ -45,7 +45,7 @@ def build(out: Path) -> Path:
     """Write `primdiffusion-<version>.zip` into `out` and return its path. Raises BuildError when a part is missing."""
     manifest = tomllib.loads((ADDON / "blender_manifest.toml").read_text(encoding="utf-8"))
     files = contents()
-    if "backend/primdiffusion/serve.py" not in files:
+    if "backend/primdiffusion/__init__.py" not in files:
         raise BuildError(f"the backend is missing in {BACKEND}; build from a complete checkout")
     out.mkdir(parents=True, exist_ok=True)
     target = out / f"{manifest['id']}-{manifest['version']}.zip"

@@ -36,5 +36,6 @@ def continuous_quaternions(quaternions: NDArray) -> NDArray[np.float64]:
     Blender interpolates components, and q and -q are far apart.
     """
     dots = (quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True)
-    signs = np.concatenate([np.ones_like(quaternions[:1, ..., :1]), np.cumprod(np.where(dots < 0, -1.0, 1.0), 0)])
+    flips: NDArray[np.float64] = np.where(dots < 0, -1.0, 1.0)
+    signs: NDArray[np.float64] = np.concatenate([np.ones_like(quaternions[:1, ..., :1]), np.cumprod(flips, 0)])
     return quaternions * signs

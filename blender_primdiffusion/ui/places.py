@@ -14,7 +14,7 @@ def backend_module_path() -> Path | None:
     """The folder that holds the package `primdiffusion`: bundled in the zip, or beside us in a checkout, else None."""
     root = Path(__file__).resolve().parent.parent
     for folder in (root / "backend", root.parent / "backend"):
-        if (folder / "primdiffusion" / "serve.py").is_file():
+        if (folder / "primdiffusion" / "__init__.py").is_file():
             return folder
     return None
 

@@ -35,7 +35,7 @@ report = {
     "files": len(list(Path(blend).parent.rglob("*.vdb"))),
     "written_into_the_addon": [p.name for p in installed.rglob("*") if p.suffix in (".nbi", ".nbc")]
     + [str(p) for p in (installed / "backend").rglob("*.pyc")],
-    "backend_in_zip": (installed / "backend" / "primdiffusion" / "serve.py").is_file(),
+    "backend_in_zip": (installed / "backend" / "primdiffusion" / "human.py").is_file(),
     "seconds": seconds,
 }
 bpy.ops.preferences.addon_disable(module=module)

@@ -40,7 +40,7 @@ def test_the_zip_holds_addon_backend_and_licence_and_nothing_stray(archive):
     names = zipfile.ZipFile(archive).namelist()
     assert names == sorted(names)
     wanted = {"blender_manifest.toml", "__init__.py", "LICENSE", "worker/client.py", "scene/human.py"}
-    wanted |= {"backend/primdiffusion/serve.py", "backend/primdiffusion/body/data/body.npz"}
+    wanted |= {"backend/primdiffusion/human.py", "backend/primdiffusion/body/data/body.npz"}
     assert wanted <= set(names)
     assert not [name for name in names if "__pycache__" in name or name.endswith((".pyc", ".nbi", ".nbc"))]
     assert WEIGHTS.is_file() == ("backend/primdiffusion/weights/default.safetensors" in names)
