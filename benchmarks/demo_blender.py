@@ -49,7 +49,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float]:
     scene_human = sys.modules[f"{MODULE}.scene.human"]
     collection = scene_human.humans(bpy.context.scene)[0]
     armature = scene_human.armature_of(collection)
-    spent = sys.modules[f"{MODULE}.ui.session"].session.seconds
+    spent = sys.modules[f"{MODULE}.ui.generation"].session.seconds
     rotations = walk_and_wave(arguments.frames)
     numbers = np.arange(1, arguments.frames + 1)
     start = time.perf_counter()

@@ -40,6 +40,9 @@ class Session:
         """How the last generation ended otherwise."""
         self.device = ""
         """What the backend computes on, once it has said so."""
+        self.seconds: dict[str, float] = {}
+        """Of the last generation: "generate" from the click to the backend's answer, "build" in the scene."""
+        self._started = 0.0
         self._backend: Backend | None = None
         self._backend_python = ""
         self._folder: Path | None = None
@@ -54,6 +57,7 @@ class Session:
         if self.busy:
             raise Busy("a person is being generated; wait for it or press Cancel")
         self.error = self.notice = ""
+        self.seconds, self._started = {}, time.monotonic()
         self._folder = Path(tempfile.mkdtemp(prefix="generate_", dir=bpy.app.tempdir or None))
         checkpoint = preference("checkpoint")
         self.job = GenerateJob(
@@ -114,13 +118,13 @@ class Session:
             self._backend = None
 
     def _build(self, context: bpy.types.Context, job: GenerateJob) -> bpy.types.Collection:
-        started = time.monotonic()
+        began = time.monotonic()
         result = job.result or {}
         human_npz = Path(result["human"])
         keep = [Path(result["person"])] if "person" in result else []  # for the exact marcher, later
         collection = build_human(context, human_npz, "Human", keep)
-        seconds = time.monotonic() - started
-        self.notice = overlap_warning(collection) or f"{job.message}, built in {seconds:.1f} s"
+        self.seconds = {"generate": began - self._started, "build": time.monotonic() - began}
+        self.notice = overlap_warning(collection) or f"{job.message}, built in {self.seconds['build']:.1f} s"
         bpy.ops.ed.undo_push(message="Generate Human")
         return collection
 

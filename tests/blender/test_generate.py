@@ -65,6 +65,7 @@ def test_generate_builds_a_person_and_keeps_the_backends_file_beside_its_volumes
     assert not session.busy
     assert session.error == ""
     assert session.device == "fake device"
+    assert set(session.seconds) == {"generate", "build"}
 
 
 def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_job(addon):
