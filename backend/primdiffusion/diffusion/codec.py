@@ -17,16 +17,19 @@ from torch import Tensor
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.primitives.primitives import GRID, K, Payload, S
+from primdiffusion.primitives.slab import NETWORK_SCALE
 
 VALUES = 4 * S**3
 """Values of a primitive: encoded red, green, blue, relative density, each D, H, W."""
+SLAB_UNIT = 2 * NETWORK_SCALE
+"""Network units per value: noise on latents is the noise that the paper puts on the slab."""
 DEAD_ZONE = (0.08, 0.84)
 """Decoded relative density a becomes clip((a - 0.08) / 0.84): what truncation leaves around a person is not haze."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LinearCodec(TensorRecord):
-    """Cells [*b, 1024, 2048] to latents [*b, C, 32, 32] and back: z = scale * basis (v - mean)."""
+    """Cells [*b, 1024, 2048] to latents [*b, C, 32, 32] and back: z = 0.364 basis (v - mean), in the slab's units."""
 
     mean: Float[Tensor, "k v"]
     """Mean values of every primitive; equal to its own mirror image."""
@@ -34,17 +37,15 @@ class LinearCodec(TensorRecord):
     """Orthonormal rows, each even or odd under the mirror of a cell."""
     parity: Float[Tensor, "c"]
     """1 for even rows, -1 for odd ones."""
-    scale: float
-    """Latent units per unit of value; the only free scale, so that noise stays isotropic."""
 
     def encode(self, cells: Float[Tensor, "*b k v"]) -> Float[Tensor, "*b c 32 32"]:
         """Latents of cells; loses what lies outside the basis."""
-        latents = (cells - self.mean) @ self.basis.T * self.scale
+        latents = (cells - self.mean) @ self.basis.T * SLAB_UNIT
         return latents.transpose(-1, -2).unflatten(-1, (GRID, GRID))
 
     def decode(self, latents: Float[Tensor, "*b c 32 32"]) -> Float[Tensor, "*b k v"]:
         """Cells of latents, unclamped."""
-        return latents.flatten(-2).transpose(-1, -2) @ self.basis / self.scale + self.mean
+        return latents.flatten(-2).transpose(-1, -2) @ self.basis / SLAB_UNIT + self.mean
 
     def mirror(self, latents: Float[Tensor, "*b c 32 32"]) -> Float[Tensor, "*b c 32 32"]:
         """The person seen in a mirror: columns reversed, each cell reversed along W (the layout is symmetric)."""
@@ -77,16 +78,11 @@ def mirror_cells(cells: Float[Tensor, "*b k v"]) -> Float[Tensor, "*b k v"]:
 
 
 def fit_codec(
-    cells: Float[Tensor, "n k v"],
-    channels: int,
-    generator: torch.Generator,
-    cells_each: int = 128,
-    latent_std: float = 1.0,
+    cells: Float[Tensor, "n k v"], channels: int, generator: torch.Generator, cells_each: int = 128
 ) -> LinearCodec:
     """Per-cell mean, and shared principal components of `cells_each` random cells of every person and their mirrors.
 
-    `latent_std` is the root mean square that latents of these people get. Raises ValueError for fewer samples than
-    channels.
+    Raises ValueError for fewer samples than channels.
     """
     if cells.shape[0] * cells_each < channels or tuple(cells.shape[1:]) != (K, VALUES):
         raise ValueError(
@@ -107,8 +103,7 @@ def fit_codec(
         parity.append(torch.full_like(value, sign))
     order = torch.cat(variances).argsort(descending=True)[:channels]
     basis, parity = torch.cat(rows)[order], torch.cat(parity)[order].float()
-    spread = ((cells[:: max(1, len(cells) // 64)] - mean) @ basis.T).square().mean().sqrt()
-    return LinearCodec(mean, basis.contiguous(), parity, float(latent_std / spread))
+    return LinearCodec(mean, basis.contiguous(), parity)
 
 
 def _parity_parts(values: Float[Tensor, "n v"]) -> tuple[Tensor, Tensor]:

@@ -47,7 +47,7 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
         tensors |= {
             f"shapes.{field.name}": getattr(model.shapes, field.name) for field in dataclasses.fields(ShapePrior)
         }
-        architecture |= {"kind": "person", "codec_scale": codec.scale}
+        architecture |= {"kind": "person"}
     else:
         architecture |= {"kind": "slab"}
     architecture["config"] = dataclasses.asdict(model.denoiser.config)
@@ -101,7 +101,7 @@ def _build(tensors: Mapping[str, Tensor], architecture: dict[str, Any], card: di
     else:
         prior = PersonPrior(**_under(weights, "prior_"))
         denoiser = PersonDenoiser(denoiser_config(config), prior, schedule)
-        codec = CellCodec(LinearCodec(**_under(tensors, "codec."), scale=float(architecture["codec_scale"])))
+        codec = CellCodec(LinearCodec(**_under(tensors, "codec.")))
         shapes = ShapePrior(**_under(tensors, "shapes."))
     denoiser.load_state_dict(weights)
     denoiser.eval().requires_grad_(False)

@@ -19,8 +19,6 @@ class CodecConfig:
     """Latent channels of a primitive."""
     people: int = 160
     """People (geometry and colours) that the basis is fitted to, drawn at random."""
-    latent_std: float = 1.0
-    """Root mean square of the latents: where the noise schedule lies in relation to the data."""
 
 
 @dataclasses.dataclass(frozen=True)

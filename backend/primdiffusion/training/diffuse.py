@@ -31,8 +31,7 @@ from primdiffusion.training.latents import (
     encode_people,
     find_people,
     fit_codec_to,
-    outfit_of,
-    read_person,
+    read_outfits,
     split_people,
 )
 from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors
@@ -98,7 +97,7 @@ def prepare(config: TrainingConfig) -> Prepared:
     paths = find_people(config.data)
     train_paths, held_paths = split_people(paths, config.holdout, config.seed)
     generator = torch.Generator().manual_seed(config.seed)
-    outfits = sorted({outfit_of(read_person(path)) for path in paths})
+    outfits = read_outfits(paths)
     codec = fit_codec_to(train_paths, config.codec, generator)
     train, full_density = encode_people(train_paths, codec, outfits)
     held, _ = encode_people(held_paths, codec, outfits)
@@ -269,9 +268,7 @@ def _save_prepared(path: Path, prepared: Prepared) -> None:
         record = getattr(prepared, name)
         for field in dataclasses.fields(record):
             value = getattr(record, field.name)
-            tensors[f"{name}.{field.name}"] = (
-                value if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64)
-            ).contiguous()
+            tensors[f"{name}.{field.name}"] = value.contiguous()
     write_atomically(path, save(tensors, metadata={"full_density": repr(prepared.full_density)}))
 
 
@@ -283,12 +280,10 @@ def _load_prepared(path: Path) -> Prepared:
     def part(name: str) -> dict[str, Tensor]:
         return {key.removeprefix(f"{name}."): value for key, value in tensors.items() if key.startswith(f"{name}.")}
 
-    codec = part("codec")
-    scale = float(codec.pop("scale"))
     return Prepared(
         LatentSet(**part("train")),
         LatentSet(**part("held")),
-        LinearCodec(**codec, scale=scale),
+        LinearCodec(**part("codec")),
         PersonPrior(**part("prior")),
         ShapePrior(**part("shapes")),
         full_density,

@@ -20,6 +20,9 @@ from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.training.config import CodecConfig
 
+_DAMAGED = (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile)
+_NO_PERSON = "{path} is no person's payload ({error}): make it again with `primdiffusion people`"
+
 
 @dataclasses.dataclass(frozen=True)
 class StoredPerson:
@@ -57,10 +60,8 @@ def read_person(path: Path) -> StoredPerson:
             betas = torch.from_numpy(file["betas"]).float()
             attributes = json.loads(str(file["attributes"]))
             full_density = float(file["full_density"])
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(
-            f"{path} is no person's payload ({error}): generate it again with `primdiffusion people`"
-        ) from error
+    except _DAMAGED as error:
+        raise ValueError(_NO_PERSON.format(path=path, error=error)) from error
     if voxels.dtype != torch.uint8 or tuple(voxels.shape[1:]) != (K, S, S, S, 4):
         raise ValueError(
             f"{path} holds voxels {voxels.dtype} {tuple(voxels.shape)}; uint8 [n, {K}, {S}, {S}, {S}, 4] is needed"
@@ -94,7 +95,7 @@ def fit_codec_to(paths: Sequence[Path], config: CodecConfig, generator: torch.Ge
     for index in chosen:
         voxels = read_person(paths[index]).voxels
         cells.append(cells_from_voxels(voxels[int(torch.randint(len(voxels), (), generator=generator))]))
-    return fit_codec(torch.stack(cells), config.channels, generator, latent_std=config.latent_std)
+    return fit_codec(torch.stack(cells), config.channels, generator)
 
 
 def encode_people(paths: Sequence[Path], codec: LinearCodec, outfits: Sequence[str]) -> tuple[LatentSet, float]:
@@ -105,7 +106,7 @@ def encode_people(paths: Sequence[Path], codec: LinearCodec, outfits: Sequence[s
         latents.append(codec.encode(cells_from_voxels(person.voxels)).half())
         geometry.append(torch.full((len(person.voxels),), index))
         betas.append(person.betas)
-        labels.append(outfits.index(outfit_of(person)))
+        labels.append(outfits.index(outfit_of(person.attributes)))
         densities.add(person.full_density)
     if len(densities) != 1:
         raise ValueError(
@@ -114,6 +115,18 @@ def encode_people(paths: Sequence[Path], codec: LinearCodec, outfits: Sequence[s
     return LatentSet(torch.cat(latents), torch.cat(geometry), torch.stack(betas), torch.tensor(labels)), densities.pop()
 
 
-def outfit_of(person: StoredPerson) -> str:
+def outfit_of(attributes: dict[str, Any]) -> str:
     """The name of a person's outfit; one name for people without."""
-    return str(person.attributes.get("outfit", "unknown"))
+    return str(attributes.get("outfit", "unknown"))
+
+
+def read_outfits(paths: Sequence[Path]) -> list[str]:
+    """The names of all outfits worn, sorted; does not read the people's voxels."""
+    outfits = set()
+    for path in paths:
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                outfits.add(outfit_of(json.loads(str(file["attributes"]))))
+        except _DAMAGED as error:
+            raise ValueError(_NO_PERSON.format(path=path, error=error)) from error
+    return sorted(outfits)
