@@ -81,6 +81,7 @@ def child_environment(module_path: Path | None, cache_dir: Path | None, extra: M
     anything installed. `cache_dir` takes byte code and compiled kernels, so that the extension's folder stays as it is.
     """
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONHOME", "PYTHONSTARTUP")}
+    environment.update(PYTHONSAFEPATH="1")  # no modules from the current folder, which may be anybody's
     environment.update(PYTHONUTF8="1", PYTHONUNBUFFERED="1", PYTHONFAULTHANDLER="1")
     if module_path is not None:
         environment["PYTHONPATH"] = str(module_path)
@@ -102,7 +103,7 @@ class BackendClient:
         cache_dir: Path | None = None,
         silence_s: float = SILENCE_S,
     ):
-        self._command = [str(python), "-P", "-m", "primdiffusion.serve"]  # -P: no modules from the current folder
+        self._command = [str(python), "-m", "primdiffusion.serve"]
         self._environment = child_environment(module_path, cache_dir, env or {})
         self._silence_s = silence_s
         self._process: subprocess.Popen[bytes] | None = None
@@ -287,7 +288,7 @@ class BackendClient:
 def _parse(line: bytes) -> dict[str, Any] | None:
     try:
         message = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return message if isinstance(message, dict) else None
 

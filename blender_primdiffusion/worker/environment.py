@@ -16,8 +16,10 @@ VARIABLE = "PRIMDIFFUSION_PYTHON"
 TRIAL_S = 90.0
 """A first import of torch from a slow disk, with a virus scanner, takes most of a minute."""
 TRIAL = (
-    "import json, sys, primdiffusion, torch; print(json.dumps({'version': primdiffusion.__version__, "
-    "'torch': torch.__version__, 'python': sys.version.split()[0]}))"
+    "import sys; sys.version_info >= (3, 11) or sys.exit('it is Python %d.%d, and 3.11 or newer is needed' "
+    "% sys.version_info[:2]); import json, primdiffusion, torch; "
+    "print(json.dumps({'version': primdiffusion.__version__, 'torch': torch.__version__, "
+    "'python': sys.version.split()[0]}))"
 )
 
 
@@ -86,7 +88,7 @@ def _try(path: Path, source: str, environment: Mapping[str, str], timeout_s: flo
     named = f"{path} ({source})"
     try:
         done = subprocess.run(
-            [str(path), "-P", "-c", TRIAL],
+            [str(path), "-c", TRIAL],
             stdin=subprocess.DEVNULL,
             capture_output=True,
             env=dict(environment),

@@ -232,6 +232,15 @@ def test_the_environment_leads_the_childs_python_nowhere_else(monkeypatch, tmp_p
     assert environment["EXTRA"] == "1"
 
 
+def test_a_module_in_the_current_folder_is_not_taken_for_the_backends(monkeypatch, tmp_path):
+    (tmp_path / "primdiffusion.py").write_text("raise SystemExit(7)")
+    monkeypatch.chdir(tmp_path)
+    client = BackendClient(PYTHON)
+    client.start()
+    wait_for(client, lambda e: isinstance(e, Response))
+    client.kill()
+
+
 def test_every_way_to_die_has_a_sentence():
     assert "memory" in death_sentence(-9)
     assert "signal 11" in death_sentence(-11)

@@ -2,11 +2,19 @@
 
 import os
 import stat
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from worker.environment import VARIABLE, BackendNotFound, candidates, find_backend_python, python_of_environment
+from worker.environment import (
+    TRIAL,
+    VARIABLE,
+    BackendNotFound,
+    candidates,
+    find_backend_python,
+    python_of_environment,
+)
 
 PYTHON = Path(sys.executable)
 
@@ -68,6 +76,13 @@ def test_a_python_that_will_not_do_is_named_with_its_reason_and_what_to_do(tmp_p
 def test_a_broken_environment_of_the_extension_is_passed_over(tmp_path):
     script(python_of_environment(tmp_path), "exit 1")
     assert find_backend_python(own_environment=tmp_path).path == PYTHON
+
+
+def test_an_old_python_is_told_so():
+    old = "import sys; sys.version_info = (3, 9); "
+    done = subprocess.run([sys.executable, "-c", old + TRIAL], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr == "it is Python 3.9, and 3.11 or newer is needed\n"
 
 
 def test_a_folder_is_no_python(tmp_path):

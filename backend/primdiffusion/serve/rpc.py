@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import threading
 import types
 import typing
@@ -62,7 +63,7 @@ def parse_request(line: bytes) -> Request:
     """The request in one line. Raises MalformedRequest for anything that is not one JSON-RPC 2.0 request object."""
     try:
         message = json.loads(line.decode("utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as e:
+    except (ValueError, RecursionError) as e:
         raise MalformedRequest(PARSE_ERROR, f"the line is not JSON in UTF-8 ({e}): send one JSON object a line") from e
     if isinstance(message, list):
         raise MalformedRequest(INVALID_REQUEST, "batches are not supported: send one request a line")
@@ -71,6 +72,8 @@ def parse_request(line: bytes) -> Request:
     id = message.get("id")
     if isinstance(id, bool) or not isinstance(id, str | int | float | None):
         raise MalformedRequest(INVALID_REQUEST, f"a request's id is a string or a number, not {type(id).__name__}")
+    if isinstance(id, float) and not math.isfinite(id):
+        raise MalformedRequest(INVALID_REQUEST, f"a request's id is a finite number, not {id}")
     if message.get("jsonrpc") != "2.0":
         raise MalformedRequest(INVALID_REQUEST, 'a request needs "jsonrpc": "2.0"', id)
     method, params = message.get("method"), message.get("params", {})
@@ -125,7 +128,7 @@ class Wire:
         self._lock = threading.Lock()
 
     def _send(self, message: dict[str, Any]) -> None:
-        line = json.dumps({"jsonrpc": "2.0", **message}, ensure_ascii=False, allow_nan=False).encode("utf-8") + b"\n"
+        line = json.dumps({"jsonrpc": "2.0", **message}, allow_nan=False).encode("utf-8") + b"\n"
         with self._lock:
             self._stream.write(line)
             self._stream.flush()

@@ -123,8 +123,10 @@ class Server:
                 known = ", ".join(self._methods)
                 raise RpcError(METHOD_NOT_FOUND, f"there is no method {request.method!r}: the methods are {known}")
             method(request)
-        except RpcError as e:
-            self._fail(request, e)
+        except OSError:
+            raise
+        except Exception as e:
+            self._fail(request, _as_rpc_error(e))
 
     def _hello(self, request: Request) -> None:
         read_params(NoParams, request.params, "hello")

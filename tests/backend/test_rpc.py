@@ -1,0 +1,102 @@
+"""Lines of JSON-RPC, and parameters with types."""
+
+import dataclasses
+import io
+import json
+import math
+import threading
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from primdiffusion.serve.rpc import (
+    INVALID_PARAMS,
+    MalformedRequest,
+    Request,
+    RpcError,
+    Wire,
+    parse_request,
+    read_params,
+)
+
+scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text()
+anything = st.recursive(scalars, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=10)
+requests = st.fixed_dictionaries({}, optional={name: anything for name in ("jsonrpc", "id", "method", "params")}).map(
+    lambda message: {**message, "jsonrpc": "2.0"} if len(message) % 2 else message
+)
+
+
+@given(
+    st.binary()
+    | anything.map(lambda value: json.dumps(value).encode())
+    | requests.map(lambda r: json.dumps(r).encode())
+)
+def test_any_line_is_a_request_or_an_error_that_can_be_sent(line):
+    stream = io.BytesIO()
+    try:
+        request = parse_request(line)
+    except MalformedRequest as e:
+        Wire(stream).fail(e.id, e)
+    else:
+        assert isinstance(request, Request)
+        Wire(stream).respond(request.id, request.method)
+    assert stream.getvalue().count(b"\n") == 1
+    assert "id" in json.loads(stream.getvalue())
+
+
+@dataclasses.dataclass(frozen=True)
+class Params:
+    count: int
+    scale: float = 1.0
+    name: str | None = None
+    pose: str | list | None = None
+
+    def __post_init__(self) -> None:
+        if self.count < 0:
+            raise ValueError(f"count {self.count} is negative")
+
+
+def test_parameters_get_their_defaults_and_whole_numbers_pass_for_floats():
+    assert read_params(Params, {"count": 2, "scale": 3}, "m") == Params(2, 3)
+    assert read_params(Params, {"count": 2, "pose": [1]}, "m").pose == [1]
+
+
+@pytest.mark.parametrize(
+    ("params", "named"),
+    [
+        ({}, "count"),
+        ({"count": 1, "colour": 2}, "colour"),
+        ({"count": "1"}, "count"),
+        ({"count": 1.0}, "count"),
+        ({"count": True}, "count"),
+        ({"count": None}, "count"),
+        ({"count": 1, "scale": "2"}, "scale"),
+        ({"count": 1, "scale": False}, "scale"),
+        ({"count": 1, "name": 2}, "name"),
+        ({"count": 1, "pose": {}}, "pose"),
+        ({"count": -1}, "count -1 is negative"),
+    ],
+)
+def test_a_wrong_parameter_is_named(params, named):
+    with pytest.raises(RpcError, match=named) as error:
+        read_params(Params, params, "m")
+    assert error.value.code == INVALID_PARAMS
+
+
+def test_lines_of_many_threads_do_not_mix_and_nan_is_not_sent():
+    stream = io.BytesIO()
+    wire = Wire(stream)
+    threads = [
+        threading.Thread(target=lambda i=i: [wire.notify("n", thread=i, text="x" * 5000) for _ in range(50)])
+        for i in range(8)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == 400
+    assert sorted(json.loads(line)["params"]["thread"] for line in lines) == sorted(list(range(8)) * 50)
+    with pytest.raises(ValueError, match="JSON"):
+        wire.notify("n", value=math.nan)
+    assert len(stream.getvalue().splitlines()) == 400
