@@ -21,6 +21,7 @@ import tyro
 
 from primdiffusion import __version__
 from primdiffusion.failures import describe
+from primdiffusion.machine import share_processors
 
 if TYPE_CHECKING:
     from primdiffusion.diffusion.samplers import Step
@@ -201,6 +202,7 @@ def run(arguments: Sequence[str]) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The console script; ends the process with the exit codes above."""
+    share_processors()
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         run([argument for argument in given if argument != TRACEBACK])

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
 from primdiffusion import __version__
 from primdiffusion.failures import Failure, describe
-from primdiffusion.machine import memory
+from primdiffusion.machine import memory, share_processors
 from primdiffusion.serve.params import GenerateParams, RenderParams
 from primdiffusion.serve.rpc import (
     CANCELLED,
@@ -267,6 +267,7 @@ def guard_streams() -> tuple[BinaryIO, BinaryIO]:
 
 def main() -> None:
     """Serves on stdin and stdout until the other side is done."""
+    share_processors()
     source, sink = guard_streams()
     status = 0
     try:
