@@ -5,6 +5,7 @@ python installed_generate.py ZIP CHECKPOINT_OR_EMPTY BLEND SEED STEPS
 """
 
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -15,7 +16,8 @@ archive, checkpoint, blend, seed, steps = sys.argv[1:]
 bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)
 (module,) = [name for name in bpy.context.preferences.addons.keys() if name.endswith(".primdiffusion")]  # noqa: SIM118
 addon = bpy.context.preferences.addons[module].preferences
-addon.backend_python, addon.checkpoint = sys.executable, checkpoint
+addon.backend_python = os.environ.get("PRIMDIFFUSION_PYTHON", sys.executable)  # another one, where this has no torch
+addon.checkpoint = checkpoint
 bpy.ops.wm.save_as_mainfile(filepath=blend)
 
 started = time.perf_counter()

@@ -178,9 +178,9 @@ def test_an_interpreter_that_does_not_exist_is_named(saved_scene, monkeypatch):
 
 def test_registering_is_quick_and_imports_nothing_heavy():
     program = (
-        "import bpy, sys, time; before = set(sys.modules); start = time.perf_counter();"
+        "import bpy, sys, time; before = set(sys.modules); start = time.process_time();"
         "import blender_primdiffusion as b;"
-        "b.register(); took = time.perf_counter() - start; heavy = {'torch', 'openvdb', 'scipy', 'primdiffusion'};"
+        "b.register(); took = time.process_time() - start; heavy = {'torch', 'openvdb', 'scipy', 'primdiffusion'};"
         "print(took, sorted(heavy & (set(sys.modules) - before))); b.unregister()"
     )
     root = Path(__file__).parents[2]

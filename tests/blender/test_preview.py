@@ -68,10 +68,11 @@ def test_a_box_has_its_colour_opacity_size_and_place_in_cycles(lone_box, tmp_pat
 
     columns = (np.arange(96) + 0.5 - 48) * metres
     expected_x = (weights * np.linspace(-HALF[0], HALF[0], 8)).sum() / weights.sum()
+    # a wrong half voxel would be 7 to 10 mm
     seen_x, seen_z = (depth * columns).sum() / depth.sum(), (depth * -columns[:, None]).sum() / depth.sum()
     assert expected_x > 0.01  # the dense half is on the right of the picture: not mirrored
-    assert seen_x == pytest.approx(expected_x, abs=5e-4)
-    assert seen_z == pytest.approx(0.0, abs=5e-4)
+    assert seen_x == pytest.approx(expected_x, abs=1.5e-3)
+    assert seen_z == pytest.approx(0.0, abs=1.5e-3)
 
 
 def test_the_camera_frames_a_posed_person_from_every_side(saved_scene, tmp_path):
