@@ -13,6 +13,7 @@ from pathlib import Path
 
 import record
 import stages
+from primdiffusion.machine import share_processors
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
@@ -28,6 +29,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder: also compare 16 people with their meshes")
     arguments = parser.parse_args()
+    share_processors()
     out, logs = arguments.out.resolve(), arguments.out.resolve() / "logs"
     logs.mkdir(parents=True, exist_ok=True)
     blend, human = out / "human.blend", out / "person.human.safetensors"

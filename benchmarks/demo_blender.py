@@ -14,6 +14,7 @@ import shutil
 import sys
 import tempfile
 import time
+from importlib import import_module
 from pathlib import Path
 
 os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_demo_"))
@@ -46,14 +47,14 @@ def person(arguments: argparse.Namespace) -> dict[str, float]:
     bpy.ops.primdiffusion.generate(seed=arguments.seed, steps=arguments.steps)
     pressed = time.perf_counter() - start
 
-    scene_human = sys.modules[f"{MODULE}.scene.human"]
+    scene_human = import_module(f"{MODULE}.scene.human")
     collection = scene_human.humans(bpy.context.scene)[0]
     armature = scene_human.armature_of(collection)
-    spent = sys.modules[f"{MODULE}.ui.generation"].session.seconds
+    spent = import_module(f"{MODULE}.ui.generation").session.seconds
     rotations = walk_and_wave(arguments.frames)
     numbers = np.arange(1, arguments.frames + 1)
     start = time.perf_counter()
-    sys.modules[f"{MODULE}.scene.keyframes"].keyframe_poses(
+    import_module(f"{MODULE}.scene.keyframes").keyframe_poses(
         armature, numbers, rotations, np.zeros((arguments.frames, 3)), "Walk"
     )
     keyframed = time.perf_counter() - start

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import torch
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.human import place
+from primdiffusion.human import framing, place
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.render.image import as_boxes, depth_to_png, to_png
@@ -22,15 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 from walk import walk_and_wave
 
 BACKGROUND = (0.72, 0.72, 0.72)
-SIZE = 512
-
-
-def camera_around(centre: torch.Tensor, yaw_degrees: float, height: float, size: int = SIZE) -> Camera:
-    """A camera on a circle about the person, at the height of the middle, that sees `height` metres."""
-    yaw, fov = math.radians(yaw_degrees), math.radians(30)
-    distance = 0.5 * height / math.tan(fov / 2)
-    offset = torch.tensor([math.sin(yaw), 0.0, math.cos(yaw)]) * distance
-    return look_at(centre + offset, centre, vertical_fov=fov, width=size, height=size)
+SIDE = math.radians(70)
 
 
 def share_on_body(position: torch.Tensor) -> float:
@@ -56,11 +47,7 @@ def main() -> None:
     rotation = torch.from_numpy(walk_and_wave(arguments.frames)[arguments.frame]).float()
     rest = place(human, None)
     walking = place(human, BodyPose(rotation, torch.zeros(3)))
-    low, high = rest.position.amin(0), rest.position.amax(0)
-    centre = (low + high) / 2
-    span = float((high - low).max()) * 1.12
-
-    front, side = camera_around(centre, 0, span), camera_around(centre, 70, span)
+    front = framing(rest)
     march(rest, front)  # compiles, or loads the compiled code
     start = time.perf_counter()
     rendering = march(rest, front)
@@ -68,8 +55,8 @@ def main() -> None:
 
     to_png(arguments.out / "march_rest.png", rendering, BACKGROUND)
     depth_to_png(arguments.out / "march_depth.png", rendering)
-    to_png(arguments.out / "march_posed.png", march(walking, front), BACKGROUND)
-    to_png(arguments.out / "march_side.png", march(walking, side), BACKGROUND)
+    to_png(arguments.out / "march_posed.png", march(walking, framing(walking)), BACKGROUND)
+    to_png(arguments.out / "march_side.png", march(walking, framing(walking, yaw=SIDE)), BACKGROUND)
     boxes = as_boxes(rest, default_anchors().chart)
     to_png(arguments.out / "march_boxes.png", march(boxes, front), BACKGROUND)
     share = share_on_body(rest.position)

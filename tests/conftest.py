@@ -1,6 +1,9 @@
 """Shape annotations of the backend's maths are checked at run time in tests."""
 
 from jaxtyping import install_import_hook
+from primdiffusion.machine import share_processors
+
+share_processors()
 
 CHECKED = [
     f"primdiffusion.{module}"
