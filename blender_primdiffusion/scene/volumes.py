@@ -25,6 +25,8 @@ PAD = 1
 """Empty voxels kept all round those that are not: Cycles draws a grid only half a voxel beyond its last one."""
 
 
+_NEXT_TO_NOTHING = 1e-4
+"""Opacity per metre of the one voxel of an empty primitive: Cycles complains of grids without any value."""
 _ALL_ACTIVE = -1.0
 """A tolerance no difference from the background is below: zeros become active voxels too."""
 
@@ -77,7 +79,9 @@ def bake(density: NDArray, rgb: NDArray, half_extent: NDArray) -> Grids:
         first[:, axis] = np.argmax(full, -1) - PAD
         last[:, axis] = full.shape[-1] - 1 - np.argmax(full[:, ::-1], -1) + PAD
     empty = ~(windowed > 0).any((1, 2, 3))
-    first[empty] = last[empty] = VOXELS // 2  # a grid needs a voxel, if an empty one
+    middle = VOXELS // 2
+    first[empty] = last[empty] = middle
+    windowed[empty, middle, middle, middle] = _NEXT_TO_NOTHING
     return Grids(
         windowed.astype(np.float16), colour.astype(np.float16), np.asarray(half_extent, np.float64), first, last
     )
