@@ -1,7 +1,6 @@
 import pytest
 import torch
 from diffusers import DDIMScheduler, DDPMScheduler
-
 from primdiffusion.diffusion.samplers import ddim, ddpm
 from primdiffusion.diffusion.schedule import leading_steps, linear, trailing_steps
 

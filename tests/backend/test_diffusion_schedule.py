@@ -3,8 +3,6 @@ import pytest
 import torch
 from diffusers import DDPMScheduler
 from diffusers.schedulers.scheduling_ddim import rescale_zero_terminal_snr
-from scipy.stats import kstest
-
 from primdiffusion.diffusion.schedule import (
     CLEAN,
     leading_steps,
@@ -13,6 +11,7 @@ from primdiffusion.diffusion.schedule import (
     trailing_steps,
     zero_terminal_snr,
 )
+from scipy.stats import kstest
 
 
 @pytest.mark.parametrize(("ours", "theirs"), [(linear, "linear"), (sqrt_linear, "scaled_linear")])

@@ -94,14 +94,16 @@ def blends(
 ) -> tuple[Float[Tensor, "batch 2"], Int[Tensor, "batch 2"]]:
     """Weights and places of two people of one geometry each; a `share` of them mixed, the others the first alone.
 
-    Colour variants of one geometry have the same density, so their mixture is a person again, of mixed colours.
+    Colour variants of one geometry have the same density, so their mixture is a person again, of mixed colours. Weights
+    reach beyond 0 ... 1 so far that mixing keeps the variance of colours: E[p^2 + (1-p)^2] = 1.
     """
     first = torch.randint(len(geometry), (batch,), generator=generator)
     counts = torch.bincount(geometry)
     starts = counts.cumsum(0) - counts
     own = geometry[first]
     second = starts[own] + (torch.rand(batch, generator=generator) * counts[own]).long()
-    part = torch.rand(batch, generator=generator) * (torch.rand(batch, generator=generator) < share)
+    part = 0.5 + 3**0.5 * (torch.rand(batch, generator=generator) - 0.5)
+    part = part * (torch.rand(batch, generator=generator) < share)
     return torch.stack([1 - part, part], dim=1), torch.stack([first, second], dim=1)
 
 

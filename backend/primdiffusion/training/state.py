@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 
 import torch
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
@@ -65,7 +65,7 @@ class TrainingState:
                 place = file.metadata()
             for name, module in (("network", self.network), ("average", self.average)):
                 module.load_state_dict(_under(tensors, name))
-        except (OSError, RuntimeError, KeyError) as error:
+        except (SafetensorError, OSError, RuntimeError, KeyError) as error:
             raise ValueError(
                 f"{path} does not fit this network or is damaged ({error}): start a new run folder"
             ) from error

@@ -1,0 +1,86 @@
+"""Small made-up people for tests of the diffusion room."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from primdiffusion.diffusion.codec import VALUES, LinearCodec
+from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
+from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkConfig
+from primdiffusion.diffusion.model import CellCodec, DiffusionModel, ShapePrior
+from primdiffusion.diffusion.schedule import linear
+from primdiffusion.primitives.primitives import GRID, K, S
+
+CHANNELS, COMPONENTS = 4, 6
+SMALL = DenoiserConfig(
+    PersonNetworkConfig(width=16, blocks=1),
+    LocalUNetConfig(widths=(8, 8), position_channels=2, condition_width=8, heads=2),
+)
+
+
+def random_prior(shape: tuple[int, int, int], components: int, parts: int, seed: int) -> PersonPrior:
+    """A mixture over latents of any shape, with variances that fall along the components."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*size: int) -> torch.Tensor:
+        return torch.randn(size, generator=generator, dtype=torch.float64)
+
+    size = shape[0] * shape[1] * shape[2]
+    return PersonPrior(
+        mean=normal(*shape),
+        basis=torch.linalg.qr(normal(size, components))[0].T.contiguous(),
+        parity=torch.ones(components),
+        rest_variance=0.02 + 0.05 * torch.rand(shape, generator=generator, dtype=torch.float64),
+        weight=torch.full((parts,), 1 / parts, dtype=torch.float64),
+        centre=2 * normal(parts, components),
+        axes=torch.linalg.qr(normal(parts, components, components))[0],
+        variance=(1.0 / (1 + torch.arange(components, dtype=torch.float64))).expand(parts, -1).contiguous(),
+    )
+
+
+def small_model(seed: int = 0, scale: float = 3.0) -> DiffusionModel:
+    """A model of the default architecture with few channels; its networks' outputs are made to differ from 0."""
+    prior = random_prior((CHANNELS, GRID, GRID), COMPONENTS, 2, seed).to(dtype=torch.float32)
+    prior = PersonPrior(**{**vars(prior), "centre": prior.centre * scale, "variance": prior.variance * scale**2})
+    torch.manual_seed(seed)
+    denoiser = PersonDenoiser(SMALL, prior, linear()).eval()
+    torch.nn.init.normal_(denoiser.person.outer.weight, std=0.1)
+    torch.nn.init.normal_(denoiser.local.outer.weight, std=0.1)
+    basis = torch.linalg.qr(torch.randn(VALUES, CHANNELS))[0].T.contiguous()
+    codec = LinearCodec(torch.full((K, VALUES), 0.5), basis, torch.ones(CHANNELS))
+    shapes = ShapePrior(torch.randn(10, 3), torch.zeros(10), torch.eye(10), torch.full((10,), 2.5))
+    return DiffusionModel(
+        denoiser.requires_grad_(False),
+        linear(),
+        CellCodec(codec),
+        shapes,
+        100.0,
+        {"name": "small", "licence": "CC0-1.0"},
+    )
+
+
+def write_people(folder: Path, geometries: int, variants: int = 2, outfits: int = 2) -> None:
+    """Files of people that differ in outfit, in one direction of shape and in the colours of two garments."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(0)
+    ramp = np.linspace(0, 1, S)[:, None, None]
+    row = np.arange(K) // GRID
+    for number in range(geometries):
+        outfit, tall = number % outfits, rng.normal()
+        density = np.clip(0.5 + 0.1 * tall - ramp + 0.2 * outfit * (row[:, None, None, None] > 12), 0, 1)
+        density = np.broadcast_to(density, (variants, K, S, S, S))
+        upper = (row < 10 + 6 * outfit)[None, :, None]
+        colour = np.where(upper, rng.uniform(size=(variants, 1, 3)), rng.uniform(size=(variants, 1, 3)))
+        colour = np.broadcast_to(colour[:, :, None, None, None, :], (variants, K, S, S, S, 3))
+        voxels = np.concatenate([colour, density[..., None]], -1) * 255
+        np.savez(
+            folder / f"person_{number:06d}.npz",
+            voxels=voxels.astype(np.uint8),
+            betas=np.array([tall, *np.zeros(9)]),
+            attributes=np.array(json.dumps({"outfit": f"outfit{outfit}"})),
+            full_density=np.array(100.0),
+        )

@@ -1,0 +1,149 @@
+import json
+
+import pytest
+import torch
+from diffusion_people import small_model
+from primdiffusion.diffusion.model import DiffusionModel, WholeSlab, sample
+from primdiffusion.diffusion.schedule import linear
+from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
+from primdiffusion.training.checkpoint import (
+    CheckpointError,
+    default_checkpoint,
+    load_checkpoint,
+    model_card,
+    read_card,
+    save_checkpoint,
+)
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+LEVELS = ("50", "100", "300", "500", "700", "900")
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "model.safetensors"
+    save_checkpoint(path, small_model(), "linear")
+    return path
+
+
+def rewrite(path, change_tensors=lambda t: t, change_metadata=lambda m: m):
+    with safe_open(path, framework="pt") as file:
+        tensors, metadata = {k: file.get_tensor(k) for k in file.keys()}, file.metadata()  # noqa: SIM118
+    save_file(change_tensors(tensors), path, change_metadata(metadata))
+
+
+def test_a_saved_model_generates_the_same_people(path):
+    model, loaded = small_model(), load_checkpoint(path)
+    x, t = torch.randn(2, 4, 32, 32), 300
+    assert torch.allclose(loaded.denoise(x, t), model.denoise(x, t), atol=0.02)
+    assert loaded.full_density == 100.0
+    assert read_card(path) == loaded.card == {"name": "small", "licence": "CC0-1.0"}
+    again = path.with_name("again.safetensors")
+    save_checkpoint(again, loaded, "linear")
+    assert torch.equal(load_checkpoint(again).denoise(x, t), loaded.denoise(x, t))
+
+
+def test_no_temporary_file_is_left(path):
+    assert [p.name for p in path.parent.iterdir()] == ["model.safetensors"]
+
+
+def test_a_slab_network_is_saved_and_loaded(tmp_path):
+    torch.manual_seed(0)
+    network = SlabUNet(UNetConfig(width=32, multipliers=(1, 1), blocks=1, heads=2))
+    torch.nn.init.normal_(network.out[2].weight, std=0.1)
+    schedule, path = linear(), tmp_path / "slab.safetensors"
+    model = DiffusionModel(network, schedule, WholeSlab(), small_model().shapes, 25.5, {})
+    save_checkpoint(path, model, "linear")
+    x = torch.randn(1, 56, 16, 16)
+    loaded = load_checkpoint(path)
+    assert torch.allclose(loaded.denoise(x, 5), model.denoise(x, 5), atol=0.02)
+    assert loaded.codec.shape == (56, 256, 256)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nothing"):
+        load_checkpoint(tmp_path / "nothing.safetensors")
+
+
+@pytest.mark.parametrize("keep", [0, 6, 500, 0.5, 0.999])
+def test_a_truncated_file_is_refused(path, keep):
+    content = path.read_bytes()
+    path.write_bytes(content[: keep if isinstance(keep, int) else int(keep * len(content))])
+    with pytest.raises(CheckpointError, match="truncated"):
+        load_checkpoint(path)
+
+
+def test_a_file_of_another_kind_is_refused(path):
+    rewrite(path, change_metadata=lambda m: {"format": "pt"})
+    with pytest.raises(CheckpointError, match="'pt'"):
+        load_checkpoint(path)
+
+
+def test_another_version_is_refused(path):
+    rewrite(path, change_metadata=lambda m: m | {"format_version": "99"})
+    with pytest.raises(CheckpointError, match="version 99"):
+        load_checkpoint(path)
+
+
+def test_weights_that_are_not_numbers_are_named(path):
+    rewrite(path, lambda t: t | {"denoiser.person.outer.bias": torch.full((6,), float("nan"))})
+    with pytest.raises(CheckpointError, match=r"person\.outer\.bias"):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda t: {k: v for k, v in t.items() if k != "denoiser.person.outer.weight"},
+        lambda t: t | {"denoiser.person.outer.weight": torch.zeros(3, 3)},
+        lambda t: {k: v for k, v in t.items() if k != "codec.basis"},
+        lambda t: t | {"denoiser.prior_surplus": torch.zeros(1)},
+    ],
+)
+def test_weights_that_do_not_fit_are_refused(path, damage):
+    rewrite(path, damage)
+    with pytest.raises(CheckpointError, match="does not match its own description"):
+        load_checkpoint(path)
+
+
+def test_an_unfinished_model_is_not_saved(tmp_path):
+    model = small_model()
+    model.denoiser.person.outer.bias.fill_(float("inf"))
+    with pytest.raises(CheckpointError, match="NaN or infinite"):
+        save_checkpoint(tmp_path / "bad.safetensors", model, "linear")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def default():
+    return load_checkpoint()
+
+
+def test_the_default_checkpoint_is_small_and_says_what_it_is(default):
+    assert default_checkpoint().stat().st_size <= 48_000_000
+    assert {"licence", "data", "full_density", "seed", "steps", "device", "version"} <= default.card.keys()
+    assert default.full_density == default.card["full_density"]
+
+
+def test_the_default_card_s_claim_follows_from_its_numbers(default):
+    errors = default.card["held_out_rms_x0_error"]
+    better = all(errors["denoiser"][level] < errors["gaussian"][level] for level in LEVELS)
+    assert better is default.card["beats_gaussian_at_every_level"] is True
+
+
+def test_the_default_checkpoint_draws_people_that_differ(default):
+    people = [list(sample(default, seed, 5))[-1].x0 for seed in (1, 2)]
+    payloads = [default.decode(x0).validate() for x0 in people]
+    filled = [(payload.density > 0.5 * default.full_density).float().mean().item() for payload in payloads]
+    assert all(0.2 < share < 0.8 for share in filled)
+    assert (payloads[0].rgb - payloads[1].rgb).abs().mean() > 0.02
+
+
+def test_the_committed_model_card_is_the_checkpoint_s(request):
+    page = request.config.rootpath / "docs" / "model_card.md"
+    assert page.read_text() == model_card(read_card())
+
+
+def test_a_card_is_json_all_the_way(default):
+    assert json.loads(json.dumps(default.card)) == default.card

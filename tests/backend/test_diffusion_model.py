@@ -1,0 +1,94 @@
+import pytest
+import torch
+from diffusion_people import small_model
+from primdiffusion.diffusion.model import STANDARD_SHAPES, sample, seeded
+from primdiffusion.diffusion.schedule import trailing_steps
+from primdiffusion.primitives.primitives import GRID, K, S
+
+
+@pytest.fixture(scope="module")
+def model():
+    return small_model()
+
+
+def result(*arguments, **settings):
+    *_, step = sample(*arguments, **settings)
+    return step.x0
+
+
+def test_a_seed_gives_one_person_and_another_seed_another(model):
+    first, again, other = result(model, 1, 5), result(model, 1, 5), result(model, 2, 5)
+    assert torch.equal(first, again)
+    assert (first - other).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("sampler", ["ddim", "ddpm"])
+def test_sampling_yields_every_step_down_to_a_clean_person(model, sampler):
+    steps = list(sample(model, 0, 6, sampler))
+    assert [(s.index, s.total, s.t) for s in steps] == [(i, 6, t) for i, t in enumerate(trailing_steps(1000, 6))]
+    assert torch.equal(steps[-1].x, steps[-1].x0)
+    assert steps[-1].x0.isfinite().all()
+
+
+def test_a_start_without_the_prior_loses_variety():
+    # a few strong components still show at T-1: noise alone stands for a person without them
+    model = small_model(scale=300.0)
+    last, generator = 999, seeded(0)
+    start = model.start(400, generator, last)
+    prior = model.denoiser.prior
+    y = prior.split(start, torch.tensor(model.schedule.signal(last)))[0]
+    expected = model.schedule.signal(last) ** 2 * prior.marginal_variance() + model.schedule.noise(last) ** 2
+    assert torch.allclose(y.var(0), expected, rtol=0.25)
+    assert expected.max() > 2
+
+
+def test_decoding_gives_a_valid_payload(model):
+    payload = model.decode(40 * torch.randn(2, 4, GRID, GRID)).validate()
+    assert payload.rgb.shape == (2, K, 3, S, S, S)
+    assert payload.rgb.min() >= 0
+    assert payload.rgb.max() <= 1
+    assert payload.density.min() >= 0
+    assert payload.density.max() <= model.full_density
+    assert torch.equal(payload.delta_scale, torch.ones(2, K, 3))
+
+
+def test_shapes_follow_the_person_and_the_seed_within_limits(model):
+    x0 = result(model, 3, 3, count=2)
+    betas = model.betas(x0, 7)
+    assert betas.shape == (2, 10)
+    assert torch.equal(betas, model.betas(x0, 7))
+    assert not torch.equal(betas, model.betas(x0, 8))
+    assert betas.abs().max() <= 2.5
+    assert not torch.allclose(betas, model.betas(-x0, 7))
+
+
+def test_shapes_without_knowledge_are_standard_normal():
+    betas = STANDARD_SHAPES.sample(torch.zeros(20_000, 0), seeded(0))
+    assert betas.mean(0).abs().max() < 0.05
+    assert (betas.std(0) - 1).abs().max() < 0.05
+
+
+def test_sampling_does_not_disturb_the_global_random_state(model):
+    before = torch.get_rng_state()
+    result(model, 1, 2)
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_results_are_ordinary_tensors(model):
+    # inference tensors would make a user's own optimisation of a person fail
+    x0 = result(model, 1, 2)
+    assert not model.decode(x0).rgb.is_inference()
+
+
+@pytest.mark.parametrize(
+    ("settings", "word"), [({"sampler": "euler"}, "ddim"), ({"steps": 0}, "1000"), ({"steps": 1001}, "1001")]
+)
+def test_wrong_settings_are_named(model, settings, word):
+    with pytest.raises(ValueError, match=word):
+        sample(model, 0, **settings)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63])
+def test_seeds_out_of_range_are_refused(model, seed):
+    with pytest.raises(ValueError, match="seed"):
+        sample(model, seed)

@@ -1,0 +1,101 @@
+import pytest
+import torch
+from diffusion_people import CHANNELS, COMPONENTS, SMALL, random_prior
+from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
+from primdiffusion.diffusion.schedule import linear
+from primdiffusion.diffusion.unet import PAPER, PAPER_WITH_ATTENTION, SlabUNet, UNetConfig, step_features
+
+GRID = 8
+
+
+@pytest.mark.parametrize(("config", "parameters"), [(PAPER, 84_846_776), (PAPER_WITH_ATTENTION, 129_996_856)])
+def test_paper_network_has_the_released_size(config, parameters):
+    with torch.device("meta"):
+        network = SlabUNet(config)
+    assert sum(p.numel() for p in network.parameters()) == parameters
+
+
+def test_paper_network_has_the_released_names():
+    with torch.device("meta"):
+        names = SlabUNet().state_dict().keys()
+    assert len(names) == 298
+    assert {
+        "time_embed.0.weight",
+        "input_blocks.0.0.weight",
+        "input_blocks.1.0.in_layers.2.weight",
+        "input_blocks.3.0.op.weight",
+        "input_blocks.4.0.skip_connection.weight",
+        "middle_block.1.transformer_blocks.0.attn2.to_k.weight",
+        "middle_block.1.transformer_blocks.0.ff.net.0.proj.weight",
+        "output_blocks.2.1.conv.weight",
+        "output_blocks.11.0.out_layers.3.bias",
+        "out.2.bias",
+    } <= set(names)
+
+
+def test_small_paper_network_runs_learns_and_starts_at_zero():
+    network = SlabUNet(
+        UNetConfig(slab_channels=3, width=32, multipliers=(1, 2), blocks=1, attention_levels=(1,), heads=2)
+    )
+    x, t = torch.randn(2, 3, 16, 16), torch.tensor([3, 700])
+    assert network(x, t).abs().max() == 0
+    network(x, t).sum().backward()
+    assert network.out[2].weight.grad.abs().max() > 0
+
+
+def test_step_features_are_cosines_then_sines():
+    features = step_features(torch.tensor([0, 1]), 8)
+    assert torch.equal(features[0], torch.tensor([1.0, 1, 1, 1, 0, 0, 0, 0]))
+    assert features[1, 0].item() == pytest.approx(torch.tensor(1.0).cos().item())
+    assert features[1, 4].item() == pytest.approx(torch.tensor(1.0).sin().item())
+
+
+@pytest.fixture
+def prior():
+    return random_prior((CHANNELS, GRID, GRID), COMPONENTS, 2, 0).to(dtype=torch.float32)
+
+
+@pytest.mark.parametrize("config", [SMALL, DenoiserConfig(None, None), DenoiserConfig(SMALL.person, None)])
+def test_untrained_denoiser_is_the_closed_form(prior, config):
+    denoiser = PersonDenoiser(config, prior, linear()).eval()
+    x, t = 3 * torch.randn(5, CHANNELS, GRID, GRID), torch.tensor([0, 100, 400, 800, 999])
+    expected = prior.denoise(x, *linear().levels(t, x))
+    assert torch.allclose(denoiser(x, t), expected, atol=1e-5)
+
+
+def test_corrections_vanish_with_the_noise(prior):
+    torch.manual_seed(0)
+    denoiser = PersonDenoiser(SMALL, prior, linear()).eval()
+    torch.nn.init.normal_(denoiser.person.outer.weight)
+    torch.nn.init.normal_(denoiser.local.outer.weight)
+    x = prior.sample(4, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        moved = [
+            (denoiser(x, t) - prior.denoise(x, *linear().levels(t, x))).abs().mean().item()
+            for t in (torch.full((4,), 0), torch.full((4,), 500))
+        ]
+    assert moved[0] < 0.1 * moved[1]
+
+
+def test_the_two_errors_add_up(prior):
+    torch.manual_seed(0)
+    denoiser = PersonDenoiser(SMALL, prior, linear()).eval()
+    torch.nn.init.normal_(denoiser.person.outer.weight, std=0.3)
+    z, t = prior.sample(3, torch.Generator().manual_seed(1)), torch.tensor([200, 500, 800])
+    x = linear().q_sample(z, t, torch.randn_like(z))
+    c, rest = prior.split(z)
+    with torch.no_grad():
+        guess_c, guess_rest = prior.split(denoiser(x, t))
+        whole = (denoiser(x, t) - z).square().sum()
+    parts = (guess_c - c).square().sum() + (guess_rest - rest).square().sum()
+    assert whole.item() == pytest.approx(parts.item(), rel=1e-4)
+
+
+def test_gradients_reach_every_weight(prior):
+    torch.manual_seed(0)
+    denoiser = PersonDenoiser(SMALL, prior, linear())
+    for parameter in denoiser.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    denoiser(torch.randn(2, CHANNELS, GRID, GRID), torch.tensor([50, 600])).square().sum().backward()
+    idle = [name for name, p in denoiser.named_parameters() if p.grad is None or p.grad.abs().max() == 0]
+    assert idle == []

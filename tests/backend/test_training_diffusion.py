@@ -1,0 +1,264 @@
+import dataclasses
+import json
+import os
+import signal
+import threading
+
+import numpy as np
+import pytest
+import torch
+from diffusion_people import SMALL, write_people
+from primdiffusion.diffusion.codec import mirror_cells
+from primdiffusion.training.checkpoint import load_checkpoint, model_card
+from primdiffusion.training.config import (
+    CodecConfig,
+    PhaseConfig,
+    PriorConfig,
+    TrainingConfig,
+    check_resumable,
+    to_json,
+)
+from primdiffusion.training.diffuse import Interrupt, prepare, train
+from primdiffusion.training.latents import find_people, read_person, split_people
+from primdiffusion.training.losses import LEVELS, blends, closed_form, weighted_error, x0_errors
+from primdiffusion.training.state import TrainingState, learning_rate_factor
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("people")
+    write_people(folder, geometries=16, variants=3)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def prepared_once(people, tmp_path_factory):
+    config = settings(people, tmp_path_factory.mktemp("prepared"))
+    return config, prepare(config)
+
+
+def settings(people, run, **changes):
+    config = TrainingConfig(
+        data=people,
+        run=run,
+        holdout=0.2,
+        codec=CodecConfig(channels=4, people=8),
+        prior=PriorConfig(components=6),
+        model=SMALL,
+        person=PhaseConfig(steps=6, batch=16, evaluate_every=6),
+        local=PhaseConfig(steps=4, batch=4, evaluate_every=4),
+    )
+    return dataclasses.replace(config, **changes)
+
+
+@pytest.fixture
+def run(prepared_once, tmp_path):
+    """A run folder in which the closed-form part is done already."""
+    config, _ = prepared_once
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name in ("prepared.safetensors", "people.json"):
+        os.link(config.run / name, folder / name)
+    return folder
+
+
+def weights(run):
+    return {key: value for key, value in load_checkpoint(run / "model.safetensors").denoiser.state_dict().items()}
+
+
+def test_a_resumed_run_is_bit_identical_to_an_uninterrupted_one(people, run, tmp_path):
+    whole, parts = run, tmp_path / "parts"
+    parts.mkdir()
+    os.link(run / "prepared.safetensors", parts / "prepared.safetensors")
+    train(settings(people, whole))
+    for minutes in (0.0, 0.004, 0.004, None):  # stops before, within and between phases
+        train(settings(people, parts, minutes=minutes))
+    states = [sorted(folder.glob("*.state.safetensors")) for folder in (whole, parts)]
+    assert [path.name for path in states[0]] == ["local.state.safetensors", "person.state.safetensors"]
+    expected, got = weights(whole), weights(parts)
+    assert all(torch.equal(expected[key], got[key]) for key in expected)
+
+
+def state_of_a_line(seed=0):
+    torch.manual_seed(3)
+    network = torch.nn.Sequential(torch.nn.Linear(3, 8), torch.nn.Dropout(0.5), torch.nn.Linear(8, 1))
+    return TrainingState(network, PhaseConfig(steps=50, batch=4), seed)
+
+
+def advance(state, steps):
+    for _ in range(steps):
+        state.network.train()
+        x = torch.randn(4, 3, generator=state.generator)
+        state.update((state.network(x) - x.sum(1, keepdim=True)).square().mean())
+
+
+def test_a_state_saved_in_the_middle_goes_on_bit_for_bit(tmp_path):
+    whole, part = state_of_a_line(), state_of_a_line()
+    torch.manual_seed(11)
+    advance(whole, 20)
+    torch.manual_seed(11)
+    advance(part, 7)
+    part.save(tmp_path / "state")
+    torch.randn(100)  # anything else drawn in between must not matter
+    resumed = state_of_a_line(seed=99)
+    resumed.load(tmp_path / "state")
+    advance(resumed, 13)
+    assert resumed.step == 20
+    for a, b in zip(whole.network.parameters(), resumed.network.parameters(), strict=True):
+        assert torch.equal(a, b)
+    for a, b in zip(whole.average.parameters(), resumed.average.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_the_average_lags_behind_the_weights():
+    state = state_of_a_line()
+    start = [p.clone() for p in state.network.parameters()]
+    advance(state, 15)
+    moved = sum((p - q).abs().sum() for p, q in zip(state.network.parameters(), start, strict=True))
+    lagged = sum((p - q).abs().sum() for p, q in zip(state.average.parameters(), start, strict=True))
+    assert 0 < lagged < moved
+
+
+def test_a_damaged_or_foreign_state_is_refused(tmp_path):
+    state, other = state_of_a_line(), TrainingState(torch.nn.Linear(2, 2), PhaseConfig(steps=1, batch=1), 0)
+    state.save(tmp_path / "state")
+    with pytest.raises(ValueError, match="does not fit"):
+        other.load(tmp_path / "state")
+    (tmp_path / "state").write_bytes((tmp_path / "state").read_bytes()[:100])
+    with pytest.raises(ValueError, match="damaged"):
+        state_of_a_line().load(tmp_path / "state")
+
+
+def test_a_gradient_that_is_not_finite_stops_the_run():
+    state = state_of_a_line()
+    with pytest.raises(FloatingPointError, match="step 0"):
+        state.update(state.network(torch.full((1, 3), float("nan"))).sum())
+
+
+def test_learning_rate_warms_up_and_falls_to_a_tenth():
+    assert learning_rate_factor(0, 1000) == pytest.approx(0.01)
+    assert learning_rate_factor(99, 10**9) == pytest.approx(1.0)
+    assert learning_rate_factor(1000, 1000) == pytest.approx(0.1)
+
+
+def test_ctrl_c_stops_after_the_step_and_the_handler_is_given_back():
+    before = signal.getsignal(signal.SIGINT)
+    with Interrupt(None) as interrupt:
+        assert not interrupt.due()
+        threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
+        for _ in range(200):
+            if interrupt.due():
+                break
+            threading.Event().wait(0.02)
+        assert interrupt.due()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_other_settings_are_refused_and_other_limits_are_not(people, tmp_path):
+    saved = to_json(settings(people, tmp_path))
+    check_resumable(saved, settings(people, tmp_path / "moved", minutes=3.0))
+    with pytest.raises(ValueError, match=r"prior\.components"):
+        check_resumable(saved, settings(people, tmp_path, prior=PriorConfig(components=7)))
+
+
+def test_a_run_leaves_metrics_a_configuration_and_a_card(people, run):
+    model = train(settings(people, run))
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert [(row["phase"], row["step"]) for row in rows] == [("person", 6), ("local", 4)]
+    assert all(np.isfinite(row["rms_500"]) for row in rows)
+    assert json.loads((run / "config.json").read_text())["person"]["steps"] == 6
+    errors = model.card["held_out_rms_x0_error"]
+    assert errors.keys() == {"gaussian", "mixture", "denoiser"}
+    assert {int(level) for level in errors["gaussian"]} == set(LEVELS)
+    page = model_card(model.card)
+    assert f"{errors['gaussian']['500']:.4f}" in page
+
+
+def test_held_out_geometries_are_never_trained_on(people):
+    paths = find_people(people)
+    train_paths, held = split_people(paths, 0.2, seed=0)
+    assert len(held) == 3
+    assert set(train_paths).isdisjoint(held)
+    assert sorted(train_paths + held) == paths
+    assert split_people(paths, 0.2, seed=0) == (train_paths, held)
+    assert split_people(paths, 0.2, seed=1)[1] != held
+
+
+def test_the_prior_s_components_are_even_or_odd_in_the_mirror(prepared_once):
+    _, prepared = prepared_once
+    prior, codec = prepared.prior, prepared.codec
+    pictures = prior.basis.unflatten(1, prior.mean.shape)
+    assert torch.allclose(codec.mirror(pictures), pictures * prior.parity[:, None, None, None], atol=1e-3)
+    assert torch.allclose(prior.basis @ prior.basis.T, torch.eye(6), atol=1e-4)
+    assert torch.allclose(codec.mirror(prior.mean), prior.mean, atol=1e-3)
+    assert torch.allclose(mirror_cells(codec.mean), codec.mean, atol=1e-3)
+
+
+def test_the_prior_describes_the_people_it_was_fitted_to(prepared_once):
+    _, prepared = prepared_once
+    z = prepared.train.latents.float()
+    energy = (z - prepared.prior.mean).square().sum((1, 2, 3)).mean()
+    described = prepared.prior.marginal_variance().sum() + prepared.prior.rest_variance.sum()
+    assert described.item() == pytest.approx(energy.item(), rel=0.15)
+    assert len(prepared.prior.weight) == 2
+
+
+def test_shapes_learn_what_the_person_shows(prepared_once):
+    # the first beta of these people sets their density, so it can be read off them; the others are constant
+    _, prepared = prepared_once
+    held, prior = prepared.held, prepared.prior
+    first = torch.searchsorted(held.geometry, torch.arange(len(held.betas)))
+    features = prior.split(held.latents[first].float())[0] / prior.marginal_variance().sqrt()
+    left = prepared.shapes.scale @ prepared.shapes.scale.T
+    assert features.shape[1] == prepared.shapes.weight.shape[1]
+    assert left[0, 0] < 0.8 * prepared.train.betas[:, 0].var()
+
+
+def test_a_network_that_knows_more_has_less_error(prepared_once):
+    from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
+    from primdiffusion.diffusion.schedule import linear
+
+    _, prepared = prepared_once
+    denoiser = PersonDenoiser(DenoiserConfig(None, None), prepared.prior, linear())
+    guesses = {
+        "nothing": lambda x, t: prepared.prior.mean.expand_as(x),
+        "gaussian": closed_form(denoiser, single=True),
+        "truth": lambda x, t: prepared.held.latents.float(),
+    }
+    errors = x0_errors(guesses, denoiser, prepared.held.latents[:16], levels=(300, 900))
+    for level in (300, 900):
+        assert errors["gaussian"][level] < errors["nothing"][level]
+    assert errors["gaussian"][300] < errors["gaussian"][900]
+
+
+def test_blends_stay_within_a_geometry_and_keep_the_variance():
+    geometry = torch.tensor([0, 0, 0, 1, 1, 2])
+    weight, place = blends(geometry, 40_000, 1.0, torch.Generator().manual_seed(0))
+    assert torch.equal(geometry[place[:, 0]], geometry[place[:, 1]])
+    assert torch.allclose(weight.sum(1), torch.ones(40_000), atol=1e-6)
+    assert weight.square().sum(1).mean().item() == pytest.approx(1.0, abs=0.02)
+    alone, _ = blends(geometry, 100, 0.0, torch.Generator().manual_seed(0))
+    assert torch.equal(alone[:, 1], torch.zeros(100))
+
+
+def test_error_weights_have_mean_one_at_every_level():
+    error, std = torch.ones(2, 5), torch.rand(2, 5) + 0.1
+    for power in (0.0, 1.0, 2.0):
+        assert weighted_error(error, std, power).item() == pytest.approx(1.0, abs=1e-5)
+    wide = torch.tensor([[1.0, 3.0]])
+    assert weighted_error(torch.tensor([[0.0, 1.0]]), wide, 2.0).item() == pytest.approx(0.9, abs=1e-6)
+
+
+def test_a_damaged_person_is_named(tmp_path, people):
+    path = tmp_path / "person_000009.npz"
+    path.write_bytes((people / "person_000000.npz").read_bytes()[:2000])
+    with pytest.raises(ValueError, match="person_000009"):
+        read_person(path)
+    np.savez(path, voxels=np.zeros((1, 3), np.uint8), betas=np.zeros(10), attributes=np.array("{}"), full_density=100.0)
+    with pytest.raises(ValueError, match="voxels"):
+        read_person(path)
+
+
+def test_an_empty_folder_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="primdiffusion people"):
+        find_people(tmp_path)
