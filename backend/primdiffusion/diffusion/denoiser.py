@@ -31,6 +31,11 @@ class PersonDenoiser(nn.Module):
     orthogonal, so the squared error is the sum of theirs and each can be trained alone.
     """
 
+    component_std: Tensor
+    picture_std: Tensor
+    prior_parity: Tensor
+    prior_rest_variance: Tensor
+
     def __init__(self, config: DenoiserConfig, prior: PersonPrior, schedule: Schedule):
         super().__init__()
         self.config, self.schedule = config, schedule
@@ -44,7 +49,7 @@ class PersonDenoiser(nn.Module):
         self.person = PersonNetwork(components, config.person) if config.person else None
         self.local = LocalUNet(channels, components, grid, config.local) if config.local else None
         if self.local is not None:
-            self.local.to(memory_format=torch.channels_last)
+            self.local = self.local.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     @property
     def prior(self) -> PersonPrior:

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from primdiffusion.diffusion.unet import TimeEmbedding
+from primdiffusion.diffusion.unet import TimeEmbedding, zeroed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,10 +53,8 @@ class PersonBlock(nn.Module):
         self.norm = nn.LayerNorm(width, elementwise_affine=False)
         self.film = nn.Linear(condition_width, 2 * width)
         self.mlp = nn.Sequential(
-            nn.Linear(width, 2 * width), nn.SiLU(), nn.Dropout(dropout), nn.Linear(2 * width, width)
+            nn.Linear(width, 2 * width), nn.SiLU(), nn.Dropout(dropout), zeroed(nn.Linear(2 * width, width))
         )
-        nn.init.zeros_(self.mlp[3].weight)
-        nn.init.zeros_(self.mlp[3].bias)
 
     def forward(self, x: Float[Tensor, "b f"], condition: Float[Tensor, "b e"]) -> Float[Tensor, "b f"]:
         """The stream after this block."""
@@ -72,9 +70,7 @@ class PersonNetwork(nn.Module):
         self.time = TimeEmbedding(64, 256)
         self.inner = nn.Linear(2 * components, config.width)
         self.blocks = nn.ModuleList([PersonBlock(config.width, 256, config.dropout) for _ in range(config.blocks)])
-        self.outer = nn.Linear(config.width, components)
-        nn.init.zeros_(self.outer.weight)
-        nn.init.zeros_(self.outer.bias)
+        self.outer = zeroed(nn.Linear(config.width, components))
 
     def forward(
         self, noisy: Float[Tensor, "b r"], guess: Float[Tensor, "b r"], t: Int[Tensor, "b"]
@@ -93,10 +89,12 @@ class LocalBlock(nn.Module):
     def __init__(self, channels: int, out_channels: int, condition_width: int):
         super().__init__()
         self.norm1, self.conv1 = nn.GroupNorm(8, channels), nn.Conv2d(channels, out_channels, 3, padding=1)
-        self.norm2, self.conv2 = nn.GroupNorm(8, out_channels), nn.Conv2d(out_channels, out_channels, 3, padding=1)
+        self.norm2, self.conv2 = (
+            nn.GroupNorm(8, out_channels),
+            zeroed(nn.Conv2d(out_channels, out_channels, 3, padding=1)),
+        )
         self.film = nn.Linear(condition_width, 2 * out_channels)
         self.skip = nn.Identity() if channels == out_channels else nn.Conv2d(channels, out_channels, 1)
-        nn.init.zeros_(self.conv2.weight)
 
     def forward(self, x: Float[Tensor, "b c h w"], condition: Float[Tensor, "b e"]) -> Float[Tensor, "b d h w"]:
         """The block's output."""
@@ -114,15 +112,24 @@ class LocalAttention(nn.Module):
         self.norm, self.qkv, self.out = (
             nn.GroupNorm(8, channels),
             nn.Conv2d(channels, 3 * channels, 1),
-            nn.Conv2d(channels, channels, 1),
+            zeroed(nn.Conv2d(channels, channels, 1)),
         )
-        nn.init.zeros_(self.out.weight)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """The input plus what other cells add."""
         q, k, v = self.qkv(self.norm(x)).flatten(2).unflatten(1, (3, self.heads, -1)).transpose(-1, -2).unbind(1)
         mixed = functional.scaled_dot_product_attention(q, k, v).transpose(-1, -2).flatten(1, 2)
         return x + self.out(mixed.unflatten(-1, x.shape[2:]))
+
+
+class LocalStage(nn.ModuleList):
+    """Local blocks in a row."""
+
+    def forward(self, x: Float[Tensor, "b c h w"], condition: Float[Tensor, "b e"]) -> Tensor:
+        """The last block's output."""
+        for block in self:
+            x = block(x, condition)
+        return x
 
 
 class LocalUNet(nn.Module):
@@ -138,9 +145,9 @@ class LocalUNet(nn.Module):
         self.down, self.up, self.shrink, self.grow, self.attend = (nn.ModuleList() for _ in range(5))
         for level, width in enumerate(widths):
             last = level == len(widths) - 1
-            self.down.append(nn.ModuleList([LocalBlock(width, width, condition_width) for _ in range(config.blocks)]))
+            self.down.append(LocalStage([LocalBlock(width, width, condition_width) for _ in range(config.blocks)]))
             self.up.append(
-                nn.ModuleList(
+                LocalStage(
                     [LocalBlock(2 * width if i == 0 else width, width, condition_width) for i in range(config.blocks)]
                 )
             )
@@ -148,9 +155,7 @@ class LocalUNet(nn.Module):
             if not last:
                 self.shrink.append(nn.Conv2d(width, widths[level + 1], 2, stride=2))
                 self.grow.append(nn.Conv2d(widths[level + 1], width, 1))
-        self.norm, self.outer = nn.GroupNorm(8, widths[0]), nn.Conv2d(widths[0], channels, 3, padding=1)
-        nn.init.zeros_(self.outer.weight)
-        nn.init.zeros_(self.outer.bias)
+        self.norm, self.outer = nn.GroupNorm(8, widths[0]), zeroed(nn.Conv2d(widths[0], channels, 3, padding=1))
 
     def forward(
         self,
@@ -164,17 +169,14 @@ class LocalUNet(nn.Module):
         position = self.position.expand(len(noisy), -1, -1, -1)
         x = self.inner(torch.cat([noisy, picture, position], dim=1).contiguous(memory_format=torch.channels_last))
         skips = []
-        for level, blocks in enumerate(self.down):
-            for block in blocks:
-                x = block(x, condition)
+        for level, stage in enumerate(self.down):
+            x = stage(x, condition)
             x = self.attend[level](x)
             skips.append(x)
             if level < len(self.shrink):
                 x = self.shrink[level](x)
         for level in reversed(range(len(self.up))):
-            x = torch.cat([x, skips.pop()], dim=1)
-            for block in self.up[level]:
-                x = block(x, condition)
+            x = self.up[level](torch.cat([x, skips.pop()], dim=1), condition)
             if level:
                 x = self.grow[level - 1](functional.interpolate(x, scale_factor=2.0, mode="nearest"))
         return self.outer(functional.silu(self.norm(x)))

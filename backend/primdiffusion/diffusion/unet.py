@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -36,6 +37,14 @@ class UNetConfig:
 
 PAPER = UNetConfig()
 PAPER_WITH_ATTENTION = UNetConfig(attention_levels=(2, 3))
+Layer = TypeVar("Layer", nn.Linear, nn.Conv2d)
+
+
+def zeroed(layer: Layer) -> Layer:
+    """The layer with weights and bias 0: a block that ends in it adds nothing before it is trained."""
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
+    return layer
 
 
 class TimeEmbedding(nn.Sequential):
@@ -47,8 +56,7 @@ class TimeEmbedding(nn.Sequential):
 
     def forward(self, t: Int[Tensor, "b"]) -> Float[Tensor, "b width"]:
         """Embedding of a batch of steps."""
-        weight = self[0].weight
-        return super().forward(step_features(t, self.features).to(weight))
+        return super().forward(step_features(t, self.features).to(next(self.parameters()).dtype))
 
 
 def step_features(t: Int[Tensor, "b"], features: int, longest: float = 10_000.0) -> Float[Tensor, "b features"]:
@@ -72,10 +80,8 @@ class ResidualBlock(nn.Module):
             nn.GroupNorm(32, out_channels),
             nn.SiLU(),
             nn.Identity(),
-            nn.Conv2d(out_channels, out_channels, 3, padding=1),
+            zeroed(nn.Conv2d(out_channels, out_channels, 3, padding=1)),
         )
-        nn.init.zeros_(self.out_layers[3].weight)
-        nn.init.zeros_(self.out_layers[3].bias)
         same = channels == out_channels
         self.skip_connection = nn.Identity() if same else nn.Conv2d(channels, out_channels, 1)
 
@@ -154,9 +160,7 @@ class SpatialTransformer(nn.Module):
         self.norm = nn.GroupNorm(32, channels, eps=1e-6)
         self.proj_in = nn.Conv2d(channels, channels, 1)
         self.transformer_blocks = nn.ModuleList([TransformerBlock(channels, heads)])
-        self.proj_out = nn.Conv2d(channels, channels, 1)
-        nn.init.zeros_(self.proj_out.weight)
-        nn.init.zeros_(self.proj_out.bias)
+        self.proj_out = zeroed(nn.Conv2d(channels, channels, 1))
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """The input plus what attention adds."""
@@ -233,10 +237,8 @@ class SlabUNet(nn.Module):
                     stage.append(Upsample(channels))
                 self.output_blocks.append(stage)
         self.out = nn.Sequential(
-            nn.GroupNorm(32, channels), nn.SiLU(), nn.Conv2d(channels, config.slab_channels, 3, padding=1)
+            nn.GroupNorm(32, channels), nn.SiLU(), zeroed(nn.Conv2d(channels, config.slab_channels, 3, padding=1))
         )
-        nn.init.zeros_(self.out[2].weight)
-        nn.init.zeros_(self.out[2].bias)
 
     def _stage(self, channels: int, out_channels: int, level: int) -> Stage:
         stage = Stage(ResidualBlock(channels, out_channels, 4 * self.config.width))

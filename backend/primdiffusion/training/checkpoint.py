@@ -50,6 +50,8 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
         architecture |= {"kind": "person"}
     else:
         architecture |= {"kind": "slab"}
+    if not isinstance(model.denoiser, PersonDenoiser | SlabUNet):
+        raise TypeError(f"checkpoints hold a PersonDenoiser or a SlabUNet, not a {type(model.denoiser).__name__}")
     architecture["config"] = dataclasses.asdict(model.denoiser.config)
     halved = {key: value.half() if _is_halved(key, value) else value for key, value in tensors.items()}
     metadata = {
@@ -95,8 +97,8 @@ def _build(tensors: Mapping[str, Tensor], architecture: dict[str, Any], card: di
     config = architecture["config"]
     weights = _under(tensors, "denoiser.")
     if architecture["kind"] == "slab":
-        lists = {key: tuple(value) if isinstance(value, list) else value for key, value in config.items()}
-        denoiser: torch.nn.Module = SlabUNet(UNetConfig(**lists))
+        levels = {key: tuple(config[key]) for key in ("multipliers", "attention_levels")}
+        denoiser: torch.nn.Module = SlabUNet(UNetConfig(**{**config, **levels}))
         codec, shapes = WholeSlab(), STANDARD_SHAPES
     else:
         prior = PersonPrior(**_under(weights, "prior_"))

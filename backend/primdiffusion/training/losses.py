@@ -40,7 +40,7 @@ class PersonObjective:
     @property
     def network(self) -> nn.Module:
         """What is trained."""
-        return self.denoiser.person
+        return _present(self.denoiser.person)
 
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted x0 error of a random batch at random levels."""
@@ -68,7 +68,7 @@ class RestObjective:
     @property
     def network(self) -> nn.Module:
         """What is trained."""
-        return self.denoiser.local
+        return _present(self.denoiser.local)
 
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted x0 error of a random batch at random levels."""
@@ -87,6 +87,12 @@ class RestObjective:
         std = std * noise / (signal**2 * std**2 + noise**2).sqrt()
         error = (self.denoiser.rest(rest, coefficients, t) - clean) / std
         return weighted_error(error.flatten(1), std.flatten(1), self.config.error_power)
+
+
+def _present(network: nn.Module | None) -> nn.Module:
+    if network is None:
+        raise ValueError("this denoiser was configured without the network that is to be trained: give it a size")
+    return network
 
 
 def blends(
