@@ -1,0 +1,49 @@
+"""Writes docs/results.md: one table for each file in docs/results, every number as a benchmark measured it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "docs" / "results"
+SOURCES = {
+    "demo": ("The demo", "benchmarks/demo.py --assets DIR --json docs/results/demo.json"),
+    "people": ("Payloads against their meshes", "benchmarks/people.py --assets DIR --json docs/results/people.json"),
+    "march": ("The marcher", "benchmarks/march.py --json docs/results/march.json"),
+    "denoisers": ("Denoisers on held-out people", "benchmarks/denoisers.py --json docs/results/denoisers.json"),
+    "layout": ("The grid on the default body", "scripts/bake_layout"),
+}  # fmt: skip
+ABOUT = ("device", "cores", "memory_gb", "python", "commit", "date")
+"""Facts about the measurement, told above the table; package versions stay in the JSON file."""
+
+
+def section(name: str) -> str:
+    """The table of docs/results/NAME.json; null is written as "not measured"."""
+    title, command = SOURCES[name]
+    record = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+    about = ", ".join(f"{key} {record[key]}" for key in ABOUT if key in record)
+    lines = [f"## {title}", f"`{command}`", "", about, "", "| figure | value |", "|---|---|"]
+    for key, value in record.items():
+        if key not in ABOUT and not key.startswith("version_"):
+            lines.append(f"| {key} | {_written(value)} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """All sections whose file is there."""
+    head = "# Results\n\nMade by `benchmarks/report.py` from `docs/results`; the commands make the files anew.\n\n"
+    present = [name for name in SOURCES if (RESULTS / f"{name}.json").is_file()]
+    (ROOT / "docs" / "results.md").write_text(head + "\n\n".join(map(section, present)) + "\n", encoding="utf-8")
+
+
+def _written(value: object) -> str:
+    if value is None:
+        return "not measured"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return json.dumps(value) if isinstance(value, (dict, list)) else str(value)
+
+
+if __name__ == "__main__":
+    main()
