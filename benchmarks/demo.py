@@ -13,6 +13,7 @@ from pathlib import Path
 
 import record
 import stages
+from PIL import Image
 from primdiffusion.machine import share_processors
 
 HERE = Path(__file__).resolve().parent
@@ -60,14 +61,24 @@ def main() -> None:
         options = ["--quick"] if arguments.quick else []
         stage("people against meshes", "benchmarks/people.py", "--assets", arguments.assets, *options)
 
+    overview(out, ["march_rest", "march_posed", "march_side", "march_depth", "march_boxes", "cycles"])
     figures["seconds_setup_excluded_total"] = time.perf_counter() - begun
     figures["peak_gb"] = max(row.took.peak_gb for row in rows)
     print(f"\n{stages.table(rows)}\n")
     print(f"from the button to a person in the scene: {figures['seconds_pressed_to_standing']:.1f} s")
     print(f"volumes follow linear blend skinning to {figures['lbs_error_mm_max']:.5f} mm")
-    print(f"look at {out}: human.blend, cycles.png, march_*.png, contact_sheet.png")
+    print(f"look at {out}: overview.png, contact_sheet.png, human.blend")
     if arguments.json is not None:
         record.write_record(arguments.json, figures)
+
+
+def overview(out: Path, names: list[str], size: int = 384) -> None:
+    """The pictures that are there, side by side, as out/overview.png."""
+    pictures = [Image.open(out / f"{name}.png").convert("RGB") for name in names if (out / f"{name}.png").is_file()]
+    strip = Image.new("RGB", (size * len(pictures), size))
+    for column, picture in enumerate(pictures):
+        strip.paste(picture.resize((size, size), Image.Resampling.LANCZOS), (column * size, 0))
+    strip.save(out / "overview.png", optimize=True)
 
 
 if __name__ == "__main__":

@@ -105,7 +105,7 @@ def cycles(arguments: argparse.Namespace) -> dict[str, float]:
     sys.path.insert(0, str(ROOT))
     from blender_primdiffusion.scene.preview import setup_cycles_preview
 
-    setup_cycles_preview(scene, size=arguments.size, samples=arguments.samples)
+    setup_cycles_preview(scene, size=arguments.size, samples=arguments.samples, yaw=arguments.yaw, world=0.48)
     scene.render.filepath = str(arguments.out)
     start = time.perf_counter()
     bpy.ops.render.render(write_still=True)
@@ -130,6 +130,7 @@ def main() -> None:
         drawing.add_argument(f"--{name}", type=Path, required=True)
     drawing.add_argument("--size", type=int, default=384)
     drawing.add_argument("--samples", type=int, default=1)
+    drawing.add_argument("--yaw", type=float, default=0.5, help="radians around the person, 0 is the front")
     arguments = parser.parse_args()
     arguments.json.write_text(json.dumps(arguments.stage(arguments)))
 
