@@ -40,6 +40,16 @@ from primdiffusion.training.state import TrainingState
 
 log = logging.getLogger(__name__)
 
+LIMITS = (
+    "The people are adults from MakeHuman's bodies, in twelve outfits, six pairs of shoes and ten hair styles, with "
+    "colours and patterns drawn at random: no robes, uniforms, beards, glasses, wheelchairs or children.",
+    "Primitives are 6 to 17 mm a voxel and the codec keeps 64 of 2048 numbers: faces, stripes and prints are soft.",
+    "Patterns of two garments can blend into one, and a garment can change its colour at the sleeves.",
+    "Body shapes are drawn from a Gaussian given the person; they suit the clothes on average only.",
+    "Sampling in few steps makes people more alike than those trained on; more steps let them differ more.",
+)
+"""What a user of such a checkpoint should know; stated on its card."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Prepared:
@@ -251,6 +261,7 @@ def _card(
         "held_out_rms_x0_error": {
             name: {str(level): round(e, 5) for level, e in by.items()} for name, by in errors.items()
         },
+        "limits": list(LIMITS),
         "beats_gaussian_at_every_level": all(
             errors["denoiser"][level] < errors["gaussian"][level] for level in errors["gaussian"]
         ),
