@@ -3,9 +3,14 @@
 import dataclasses
 import json
 import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from primdiffusion.people import assets as assets_module
 from primdiffusion.people import load_base_mesh, make_person, open_assets, recolour
@@ -256,3 +261,24 @@ def test_processes_make_the_same_files_as_one(assets, tmp_path):
     for first, second in zip(alone, together, strict=True):
         with np.load(first) as a, np.load(second) as b:
             assert np.array_equal(a["voxels"], b["voxels"])
+
+
+@pytest.mark.slow
+def test_workers_end_when_the_command_is_killed(assets, tmp_path):
+    command = [sys.executable, "-m", "primdiffusion.people", "--assets", str(assets.root), "--out", str(tmp_path)]
+    process = subprocess.Popen([*command, "--count", "50", "--workers", "2"], stdout=subprocess.DEVNULL)
+    try:
+        assert _within(60, lambda: any(tmp_path.glob("*.npz")))
+        workers = psutil.Process(process.pid).children(recursive=True)
+        assert len(workers) >= 2
+    finally:
+        process.kill()
+        process.wait()
+    assert _within(10, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))
+
+
+def _within(seconds: float, reached: Callable[[], bool]) -> bool:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline and not reached():
+        time.sleep(0.2)
+    return reached()

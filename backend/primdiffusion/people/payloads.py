@@ -12,6 +12,7 @@ import contextlib
 import json
 import multiprocessing
 import os
+import threading
 import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
@@ -73,7 +74,7 @@ def make_payloads(
             report(done, count)
         return paths
     context = multiprocessing.get_context("spawn")
-    with _single_threaded_children(), ProcessPoolExecutor(workers, context, _one_thread) as pool:
+    with _single_threaded_children(), ProcessPoolExecutor(workers, context, _begin_worker) as pool:
         waiting = {pool.submit(write_person, assets, path, variants, person_seed) for path, person_seed in jobs}
         while waiting:
             finished, waiting = wait(waiting, timeout=1.0, return_when=FIRST_EXCEPTION)
@@ -150,6 +151,17 @@ def _single_threaded_children() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _one_thread() -> None:
-    """Keep torch, which does not heed all of the environment, to one thread."""
+def _begin_worker() -> None:
+    """One thread for torch, which does not heed all of the environment; no life after the process that gives the work.
+
+    A pool's workers outlive a parent that is killed, and keep its place on the processors.
+    """
     torch.set_num_threads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
