@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -28,7 +29,12 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
     parser.add_argument("--quick", action="store_true", help="no Cycles frame, a small contact sheet")
     parser.add_argument("--seed", type=int, default=7)
-    parser.add_argument("--assets", type=Path, help="MakeHuman asset folder: also compare 16 people with their meshes")
+    parser.add_argument(
+        "--assets",
+        type=Path,
+        default=nearby_assets(),
+        help="MakeHuman asset folder; with --json, 16 people made from it are compared with their meshes",
+    )
     arguments = parser.parse_args()
     share_processors()
     out, logs = arguments.out.resolve(), arguments.out.resolve() / "logs"
@@ -40,9 +46,11 @@ def main() -> None:
 
     def stage(name: str, script: str, *options: str | Path, figures_file: bool = True) -> None:
         report = logs / f"{len(rows)}.json"
-        told = ["--json", report] if figures_file else []
+        asked = ["--json", report] if figures_file else []
         print(f"{name} ...", flush=True)
-        rows.append(stages.run_stage(name, [sys.executable, ROOT / script, *options, *told], logs / f"{len(rows)}.log"))
+        rows.append(
+            stages.run_stage(name, [sys.executable, ROOT / script, *options, *asked], logs / f"{len(rows)}.log")
+        )
         if figures_file:
             figures.update(json.loads(report.read_text()))
 
@@ -57,7 +65,7 @@ def main() -> None:
     stage("march five pictures", "benchmarks/demo_march.py", "--human", human, *walk, "--out", out)
     count = "4" if arguments.quick else "12"
     stage("contact sheet", "benchmarks/contact_sheet.py", "--count", count, "--out", out / "contact_sheet.png")
-    if arguments.assets is not None:
+    if arguments.json is not None and arguments.assets is not None:
         options = ["--quick"] if arguments.quick else []
         stage("people against meshes", "benchmarks/people.py", "--assets", arguments.assets, *options)
 
@@ -69,7 +77,15 @@ def main() -> None:
     print(f"volumes follow linear blend skinning to {figures['lbs_error_mm_max']:.5f} mm")
     print(f"look at {out}: overview.png, contact_sheet.png, human.blend")
     if arguments.json is not None:
-        record.write_record(arguments.json, figures)
+        about = record.surroundings()  # a stage told its own already
+        record.write_record(arguments.json, {name: value for name, value in figures.items() if name not in about})
+
+
+def nearby_assets() -> Path | None:
+    """The folder that PRIMDIFFUSION_ASSETS names, or one beside the checkout, if it is there."""
+    beside = ROOT.parent / "shared" / "data" / "makehuman"
+    folder = Path(os.environ.get("PRIMDIFFUSION_ASSETS", beside))
+    return folder if folder.is_dir() else None
 
 
 def overview(out: Path, names: list[str], size: int = 384) -> None:

@@ -7,11 +7,8 @@ picture and the truth at a quarter of a millimetre. Seconds are medians of warm 
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import platform
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -29,6 +26,7 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.cpu import march_cpu
 from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings, strides_of
 from primdiffusion.render.reference import march_reference
+from record import write_record
 from torch import Tensor
 
 
@@ -109,29 +107,17 @@ def measure(quick: bool) -> dict[str, float | int | str | None]:
     return figures
 
 
-def circumstances() -> dict[str, str | int]:
-    """What a reader needs to compare the figures with others."""
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    return {
-        "device": f"{platform.processor() or platform.machine()} CPU",
-        "threads": numba.get_num_threads(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "numba": numba.__version__,
-        "commit": commit.stdout.strip() or "unknown",
-    }
-
-
 def main() -> None:
     """Measures, prints and, if asked, writes the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--quick", action="store_true", help="under a minute")
     arguments = parser.parse_args()
-    text = json.dumps(circumstances() | measure(arguments.quick), indent=2)
+    figures = {"threads": numba.get_num_threads()} | measure(arguments.quick)
     if arguments.json:
-        arguments.json.write_text(text + "\n")
-    sys.stdout.write(text + "\n")
+        write_record(arguments.json, figures)
+    for name, value in figures.items():
+        sys.stdout.write(f"{name} {value}\n")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ pixels of both silhouettes. `--quick` takes 4 people from 2 sides. `--pictures D
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 import time
@@ -34,6 +33,7 @@ from primdiffusion.primitives.from_mesh import colour, surface_field
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.march import march
+from record import write_record
 
 Result = TypeVar("Result")
 FIRST_SEED = 10_000_000
@@ -167,10 +167,10 @@ def main() -> None:
         arguments.pictures.mkdir(parents=True, exist_ok=True)
     people, directions = (4, 2) if arguments.quick else (16, len(DIRECTIONS))
     figures = measure(open_assets(arguments.assets), people, directions, arguments.pictures)
-    text = json.dumps(figures, indent=2)
     if arguments.json:
-        arguments.json.write_text(text + "\n")
-    sys.stdout.write(text + "\n")
+        write_record(arguments.json, figures)
+    for name, value in figures.items():
+        sys.stdout.write(f"{name} {value}\n")
 
 
 if __name__ == "__main__":

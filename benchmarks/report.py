@@ -8,7 +8,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
 SOURCES = {
-    "demo": ("The demo", "benchmarks/demo.py --assets DIR --json docs/results/demo.json"),
+    "demo": ("The demo", "benchmarks/demo.py --json docs/results/demo.json"),
     "people": ("Payloads against their meshes", "benchmarks/people.py --assets DIR --json docs/results/people.json"),
     "march": ("The marcher", "benchmarks/march.py --json docs/results/march.json"),
     "denoisers": ("Denoisers on held-out people", "benchmarks/denoisers.py --json docs/results/denoisers.json"),
