@@ -8,7 +8,6 @@ checkpoint's card states: they were measured when it was trained, on people that
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.unet import PAPER, PAPER_WITH_ATTENTION, SlabUNet
 from primdiffusion.training.checkpoint import default_checkpoint, load_checkpoint
-from record import write_record
+from record import tell
 from torch.utils.flop_counter import FlopCounterMode
 
 STEPS = 30
@@ -96,10 +95,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="under a minute")
     arguments = parser.parse_args()
     figures = measure(arguments.quick)
-    if arguments.json:
-        write_record(arguments.json, figures)
-    for name, value in figures.items():
-        sys.stdout.write(f"{name} {value}\n")
+    tell(figures, arguments.json)
 
 
 if __name__ == "__main__":

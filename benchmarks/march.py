@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import math
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +25,7 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.cpu import march_cpu
 from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings, strides_of
 from primdiffusion.render.reference import march_reference
-from record import write_record
+from record import tell
 from torch import Tensor
 
 
@@ -114,10 +113,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="under a minute")
     arguments = parser.parse_args()
     figures = {"threads": numba.get_num_threads()} | measure(arguments.quick)
-    if arguments.json:
-        write_record(arguments.json, figures)
-    for name, value in figures.items():
-        sys.stdout.write(f"{name} {value}\n")
+    tell(figures, arguments.json)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -33,7 +32,7 @@ from primdiffusion.primitives.from_mesh import colour, surface_field
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.march import march
-from record import write_record
+from record import tell
 
 Result = TypeVar("Result")
 FIRST_SEED = 10_000_000
@@ -167,10 +166,7 @@ def main() -> None:
         arguments.pictures.mkdir(parents=True, exist_ok=True)
     people, directions = (4, 2) if arguments.quick else (16, len(DIRECTIONS))
     figures = measure(open_assets(arguments.assets), people, directions, arguments.pictures)
-    if arguments.json:
-        write_record(arguments.json, figures)
-    for name, value in figures.items():
-        sys.stdout.write(f"{name} {value}\n")
+    tell(figures, arguments.json)
 
 
 if __name__ == "__main__":

@@ -41,6 +41,14 @@ def write_record(path: str | Path, figures: Mapping[str, float | int | bool | st
     os.replace(unfinished, path)
 
 
+def tell(figures: Mapping[str, float | int | bool | str | None], path: Path | None) -> None:
+    """Prints a figure a line; also writes the record where a path is given."""
+    if path is not None:
+        write_record(path, figures)
+    for name, value in figures.items():
+        print(name, value)
+
+
 def surroundings() -> dict[str, str | int | float]:
     """Device, cores, memory, versions, commit ("+" behind it: with changes) and date of a measurement."""
     facts: dict[str, str | int | float] = {

@@ -30,7 +30,7 @@ def setup_cycles_preview(
     size: pixels a side. samples: per pixel; more only smooth edges, since no light scatters. yaw: radians the camera
     stands to the person's left of the front. world: grey level of the background, None for a transparent film. The view
     transform is Standard, so that a colour in the volumes is that colour in the picture. A picture of 384 x 384 at one
-    sample takes 5 to 10 minutes of CPU time. Raises ValueError when nobody is in the scene.
+    sample took a minute on two idle cores (docs/results/demo.json). Raises ValueError when nobody is in the scene.
     """
     extents = [posed_extent(collection) for collection in humans(scene)]
     if not extents:
