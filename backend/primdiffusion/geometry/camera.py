@@ -14,36 +14,49 @@ from primdiffusion.geometry.records import TensorRecord
 
 @dataclasses.dataclass(frozen=True)
 class Camera(TensorRecord):
-    """One view: `x_pixel ~ intrinsics @ (world_to_camera @ [x_world, 1])`."""
+    """One view, or a batch of views of one size: `x_pixel ~ intrinsics @ (world_to_camera @ [x_world, 1])`."""
 
-    intrinsics: Float[Tensor, "3 3"]
+    intrinsics: Float[Tensor, "*#c 3 3"]
     """Focal lengths and principal point, pixels."""
-    world_to_camera: Float[Tensor, "3 4"]
+    world_to_camera: Float[Tensor, "*#c 3 4"]
     """[R | t], metres."""
     width: int
     height: int
 
     @property
-    def position(self) -> Float[Tensor, "3"]:
+    def position(self) -> Float[Tensor, "*#c 3"]:
         """The centre of projection in the world, -R^T t."""
-        return -self.world_to_camera[:, :3].T @ self.world_to_camera[:, 3]
+        return -(self.world_to_camera[..., :3].mT @ self.world_to_camera[..., 3:])[..., 0]
 
-    def rays(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "height width 3"]]:
+    def rays(self) -> tuple[Float[Tensor, "*#c 3"], Float[Tensor, "*#c height width 3"]]:
         """The common origin and, for each pixel centre, a unit direction in the world (SPEC 4)."""
-        k = self.intrinsics
+        k = self.intrinsics[..., None, None]
         v, u = torch.meshgrid(
             torch.arange(self.height, dtype=k.dtype, device=k.device) + 0.5,
             torch.arange(self.width, dtype=k.dtype, device=k.device) + 0.5,
             indexing="ij",
         )
-        y = (v - k[1, 2]) / k[1, 1]
-        x = (u - k[0, 2] - k[0, 1] * y) / k[0, 0]
+        y = (v - k[..., 1, 2, :, :]) / k[..., 1, 1, :, :]
+        x = (u - k[..., 0, 2, :, :] - k[..., 0, 1, :, :] * y) / k[..., 0, 0, :, :]
         in_camera = torch.stack([x, y, torch.ones_like(x)], dim=-1)
-        in_world = in_camera @ self.world_to_camera[:, :3]
+        in_world = in_camera @ self.world_to_camera[..., None, :, :3]
         return self.position, torch.nn.functional.normalize(in_world, dim=-1)
 
+    def moved_in_picture(self, right: float, down: float) -> Camera:
+        """The camera whose pixel (u + right, v + down) sees what this one's (u, v) does: the principal point moves."""
+        shift = torch.zeros_like(self.intrinsics)
+        shift[..., 0, 2], shift[..., 1, 2] = right, down
+        return dataclasses.replace(self, intrinsics=self.intrinsics + shift)
+
+    def crop(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The part of the picture from pixel (left, top): its pixels' rays are the whole picture's."""
+        return dataclasses.replace(self.moved_in_picture(float(-left), float(-top)), width=width, height=height)
+
     def project(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 2"], Float[Tensor, "*b"]]:
-        """Pixel coordinates and depth along the optical axis; points behind the camera have depth <= 0."""
+        """Pixel coordinates and depth along the optical axis; points behind the camera have depth <= 0.
+
+        Of one camera, not of a batch.
+        """
         in_camera = points @ self.world_to_camera[:, :3].T + self.world_to_camera[:, 3]
         depth = in_camera[..., 2]
         homogeneous = in_camera @ self.intrinsics.T

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -73,3 +74,14 @@ class Primitives(TensorRecord):
         """The payload in its frames; half extents become rest half extent x delta scale."""
         half_extent = frames.half_extent * payload.delta_scale
         return cls(frames.position, frames.rotation, half_extent, payload.rgb, payload.density)
+
+    @classmethod
+    def together(cls, people: Sequence[Primitives]) -> Primitives:
+        """The boxes of several people as one set, so that one picture shows them all; leading dimensions must agree."""
+        after_k = {"position": 1, "rotation": 2, "half_extent": 1, "rgb": 4, "density": 3}
+        return cls(
+            **{
+                name: torch.cat([getattr(person, name) for person in people], dim=-1 - dims)
+                for name, dims in after_k.items()
+            }
+        )

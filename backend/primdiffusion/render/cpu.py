@@ -19,7 +19,7 @@ from numpy import ndarray
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.compositing import SURFACE_OPACITY, Rendering
-from primdiffusion.render.lattice import WINDOW_SHARPNESS, MarchSettings, check_scene, strides_of
+from primdiffusion.render.lattice import WINDOW_SHARPNESS, MarchSettings, check_scene, check_unbatched, strides_of
 from primdiffusion.render.tiles import TILE, tile_lists
 
 # numba's disk cache watches this file only: touch it after changing a constant that is imported above.
@@ -37,6 +37,7 @@ def march_cpu(primitives: Primitives, camera: Camera, settings: MarchSettings = 
     result is cached on disk. Raises ValueError as `check_scene` does.
     """
     check_scene(primitives, camera)
+    check_unbatched(primitives, camera)
     solid = (primitives.half_extent > 0).all(-1).nonzero()[:, 0]
     boxes = primitives.map(lambda tensor: tensor.detach().cpu()[solid])
     stride = strides_of(boxes, settings).numpy()

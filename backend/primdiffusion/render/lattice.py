@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from typing import Literal, get_args
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import Primitives
+
+Compositing = Literal["mixed", "index_order"]
+"""How boxes that share a lattice point share what is left of a ray (SPEC 4): by opacity, or lower index first."""
+
+ORTHOGONAL = 1e-2
+"""Largest entry of R^T R - 1 that passes as rounding of a rotation."""
 
 WINDOW_SHARPNESS = 8.0
 WINDOW_POWER = 8
@@ -32,10 +41,16 @@ class MarchSettings:
     """Falling; each divides the one before it."""
     samples_per_voxel: float = 2.0
     """Samples wanted on the shortest edge of a voxel."""
+    compositing: Compositing = "mixed"
+    """Ours is "mixed", which no order of the boxes changes; the released code's is "index_order"."""
+    pixel_centre: float = 0.5
+    """Where in a pixel its ray passes; the released code's is 0. Applied by `march`, not by the back ends."""
 
     def __post_init__(self) -> None:
-        if not self.step > 0:
-            raise ValueError(f"the step is {self.step} m; it must be positive")
+        if not (self.step > 0 and math.isfinite(self.step)):
+            raise ValueError(f"the step is {self.step} m; it must be positive and finite")
+        if self.compositing not in get_args(Compositing):
+            raise ValueError(f"compositing is {self.compositing!r}; choose from {get_args(Compositing)}")
         if not self.samples_per_voxel > 0:
             raise ValueError(f"samples_per_voxel is {self.samples_per_voxel}; it must be positive")
         pairs = zip(self.strides, self.strides[1:], strict=False)
@@ -51,6 +66,20 @@ class MarchSettings:
 UNIFORM_MILLIMETRE = MarchSettings(step=0.001, strides=(1,))
 """Every box at every millimetre: the released code's sampling, and slow truth for the default."""
 
+RELEASED = dataclasses.replace(UNIFORM_MILLIMETRE, compositing="index_order", pixel_centre=0.0)
+"""As the released code draws (SPEC 4): every millimetre, boxes in index order, rays through the pixels' corners."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Span(TensorRecord):
+    """The part of each ray that is drawn: lattice points with near <= t <= far, metres along the ray.
+
+    Not differentiable. Far may be infinite; a span that is empty leaves its pixel empty.
+    """
+
+    near: Float[Tensor, "*b height width"]
+    far: Float[Tensor, "*b height width"]
+
 
 def strides_of(primitives: Primitives, settings: MarchSettings) -> Int[Tensor, "k"]:
     """Each box's stride in lattice points (see `MarchSettings`)."""
@@ -61,25 +90,69 @@ def strides_of(primitives: Primitives, settings: MarchSettings) -> Int[Tensor, "
     return stride
 
 
-def check_scene(primitives: Primitives, camera: Camera) -> None:
-    """ValueError, naming the field, unless the boxes are one unbatched, finite set and the picture has pixels."""
-    k, s = primitives.position.shape[0], primitives.density.shape[-1]
+def check_scene(primitives: Primitives, camera: Camera, span: Span | None = None) -> None:
+    """ValueError, naming the field, unless all is finite, of one size and one device, and the picture has pixels.
+
+    Leading dimensions are free. Rotations may reflect (the box's contents are then mirrored), but not shear.
+    """
+    k, s = primitives.position.shape[-2] if primitives.position.ndim > 1 else -1, primitives.density.shape[-1]
     shapes = {"position": (k, 3), "rotation": (k, 3, 3), "half_extent": (k, 3)}
     shapes |= {"rgb": (k, 3, s, s, s), "density": (k, s, s, s)}
     for name, shape in shapes.items():
         value: Tensor = getattr(primitives, name)
-        if tuple(value.shape) != shape:
-            raise ValueError(
-                f"primitives.{name} has shape {tuple(value.shape)}, not {shape}: march one person at a time"
-            )
+        if tuple(value.shape[-len(shape) :]) != shape:
+            raise ValueError(f"primitives.{name} has shape {tuple(value.shape)}; it must end in {shape}")
         if not torch.isfinite(value).all():
             raise ValueError(f"primitives.{name} holds NaN or infinite values; pose or generate the person again")
     if bool((primitives.density < 0).any()):
         raise ValueError(f"density falls to {float(primitives.density.min()):.4g} per metre; clamp it to 0 or more")
-    for name in ("intrinsics", "world_to_camera"):
-        if not torch.isfinite(getattr(camera, name)).all():
-            raise ValueError(
-                f"camera.{name} holds NaN or infinite values: {getattr(camera, name).tolist()}; look_at makes one"
-            )
+    _check_rotation(primitives.rotation)
+    for name, shape in (("intrinsics", (3, 3)), ("world_to_camera", (3, 4))):
+        value = getattr(camera, name)
+        if tuple(value.shape[-2:]) != shape:
+            raise ValueError(f"camera.{name} has shape {tuple(value.shape)}; it must end in {shape}")
+        if not torch.isfinite(value).all():
+            raise ValueError(f"camera.{name} holds NaN or infinite values: {value.tolist()}; look_at makes one")
     if camera.width < 1 or camera.height < 1:
         raise ValueError(f"the picture is {camera.width} x {camera.height} pixels; both sides must be at least 1")
+    check_one_device(primitives, camera, span)
+    if span is not None:
+        _check_span(span, camera)
+
+
+def check_unbatched(primitives: Primitives, camera: Camera, span: Span | None = None) -> None:
+    """ValueError unless this is one set of boxes and one view; `march` takes batches."""
+    given = [primitives.position[..., 0], camera.intrinsics[..., 0], camera.world_to_camera[..., 0]]
+    if any(tensor.ndim != 1 for tensor in given) or (span is not None and span.near.ndim != 2):
+        shapes = [tuple(tensor.shape[:-1]) for tensor in given]
+        raise ValueError(f"the primitives and the camera have leading dimensions {shapes}: give a batch to `march`")
+
+
+def check_one_device(*records: TensorRecord | None) -> None:
+    """ValueError where tensors lie on several devices."""
+    fields = [value for record in records if record is not None for value in vars(record).values()]
+    devices = {str(value.device) for value in fields if isinstance(value, Tensor)}
+    if len(devices) > 1:
+        raise ValueError(f"primitives, camera and span lie on {sorted(devices)}: move them to one device with .to()")
+
+
+def _check_rotation(rotation: Tensor) -> None:
+    product = rotation.detach().mT @ rotation.detach()
+    excess = (product - torch.eye(3, dtype=product.dtype, device=product.device)).abs().amax((-2, -1))
+    if excess.numel() and float(excess.max()) > ORTHOGONAL:
+        raise ValueError(
+            f"primitives.rotation is no rotation in box {int(excess.flatten().argmax())}: R^T R is off the identity by "
+            f"{float(excess.max()):.3g}; put scale into half_extent and shear into the mesh before frames are attached"
+        )
+
+
+def _check_span(span: Span, camera: Camera) -> None:
+    for name in ("near", "far"):
+        value: Tensor = getattr(span, name)
+        if tuple(value.shape[-2:]) != (camera.height, camera.width):
+            raise ValueError(
+                f"span.{name} has shape {tuple(value.shape)}; it must end in the picture's ({camera.height}, "
+                f"{camera.width})"
+            )
+        if torch.isnan(value).any():
+            raise ValueError(f"span.{name} holds NaN; use 0 and infinity where there is no limit")

@@ -2,26 +2,145 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
+from typing import TypeVar
+
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu import march_cpu
-from primdiffusion.render.lattice import MarchSettings
+from primdiffusion.render.lattice import RELEASED, MarchSettings, Span, check_one_device
 from primdiffusion.render.reference import march_reference
 
-__all__ = ["MarchSettings", "Rendering", "march"]
+Record = TypeVar("Record", bound=TensorRecord)
+
+__all__ = ["RELEASED", "MarchSettings", "Rendering", "Span", "march"]
 
 
-def march(primitives: Primitives, camera: Camera, settings: MarchSettings = MarchSettings()) -> Rendering:  # noqa: B008
-    """The picture of `primitives` (unbatched) from `camera`: premultiplied linear rgb [H, W, 3], alpha, depth (metres).
+def march(
+    primitives: Primitives,
+    camera: Camera,
+    settings: MarchSettings = MarchSettings(),  # noqa: B008
+    *,
+    span: Span | None = None,
+    background: Float[Tensor, "*h w 3"] | Sequence[float] | None = None,
+) -> Rendering:
+    """Pictures [*b, H, W] of `primitives` from `camera`: premultiplied linear rgb, alpha, depths (metres).
 
-    The rule is in `march_reference`. float32 tensors on the CPU without gradients go to the fast `march_cpu`; other
-    dtypes, devices and anything that needs gradients to `march_reference`. Raises ValueError as `check_scene` does.
+    The leading dimensions of primitives, camera and span broadcast against each other to *b: people [p, 1] and cameras
+    [v] give pictures [p, v, H, W]. Several people in one picture are one set of boxes (`Primitives.together`). The rule
+    is in `march_reference`; `RELEASED` as settings draws as the released code does. A `background`, linear, [3] or
+    [*b, H, W, 3], is put behind the rgb; alpha remains what the boxes cover. Reflecting rotations mirror a box's
+    contents; boxes with an extent of zero or less are not drawn.
+
+    Differentiable in every tensor but the span. float32 goes to the fast back end of its device (`march_cpu`, or
+    `march_cuda` where Triton is installed), anything else to `march_reference`, which is slow. Raises ValueError as
+    `check_scene` does, and where leading dimensions do not broadcast.
     """
+    check_one_device(primitives, camera, span)
+    if settings.pixel_centre != 0.5:
+        shift = 0.5 - settings.pixel_centre
+        camera = camera.moved_in_picture(shift, shift)
+    batch = _batch_shape(primitives, camera, span)
+    boxes = _unbound(primitives, PRIMITIVE_DIMENSIONS, batch)
+    views = _unbound(camera, CAMERA_DIMENSIONS, batch)
+    spans = [None] * len(views) if span is None else _unbound(span, SPAN_DIMENSIONS, batch)
+    if _is_plain(primitives, camera) and span is None and settings.compositing == "mixed":
+        pictures = [march_cpu(person, view, settings) for person, view in zip(boxes, views, strict=True)]
+    else:
+        scenes = zip(boxes, views, spans, strict=True)
+        pictures = [march_reference(person, view, settings, limits) for person, view, limits in scenes]
+    rendering = _stacked(pictures, batch)
+    return rendering if background is None else _over(rendering, background)
+
+
+def _is_plain(primitives: Primitives, camera: Camera) -> bool:
+    """Whether the fast back end for CPUs takes it."""
     tensors = [*vars(primitives).values(), camera.intrinsics, camera.world_to_camera]
-    plain = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
     differentiable = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    draw = march_cpu if plain and not differentiable else march_reference
-    return draw(primitives, camera, settings)
+    plain = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
+    return plain and not differentiable
+
+
+PRIMITIVE_DIMENSIONS = {"position": 2, "rotation": 3, "half_extent": 2, "rgb": 5, "density": 4}
+CAMERA_DIMENSIONS = {"intrinsics": 2, "world_to_camera": 2}
+SPAN_DIMENSIONS = {"near": 2, "far": 2}
+"""Dimensions of each field of one scene; those before them are the batch."""
+
+
+def _leading(record: TensorRecord, dimensions: dict[str, int]) -> torch.Size:
+    """The record's batch shape; ValueError where its fields' do not broadcast."""
+    shapes = [tuple(getattr(record, name).shape) for name in dimensions]
+    if any(len(shape) < count for shape, count in zip(shapes, dimensions.values(), strict=True)):
+        given = dict(zip(dimensions, shapes, strict=True))
+        raise ValueError(f"{type(record).__name__} has shapes {given}; its fields need {dimensions} dimensions")
+    leads = [shape[: len(shape) - count] for shape, count in zip(shapes, dimensions.values(), strict=True)]
+    try:
+        return torch.broadcast_shapes(*leads)
+    except RuntimeError:
+        given = dict(zip(dimensions, shapes, strict=True))
+        raise ValueError(f"the leading dimensions of {type(record).__name__} do not broadcast: {given}") from None
+
+
+def _batch_shape(primitives: Primitives, camera: Camera, span: Span | None) -> torch.Size:
+    leads = [_leading(primitives, PRIMITIVE_DIMENSIONS), _leading(camera, CAMERA_DIMENSIONS)]
+    if span is not None:
+        leads.append(_leading(span, SPAN_DIMENSIONS))
+    try:
+        batch = torch.broadcast_shapes(*leads)
+    except RuntimeError:
+        named = ", ".join(str(tuple(lead)) for lead in leads)
+        raise ValueError(
+            f"the leading dimensions of primitives, camera and span, {named}, do not broadcast: people [p, 1] and "
+            "cameras [v] give [p, v] pictures"
+        ) from None
+    if 0 in batch:
+        raise ValueError(f"a batch of {tuple(batch)} holds no picture: give at least one person and one camera")
+    return batch
+
+
+def _unbound(record: Record, dimensions: dict[str, int], batch: torch.Size) -> list[Record]:
+    """One unbatched record a picture. Records that are used in several pictures are the same object."""
+    lead = _leading(record, dimensions)
+    if not lead:
+        return [record] * batch.numel()
+    # unbind and not indexing: its gradient is one stack, not a whole batch of zeros for each scene.
+    fields = {
+        name: getattr(record, name).expand(*lead, *getattr(record, name).shape[-count:]).flatten(0, len(lead) - 1)
+        for name, count in dimensions.items()
+    }
+    singles = [
+        dataclasses.replace(record, **dict(zip(fields, values, strict=True)))
+        for values in zip(*(field.unbind(0) for field in fields.values()), strict=True)
+    ]
+    place = torch.arange(len(singles)).reshape(lead).expand(batch).flatten()
+    return [singles[i] for i in place.tolist()]
+
+
+def _stacked(pictures: list[Rendering], batch: torch.Size) -> Rendering:
+    if not batch:
+        return pictures[0]
+    names = [field.name for field in dataclasses.fields(Rendering)]
+    return Rendering(
+        **{name: torch.stack([getattr(p, name) for p in pictures]).unflatten(0, tuple(batch)) for name in names}
+    )
+
+
+def _over(rendering: Rendering, background: Float[Tensor, "*h w 3"] | Sequence[float]) -> Rendering:
+    behind = torch.as_tensor(background, dtype=rendering.rgb.dtype, device=rendering.rgb.device)
+    try:
+        rgb = rendering.rgb + (1 - rendering.alpha)[..., None] * behind
+    except RuntimeError:
+        rgb = behind
+    if rgb.shape != rendering.rgb.shape:
+        raise ValueError(
+            f"the background has shape {tuple(behind.shape)}: give 3 linear values or a picture "
+            f"{tuple(rendering.rgb.shape)}"
+        )
+    return dataclasses.replace(rendering, rgb=rgb)

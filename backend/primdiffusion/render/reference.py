@@ -12,41 +12,51 @@ from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.compositing import Rendering, composite
 from primdiffusion.render.lattice import (
-    UNIFORM_MILLIMETRE,
     WINDOW_POWER,
     WINDOW_SHARPNESS,
+    Compositing,
     MarchSettings,
+    Span,
     check_scene,
+    check_unbatched,
     strides_of,
 )
-
-Grouping = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 RAYS_AT_ONCE = 1024
 """Bounds the memory of the ray-box table; no effect on the result."""
 
 
-def march_reference(primitives: Primitives, camera: Camera, settings: MarchSettings = MarchSettings()) -> Rendering:  # noqa: B008
-    """The picture of `primitives` (unbatched) from `camera`: the mixed rule of SPEC 4.
+def march_reference(
+    primitives: Primitives,
+    camera: Camera,
+    settings: MarchSettings = MarchSettings(),  # noqa: B008
+    span: Span | None = None,
+) -> Rendering:
+    """The picture of `primitives` from `camera` (both unbatched): SPEC 4.
 
     At lattice point t_n = n * spacing each box whose stride s divides n and that contains the point adds the opacity
-    a_i = density * window * s * spacing. The point's opacity is sum a_i, its colour sum a_i c_i / sum a_i, so the order
-    of the boxes does not matter. Points are composited front to back as `composite` says.
+    a_i = density * window * s * spacing. With "mixed" compositing the point's opacity is sum a_i, its colour
+    sum a_i c_i / sum a_i, so the order of the boxes does not matter; with "index_order" they follow one another, the
+    lowest index first, which differs at the point that saturates a ray. Points are composited front to back as
+    `composite` says. Boxes with an extent of zero or less hold no point.
 
     Differentiable in every tensor of `primitives` and `camera`; the number and places of the samples are treated as
     fixed, so the steps of 3.4e-4 (the window's value) at the boxes' faces give no gradient. Cost: memory in proportion
     to all samples of the picture when gradients are recorded. Raises ValueError as `check_scene` does, and where the
-    tensors differ in dtype or device or are narrower than float32.
+    tensors are batched, differ in dtype or are narrower than float32.
     """
-    return _march(primitives, camera, settings, _by_point)
+    check_scene(primitives, camera, span)
+    check_unbatched(primitives, camera, span)
+    _check_dtype([*vars(primitives).values(), camera.intrinsics, camera.world_to_camera])
+    origin, directions = camera.rays()
+    reach = _reach(camera, span, settings.spacing)
+    portions = zip(directions.flatten(0, 1).split(RAYS_AT_ONCE), reach.split(RAYS_AT_ONCE), strict=True)
+    blocks = [_march_rays(primitives, origin, rays, allowed, settings) for rays, allowed in portions]
 
+    def picture(name: str) -> Tensor:
+        return torch.cat([getattr(block, name) for block in blocks]).unflatten(0, (camera.height, camera.width))
 
-def march_released(primitives: Primitives, camera: Camera, settings: MarchSettings = UNIFORM_MILLIMETRE) -> Rendering:
-    """As the released code composites (SPEC 4): boxes that share a lattice point one after the other in index order.
-
-    Differs from `march_reference` only at the sample that saturates a ray, where the box with the lowest index wins.
-    """
-    return _march(primitives, camera, settings, _by_sample)
+    return Rendering(picture("rgb"), picture("alpha"), picture("depth"), picture("first_hit"))
 
 
 def trilinear(
@@ -76,39 +86,33 @@ def window(local: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
     return torch.exp(-WINDOW_SHARPNESS * local.pow(WINDOW_POWER).sum(-1))
 
 
-def _march(primitives: Primitives, camera: Camera, settings: MarchSettings, grouping: Grouping) -> Rendering:
-    check_scene(primitives, camera)
-    _check_kind([*vars(primitives).values(), camera.intrinsics, camera.world_to_camera])
-    origin, directions = camera.rays()
-    portions = directions.flatten(0, 1).split(RAYS_AT_ONCE)
-    blocks = [_march_rays(primitives, origin, portion, settings, grouping) for portion in portions]
-
-    def picture(name: str) -> Tensor:
-        return torch.cat([getattr(block, name) for block in blocks]).unflatten(0, (camera.height, camera.width))
-
-    return Rendering(picture("rgb"), picture("alpha"), picture("depth"), picture("first_hit"))
-
-
-def _check_kind(tensors: list[Tensor]) -> None:
-    kinds = {(tensor.dtype, str(tensor.device)) for tensor in tensors}
-    if len(kinds) > 1:
-        raise ValueError(
-            f"primitives and camera mix dtypes or devices {sorted(map(str, kinds))}: convert one with .to()"
-        )
+def _check_dtype(tensors: list[Tensor]) -> None:
+    dtypes = {tensor.dtype for tensor in tensors}
+    if len(dtypes) > 1:
+        raise ValueError(f"primitives and camera mix dtypes {sorted(map(str, dtypes))}: convert one with .to()")
     dtype = tensors[0].dtype
     if torch.finfo(dtype).bits < 32:
         raise ValueError(f"{dtype} cannot tell lattice points a millimetre apart: use float32 or float64")
+
+
+def _reach(camera: Camera, span: Span | None, spacing: float) -> Float[Tensor, "r 2"]:
+    """First and last lattice index that may be sampled on each ray; as floats, for the last may be infinite."""
+    if span is None:
+        no_limit = camera.intrinsics.new_tensor([1.0, torch.inf])
+        return no_limit.expand(camera.height * camera.width, 2)
+    first, last = (span.near.detach() / spacing).ceil().clamp_min(1), (span.far.detach() / spacing).floor()
+    return torch.stack([first.flatten(), last.flatten()], dim=-1)
 
 
 def _march_rays(
     primitives: Primitives,
     origin: Float[Tensor, "3"],
     directions: Float[Tensor, "r 3"],
+    reach: Float[Tensor, "r 2"],
     settings: MarchSettings,
-    grouping: Grouping,
 ) -> Rendering:
     stride = strides_of(primitives, settings)
-    ray, box, n = _samples(primitives, origin, directions, stride, settings.spacing)
+    ray, box, n = _samples(primitives, origin, directions, reach, stride, settings.spacing)
     order = torch.argsort(ray * (n.max() + 1 if len(n) else 1) + n, stable=True)  # within a point: index order
     ray, box, n = ray[order], box[order], n[order]
 
@@ -119,7 +123,7 @@ def _march_rays(
     rgb, density = trilinear(rgb_density, box, local).split((3, 1), dim=-1)
     opacity = density[:, 0] * window(local) * (stride[box].to(distance.dtype) * settings.spacing)
 
-    group, first = grouping(ray, n)
+    group, first = GROUPING[settings.compositing](ray, n)
     group_opacity = opacity.new_zeros(len(first)).index_add(0, group, opacity)
     seen = group_opacity > 0
     group_rgb = rgb.new_zeros((len(first), 3)).index_add(0, group, opacity[:, None] * rgb)
@@ -138,6 +142,7 @@ def _samples(
     primitives: Primitives,
     origin: Float[Tensor, "3"],
     directions: Float[Tensor, "r 3"],
+    reach: Float[Tensor, "r 2"],
     stride: Int[Tensor, "k"],
     spacing: float,
 ) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"], Int[Tensor, "m"]]:
@@ -165,7 +170,7 @@ def _samples(
     box = solid[candidate]
     n = (first.repeat_interleave(count) + within) * stride[box]
     local = _to_local(primitives, box, origin + (n.to(origin.dtype) * spacing)[:, None] * directions[ray])
-    inside = (local.abs() < 1).all(-1)
+    inside = (local.abs() < 1).all(-1) & (n >= reach[ray, 0]) & (n <= reach[ray, 1])
     return ray[inside], box[inside], n[inside]
 
 
@@ -180,6 +185,13 @@ def _by_sample(ray: Int[Tensor, "m"], n: Int[Tensor, "m"]) -> tuple[Int[Tensor, 
     """Each sample is a group of its own."""
     every = torch.arange(len(ray), device=ray.device)
     return every, every
+
+
+GROUPING: dict[Compositing, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]] = {
+    "mixed": _by_point,
+    "index_order": _by_sample,
+}
+"""Which samples of a ray are composited as one."""
 
 
 def _rows(
