@@ -25,14 +25,17 @@ from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.samplers import Step
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.records import TensorRecord
+from primdiffusion.geometry.rotation import polar
 from primdiffusion.primitives.anchors import Anchors, attach, default_anchors
-from primdiffusion.primitives.primitives import Payload, Primitives
+from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
 
 DEFAULT_SETTINGS = MarchSettings()
 VERTICAL_FOV = math.radians(30)
 LARGEST_PICTURE = 8192
 """Pixels a side; beyond, a slip of the finger takes all memory."""
+SMALLEST_SCALE = 1e-6
+"""Of an object: below, a person is smaller than what float32 tells apart."""
 FRAMING_MARGIN = 1.04
 """How much farther than just filling the picture the camera stands."""
 
@@ -103,12 +106,57 @@ def place(
 
     Anchors belong to a body: give both or neither. Differentiable in the pose and the human.
     """
-    if (body is None) != (anchors is None):
-        raise ValueError("a body and its anchors go together: give both, or neither for the default body")
-    body = default_body() if body is None else body
-    anchors = default_anchors() if anchors is None else anchors
+    body, anchors = _together(body, anchors)
     frames = attach(anchors, pose_body(human.betas, pose, body).vertices, body.faces)
     return Primitives.place(frames, human.payload)
+
+
+def place_skinned(
+    human: Human,
+    skinning: Float[Tensor, "24 r 4"],
+    object_to_world: Float[Tensor, "r 4"],
+    betas: Float[Tensor, "n"] | None = None,
+    body: BodyModel | None = None,
+    anchors: Anchors | None = None,
+) -> Primitives:
+    """The person's primitives as an armature moves them: affine matrices (r = 3 or 4 rows), joints' and the object's.
+
+    `skinning` takes rest to posed in the object's space (posed x rest^-1, SMPL's joint order); `betas` stand for the
+    human's own where given. The object's 3x3 part is split into Q P (`polar`): the stretch P moves the posed vertices,
+    on which the frames sit, and with s = cbrt(det P) boxes are s times as large and 1/s as dense, so a person is as
+    opaque at any size; Q and the translation move the frames. Where the object mirrors, so do the frames (det -1).
+
+    Raises ValueError for matrices with NaN or infinite values, and for an object that is flat (scaled to zero).
+    """
+    body, anchors = _together(body, anchors)
+    for name, matrix in (("skinning", skinning), ("object_to_world", object_to_world)):
+        if not torch.isfinite(matrix).all():
+            raise ValueError(f"{name} holds NaN or infinite values: check the pose and scale of the armature")
+    orthogonal, stretch = polar(object_to_world[:3, :3].double())
+    scale = float(torch.linalg.det(stretch)) ** (1 / 3)
+    if not scale > SMALLEST_SCALE:
+        raise ValueError(f"the object is scaled to {scale:.3g} of its size: give it a scale other than zero")
+    orthogonal, unit_stretch = orthogonal.to(skinning), (stretch / scale).to(skinning)
+    vertices = body.shape(human.betas if betas is None else betas).follow(skinning) @ unit_stretch.T
+    frames = attach(anchors, vertices, body.faces)
+    frames = Frames(
+        position=frames.position @ (scale * orthogonal).T + object_to_world[:3, 3],
+        rotation=orthogonal @ frames.rotation,
+        half_extent=frames.half_extent * scale,
+    )
+    unscaled = abs(scale - 1) < 1e-6  # as after a rotation in float32; the payload then stays the same tensor
+    payload = human.payload
+    return Primitives.place(
+        frames, payload if unscaled else dataclasses.replace(payload, density=payload.density / scale)
+    )
+
+
+def _together(body: BodyModel | None, anchors: Anchors | None) -> tuple[BodyModel, Anchors]:
+    if body is None and anchors is None:
+        return default_body(), default_anchors()
+    if body is None or anchors is None:
+        raise ValueError("a body and its anchors go together: give both, or neither for the default body")
+    return body, anchors
 
 
 def framing(primitives: Primitives, yaw: float = 0.0, width: int = 512, height: int = 512) -> Camera:

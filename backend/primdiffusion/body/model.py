@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from primdiffusion.body.skinning import rigid_matrix, skin, world_from_joints, world_from_rest
+from primdiffusion.body.skinning import relative_rotations, rigid_matrix, skin, world_from_joints, world_from_rest
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 
@@ -114,15 +114,32 @@ class ShapedBody(TensorRecord):
 
     def pose(self, pose: BodyPose) -> PosedBody:
         """The person in a pose (SMPL eqs. 2-4, 7 and 9); batches of bodies and poses broadcast."""
-        vertices, joints = self.vertices, self.joints
-        identity = torch.eye(3, dtype=joints.dtype, device=joints.device)
-        if self.model.pose_basis.numel() > 0:
-            feature = (pose.joint_rotation[..., 1:, :, :] - identity).flatten(-3)
-            vertices = vertices + torch.einsum("vcp,...p->...vc", self.model.pose_basis, feature)
+        joints = self.joints
         world_from_joint = world_from_joints(pose.joint_rotation, joints, self.model.parents.tolist())
+        identity = torch.eye(3, dtype=joints.dtype, device=joints.device)
         world_from_joint = rigid_matrix(identity, pose.translation)[..., None, :, :] @ world_from_joint
         skinning = world_from_rest(world_from_joint, joints)
-        return PosedBody(skin(vertices, self.model.skin_weights, skinning), world_from_joint, skinning)
+        vertices = skin(self._corrected(pose.joint_rotation), self.model.skin_weights, skinning)
+        return PosedBody(vertices, world_from_joint, skinning)
+
+    def follow(self, skinning: Float[Tensor, "*#b J r 4"]) -> Float[Tensor, "... V 3"]:
+        """The vertices moved by any 24 affine matrices (r = 3 or 4 rows), such as those of an animator's armature.
+
+        `skinning` takes points of the rest pose to where they go, as `PosedBody.skinning` does. The pose-dependent
+        correctives (SMPL eq. 9) follow the joints' rotations relative to their parents, without scale and shear.
+        """
+        if self.model.pose_basis.numel() == 0:
+            return skin(self.vertices, self.model.skin_weights, skinning)
+        relative = relative_rotations(skinning, self.model.parents.tolist())
+        return skin(self._corrected(relative), self.model.skin_weights, skinning)
+
+    def _corrected(self, joint_rotation: Float[Tensor, "*#b J 3 3"]) -> Float[Tensor, "... V 3"]:
+        """Rest vertices with the pose-dependent correctives of SMPL eq. 9."""
+        if self.model.pose_basis.numel() == 0:
+            return self.vertices
+        identity = torch.eye(3, dtype=joint_rotation.dtype, device=joint_rotation.device)
+        feature = (joint_rotation[..., 1:, :, :] - identity).flatten(-3)
+        return self.vertices + torch.einsum("vcp,...p->...vc", self.model.pose_basis, feature)
 
 
 @dataclasses.dataclass(frozen=True)

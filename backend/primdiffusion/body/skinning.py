@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from primdiffusion.geometry.rotation import polar
+
 
 def rigid_matrix(rotation: Float[Tensor, "*#b 3 3"], translation: Float[Tensor, "*#b 3"]) -> Float[Tensor, "... 4 4"]:
     """The 4x4 matrix of x -> rotation @ x + translation; batches broadcast."""
@@ -44,8 +46,20 @@ def world_from_rest(
     return rigid_matrix(rotation, world_from_joint[..., :3, 3] - moved_rest)
 
 
+def relative_rotations(skinning: Float[Tensor, "*b J r 4"], parents: Sequence[int]) -> Float[Tensor, "*b J 3 3"]:
+    """The joints' rotations relative to their parents, out of any affine matrices world <- rest.
+
+    Each matrix counts as its nearest orthogonal one (`polar`); a rest pose has no rotations, so these are the joints'.
+    """
+    world, _ = polar(skinning[..., :3, :3])
+    parent = [world[..., max(p, 0), :, :] for p in parents]
+    relative = torch.stack(parent, dim=-3).mT @ world
+    roots = torch.tensor([p < 0 for p in parents], device=world.device)
+    return torch.where(roots[:, None, None], world, relative)
+
+
 def skin(
-    points: Float[Tensor, "*#b V 3"], weights: Float[Tensor, "V J"], skinning: Float[Tensor, "*#b J 4 4"]
+    points: Float[Tensor, "*#b V 3"], weights: Float[Tensor, "V J"], skinning: Float[Tensor, "*#b J r 4"]
 ) -> Float[Tensor, "... V 3"]:
     """Points moved by the weighted mean of the joints' matrices (linear blend skinning)."""
     blended = torch.einsum("vj,...jrc->...vrc", weights, skinning[..., :3, :])

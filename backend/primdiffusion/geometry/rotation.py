@@ -60,3 +60,12 @@ def matrix_to_axis_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b
     half_angle = torch.atan2(sin_half, w)
     scale = torch.where(sin_half < 1e-7, 2 * torch.ones_like(w), 2 * half_angle / sin_half.clamp_min(1e-12))
     return v * scale[..., None]
+
+
+def polar(matrix: Float[Tensor, "*b 3 3"]) -> tuple[Float[Tensor, "*b 3 3"], Float[Tensor, "*b 3 3"]]:
+    """Q and P of matrix = Q P: Q the nearest orthogonal matrix, P symmetric with det P = |det matrix|.
+
+    Q reflects where the matrix does (det Q = -1). Differentiable where the singular values differ.
+    """
+    left, scales, right = torch.linalg.svd(matrix)
+    return left @ right, right.mT @ (scales[..., None] * right)
