@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 
 from .human_file import JOINT_NAMES
 
+MARK = "primdiffusion_body"
+"""Custom property of a body mesh: the engine leaves it out, shown or hidden."""
+
 
 def build_body_mesh(
     name: str,
@@ -45,6 +48,7 @@ def build_body_mesh(
     modifier = body.modifiers.new("Armature", "ARMATURE")
     modifier.object = armature
     modifier.use_deform_preserve_volume = False
+    body[MARK] = True
     body.hide_render = True
     body.hide_viewport = True
     return body

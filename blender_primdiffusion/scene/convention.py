@@ -25,3 +25,15 @@ def frames_to_blender(rotation: NDArray) -> NDArray[np.float64]:
 def rotations_to_blender(rotation: NDArray) -> NDArray[np.float64]:
     """World-to-world rotations [..., 3, 3], such as SMPL's joint rotations: both sides turn."""
     return BLENDER_FROM_BACKEND @ np.asarray(rotation, np.float64) @ BLENDER_FROM_BACKEND.T
+
+
+def points_to_backend(points: NDArray) -> NDArray[np.float64]:
+    """Positions or displacements [..., 3], z up, to y up."""
+    return np.asarray(points, np.float64) @ BLENDER_FROM_BACKEND
+
+
+def transforms_to_backend(matrices: NDArray) -> NDArray[np.float64]:
+    """Affine maps [..., 4, 4] of Blender's space into itself as rows [A | t] [..., 3, 4]: both sides turn."""
+    matrices = np.asarray(matrices, np.float64)
+    linear = BLENDER_FROM_BACKEND.T @ matrices[..., :3, :3] @ BLENDER_FROM_BACKEND
+    return np.concatenate([linear, points_to_backend(matrices[..., :3, 3])[..., None]], -1)

@@ -21,6 +21,10 @@ from .overlap import CYCLES_LIMIT, most_overlapping
 
 MARK = "primdiffusion_human"
 """Custom property of a person's collection: its provenance as JSON."""
+BETAS = "primdiffusion_betas"
+"""Custom property of a person's armature: the body's shape, which the engine draws and which may be animated."""
+PERSON_FILE = "person.human.safetensors"
+"""The person as the backend keeps it, beside the volumes."""
 _NAME_LENGTH = 40
 _KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials")
 
@@ -32,15 +36,15 @@ def build_human(
 
     The person faces -y with the soles on z = 0 at the world's origin: the armature object is lifted, its space is the
     backend's turned z up. Volumes are written to `folder_of(collection)`, and the files in `keep` are copied
-    beside them. Raises HumanFileError or
-    VolumeWriteError, and then leaves neither data nor files. Takes several seconds; makes no undo step, its caller
-    does.
+    beside them. Raises HumanFileError or VolumeWriteError, and then leaves neither data nor files. Takes several
+    seconds; makes no undo step, its caller does.
     """
     human = read_human(human_npz)
     with _nothing_left_on_failure():
         collection = bpy.data.collections.new(name[:_NAME_LENGTH])
         label = collection.name
         armature = build_armature(context, label, points_to_blender(human.joints))
+        armature[BETAS] = human.betas.tolist()
         collection.objects.link(armature)
         vertices = points_to_blender(human.vertices)
         armature.location = (0.0, 0.0, -vertices[:, 2].min())
@@ -69,6 +73,25 @@ def build_human(
 def folder_of(collection: bpy.types.Collection) -> Path:
     """Where a person's files live: `<blendname>_humans/<collection name>` (see `humans_folder`)."""
     return volumes.humans_folder() / bpy.path.clean_name(collection.name)
+
+
+def person_file(collection: bpy.types.Collection) -> Path:
+    """The backend's own file of a person: beside their volumes, wherever these are now, else in `folder_of`.
+
+    Volumes keep their paths when a collection is renamed and when a .blend is saved elsewhere. Raises FileNotFoundError
+    with a sentence that names the person and the file.
+    """
+    volume = next((thing.data for thing in collection.all_objects if thing.type == "VOLUME"), None)
+    folders = [folder_of(collection)]
+    if volume is not None and volume.filepath:
+        folders.insert(0, Path(bpy.path.abspath(volume.filepath, library=volume.library)).parent)
+    for folder in folders:
+        if (folder / PERSON_FILE).is_file():
+            return folder / PERSON_FILE
+    raise FileNotFoundError(
+        f"the file of the person {collection.name!r} is missing: {str(folders[0] / PERSON_FILE)!r}; put it back beside "
+        "the person's volumes, or generate the person again"
+    )
 
 
 def overlap_warning(collection: bpy.types.Collection) -> str | None:

@@ -6,7 +6,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..scene.collect import collect_before_saving
-from . import operators, panel, preferences, properties
+from . import operators, panel, preferences, properties, render_panels
 from .generation import session
 
 CLASSES = (
@@ -15,6 +15,9 @@ CLASSES = (
     operators.PRIMDIFFUSION_OT_generate,
     operators.PRIMDIFFUSION_OT_cancel,
     panel.PRIMDIFFUSION_PT_generate,
+    render_panels.PRIMDIFFUSION_PT_marching,
+    render_panels.PRIMDIFFUSION_PT_film,
+    render_panels.PRIMDIFFUSION_PT_passes,
 )
 
 
@@ -29,6 +32,7 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion = bpy.props.PointerProperty(type=properties.PRIMDIFFUSION_PG_settings)
+    render_panels.join_panels()
     bpy.app.handlers.load_pre.append(drop_job_before_loading)
     bpy.app.handlers.save_pre.append(collect_before_saving)
 
@@ -40,6 +44,7 @@ def unregister() -> None:
         bpy.app.timers.unregister(operators.follow)
     bpy.app.handlers.save_pre.remove(collect_before_saving)
     bpy.app.handlers.load_pre.remove(drop_job_before_loading)
+    render_panels.leave_panels()
     del bpy.types.Scene.primdiffusion
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

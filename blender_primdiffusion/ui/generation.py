@@ -9,13 +9,11 @@ from pathlib import Path
 
 import bpy
 
+from ..places import new_backend, preference
 from ..scene.human import build_human, overlap_warning
 from ..scene.human_file import HumanFileError
 from ..scene.volumes import VolumeWriteError
-from ..worker.client import BackendClient
-from ..worker.environment import find_backend_python
 from ..worker.job import Backend, GenerateJob
-from .places import backend_module_path, own_folder, preference
 
 TICK_S = 0.1
 
@@ -134,14 +132,7 @@ class Session:
             return self._backend
         if self._backend is not None:
             self._backend.shutdown()
-        module_path, cache = backend_module_path(), own_folder() / "cache"  # read here: the thread must not touch bpy
-        own_environment = own_folder() / "environment"
-
-        def make_client() -> BackendClient:
-            found = find_backend_python(python or None, own_environment, module_path, cache_dir=cache)
-            return BackendClient(found.path, module_path, cache_dir=cache)
-
-        self._backend, self._backend_python = Backend(make_client), python
+        self._backend, self._backend_python = new_backend(python), python
         return self._backend
 
 

@@ -116,6 +116,7 @@ class BackendClient:
         self._output_ended_at: float | None = None
         self._reported_end = False
         self._heard = threading.Event()
+        self._arrival = threading.Event()
         self._silence = 0.0
         self._reported_silence = False
         self._polled_at = time.monotonic()
@@ -185,6 +186,11 @@ class BackendClient:
             self._reported_silence = True
             events.append(Silent(self._silence))
         return events
+
+    def wait(self, timeout_s: float) -> None:
+        """Sleeps until the child has said something (heartbeats aside) or ended, at most `timeout_s`; then `poll`."""
+        if self._arrival.wait(timeout_s):
+            self._arrival.clear()
 
     def shutdown(self, timeout_s: float = 2.0) -> None:
         """Ends the child politely, or by force after `timeout_s`; waits no longer than that. Safe to call twice."""
@@ -278,7 +284,9 @@ class BackendClient:
             self._heard.set()
             if message.get("method") != "heartbeat":  # nobody may poll for hours: let nothing pile up
                 self._incoming.put(message)
+                self._arrival.set()
         self._incoming.put(None)
+        self._arrival.set()
 
     def _listen(self, stderr: IO[bytes]) -> None:
         for line in stderr:

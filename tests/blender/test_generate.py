@@ -16,6 +16,7 @@ import pytest
 import synthetic
 
 import blender_primdiffusion
+from blender_primdiffusion import places
 from blender_primdiffusion.scene.human import folder_of, humans
 from blender_primdiffusion.ui import generation, operators
 from blender_primdiffusion.ui.generation import session
@@ -33,8 +34,8 @@ def addon(saved_scene, tmp_path, monkeypatch):
     """The add-on registered from the checkout, on an interpreter that runs the fake child."""
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic.write(tmp_path / "prepared.npz", 8)))
     python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-    monkeypatch.setattr(generation, "find_backend_python", lambda *_, **__: python)
-    monkeypatch.setattr(generation, "backend_module_path", lambda: FAKE)
+    monkeypatch.setattr(places, "find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr(places, "backend_module_path", lambda: FAKE)
     session.error = session.notice = session.device = ""
     blender_primdiffusion.register()
     yield saved_scene

@@ -1,4 +1,4 @@
-"""A child that answers generate with FAKE_HUMAN's file, or misbehaves: see the seeds."""
+"""A child that answers generate with FAKE_HUMAN's file and draw with one colour, or misbehaves."""
 
 import json
 import os
@@ -8,7 +8,11 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
+
 DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
+BANDS = 4
+COLOUR, DEPTH = (0.25, 0.5, 0.75, 1.0), 3.0
 _lock = threading.Lock()
 
 
@@ -43,15 +47,39 @@ def generate(id: int, params: dict, cancelled: threading.Event) -> None:
     say(id=id, result={"human": str(human), "person": person, "seed": seed, "steps": steps, "seconds": 0.1})
 
 
+def draw(id: int, params: dict, cancelled: threading.Event) -> None:
+    """Fills the frame with COLOUR and DEPTH from the top; takes FAKE_BAND_S a band, fails as FAKE_DRAW says."""
+    _, _, width, height = params["region"] or [0, 0, params["width"], params["height"]]
+    frame = np.memmap(params["frame"], np.float32, "r+")
+    combined = frame[: width * height * 4].reshape(height, width, 4)
+    depth = frame[width * height * 4 :].reshape(height, width)
+    for band in range(BANDS):
+        low, high = height * (BANDS - 1 - band) // BANDS, height * (BANDS - band) // BANDS
+        combined[low:high], depth[low:high] = COLOUR, DEPTH
+        say(method="progress", params={"id": id, "stage": "draw", "step": height - low, "total": height, "eta_s": 1.0})
+        time.sleep(float(os.environ.get("FAKE_BAND_S", "0")))
+        if cancelled.is_set():
+            say(id=id, error={"code": -32001, "message": "cancelled"})
+            return
+        if os.environ.get("FAKE_DRAW") == "dies":
+            os._exit(9)
+        if os.environ.get("FAKE_DRAW") == "no memory":
+            data = {"kind": "out_of_memory", "remedy": "draw fewer pixels"}
+            say(id=id, error={"code": -32002, "message": "there is not enough memory", "data": data})
+            return
+    say(id=id, result={"seconds": 0.0, "seconds_place": 0.0, "seconds_march": 0.0})
+
+
 cancelled = threading.Event()
 for line in sys.stdin:
     request = json.loads(line)
     id, method = request["id"], request["method"]
     if method == "hello":
         say(id=id, result={"version": "0-fake", "ready": True, "device": "cpu", "device_name": "fake device"})
-    elif method == "generate":
+    elif method in ("generate", "draw"):
         cancelled.clear()
-        threading.Thread(target=generate, args=(id, request["params"], cancelled), daemon=True).start()
+        work = generate if method == "generate" else draw
+        threading.Thread(target=work, args=(id, request["params"], cancelled), daemon=True).start()
     elif method == "cancel":
         cancelled.set()
         say(id=id, result={})

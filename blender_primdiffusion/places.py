@@ -6,13 +6,17 @@ from pathlib import Path
 
 import bpy
 
-EXTENSION = str(__package__).rpartition(".")[0]
+from .worker.client import BackendClient
+from .worker.environment import find_backend_python
+from .worker.job import Backend
+
+EXTENSION = str(__package__)
 """The extension's full module name; `bl_ext.<repository>.primdiffusion` once installed."""
 
 
 def backend_module_path() -> Path | None:
     """The folder that holds the package `primdiffusion`: bundled in the zip, or beside us in a checkout, else None."""
-    root = Path(__file__).resolve().parent.parent
+    root = Path(__file__).resolve().parent
     for folder in (root / "backend", root.parent / "backend"):
         if (folder / "primdiffusion" / "__init__.py").is_file():
             return folder
@@ -32,3 +36,18 @@ def preference(name: str) -> str:
     addon = bpy.context.preferences.addons.get(EXTENSION)
     value = getattr(addon.preferences, name, "") if addon is not None else ""
     return bpy.path.abspath(value) if value else ""
+
+
+def new_backend(python: str) -> Backend:
+    """A child that is yet to be started, on the interpreter of this path; empty: found when it starts.
+
+    What Blender knows is read here: the thread that starts the child must not touch bpy.
+    """
+    module_path, cache = backend_module_path(), own_folder() / "cache"
+    own_environment = own_folder() / "environment"
+
+    def make_client() -> BackendClient:
+        found = find_backend_python(python or None, own_environment, module_path, cache_dir=cache)
+        return BackendClient(found.path, module_path, cache_dir=cache)
+
+    return Backend(make_client)

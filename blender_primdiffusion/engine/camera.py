@@ -1,0 +1,48 @@
+"""The scene's camera and the part of its picture that is wanted, as Blender's own renderers would have them."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from .view import View, view_from_matrices, without_scale
+
+
+def camera_view(
+    camera: bpy.types.Object, depsgraph: bpy.types.Depsgraph, size: tuple[int, int], subject: NDArray
+) -> View:
+    """What a camera object sees in a picture of `size` (width, height), by Blender's own projection.
+
+    So lens, shift, sensor fit and the pixels' aspect are Blender's. Raises ValueError for a panoramic camera.
+    """
+    evaluated = camera.evaluated_get(depsgraph)
+    data = evaluated.data
+    if evaluated.type != "CAMERA" or data.type not in ("PERSP", "ORTHO"):
+        kind = data.type.lower() if evaluated.type == "CAMERA" else evaluated.type.lower()
+        raise ValueError(
+            f"the camera {camera.name!r} is of type {kind}; PrimDiffusion draws perspective and orthographic cameras: "
+            "change its lens type, or choose another camera"
+        )
+    render = depsgraph.scene.render
+    projection = camera.calc_matrix_camera(
+        depsgraph, x=size[0], y=size[1], scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
+    )
+    world_to_view = np.linalg.inv(without_scale(evaluated.matrix_world))
+    return view_from_matrices(projection, world_to_view, (data.clip_start, data.clip_end), size, subject)
+
+
+def wanted_region(render: bpy.types.RenderSettings, size: tuple[int, int]) -> list[int] | None:
+    """The border as [x, y, width, height] in pixels from the left and the bottom, None for the whole picture.
+
+    Truncated in float32, as Blender does: the engine's result has exactly this size.
+    """
+    if not render.use_border:
+        return None
+    low = [int(np.float32(edge) * np.float32(n)) for edge, n in zip(_corner(render, "min"), size, strict=True)]
+    high = [int(np.float32(edge) * np.float32(n)) for edge, n in zip(_corner(render, "max"), size, strict=True)]
+    return [low[0], low[1], high[0] - low[0], high[1] - low[1]]
+
+
+def _corner(render: bpy.types.RenderSettings, which: str) -> tuple[float, float]:
+    return getattr(render, f"border_{which}_x"), getattr(render, f"border_{which}_y")

@@ -1,0 +1,88 @@
+"""F12, animations and renders from the command line: one view layer's picture, shown band by band as it comes."""
+
+from __future__ import annotations
+
+import time
+
+import bpy
+
+from ..worker.drawing import Drawing
+from . import studio
+from .camera import camera_view, wanted_region
+from .frames import Frame
+from .picture import picture_of, solids_file
+from .view import View, blender_depth
+
+ANSWER_S = 0.1
+"""How often Blender is asked whether the user wants to stop."""
+SHOW_S = 0.2
+"""Between updates of the picture in the window: each copies it as a whole."""
+
+
+class RenderFailed(RuntimeError):
+    """No picture; the message is for the user."""
+
+
+def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph) -> Drawing:
+    """Draws one view layer into the engine's result; returns when it is there, or cancelled by the user.
+
+    Raises RenderFailed, FileNotFoundError for a person without a file, and ValueError for what cannot be drawn.
+    """
+    scene = depsgraph.scene
+    camera = engine.camera_override or scene.camera
+    if camera is None:
+        raise ValueError("the scene has no camera; add one")
+    size = (engine.resolution_x, engine.resolution_y)
+    region = wanted_region(scene.render, size)
+    width, height = region[2:] if region else size
+    result = engine.begin_result(0, 0, width, height, layer=depsgraph.view_layer_eval.name)
+    finished = False
+    try:
+        picture = picture_of(depsgraph, solids_file(depsgraph, studio.frames.folder))
+        view = camera_view(camera, depsgraph, size, picture.subject)
+        frame = studio.frames.take("final", width, height)
+        frame.clear()
+        params = {**picture.params(), **view.params(), "region": region, "frame": str(frame.path)}
+        drawing = studio.drawing_child().draw(params)
+        _follow(engine, drawing, result, frame, view)
+        if drawing.error is not None:
+            raise RenderFailed(str(drawing.error))
+        _fill(result, frame, view)
+        finished = True
+    finally:
+        engine.end_result(result, cancel=not finished, do_merge_results=finished)
+    return drawing
+
+
+def _follow(
+    engine: bpy.types.RenderEngine, drawing: Drawing, result: bpy.types.RenderResult, frame: Frame, view: View
+) -> None:
+    shown_rows, shown_at = 0, time.monotonic()
+    while not drawing.finished:
+        news = drawing.wait(ANSWER_S)
+        if engine.test_break():
+            drawing.cancel()
+        if not news or drawing.finished:
+            continue
+        engine.update_stats("", _stats(drawing, frame.height))
+        engine.update_progress(drawing.rows / frame.height)
+        if not bpy.app.background and drawing.rows > shown_rows and time.monotonic() - shown_at > SHOW_S:
+            _fill(result, frame, view)
+            engine.update_result(result)
+            shown_rows, shown_at = drawing.rows, time.monotonic()
+
+
+def _stats(drawing: Drawing, height: int) -> str:
+    if drawing.state in ("waiting", "starting"):
+        return "Starting the backend"
+    left = f", {drawing.eta_s:.1f} s left" if drawing.eta_s else ""
+    return f"Row {drawing.rows} of {height}{left}"
+
+
+def _fill(result: bpy.types.RenderResult, frame: Frame, view: View) -> None:
+    """Copies what is in the frame into the passes."""
+    for render_pass in result.layers[0].passes:
+        if render_pass.name == "Combined":
+            render_pass.rect.foreach_set(frame.combined)
+        elif render_pass.name in ("Depth", "Z"):
+            render_pass.rect.foreach_set(blender_depth(frame.depth, view))

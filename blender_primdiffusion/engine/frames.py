@@ -1,0 +1,118 @@
+"""Pictures as the child leaves them: files in memory that both processes map; nothing is copied through a pipe."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+SHARED_MEMORY = Path("/dev/shm")
+CHANNELS = 5
+"""Combined (4) and depth."""
+_PREFIX = "primdiffusion_"
+
+
+class Frame:
+    """One picture in a file: rows from the bottom, as Blender's passes have them."""
+
+    def __init__(self, path: Path, width: int, height: int):
+        self.path, self.width, self.height = path, width, height
+        self._values = np.memmap(path, np.float32, "r+", shape=(width * height * CHANNELS,))
+
+    @property
+    def combined(self) -> NDArray[np.float32]:
+        """Linear, premultiplied RGBA, flat [height * width * 4]."""
+        return self._values[: self.width * self.height * 4]
+
+    @property
+    def depth(self) -> NDArray[np.float32]:
+        """Metres along the optical axis, flat [height * width]."""
+        return self._values[self.width * self.height * 4 :]
+
+    def clear(self) -> None:
+        """Nothing drawn yet."""
+        self._values[:] = 0
+
+
+class Frames:
+    """A folder in shared memory for frames and what else the child reads; `close` removes it with all that is in it."""
+
+    def __init__(self) -> None:
+        self._folder: Path | None = None
+        self._spare: dict[str, Frame] = {}
+
+    @property
+    def folder(self) -> Path:
+        """Made at first use."""
+        if self._folder is None or not self._folder.is_dir():
+            _sweep()
+            place = SHARED_MEMORY if os.access(SHARED_MEMORY, os.W_OK) else None
+            self._folder = Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{os.getpid()}_", dir=place))
+            self._spare.clear()
+        return self._folder
+
+    def take(self, name: str, width: int, height: int) -> Frame:
+        """The frame of this name; the one of last time if it has this size. OSError where there is no room for it."""
+        frame = self._spare.get(name)
+        if frame is None or (frame.width, frame.height) != (width, height) or not frame.path.exists():
+            self.drop(name)
+            path = self._allocate(name, width * height * CHANNELS * 4)
+            frame = self._spare[name] = Frame(path, width, height)
+        return frame
+
+    def drop(self, name: str) -> None:
+        """Removes the frame of this name; who still maps it keeps it."""
+        frame = self._spare.pop(name, None)
+        if frame is not None:
+            frame.path.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Removes the folder."""
+        self._spare.clear()
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._folder = None
+
+    def _allocate(self, name: str, size: int) -> Path:
+        """A file of `size` bytes that has its room: a full memory file system would otherwise end the process later."""
+        try:
+            return _reserve(self.folder / f"{name}_{size}.frame", size)
+        except OSError:
+            if self.folder.parent != SHARED_MEMORY:
+                raise
+        self.close()
+        self._folder = Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{os.getpid()}_"))
+        return _reserve(self._folder / f"{name}_{size}.frame", size)
+
+
+def _reserve(path: Path, size: int) -> Path:
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600)
+    try:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(descriptor, 0, size)
+        else:
+            os.truncate(descriptor, size)
+    except OSError:
+        path.unlink(missing_ok=True)
+        raise
+    finally:
+        os.close(descriptor)
+    return path
+
+
+def _sweep() -> None:
+    """Removes what a killed Blender left in shared memory, which only a restart would free."""
+    if os.name == "nt":
+        return
+    for folder in SHARED_MEMORY.glob(f"{_PREFIX}*_*"):
+        pid = folder.name[len(_PREFIX) :].partition("_")[0]
+        with contextlib.suppress(OSError, ValueError):
+            try:
+                os.kill(int(pid), 0)
+            except ProcessLookupError:
+                shutil.rmtree(folder, ignore_errors=True)

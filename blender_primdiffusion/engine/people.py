@@ -1,0 +1,92 @@
+"""Who is in the picture: people's armatures as the dependency graph has evaluated them, in the backend's terms."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene.convention import transforms_to_backend
+from ..scene.human import BETAS, MARK, person_file
+from ..scene.human_file import JOINT_NAMES
+
+
+@dataclasses.dataclass(frozen=True)
+class Posed:
+    """One person as the child wants them; backend axes, metres."""
+
+    file: Path
+    object_to_world: NDArray[np.float64]
+    """[3, 4] of the armature object."""
+    joints: NDArray[np.float64]
+    """[24, 3, 4], rest to pose in the armature's space, of SMPL's joints."""
+    betas: list[float] | None
+    """The body's shape; None for the file's."""
+    pelvis: NDArray[np.float64]
+    """Where they are [3]: Blender's world."""
+
+    def params(self) -> dict[str, object]:
+        """As the request `draw` wants it."""
+        return {
+            "human": str(self.file),
+            "object": self.object_to_world.tolist(),
+            "joints": self.joints.tolist(),
+            "betas": self.betas,
+        }
+
+
+def posed_people(depsgraph: bpy.types.Depsgraph) -> list[Posed]:
+    """Everybody whose armature the dependency graph shows, instances included.
+
+    An armature stands for its person: it is hidden with it and shown wherever it is instanced. Raises FileNotFoundError
+    for a person whose file is missing and ValueError for a shape that is no list of numbers.
+    """
+    owners = dict(_armatures())
+    people = []
+    for instance in depsgraph.object_instances:
+        thing = instance.object
+        if thing.type != "ARMATURE" or not instance.show_self:
+            continue
+        owner = owners.get(thing.original)
+        if owner is not None:
+            people.append(_posed(thing, np.array(instance.matrix_world), owner))
+    return people
+
+
+def _armatures() -> Iterator[tuple[bpy.types.Object, bpy.types.Collection]]:
+    """Each armature with SMPL's joints in a person's collection, in this file and in linked ones."""
+    for collection in bpy.data.collections:
+        if MARK not in collection:
+            continue
+        for thing in collection.objects:
+            if thing.type == "ARMATURE" and all(name in thing.data.bones for name in JOINT_NAMES):
+                yield thing, collection
+
+
+def _posed(armature: bpy.types.Object, matrix: NDArray, owner: bpy.types.Collection) -> Posed:
+    bones = armature.pose.bones
+    posed = np.array([bones[name].matrix for name in JOINT_NAMES], np.float64)
+    rest = np.array([bones[name].bone.matrix_local for name in JOINT_NAMES], np.float64)
+    return Posed(
+        person_file(owner),
+        transforms_to_backend(matrix),
+        transforms_to_backend(posed @ np.linalg.inv(rest)),
+        _betas(armature, owner.name),
+        (matrix @ posed[0])[:3, 3],
+    )
+
+
+def _betas(armature: bpy.types.Object, name: str) -> list[float] | None:
+    if BETAS not in armature:
+        return None
+    try:
+        return [float(value) for value in armature[BETAS]]
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"the custom property {BETAS!r} on the armature of {name!r} is {armature[BETAS]!r}; "
+            "make it a list of ten numbers, or delete it"
+        ) from error

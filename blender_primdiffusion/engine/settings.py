@@ -1,0 +1,50 @@
+"""What the render tab asks the engine for; saved with the scene."""
+
+from __future__ import annotations
+
+import bpy
+
+STEP_M = 0.004
+
+
+class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
+    """`scene.primdiffusion_render`."""
+
+    step: bpy.props.FloatProperty(
+        name="Step",
+        description="Distance between samples along a ray: smaller is slower and finer",
+        subtype="DISTANCE",
+        unit="LENGTH",
+        default=STEP_M,
+        min=0.0005,
+        max=0.05,
+        soft_min=0.001,
+        soft_max=0.016,
+        step=0.1,
+        precision=4,
+    )
+    view: bpy.props.EnumProperty(
+        name="View",
+        description="What of the people is drawn",
+        items=(
+            ("COLOUR", "Colour", "The people as they look"),
+            ("DEPTH", "Depth", "Near is bright"),
+            ("ALPHA", "Alpha", "How opaque the people are"),
+            ("BOXES", "Primitives", "The boxes that people are made of, shaded, each in a colour of its own"),
+        ),
+        default="COLOUR",
+    )
+    solids: bpy.props.EnumProperty(
+        name="Solid Objects",
+        description="What becomes of meshes and other surfaces",
+        items=(
+            ("SHADED", "Shaded", "Drawn with simple shading; they hide people behind them"),
+            (
+                "HOLDOUT",
+                "Holdout",
+                "Not drawn; they cut holes into the people, to be filled with Cycles' picture",
+            ),
+            ("IGNORED", "Ignored", "People are drawn as if they were not there"),
+        ),
+        default="SHADED",
+    )

@@ -1,0 +1,181 @@
+"""The 3D view in Rendered mode: says what it would like to see, draws what has come; waits for nothing."""
+
+from __future__ import annotations
+
+import itertools
+import weakref
+from pathlib import Path
+
+import bpy
+import gpu
+import numpy as np
+from gpu_extras.presets import draw_texture_2d
+
+from . import studio
+from .picture import Picture, picture_of, solids_file
+from .refine import Refinement, Shown, Wish
+from .solids import changed_by
+from .view import view_from_matrices
+
+TICK_S = 1 / 60
+_viewports: weakref.WeakSet[Viewport] = weakref.WeakSet()
+_numbers = itertools.count()
+
+
+class Viewport:
+    """One region in Rendered mode. All methods are for Blender's main thread."""
+
+    def __init__(self) -> None:
+        number = next(_numbers)
+        names = [f"view{number}_{turn}" for turn in "01"]
+        self._refinement = Refinement(
+            lambda params: studio.drawing_child().draw(params),
+            lambda turn, width, height: studio.frames.take(names[int(turn)], width, height),
+        )
+        self._picture: Picture | None = None
+        self._solids: Path | None = None
+        self._solids_known = ""
+        self._error = ""
+        self._texture: tuple[Shown, gpu.types.GPUTexture] | None = None
+        _viewports.add(self)
+        weakref.finalize(self, _leave, self._refinement, names)
+
+    def update(self, depsgraph: bpy.types.Depsgraph) -> None:
+        """The scene has changed: read it while the dependency graph may be read."""
+        try:
+            wanted = depsgraph.scene.primdiffusion_render.solids
+            if wanted != self._solids_known or changed_by(depsgraph):
+                self._solids, self._solids_known = solids_file(depsgraph, studio.frames.folder), wanted
+            self._picture = picture_of(depsgraph, self._solids)
+            self._error = ""
+        except (ValueError, OSError) as error:
+            self._picture, self._error = None, str(error)
+
+    def draw(self, engine: bpy.types.RenderEngine, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
+        """Wish for what the region looks at now, and draw the newest picture over the whole of it."""
+        if self._picture is not None:
+            self._refinement.want(_wish(self._picture, context, depsgraph))
+            self._refinement.advance()
+            if not self._refinement.resting:
+                follow()
+        shown = self._refinement.shown
+        if shown is not None:
+            self._draw_picture(engine, shown, context, depsgraph)
+        error = self._error or self._refinement.error
+        engine.update_stats("", f"PrimDiffusion: {error}" if error else "")
+
+    @property
+    def resting(self) -> bool:
+        """Nothing will change by itself."""
+        return self._refinement.resting
+
+    def advance(self) -> bool:
+        """Follow the child; True when there is something new to draw."""
+        return self._refinement.advance()
+
+    def _draw_picture(
+        self,
+        engine: bpy.types.RenderEngine,
+        shown: Shown,
+        context: bpy.types.Context,
+        depsgraph: bpy.types.Depsgraph,
+    ) -> None:
+        if self._texture is None or self._texture[0] is not shown:
+            frame = shown.frame
+            pixels = gpu.types.Buffer("FLOAT", len(frame.combined), frame.combined)
+            self._texture = shown, gpu.types.GPUTexture((frame.width, frame.height), format="RGBA16F", data=pixels)
+        x, y, width, height = 0, 0, context.region.width, context.region.height
+        if shown.wish.region is not None:
+            x, y, width, height = shown.wish.region
+        gpu.state.blend_set("ALPHA_PREMULT")
+        engine.bind_display_space_shader(depsgraph.scene)
+        draw_texture_2d(self._texture[1], (x, y), width, height)
+        engine.unbind_display_space_shader()
+        gpu.state.blend_set("NONE")
+
+
+def _leave(refinement: Refinement, names: list[str]) -> None:
+    """A view has left Rendered mode, or was closed."""
+    refinement.give_up()
+    for name in names:
+        studio.frames.drop(name)
+
+
+def _wish(picture: Picture, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> Wish:
+    region, around, space = context.region, context.region_data, context.space_data
+    size = (region.width, region.height)
+    clip = _clip(around, space)
+    projection, to_view = np.array(around.window_matrix), np.array(around.view_matrix)
+    view = view_from_matrices(projection, to_view, clip, size, picture.subject)
+    part = _border(context, depsgraph, size)
+    params = picture.params()
+    return Wish((repr(params), repr(view.params()), part), params, view, part)
+
+
+def _clip(around: bpy.types.RegionView3D, space: bpy.types.SpaceView3D) -> tuple[float, float]:
+    camera = space.camera
+    if around.view_perspective == "CAMERA" and camera is not None and camera.type == "CAMERA":
+        return camera.data.clip_start, camera.data.clip_end
+    if around.is_perspective:
+        return space.clip_start, space.clip_end
+    return -space.clip_end / 2, space.clip_end / 2  # as Blender clips its own parallel views
+
+
+def _border(
+    context: bpy.types.Context, depsgraph: bpy.types.Depsgraph, size: tuple[int, int]
+) -> tuple[int, int, int, int] | None:
+    """The render border of the view or of the camera looked through, in pixels of the region; None without one."""
+    around, space, render = context.region_data, context.space_data, depsgraph.scene.render
+    if around.view_perspective == "CAMERA":
+        if not render.use_border or space.camera is None or space.camera.type != "CAMERA":
+            return None
+        low, high = _camera_frame(context, depsgraph)
+        edges = np.array([[render.border_min_x, render.border_min_y], [render.border_max_x, render.border_max_y]])
+        corners = low + edges * (high - low)
+    elif space.use_render_border:
+        edges = [
+            [space.render_border_min_x, space.render_border_min_y],
+            [space.render_border_max_x, space.render_border_max_y],
+        ]
+        corners = np.array(edges) * size
+    else:
+        return None
+    (left, bottom), (right, top) = np.clip(np.round(corners), 0, size).astype(int).tolist()
+    if right <= left or top <= bottom:
+        return None
+    return left, bottom, right - left, top - bottom
+
+
+def _camera_frame(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corner [2] of the camera's picture, pixels of the region."""
+    region, camera = context.region, context.space_data.camera
+    corners = np.array(camera.data.view_frame(scene=depsgraph.scene), np.float64)
+    homogeneous = np.concatenate([corners, np.ones((4, 1))], 1)
+    clip = homogeneous @ np.array(context.region_data.window_matrix, np.float64).T
+    pixels = (clip[:, :2] / clip[:, 3:] + 1) / 2 * [region.width, region.height]
+    return pixels.min(0), pixels.max(0)
+
+
+def follow() -> None:
+    """See to it that answers are noticed, until every viewport rests."""
+    if not bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.register(_tick, first_interval=TICK_S, persistent=True)
+
+
+def stop() -> None:
+    """Notice nothing any more."""
+    if bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.unregister(_tick)
+
+
+def _tick() -> float | None:
+    if any([viewport.advance() for viewport in _viewports]):  # each of them, not only up to the first with news
+        _redraw()
+    return TICK_S if any(not viewport.resting for viewport in _viewports) else None
+
+
+def _redraw() -> None:
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D" and area.spaces.active.shading.type == "RENDERED":
+                area.tag_redraw()
