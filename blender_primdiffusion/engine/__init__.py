@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
-
 import bpy
 
 from . import studio, viewport
@@ -18,12 +16,10 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion_render = bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_render)
-    atexit.register(_at_exit)
 
 
 def unregister() -> None:
     """All of `register` undone, the child ended; scenes that used the engine go back to Blender's default."""
-    atexit.unregister(_at_exit)
     viewport.stop()
     studio.close()
     _leave_scenes()
@@ -36,10 +32,3 @@ def _leave_scenes() -> None:
     for scene in bpy.data.scenes:
         if scene.render.engine == ENGINE:
             scene.render.engine = bpy.types.RenderSettings.bl_rna.properties["engine"].default or "BLENDER_WORKBENCH"
-
-
-def _at_exit() -> None:
-    """Blender 4.5 as a Python module hangs at exit while a Python engine is the active one."""
-    studio.close()
-    _leave_scenes()
-    bpy.utils.unregister_class(PRIMDIFFUSION_RenderEngine)
