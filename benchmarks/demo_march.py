@@ -11,10 +11,12 @@ from pathlib import Path
 
 import torch
 from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.drawing.draw import draw
+from primdiffusion.drawing.scene import Look, Scene
 from primdiffusion.human import framing, place
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.anchors import default_anchors
-from primdiffusion.render.image import as_boxes, depth_to_png, to_png
+from primdiffusion.render.image import depth_to_png, rgba_to_png, to_png
 from primdiffusion.render.march import march
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
@@ -57,8 +59,8 @@ def main() -> None:
     depth_to_png(arguments.out / "march_depth.png", rendering)
     to_png(arguments.out / "march_posed.png", march(walking, framing(walking)), BACKGROUND)
     to_png(arguments.out / "march_side.png", march(walking, framing(walking, yaw=SIDE)), BACKGROUND)
-    boxes = as_boxes(rest, default_anchors().chart)
-    to_png(arguments.out / "march_boxes.png", march(boxes, front), BACKGROUND)
+    boxes = draw(Scene(rest, chart=default_anchors().chart), front, Look("boxes"))
+    rgba_to_png(arguments.out / "march_boxes.png", torch.from_numpy(boxes.combined), BACKGROUND)
     share = share_on_body(rest.position)
     arguments.json.write_text(json.dumps({"seconds_march_512": seconds, "grid_share_on_body": share}))
 

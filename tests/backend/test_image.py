@@ -1,4 +1,4 @@
-"""sRGB, picture files and boxes drawn as boxes."""
+"""sRGB and picture files."""
 
 import math
 import os
@@ -6,12 +6,10 @@ import os
 import numpy as np
 import pytest
 import torch
-from march_scenes import camera_at, random_boxes
 from PIL import Image
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.render.compositing import Rendering
-from primdiffusion.render.image import as_boxes, depth_to_png, to_png
-from primdiffusion.render.march import march
+from primdiffusion.render.image import depth_to_png, to_png
 
 KNOWN = {0.0: 0.0, 0.0031308: 0.04044994, 0.2140411: 0.5, 0.5: 0.7353570, 1.0: 1.0}
 
@@ -100,20 +98,3 @@ def test_depth_is_brighter_where_nearer_and_black_where_empty(tmp_path):
     assert near > middle > far > nothing == 0
     depth_to_png(tmp_path / "d.png", Rendering(torch.zeros(1, 4, 3), 0 * alpha, torch.full((1, 4), math.inf), depth))
     assert pixels(tmp_path / "d.png").max() == 0
-
-
-def test_boxes_are_drawn_opaque_in_flat_colours_of_their_group():
-    boxes = random_boxes(6, 3, spread=0.1).to(dtype=torch.float32)
-    group = torch.tensor([0, 0, 0, 1, 1, 1])
-    drawn = as_boxes(boxes, group)
-    assert torch.equal(drawn.position, boxes.position)
-    assert drawn.rgb.flatten(2).std(-1).max() < 1e-6
-    hue = encode_srgb(drawn.rgb[:, :, 0, 0, 0])
-    order = hue.argsort(dim=-1)
-    assert torch.equal(order[0], order[1])
-    assert not torch.equal(order[0], order[3])
-    assert len(torch.unique(hue, dim=0)) == 6
-    camera = camera_at((0.0, 0.0, 0.6), fov=0.4).to(dtype=torch.float32)
-    alpha = march(drawn, camera).alpha
-    assert ((alpha == 0) | (alpha == 1)).float().mean() > 0.9
-    assert 0 < alpha.mean() < 1

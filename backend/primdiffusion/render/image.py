@@ -1,36 +1,28 @@
-"""Renderings as picture files, and boxes drawn as boxes."""
+"""Renderings as picture files."""
 
 from __future__ import annotations
 
-import colorsys
-import dataclasses
 import os
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Float64, UInt8
 from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
-from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.render.compositing import Rendering
 
-__all__ = ["as_boxes", "decode_srgb", "depth_to_png", "encode_srgb", "over", "to_png"]
-
 Background = tuple[float, float, float]
-BOX_DENSITY = 1e5
-"""1/m: boxes drawn as boxes are opaque within a sample, almost up to their faces in spite of the window."""
 NEAR_TO_FAR = ((1.0, 0.95, 0.75), (0.98, 0.62, 0.25), (0.80, 0.25, 0.33), (0.42, 0.12, 0.47), (0.10, 0.07, 0.28))
 """Encoded sRGB of the depth picture, brightness falling with distance."""
 
 
 def over(rendering: Rendering, background: Background) -> Float[Tensor, "*r 3"]:
     """The rendering's linear colours over a plain linear background."""
-    behind = torch.tensor(background).to(rendering.rgb)
-    return rendering.rgb + (1 - rendering.alpha)[..., None] * behind
+    return _over(rendering.rgb, rendering.alpha, background)
 
 
 def to_png(path: str | Path, rendering: Rendering, background: Background | None = (0.0, 0.0, 0.0)) -> None:
@@ -38,11 +30,21 @@ def to_png(path: str | Path, rendering: Rendering, background: Background | None
 
     A reader never sees half a file: it is written beside `path` and renamed.
     """
+    rgba_to_png(path, torch.cat([rendering.rgb, rendering.alpha[..., None]], dim=-1), background)
+
+
+def rgba_to_png(path: str | Path, rgba: Float[Tensor, "h w 4"], background: Background | None) -> None:
+    """As `to_png`, of linear RGB premultiplied by alpha, and alpha."""
+    rgb, alpha = rgba[..., :3], rgba[..., 3]
     if background is not None:
-        _save(path, _to_bytes(encode_srgb(over(rendering, background))))
+        _save(path, _to_bytes(encode_srgb(_over(rgb, alpha, background))))
         return
-    straight = rendering.rgb / rendering.alpha.clamp_min(1e-6)[..., None]
-    _save(path, _to_bytes(torch.cat([encode_srgb(straight.clamp(0, 1)), rendering.alpha[..., None]], dim=-1)))
+    straight = rgb / alpha.clamp_min(1e-6)[..., None]
+    _save(path, _to_bytes(torch.cat([encode_srgb(straight.clamp(0, 1)), alpha[..., None]], dim=-1)))
+
+
+def _over(rgb: Float[Tensor, "*r 3"], alpha: Float[Tensor, "*r"], background: Background) -> Float[Tensor, "*r 3"]:
+    return rgb + (1 - alpha)[..., None] * torch.tensor(background).to(rgb)
 
 
 def depth_to_png(
@@ -56,29 +58,16 @@ def depth_to_png(
     solid = depth[(rendering.alpha >= 0.5).cpu().numpy()]
     near = near if near is not None else float(solid.min(initial=np.inf))
     far = far if far is not None else float(solid.max(initial=-np.inf))
-    place = np.clip((depth - near) / max(far - near, 1e-9), 0, 1) if near <= far else np.zeros_like(depth)
-    stops = np.linspace(0, 1, len(NEAR_TO_FAR))
-    colour = np.stack([np.interp(place, stops, channel) for channel in np.array(NEAR_TO_FAR).T], axis=-1)
+    colour = depth_colours(depth, near, far)
     alpha = rendering.alpha.detach().double().cpu().numpy()[..., None]
     _save(path, _to_bytes(torch.from_numpy(colour * alpha)))
 
 
-def as_boxes(primitives: Primitives, group: Int[Tensor, "k"] | None = None) -> Primitives:
-    """The same boxes filled with one opaque colour each, so that the marcher draws the boxes and not what they hold.
-
-    Boxes of one `group` (say, a UV chart) share a hue and differ in lightness; without groups hues differ.
-    """
-    k = torch.arange(primitives.position.shape[-2])
-    shade = (k * 0.618034) % 1
-    hue = (torch.as_tensor(group).cpu() * 0.618034) % 1 if group is not None else shade
-    lightness = 0.35 + 0.35 * ((k * 0.754878) % 1)
-    colours = [colorsys.hls_to_rgb(float(h), float(light), 0.75) for h, light in zip(hue, lightness, strict=True)]
-    rgb = decode_srgb(torch.tensor(colours, dtype=torch.float32).reshape(-1, 3)).to(primitives.rgb)
-    return dataclasses.replace(
-        primitives,
-        rgb=rgb[..., None, None, None].expand_as(primitives.rgb).contiguous(),
-        density=torch.full_like(primitives.density, BOX_DENSITY),
-    )
+def depth_colours(depth: Float[ndarray, "*r"], near: float, far: float) -> Float64[ndarray, "*r 3"]:
+    """Encoded sRGB colours, from bright at `near` or nearer to dark at `far` or farther (`NEAR_TO_FAR`)."""
+    place = np.clip((depth - near) / max(far - near, 1e-9), 0, 1) if near <= far else np.zeros_like(depth)
+    stops = np.linspace(0, 1, len(NEAR_TO_FAR))
+    return np.stack([np.interp(place, stops, channel) for channel in np.array(NEAR_TO_FAR).T], axis=-1)
 
 
 def _to_bytes(values: Float[Tensor, "h w c"]) -> UInt8[ndarray, "h w c"]:

@@ -1,0 +1,1 @@
+"""Whole pictures: people among opaque things, before a background, in one of several views."""

@@ -1,0 +1,54 @@
+"""A picture in bands from the top, so that something shows early and each band leaves a chance to stop."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterator
+
+from primdiffusion.drawing.draw import draw
+from primdiffusion.drawing.scene import Drawing, Look, Scene
+from primdiffusion.geometry.camera import Camera
+
+BAND_SECONDS = 0.3
+"""What a band should take at most: a cancelled picture stops that soon."""
+FIRST_PIXELS = 2**15
+"""Of the first band while nobody knows how fast drawing is."""
+MOST_PIXELS = 2**19
+"""Of any band: bounds the memory, some 100 bytes a pixel."""
+GROWTH = 4
+"""A band has at most this many times the last one's rows: the top of a picture is often empty and quickly done."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Band:
+    """Rows of a picture, finished."""
+
+    top: int
+    """Its first row, counted from the picture's top."""
+    drawing: Drawing
+    pixels_a_second: float
+    """The least seen in this picture so far; what the next picture of the kind may reckon with."""
+
+    @property
+    def bottom(self) -> int:
+        """The row after its last."""
+        return self.top + self.drawing.depth.shape[0]
+
+
+def draw_in_bands(scene: Scene, camera: Camera, look: Look, pixels_a_second: float | None = None) -> Iterator[Band]:
+    """The picture that `draw` gives, as bands from the top; `pixels_a_second` of a picture before, where known."""
+    top, rows = 0, camera.height
+    while top < camera.height:
+        rows = min(_rows(camera.width, pixels_a_second), rows * GROWTH, camera.height - top)
+        began = time.perf_counter()
+        drawing = draw(scene, camera.crop(0, top, camera.width, rows), look)
+        speed = rows * camera.width / max(time.perf_counter() - began, 1e-6)
+        pixels_a_second = speed if top == 0 or pixels_a_second is None else min(speed, pixels_a_second)
+        yield Band(top, drawing, pixels_a_second)
+        top += rows
+
+
+def _rows(width: int, pixels_a_second: float | None) -> int:
+    pixels = FIRST_PIXELS if pixels_a_second is None else min(BAND_SECONDS * pixels_a_second, MOST_PIXELS)
+    return max(int(pixels / width), 1)

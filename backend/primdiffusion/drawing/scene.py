@@ -1,0 +1,71 @@
+"""What a picture shows and how: the nouns of drawing."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Float32, Int
+from numpy import ndarray
+from torch import Tensor
+
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render.march import MarchSettings
+from primdiffusion.render.solids import Solids
+
+View = Literal["colour", "depth", "alpha", "boxes"]
+"""What is drawn of people: their colours, their distance in colours, their coverage in grey, their boxes."""
+NOTHING = 1e10
+"""Depth where there is nothing, metres: what Blender's Depth pass holds there."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """People and opaque things in the world."""
+
+    primitives: Primitives | None
+    """All people's boxes, unbatched (`Primitives.together`); None without people."""
+    solids: Solids | None = None
+    chart: Int[Tensor, "k"] | None = None
+    """Which region of a body each box belongs to; the view "boxes" gives regions their hues."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """How a scene is drawn."""
+
+    view: View = "colour"
+    background: tuple[float, float, float] | None = None
+    """Linear RGB behind everything; None leaves the picture transparent there."""
+    clip: tuple[float, float] = (0.0, math.inf)
+    """Depths along the optical axis, metres, between which anything is seen."""
+    settings: MarchSettings = MarchSettings()  # noqa: RUF009  frozen
+
+    def __post_init__(self) -> None:
+        """ValueError for an unknown view and planes in the wrong order."""
+        if self.view not in get_args(View):
+            raise ValueError(f"there is no view {self.view!r}; choose from {', '.join(get_args(View))}")
+        start, end = self.clip
+        if not 0 <= start < end:
+            raise ValueError(
+                f"the clip distances are {start} and {end} m: the end must lie behind the start, from 0 on"
+            )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Drawing:
+    """A finished picture, or a band of one; its top row first."""
+
+    combined: Float32[ndarray, "h w 4"]
+    """Linear RGB, premultiplied by alpha, and alpha."""
+    depth: Float32[ndarray, "h w"]
+    """Metres along the optical axis to where opacity reaches one half; NOTHING where it never does."""
+    seconds_march: float
+    """What marching took of the time."""
+
+    @classmethod
+    def empty(cls, height: int, width: int) -> Drawing:
+        """A transparent picture."""
+        return cls(np.zeros((height, width, 4), np.float32), np.full((height, width), NOTHING, np.float32), 0.0)
