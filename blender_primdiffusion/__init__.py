@@ -10,18 +10,21 @@ import atexit
 
 def register() -> None:
     """Called by Blender when the extension is enabled."""
+    import bpy
+
     from . import engine, ui
 
     engine.register()
     ui.register()
-    atexit.register(unregister)
+    if not bpy.app.binary_path:
+        atexit.register(unregister)
 
 
 def unregister() -> None:
-    """Called by Blender when the extension is disabled, or at exit; ends the child processes.
+    """Called by Blender when the extension is disabled, and at its exit; ends the child processes.
 
-    Blender 4.5 as a Python module unregisters nothing by itself, and hangs at exit when our classes are still there
-    and the engine is the active one.
+    As a Python module it has nobody to call this at exit, and 4.5 then hangs while the engine is the active one: hence
+    `atexit`. In the application that would come too late, when Blender's data are gone.
     """
     atexit.unregister(unregister)
     from . import engine, ui

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+
 from ..places import new_backend, preference
 from ..worker.drawing import DrawingChild
 from .frames import Frames
@@ -23,6 +25,7 @@ def drawing_child() -> DrawingChild:
     return _child
 
 
+@atexit.register
 def close() -> None:
     """Ends the child and frees the memory; the next picture starts anew."""
     global _child
