@@ -23,13 +23,25 @@ class Failure:
         return f"{self.sentence}: {self.remedy}" if self.remedy else self.sentence
 
 
+class PictureOutOfMemory(MemoryError):
+    """A picture that this machine cannot hold."""
+
+    def __init__(self, width: int, height: int):
+        super().__init__(f"there is not enough memory for a picture of {width} x {height} pixels")
+
+
+PICTURE_REMEDY = "choose a smaller resolution, or close other programs, then try again"
 MEMORY_REMEDY = "close other programs, or choose a smaller checkpoint or picture, then try again"
 
 
 def describe(error: BaseException) -> Failure | None:
     """The failure `error` stands for, or None where it is no domain error but a defect."""
     sentence = " ".join(str(error).split()) or type(error).__name__
-    if _out_of_memory(error):
+    if isinstance(error, PictureOutOfMemory):
+        return Failure(
+            "out_of_memory", sentence, "choose a smaller resolution, or close other programs, then try again"
+        )
+    if out_of_memory(error):
         amount = re.search(r"[Tt]ried to allocate ([\d.]+ \w+)", sentence, re.ASCII)
         wanted = f" when it asked for {amount[1]} more" if amount else ""
         where = "graphics card" if "CUDA" in sentence else "machine"
@@ -48,8 +60,11 @@ def describe(error: BaseException) -> Failure | None:
     return None
 
 
-def _out_of_memory(error: BaseException) -> bool:
-    """torch raises plain RuntimeError where its CPU allocator gives up, and its own subclass on a GPU."""
+def out_of_memory(error: BaseException) -> bool:
+    """Whether `error` says that memory ran out.
+
+    torch raises plain RuntimeError where its CPU allocator gives up, and its own subclass on a GPU.
+    """
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return True
     return isinstance(error, RuntimeError) and (

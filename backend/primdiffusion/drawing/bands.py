@@ -28,7 +28,8 @@ class Band:
     """Its first row, counted from the picture's top."""
     drawing: Drawing
     pixels_a_second: float
-    """The least seen in this picture so far; what the next picture of the kind may reckon with."""
+    """The least seen in this picture, but for its first band, which may have loaded compiled code; what the next
+    picture of the kind may reckon with."""
 
     @property
     def bottom(self) -> int:
@@ -39,13 +40,14 @@ class Band:
 def draw_in_bands(scene: Scene, camera: Camera, look: Look, pixels_a_second: float | None = None) -> Iterator[Band]:
     """The picture that `draw` gives, as bands from the top; `pixels_a_second` of a picture before, where known."""
     top, rows = 0, camera.height
+    speeds: list[float] = []
     while top < camera.height:
         rows = min(_rows(camera.width, pixels_a_second), rows * GROWTH, camera.height - top)
         began = time.perf_counter()
         drawing = draw(scene, camera.crop(0, top, camera.width, rows), look)
-        speed = rows * camera.width / max(time.perf_counter() - began, 1e-6)
-        pixels_a_second = speed if top == 0 or pixels_a_second is None else min(speed, pixels_a_second)
-        yield Band(top, drawing, pixels_a_second)
+        pixels_a_second = rows * camera.width / max(time.perf_counter() - began, 1e-6)
+        speeds.append(pixels_a_second)
+        yield Band(top, drawing, min(speeds[1:] or speeds))
         top += rows
 
 

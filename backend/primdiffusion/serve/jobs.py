@@ -1,4 +1,4 @@
-"""The work of the child: generate and render. Imports torch, so the server loads it in its own time."""
+"""The work of the child: generate, render and draw. Imports torch, so the server loads it in its own time."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from primdiffusion.person_folder import FILES, write_person
 from primdiffusion.pose_file import pose_from_numbers, read_pose
 from primdiffusion.render.image import depth_to_png, to_png
 from primdiffusion.render.march import march
+from primdiffusion.serve.draw_params import DrawParams
+from primdiffusion.serve.drawing import FrameDrawer, Report
 from primdiffusion.serve.params import GenerateParams, RenderParams
 from primdiffusion.staging import staged
 from primdiffusion.training.checkpoint import load_checkpoint
 
-Report = Callable[[str, int, int, float | None], None]
-"""Told (stage, step, total, seconds left); raises to end the job."""
-
 
 class Jobs:
-    """Runs jobs one after the other and keeps the model of the last one in memory."""
+    """Runs jobs one after the other and keeps the model of the last one, and of pictures their people, in memory."""
 
     def __init__(self) -> None:
         self._device = best_device()
         self._loaded: tuple[str | None, DiffusionModel] | None = None
+        self._drawer = FrameDrawer(self._device)
 
     def device_info(self) -> dict[str, Any]:
         """As `ready` and `hello` state it."""
@@ -81,6 +81,10 @@ class Jobs:
         if params.depth is not None:
             depth_to_png(params.depth, rendering)
         return {"out": params.out, "depth": params.depth, "seconds": round(time.perf_counter() - began, 3)}
+
+    def draw(self, params: DrawParams, report: Report) -> dict[str, Any]:
+        """Fills a frame (see `FrameDrawer.draw`). Needs no checkpoint."""
+        return self._drawer.draw(params, report)
 
     def _model(self, checkpoint: str | None) -> DiffusionModel:
         if self._loaded is None or self._loaded[0] != checkpoint:

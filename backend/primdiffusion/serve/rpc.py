@@ -94,10 +94,25 @@ def _json_type_fits(value: Any, annotation: Any) -> bool:
     return isinstance(value, typing.get_origin(annotation) or annotation)
 
 
+def _record_of_entries(annotation: Any) -> type | None:
+    """The dataclass R of an annotation list[R], otherwise None."""
+    entries = typing.get_args(annotation)
+    is_list = typing.get_origin(annotation) is list and len(entries) == 1
+    return entries[0] if is_list and isinstance(entries[0], type) and dataclasses.is_dataclass(entries[0]) else None
+
+
+def _read_entries(record: type[T], values: list[Any], name: str) -> list[T]:
+    for value in values:
+        if not isinstance(value, dict):
+            raise RpcError(INVALID_PARAMS, f"every entry of {name} must be a JSON object: {value!r:.80} was given")
+    return [read_params(record, value, f"{name}[{i}]") for i, value in enumerate(values)]
+
+
 def read_params(record: type[T], params: dict[str, Any], method: str) -> T:
     """`params` as a frozen dataclass `record`: unknown, missing or wrongly typed names raise RpcError(INVALID_PARAMS).
 
-    A ValueError of the record's own `__post_init__` (ranges) becomes the same error.
+    A field list[R] of a dataclass R takes a list of JSON objects, each read in the same way. A ValueError of the
+    record's own `__post_init__` (ranges) becomes the same error.
     """
     fields = {field.name: field for field in dataclasses.fields(record)}  # type: ignore[arg-type]
     hints = typing.get_type_hints(record)
@@ -114,8 +129,10 @@ def read_params(record: type[T], params: dict[str, Any], method: str) -> T:
             wanted = getattr(hints[name], "__name__", str(hints[name]))
             given = f"{params[name]!r:.80}"
             raise RpcError(INVALID_PARAMS, f"parameter {name!r} of {method!r} must be {wanted}: {given} was given")
+    lists = {name: _record_of_entries(hints[name]) for name in params}
+    read = {name: _read_entries(entry, params[name], f"{method}.{name}") for name, entry in lists.items() if entry}
     try:
-        return record(**params)
+        return record(**{**params, **read})
     except ValueError as e:
         raise RpcError(INVALID_PARAMS, f"{method!r}: {e}") from e
 

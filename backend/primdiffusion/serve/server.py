@@ -1,7 +1,7 @@
 """The child's side of the conversation: JSON-RPC 2.0 on stdin and stdout, a message a line (docs/protocol.md).
 
     reader thread     parses lines; answers hello, cancel and shutdown itself, so they work while a person is sampled
-    main thread       loads torch, then runs one job at a time (generate, render)
+    main thread       loads torch, then runs one job at a time (generate, render, draw)
     heartbeat thread  a notification every 0.5 s, so that the other side can tell busy from hung
 
 `hello` answers before torch is loaded: `device` is null until a `ready` notification brings it (or `problem`, a
@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 from primdiffusion import __version__
 from primdiffusion.failures import Failure, describe
 from primdiffusion.machine import memory, share_processors
+from primdiffusion.serve.draw_params import DrawParams
 from primdiffusion.serve.params import GenerateParams, RenderParams
 from primdiffusion.serve.rpc import (
     CANCELLED,
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
 
 PROTOCOL = 1
 HEARTBEAT_S = 0.5
+JOBS = {"generate": GenerateParams, "render": RenderParams, "draw": DrawParams}
+"""Methods of `Jobs`, which run on the main thread one at a time, and their parameters."""
 GRACE_S = 3.0
 """After the parent is gone a job has this long to reach its next step and tidy up; then the process ends anyway."""
 
@@ -87,8 +90,7 @@ class Server:
             "hello": self._hello,
             "cancel": self._cancel,
             "shutdown": self._shutdown,
-            "generate": self._accept,
-            "render": self._accept,
+            **dict.fromkeys(JOBS, self._accept),
         }
 
     def run(self) -> None:
@@ -148,11 +150,10 @@ class Server:
         self._end()
 
     def _accept(self, request: Request) -> None:
-        record = GenerateParams if request.method == "generate" else RenderParams
-        job = Job(request, read_params(record, request.params, request.method))
+        job = Job(request, read_params(JOBS[request.method], request.params, request.method))
         with self._lock:
             if self._job is not None:
-                sentence = f"the backend is at work on request {self._job.request.id!r}: one person at a time"
+                sentence = f"the backend is at work on request {self._job.request.id!r}: one job at a time"
                 raise RpcError(DOMAIN_ERROR, sentence, {"kind": "busy", "remedy": "wait for it, or cancel it first"})
             self._job = job
         self._queue.put(job)
@@ -202,13 +203,9 @@ class Server:
         try:
             if isinstance(jobs, RpcError):
                 raise jobs
-            result = (
-                jobs.generate(job.params, report)
-                if job.request.method == "generate"
-                else jobs.render(job.params, report)
-            )
+            result = getattr(jobs, job.request.method)(job.params, report)
         except Cancelled:
-            outcome: Any = RpcError(CANCELLED, "cancelled; nothing was written")
+            outcome: Any = RpcError(CANCELLED, "cancelled")
         except Exception as e:
             outcome = _as_rpc_error(e)
         else:

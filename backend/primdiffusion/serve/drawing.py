@@ -1,0 +1,171 @@
+"""The child's job `draw`: from parameters to a filled frame, keeping what the next picture is likely to need again."""
+
+from __future__ import annotations
+
+import functools
+import os
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy import ndarray
+
+from primdiffusion.drawing.bands import Band, draw_in_bands
+from primdiffusion.drawing.scene import Look, Scene
+from primdiffusion.failures import PictureOutOfMemory, out_of_memory
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.human import Human, place_skinned
+from primdiffusion.human_file import load_human
+from primdiffusion.primitives.anchors import default_anchors
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render.march import MarchSettings
+from primdiffusion.render.solids import Solids
+from primdiffusion.serve.draw_params import DrawParams
+
+Report = Callable[[str, int, int, float | None], None]
+"""Told (stage, step, total, seconds left); raises to end the job."""
+CHANNELS = 5
+"""Of a frame: combined and depth."""
+PEOPLE_KEPT = 16
+"""About 8 MB each, and as much again where they are scaled."""
+SOLIDS_KEPT = 2
+
+Stamp = tuple[str, int, int]
+"""A file as it is now: path, time of change, size."""
+Numbers = tuple[Any, ...]
+"""Nested tuples of floats."""
+
+
+class FrameDrawer:
+    """Draws into frames, and keeps the people, their places and the solids of the last pictures."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._human = functools.lru_cache(PEOPLE_KEPT)(_load_human)
+        self._placed = functools.lru_cache(PEOPLE_KEPT)(self._place)
+        self._everybody = functools.lru_cache(2)(self._together)
+        self._solids = functools.lru_cache(SOLIDS_KEPT)(_load_solids)
+        self._speed: dict[tuple[str, float], float] = {}
+        """Pixels a second of the last picture, by view and step."""
+
+    def draw(self, params: DrawParams, report: Report) -> dict[str, Any]:
+        """Fills the frame band by band from the top, with a report after each; returns what it took.
+
+        Raises what load_human and place_skinned do, ValueError for a frame of the wrong size or solids that are none,
+        OSError for files that cannot be read or written, PictureOutOfMemory.
+        """
+        began = time.perf_counter()
+        width, height = params.size
+        combined, depth = map_frame(params.frame, width, height)
+        report("draw", 0, height, None)
+        people = tuple((_stamp(p.human), _frozen(p.object), _frozen(p.joints), _frozen(p.betas)) for p in params.people)
+        try:
+            scene = self._scene(people, params)
+            placed = time.perf_counter()
+            seconds = self._fill(combined, depth, scene, params, report)
+        except Exception as e:
+            if out_of_memory(e):
+                raise PictureOutOfMemory(width, height) from e
+            raise
+        return {
+            "seconds": round(time.perf_counter() - began, 6),
+            "seconds_place": round(placed - began, 6),
+            "seconds_march": round(seconds, 6),
+        }
+
+    def _scene(self, people: tuple[Numbers, ...], params: DrawParams) -> Scene:
+        solids = None if params.solids is None else self._solids(_stamp(params.solids))
+        if not people:
+            return Scene(None, solids)
+        chart = default_anchors().chart.repeat(len(people)) if params.view == "boxes" else None
+        return Scene(self._everybody(people), solids, chart)
+
+    def _together(self, people: tuple[Numbers, ...]) -> Primitives:
+        placed = [self._placed(*person) for person in people]
+        return placed[0] if len(placed) == 1 else Primitives.together(placed)
+
+    def _place(self, file: Stamp, matrix: Numbers, joints: Numbers, betas: Numbers | None) -> Primitives:
+        shape = None if betas is None else torch.tensor(betas, dtype=torch.float32)
+        return place_skinned(self._human(file), torch.tensor(joints), torch.tensor(matrix), shape).to(self._device)
+
+    def _fill(self, combined: ndarray, depth: ndarray, scene: Scene, params: DrawParams, report: Report) -> float:
+        """Draws into the frame; returns the seconds of the marcher."""
+        look = Look(
+            params.view,  # type: ignore[arg-type]  checked by Look itself
+            None if params.background is None else tuple(params.background),
+            (params.clip[0], params.clip[1]),
+            MarchSettings(step=params.step),
+        )
+        began, seconds, height = time.perf_counter(), 0.0, len(depth)
+        kind = (params.view, params.step)
+        for band in draw_in_bands(scene, self._camera(params), look, self._speed.get(kind)):
+            _write(combined, depth, band)
+            self._speed[kind] = band.pixels_a_second
+            seconds += band.drawing.seconds_march
+            left = (time.perf_counter() - began) / band.bottom * (height - band.bottom)
+            report("draw", band.bottom, height, round(left, 3))
+        return seconds
+
+    def _camera(self, params: DrawParams) -> Camera:
+        intrinsics, view = torch.tensor(params.intrinsics), torch.tensor(params.world_to_camera)
+        whole = Camera(intrinsics.float(), view.float(), params.width, params.height).to(self._device)
+        return whole if params.region is None else whole.crop(*params.corner, *params.size)
+
+
+def map_frame(path: str, width: int, height: int) -> tuple[ndarray, ndarray]:
+    """Combined [h, w, 4] and depth [h, w] of a frame file, top row first; writing to them writes to the file.
+
+    Raises FileNotFoundError, ValueError for a file of another size, OSError.
+    """
+    wanted = width * height * CHANNELS * 4
+    given = _stamp(path)[2]
+    if given != wanted:
+        raise ValueError(
+            f"the frame {path} has {given} bytes, but {width} x {height} pixels need {wanted} (5 float32 a pixel): "
+            "make it anew for this size"
+        )
+    values = np.asarray(np.memmap(path, np.float32, "r+", shape=(width * height * CHANNELS,)))
+    combined = values[: width * height * 4].reshape(height, width, 4)
+    return combined[::-1], values[width * height * 4 :].reshape(height, width)[::-1]
+
+
+def _write(combined: ndarray, depth: ndarray, band: Band) -> None:
+    combined[band.top : band.bottom] = band.drawing.combined
+    depth[band.top : band.bottom] = band.drawing.depth
+
+
+def _stamp(path: str) -> Stamp:
+    try:
+        found = os.stat(path)
+    except FileNotFoundError:
+        raise FileNotFoundError(f"there is no file {path}: check the path") from None
+    return path, found.st_mtime_ns, found.st_size
+
+
+def _frozen(value: Any) -> Any:
+    """Nested lists of numbers as nested tuples of floats, which can be keys."""
+    if value is None:
+        return None
+    return tuple(map(_frozen, value)) if isinstance(value, list) else float(value)
+
+
+def _load_human(file: Stamp) -> Human:
+    return load_human(file[0])
+
+
+def _load_solids(file: Stamp) -> Solids:
+    """Raises ValueError, naming the file, where it holds no solids."""
+    path = Path(file[0])
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return Solids(
+                np.ascontiguousarray(stored["corners"], np.float32),
+                np.ascontiguousarray(stored["colour"], np.float32),
+                np.ascontiguousarray(stored["holdout"], np.bool_),
+            )
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as e:
+        raise ValueError(f"{path} holds no solids ({e}): it needs corners [F, 3, 3], colour [F, 3], holdout [F]") from e
