@@ -6,8 +6,8 @@ import dataclasses
 import time
 from collections.abc import Iterator
 
-from primdiffusion.drawing.draw import draw
-from primdiffusion.drawing.scene import Drawing, Look, Scene
+from primdiffusion.drawing.draw import draw_into
+from primdiffusion.drawing.scene import Look, Picture, Scene
 from primdiffusion.geometry.camera import Camera
 
 BAND_SECONDS = 0.3
@@ -20,35 +20,34 @@ GROWTH = 4
 """A band has at most this many times the last one's rows: the top of a picture is often empty and quickly done."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Band:
-    """Rows of a picture, finished."""
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """How far a picture has come."""
 
-    top: int
-    """Its first row, counted from the picture's top."""
-    drawing: Drawing
+    rows: int
+    """Finished, from the top."""
+    seconds_march: float
+    """Of the marcher alone, so far."""
     pixels_a_second: float
     """The least seen in this picture, but for its first band, which may have loaded compiled code; what the next
     picture of the kind may reckon with."""
 
-    @property
-    def bottom(self) -> int:
-        """The row after its last."""
-        return self.top + self.drawing.depth.shape[0]
 
-
-def draw_in_bands(scene: Scene, camera: Camera, look: Look, pixels_a_second: float | None = None) -> Iterator[Band]:
-    """The picture that `draw` gives, as bands from the top; `pixels_a_second` of a picture before, where known."""
-    top, rows = 0, camera.height
+def draw_in_bands(
+    picture: Picture, scene: Scene, camera: Camera, look: Look, pixels_a_second: float | None = None
+) -> Iterator[Progress]:
+    """Fills `picture` with what `draw` gives, in bands from the top; `pixels_a_second` of one before, where known."""
+    top, rows, seconds = 0, camera.height, 0.0
     speeds: list[float] = []
     while top < camera.height:
         rows = min(_rows(camera.width, pixels_a_second), rows * GROWTH, camera.height - top)
         began = time.perf_counter()
-        drawing = draw(scene, camera.crop(0, top, camera.width, rows), look)
+        part = camera.crop(0, top, camera.width, rows)
+        seconds += draw_into(picture.rows(top, top + rows), scene, part, look)
         pixels_a_second = rows * camera.width / max(time.perf_counter() - began, 1e-6)
         speeds.append(pixels_a_second)
-        yield Band(top, drawing, min(speeds[1:] or speeds))
         top += rows
+        yield Progress(top, seconds, min(speeds[1:] or speeds))
 
 
 def _rows(width: int, pixels_a_second: float | None) -> int:

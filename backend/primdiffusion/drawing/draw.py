@@ -17,19 +17,18 @@ import torch
 from jaxtyping import Float32
 from numpy import ndarray
 
-from primdiffusion.drawing.scene import NOTHING, Drawing, Look, Scene
+from primdiffusion.drawing.scene import NOTHING, Look, Picture, Scene
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.boxes import draw_boxes
-from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.image import depth_colours
 from primdiffusion.render.march import Span, march
 from primdiffusion.render.solids import Layer, shade_solids
 from primdiffusion.render.triangles import Nearest, nearest_triangles
 
 
-def draw(scene: Scene, camera: Camera, look: Look = Look()) -> Drawing:  # noqa: B008
+def draw(scene: Scene, camera: Camera, look: Look = Look()) -> Picture:  # noqa: B008
     """The picture of `scene`: people over solids over the background.
 
     Depth is the nearer of a person's first hit (opacity one half) and a solid. A holdout hides people behind it and
@@ -37,27 +36,35 @@ def draw(scene: Scene, camera: Camera, look: Look = Look()) -> Drawing:  # noqa:
     grey is the people's coverage; "depth" gives people (expected depth) and solids the colours of `depth_colours`.
     Works on the device of `scene.primitives`; the picture is on the CPU. Raises ValueError as `march` does.
     """
-    solids = scene.solids
-    nearest = Nearest.nothing(camera) if solids is None else nearest_triangles(solids.corners, camera, look.clip)
-    behind = Layer.empty(camera) if solids is None else shade_solids(solids, nearest, camera)
+    picture = Picture.blank(camera.width, camera.height)
+    draw_into(picture, scene, camera, look)
+    return picture
+
+
+def draw_into(picture: Picture, scene: Scene, camera: Camera, look: Look) -> float:
+    """As `draw`, into a picture of the camera's size; returns the seconds of the marcher alone."""
+    solids, nearest, behind, seconds = scene.solids, Nearest.nothing(camera), Layer.nothing(camera), 0.0
+    if solids is not None:
+        nearest = nearest_triangles(solids.corners, camera, look.clip)
+        behind = shade_solids(solids, nearest, camera)
     if scene.primitives is None or scene.primitives.position.shape[0] == 0:
-        people, seconds = Layer.empty(camera), 0.0
+        people = Layer.nothing(camera)
     elif look.view == "boxes":
-        people, seconds = _hidden(draw_boxes(scene.primitives, camera, scene.chart, look.clip), nearest), 0.0
+        people = _hidden(draw_boxes(scene.primitives, camera, scene.chart, look.clip), nearest)
     else:
         people, seconds = _people(scene.primitives, camera, look, nearest)
     if look.view == "alpha":
-        return _coverage(people, behind, seconds)
-    if look.view == "depth":
+        _write_coverage(picture, people, behind)
+        return seconds
+    if look.view == "depth" and solids is not None:
         span = depth_span(scene.primitives, camera, look.clip)
         behind = dataclasses.replace(behind, rgb=_linear_depth(behind.depth, span) * behind.alpha[..., None])
-    wall = np.full_like(people.alpha, look.background is not None)
+    wall = np.broadcast_to(np.float32(look.background is not None), nearest.depth.shape)
     if solids is not None and solids.holdout.any():
-        wall[(nearest.triangle >= 0) & solids.holdout[nearest.triangle]] = 0
-    combined, depth = np.empty((*people.alpha.shape, 4), np.float32), np.empty_like(people.alpha)
+        wall = wall * ~((nearest.triangle >= 0) & solids.holdout[nearest.triangle])
     colour = np.array(look.background or (0, 0, 0), np.float32)
-    _compose(*_arrays(people), *_arrays(behind), wall, colour, combined, depth)
-    return Drawing(combined, depth, seconds)
+    _compose(*_arrays(people), *_arrays(behind), wall, colour, picture.combined, picture.depth)
+    return seconds
 
 
 def depth_span(primitives: Primitives | None, camera: Camera, clip: tuple[float, float]) -> tuple[float, float]:
@@ -76,10 +83,10 @@ def depth_span(primitives: Primitives | None, camera: Camera, clip: tuple[float,
 
 def _people(primitives: Primitives, camera: Camera, look: Look, nearest: Nearest) -> tuple[Layer, float]:
     """The people by marching, in colour or in depth, and the seconds of the marcher."""
-    secant = _secant(camera)
+    secant = _secants(camera)
     span = _span(primitives, camera, look.clip, nearest, secant)
     began = time.perf_counter()
-    rendering: Rendering = march(primitives, camera, look.settings, span=span)
+    rendering = march(primitives, camera, look.settings, span=span)
     rgb, alpha, depth, first_hit = (
         field.cpu().numpy() for field in (rendering.rgb, rendering.alpha, rendering.depth, rendering.first_hit)
     )
@@ -90,12 +97,20 @@ def _people(primitives: Primitives, camera: Camera, look: Look, nearest: Nearest
     return Layer(rgb, alpha, first_hit / secant), seconds
 
 
-def _secant(camera: Camera) -> Float32[ndarray, "h w"]:
+def _secants(camera: Camera) -> Float32[ndarray, "h w"]:
     """Distance along a pixel's ray for each metre along the optical axis."""
-    k = camera.intrinsics.detach().cpu().double().numpy()
-    y = (np.arange(camera.height)[:, None] + 0.5 - k[1, 2]) / k[1, 1]
-    x = (np.arange(camera.width)[None, :] + 0.5 - k[0, 2] - k[0, 1] * y) / k[0, 0]
-    return np.sqrt((1 + x * x + y * y).astype(np.float32))
+    secant = np.empty((camera.height, camera.width), np.float32)
+    _fill_secants(secant, np.linalg.inv(camera.intrinsics.detach().cpu().double().numpy()))
+    return secant
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_secants(secant, inverse):
+    for row in range(secant.shape[0]):
+        y = inverse[1, 1] * (row + 0.5) + inverse[1, 2]
+        x = inverse[0, 1] * (row + 0.5) + inverse[0, 2]
+        for column in range(secant.shape[1]):
+            secant[row, column] = math.sqrt(1.0 + y * y + (x + inverse[0, 0] * (column + 0.5)) ** 2)
 
 
 def _span(
@@ -121,11 +136,11 @@ def _linear_depth(depth: ndarray, span: tuple[float, float]) -> Float32[ndarray,
     return decode_srgb(depth_colours(depth, *span).astype(np.float32))
 
 
-def _coverage(people: Layer, behind: Layer, seconds: float) -> Drawing:
+def _write_coverage(picture: Picture, people: Layer, behind: Layer) -> None:
     """Grey that an sRGB screen shows as bright as alpha says."""
-    grey = decode_srgb(people.alpha)[..., None]
-    combined = np.concatenate([grey, grey, grey, np.ones_like(grey)], axis=-1)
-    return Drawing(combined, np.minimum(np.minimum(people.depth, behind.depth), np.float32(NOTHING)), seconds)
+    picture.combined[..., :3] = decode_srgb(people.alpha)[..., None]
+    picture.combined[..., 3] = 1
+    picture.depth[:] = np.minimum(np.minimum(people.depth, behind.depth), np.float32(NOTHING))
 
 
 def _arrays(layer: Layer) -> tuple[ndarray, ndarray, ndarray]:

@@ -55,17 +55,19 @@ class Look:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Drawing:
-    """A finished picture, or a band of one; its top row first."""
+class Picture:
+    """What was drawn, or room for it; top row first. Its arrays may be views into a file."""
 
     combined: Float32[ndarray, "h w 4"]
     """Linear RGB, premultiplied by alpha, and alpha."""
     depth: Float32[ndarray, "h w"]
     """Metres along the optical axis to where opacity reaches one half; NOTHING where it never does."""
-    seconds_march: float
-    """What marching took of the time."""
 
     @classmethod
-    def empty(cls, height: int, width: int) -> Drawing:
+    def blank(cls, width: int, height: int) -> Picture:
         """A transparent picture."""
-        return cls(np.zeros((height, width, 4), np.float32), np.full((height, width), NOTHING, np.float32), 0.0)
+        return cls(np.zeros((height, width, 4), np.float32), np.full((height, width), NOTHING, np.float32))
+
+    def rows(self, top: int, bottom: int) -> Picture:
+        """The rows from `top` up to `bottom`; writing to them writes to this picture."""
+        return Picture(self.combined[top:bottom], self.depth[top:bottom])

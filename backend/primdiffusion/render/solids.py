@@ -56,10 +56,11 @@ class Layer:
     """Metres along the optical axis to what is seen; inf where there is nothing."""
 
     @classmethod
-    def empty(cls, camera: Camera) -> Layer:
-        """Nothing, as seen by a camera."""
+    def nothing(cls, camera: Camera) -> Layer:
+        """An empty picture; read only."""
         size = (camera.height, camera.width)
-        return cls(np.zeros((*size, 3), np.float32), np.zeros(size, np.float32), np.full(size, np.inf, np.float32))
+        zero, infinity = np.float32(0), np.float32(np.inf)
+        return cls(np.broadcast_to(zero, (*size, 3)), np.broadcast_to(zero, size), np.broadcast_to(infinity, size))
 
 
 def shade_solids(solids: Solids, nearest: Nearest, camera: Camera) -> Layer:
@@ -68,7 +69,8 @@ def shade_solids(solids: Solids, nearest: Nearest, camera: Camera) -> Layer:
     colour * (SKY (1 + n_up) / 2 + HEADLIGHT |n . ray|), n the normal on the viewer's side. Pixels are wholly covered
     or not at all.
     """
-    layer = Layer.empty(camera)
+    nothing = Layer.nothing(camera)
+    layer = Layer(nothing.rgb.copy(), nothing.alpha.copy(), nothing.depth.copy())
     _, direction = eye_of(camera)
     seen = (nearest.triangle, nearest.depth, direction)
     _shade(solids.corners, solids.colour, solids.holdout, *seen, layer.rgb, layer.alpha, layer.depth)

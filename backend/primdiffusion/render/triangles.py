@@ -32,9 +32,9 @@ class Nearest:
 
     @classmethod
     def nothing(cls, camera: Camera) -> Nearest:
-        """A picture without triangles."""
+        """A picture without triangles; read only."""
         size = (camera.height, camera.width)
-        return cls(np.full(size, -1, np.int32), np.full(size, np.inf, np.float32))
+        return cls(np.broadcast_to(np.int32(-1), size), np.broadcast_to(np.float32(np.inf), size))
 
 
 def nearest_triangles(
@@ -48,7 +48,8 @@ def nearest_triangles(
     k = camera.intrinsics.detach().cpu().double().numpy()
     view = camera.world_to_camera.detach().cpu().double().numpy()
     start, end = max(clip[0], CLOSEST), clip[1]
-    nearest = Nearest.nothing(camera)
+    nothing = Nearest.nothing(camera)
+    nearest = Nearest(nothing.triangle.copy(), nothing.depth.copy())
     linear, shift = k @ view[:, :3], k @ view[:, 3]
     _draw(np.ascontiguousarray(corners), linear, shift, start, end, nearest.triangle, nearest.depth)
     return nearest

@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy import ndarray
 
-from primdiffusion.drawing.bands import Band, draw_in_bands
-from primdiffusion.drawing.scene import Look, Scene
+from primdiffusion.drawing.bands import draw_in_bands
+from primdiffusion.drawing.scene import Look, Picture, Scene
 from primdiffusion.failures import PictureOutOfMemory, out_of_memory
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.human import Human, place_skinned
@@ -60,13 +59,13 @@ class FrameDrawer:
         """
         began = time.perf_counter()
         width, height = params.size
-        combined, depth = map_frame(params.frame, width, height)
+        picture = map_frame(params.frame, width, height)
         report("draw", 0, height, None)
         people = tuple((_stamp(p.human), _frozen(p.object), _frozen(p.joints), _frozen(p.betas)) for p in params.people)
         try:
             scene = self._scene(people, params)
             placed = time.perf_counter()
-            seconds = self._fill(combined, depth, scene, params, report)
+            seconds = self._fill(picture, scene, params, report)
         except Exception as e:
             if out_of_memory(e):
                 raise PictureOutOfMemory(width, height) from e
@@ -92,7 +91,7 @@ class FrameDrawer:
         shape = None if betas is None else torch.tensor(betas, dtype=torch.float32)
         return place_skinned(self._human(file), torch.tensor(joints), torch.tensor(matrix), shape).to(self._device)
 
-    def _fill(self, combined: ndarray, depth: ndarray, scene: Scene, params: DrawParams, report: Report) -> float:
+    def _fill(self, picture: Picture, scene: Scene, params: DrawParams, report: Report) -> float:
         """Draws into the frame; returns the seconds of the marcher."""
         look = Look(
             params.view,  # type: ignore[arg-type]  checked by Look itself
@@ -100,14 +99,12 @@ class FrameDrawer:
             (params.clip[0], params.clip[1]),
             MarchSettings(step=params.step),
         )
-        began, seconds, height = time.perf_counter(), 0.0, len(depth)
+        began, seconds, height = time.perf_counter(), 0.0, len(picture.depth)
         kind = (params.view, params.step)
-        for band in draw_in_bands(scene, self._camera(params), look, self._speed.get(kind)):
-            _write(combined, depth, band)
-            self._speed[kind] = band.pixels_a_second
-            seconds += band.drawing.seconds_march
-            left = (time.perf_counter() - began) / band.bottom * (height - band.bottom)
-            report("draw", band.bottom, height, round(left, 3))
+        for done in draw_in_bands(picture, scene, self._camera(params), look, self._speed.get(kind)):
+            self._speed[kind], seconds = done.pixels_a_second, done.seconds_march
+            left = (time.perf_counter() - began) / done.rows * (height - done.rows)
+            report("draw", done.rows, height, round(left, 3))
         return seconds
 
     def _camera(self, params: DrawParams) -> Camera:
@@ -116,8 +113,8 @@ class FrameDrawer:
         return whole if params.region is None else whole.crop(*params.corner, *params.size)
 
 
-def map_frame(path: str, width: int, height: int) -> tuple[ndarray, ndarray]:
-    """Combined [h, w, 4] and depth [h, w] of a frame file, top row first; writing to them writes to the file.
+def map_frame(path: str, width: int, height: int) -> Picture:
+    """The picture in a frame file; writing to it writes to the file.
 
     Raises FileNotFoundError, ValueError for a file of another size, OSError.
     """
@@ -129,13 +126,8 @@ def map_frame(path: str, width: int, height: int) -> tuple[ndarray, ndarray]:
             "make it anew for this size"
         )
     values = np.asarray(np.memmap(path, np.float32, "r+", shape=(width * height * CHANNELS,)))
-    combined = values[: width * height * 4].reshape(height, width, 4)
-    return combined[::-1], values[width * height * 4 :].reshape(height, width)[::-1]
-
-
-def _write(combined: ndarray, depth: ndarray, band: Band) -> None:
-    combined[band.top : band.bottom] = band.drawing.combined
-    depth[band.top : band.bottom] = band.drawing.depth
+    combined, depth = values[: width * height * 4], values[width * height * 4 :]
+    return Picture(combined.reshape(height, width, 4)[::-1], depth.reshape(height, width)[::-1])
 
 
 def _stamp(path: str) -> Stamp:

@@ -1,0 +1,194 @@
+"""The child's drawing without the child: frames, caches, errors."""
+
+import dataclasses
+import os
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from primdiffusion.body.model import BodyPose
+from primdiffusion.drawing.draw import draw
+from primdiffusion.drawing.scene import Look, Scene
+from primdiffusion.failures import describe
+from primdiffusion.human import framing, generate, place, pose_body
+from primdiffusion.human_file import save_human
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.serve import drawing
+from primdiffusion.serve.draw_params import DrawParams, PersonParams
+from primdiffusion.serve.drawing import FrameDrawer, map_frame
+from tiny_model import tiny_model
+
+WIDTH, HEIGHT = 40, 56
+STILL = torch.eye(3, 4).tolist()
+
+
+@pytest.fixture(scope="module")
+def human():
+    return generate(tiny_model(), seed=3, steps=5)
+
+
+@pytest.fixture(scope="module")
+def pose():
+    return BodyPose.from_axis_angle(0.3 * torch.randn(72, generator=torch.Generator().manual_seed(2)))
+
+
+@pytest.fixture
+def params(human, pose, tmp_path) -> DrawParams:
+    save_human(tmp_path / "a.human.safetensors", human)
+    camera = framing(place(human, pose), 0.4, WIDTH, HEIGHT)
+    joints = pose_body(human.betas, pose).skinning[:, :3].tolist()
+    return DrawParams(
+        frame=new_frame(tmp_path / "frame", WIDTH, HEIGHT),
+        width=WIDTH,
+        height=HEIGHT,
+        intrinsics=camera.intrinsics.tolist(),
+        world_to_camera=camera.world_to_camera.tolist(),
+        people=[PersonParams(str(tmp_path / "a.human.safetensors"), STILL, joints)],
+    )
+
+
+def new_frame(path, width: int, height: int) -> str:
+    np.full(width * height * 5, np.nan, np.float32).tofile(path)
+    return str(path)
+
+
+def drawn(params: DrawParams, drawer: FrameDrawer | None = None, reports: list | None = None):
+    drawer = drawer or FrameDrawer(torch.device("cpu"))
+    drawer.draw(params, lambda *report: reports is None or reports.append(report))
+    return map_frame(params.frame, *params.size)
+
+
+def test_the_frame_holds_the_picture_of_the_placed_person_from_its_bottom_row(human, pose, params):
+    primitives = place(human, pose)
+    want = draw(Scene(primitives), framing(primitives, 0.4, WIDTH, HEIGHT), Look(clip=(0.0, 1e10)))
+    assert (want.combined[..., 3] > 0.9).mean() > 0.05
+    drawn(params)
+    values = np.fromfile(params.frame, np.float32)
+    combined = values[: WIDTH * HEIGHT * 4].reshape(HEIGHT, WIDTH, 4)
+    depth = values[WIDTH * HEIGHT * 4 :].reshape(HEIGHT, WIDTH)
+    assert np.allclose(combined[::-1], want.combined, atol=2e-3)
+    assert np.allclose(depth[::-1], want.depth, rtol=2e-3)
+
+
+@pytest.mark.parametrize("region", [[0, 0, 40, 56], [5, 7, 20, 30], [39, 55, 1, 1], [0, 20, 40, 1]])
+def test_a_region_is_the_part_of_the_picture_counted_from_the_bottom_left(params, tmp_path, region):
+    whole = drawn(params).combined.copy()[::-1]
+    x, y, w, h = region
+    part = dataclasses.replace(params, region=region, frame=new_frame(tmp_path / "part", w, h))
+    assert np.allclose(drawn(part).combined[::-1], whole[y : y + h, x : x + w], atol=1e-3)
+
+
+def test_reports_tell_the_rows_that_are_done_and_the_frame_is_filled_that_far(params):
+    reports = []
+
+    def report(*news):
+        reports.append(news)
+        rows = news[1]
+        assert np.isfinite(map_frame(params.frame, WIDTH, HEIGHT).combined[:rows]).all()
+
+    result = FrameDrawer(torch.device("cpu")).draw(params, report)
+    assert reports[0] == ("draw", 0, HEIGHT, None)
+    assert reports[-1] == ("draw", HEIGHT, HEIGHT, 0.0)
+    assert {(stage, total) for stage, _, total, _ in reports} == {("draw", HEIGHT)}
+    assert 0 < result["seconds_march"] < result["seconds"]
+    assert 0 < result["seconds_place"] < result["seconds"]
+
+
+def test_people_are_loaded_once_and_placed_once_a_pose(params, monkeypatch, tmp_path):
+    calls = []
+    for name in ("load_human", "place_skinned"):
+        original = getattr(drawing, name)
+        monkeypatch.setattr(drawing, name, lambda *a, o=original, n=name: calls.append(n) or o(*a))
+    drawer = FrameDrawer(torch.device("cpu"))
+    moved_camera = [[*row[:3], row[3] + 0.01] for row in params.world_to_camera]
+    drawn(params, drawer)
+    drawn(dataclasses.replace(params, world_to_camera=moved_camera, view="boxes"), drawer)
+    assert calls == ["load_human", "place_skinned"] or calls == ["place_skinned", "load_human"]
+    person = dataclasses.replace(params.people[0], object=[[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0]])
+    drawn(dataclasses.replace(params, people=[person]), drawer)
+    assert sorted(calls) == ["load_human", "place_skinned", "place_skinned"]
+    os.utime(params.people[0].human, ns=(1, 1))
+    drawn(params, drawer)
+    assert sorted(calls) == ["load_human"] * 2 + ["place_skinned"] * 3, "a file that has changed is read again"
+
+
+def test_several_people_stand_in_one_picture(human, pose, params):
+    beside = [[1.0, 0, 0, 0.3], [0, 1, 0, 0], [0, 0, 1, -0.5]]
+    two = dataclasses.replace(params, people=[params.people[0], dataclasses.replace(params.people[0], object=beside)])
+    first = place(human, pose)
+    second = dataclasses.replace(first, position=first.position + torch.tensor([0.3, 0, -0.5]))
+    camera = framing(first, 0.4, WIDTH, HEIGHT)
+    want = draw(Scene(Primitives.together([first, second])), camera, Look())
+    alone = draw(Scene(first), camera, Look())
+    assert np.allclose(drawn(two).combined, want.combined, atol=2e-3)
+    assert want.combined[..., 3].mean() > 1.2 * alone.combined[..., 3].mean()
+
+
+def test_nobody_is_a_picture_too(params):
+    empty = drawn(dataclasses.replace(params, people=[], background=[0.1, 0.2, 0.3]))
+    assert np.allclose(empty.combined, (0.1, 0.2, 0.3, 1))
+    assert (empty.depth == np.float32(1e10)).all()
+
+
+def test_solids_come_from_a_file_of_plain_arrays_and_are_read_again_when_it_changes(params, tmp_path):
+    def write(colour):
+        corners = np.array([[[-9, -9, 1], [9, -9, 1], [0, 18, 1]]], np.float32)
+        np.savez(tmp_path / "s.npz", corners=corners, colour=np.array([colour], np.float32), holdout=np.zeros(1, bool))
+
+    drawer = FrameDrawer(torch.device("cpu"))
+    scene = dataclasses.replace(params, solids=str(tmp_path / "s.npz"))
+    write((0.9, 0.0, 0.0))
+    red = drawn(scene, drawer).combined.copy()
+    assert red[20, 20, 0] > 0.4
+    assert red[20, 20, 1] == 0
+    write((0.0, 0.9, 0.0))
+    os.utime(tmp_path / "s.npz", ns=(1, 1))
+    assert drawn(scene, drawer).combined[20, 20, 0] == 0
+
+
+def test_a_frame_of_another_size_is_refused_and_left_alone(params, tmp_path):
+    frame = new_frame(tmp_path / "small", WIDTH, HEIGHT - 1)
+    with pytest.raises(ValueError, match=f"{WIDTH} x {HEIGHT} pixels need {WIDTH * HEIGHT * 20}"):
+        drawn(dataclasses.replace(params, frame=frame))
+    assert np.isnan(np.fromfile(frame, np.float32)).all()
+
+
+def test_files_that_are_missing_or_hold_something_else_are_named(params, tmp_path):
+    nowhere = str(tmp_path / "nowhere")
+    person = dataclasses.replace(params.people[0], human=nowhere)
+    for wrong in ({"frame": nowhere}, {"solids": nowhere}, {"people": [person]}):
+        with pytest.raises(FileNotFoundError, match="nowhere"):
+            drawn(dataclasses.replace(params, **wrong))
+    (tmp_path / "text").write_text("no arrays")
+    np.savez(tmp_path / "others.npz", a=np.zeros(3))
+    objects = np.array([{}], dtype=object)
+    np.savez(tmp_path / "pickled.npz", corners=objects, colour=objects, holdout=objects)
+    shutil.copy(tmp_path / "others.npz", tmp_path / "cut.npz")
+    os.truncate(tmp_path / "cut.npz", 60)
+    for name in ("text", "others.npz", "pickled.npz", "cut.npz"):
+        with pytest.raises(ValueError, match=f"{name} holds no solids"):
+            drawn(dataclasses.replace(params, solids=str(tmp_path / name)))
+
+
+def test_out_of_memory_names_the_resolution(params, monkeypatch):
+    def no_room(*_):
+        torch.empty(10**15)
+
+    monkeypatch.setattr(drawing, "draw_in_bands", no_room)
+    with pytest.raises(MemoryError, match=f"{WIDTH} x {HEIGHT} pixels") as error:
+        drawn(params)
+    failure = describe(error.value)
+    assert (failure.kind, "resolution" in failure.remedy) == ("out_of_memory", True)
+
+
+def test_a_picture_can_be_stopped_at_every_report(params):
+    class Stop(Exception):
+        pass
+
+    def stop(_, rows, *__):
+        if rows > 0:
+            raise Stop
+
+    with pytest.raises(Stop):
+        FrameDrawer(torch.device("cpu")).draw(params, stop)
