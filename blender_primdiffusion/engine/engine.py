@@ -55,5 +55,5 @@ class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
 
     def _fail(self, sentence: str) -> None:
         sentence = f"PrimDiffusion: {sentence}"
-        self.error_set(sentence)
-        self.report({"ERROR"}, sentence)  # and Blender ends the render, animations too
+        self.update_stats("", sentence)
+        self.report({"ERROR"}, sentence)  # ends the render, animations too; error_set would let them go on

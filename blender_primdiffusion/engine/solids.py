@@ -28,7 +28,8 @@ _SOLID_DATA = (
     bpy.types.Scene,
 )
 """What else may change solids: their data, their colours, and who is visible."""
-_KEPT_FILES = 2
+_KEPT_FILES = 8
+"""Pictures that are still waiting, of several viewports, may want older ones."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,11 +76,11 @@ def stored(solids: Solids, folder: Path) -> Path | None:
     for values in (solids.corners, solids.colour, solids.holdout):
         digest.update(np.ascontiguousarray(values).data)
     path = folder / f"solids_{digest.hexdigest()[:16]}.npz"
-    if not path.exists():
-        unfinished = path.with_suffix(".part.npz")
-        np.savez(unfinished, corners=solids.corners, colour=solids.colour, holdout=solids.holdout)
-        os.replace(unfinished, path)
-    os.utime(path)
+    if path.exists():
+        return path
+    unfinished = folder / f".{path.name}"
+    np.savez(unfinished, corners=solids.corners, colour=solids.colour, holdout=solids.holdout)
+    os.replace(unfinished, path)
     for old in sorted(folder.glob("solids_*.npz"), key=lambda file: file.stat().st_mtime_ns)[:-_KEPT_FILES]:
         old.unlink(missing_ok=True)
     return path

@@ -1,0 +1,84 @@
+"""The backend by itself, in a process of its own: makes people and draws them with `place` and `march` alone.
+
+Speaks JSON, an object a line: {"make": folder, "seed": 0, "betas": [...]} or {"draw": {...}, "out": npz}; answers {}.
+Run by the backend's Python; Blender's tests compare the engine's pictures with it.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+from primdiffusion.human import Human, place
+from primdiffusion.human_file import export_for_blender, load_human, save_human
+from primdiffusion.primitives.anchors import attach, default_anchors
+from primdiffusion.primitives.from_mesh import from_mesh
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render.lattice import MarchSettings
+from primdiffusion.render.march import march
+
+
+def make(folder: Path, seed: int, betas: list[float]) -> None:
+    """A person in a random checkered suit: human.npz and person.human.safetensors in `folder`."""
+    body, shape = default_body(), torch.tensor(betas)
+    vertices = body.shape(shape).vertices
+    frames = attach(default_anchors(), vertices, body.faces)
+    cells = np.random.default_rng(seed).integers(40, 230, (32, 32, 4), dtype=np.uint8)
+    texture = cells.repeat(8, axis=0).repeat(8, axis=1)
+    texture[..., 3] = 255
+    skin = TexturedPart(
+        name="body",
+        vertices=vertices.double().numpy(),
+        faces=body.faces.int().numpy(),
+        corner_uv=body.uv[body.uv_faces].double().numpy(),
+        texture=texture,
+        skin_index=np.zeros((len(vertices), 1), np.int32),
+        skin_weight=np.ones((len(vertices), 1)),
+    )
+    human = Human(from_mesh(TexturedMesh((skin,)), frames), shape, {"seed": seed, "full_density": 100.0})
+    folder.mkdir(parents=True, exist_ok=True)
+    save_human(folder / "person.human.safetensors", human)
+    export_for_blender(folder / "human.npz", human)
+
+
+def placed(folder: str, rotations: list, translation: list, world: list, **_: object) -> Primitives:
+    """A posed person, then moved, turned and scaled alike in all directions by `world` [4, 4]."""
+    human = load_human(Path(folder) / "person.human.safetensors")
+    pose = BodyPose(torch.tensor(rotations, dtype=torch.float32), torch.tensor(translation, dtype=torch.float32))
+    person, matrix = place(human, pose), torch.tensor(world, dtype=torch.float64)
+    scale = float(torch.linalg.det(matrix[:3, :3])) ** (1 / 3)
+    turn = (matrix[:3, :3] / scale).float()
+    return Primitives(
+        position=(scale * person.position) @ turn.T + matrix[:3, 3].float(),
+        rotation=turn @ person.rotation,
+        half_extent=scale * person.half_extent,
+        rgb=person.rgb,
+        density=person.density / scale,
+    )
+
+
+def draw(out: str, people: list, intrinsics: list, world_to_camera: list, width: int, height: int, step: float) -> None:
+    """Combined [h, w, 4] and depth along the optical axis [h, w], top row first."""
+    primitives = Primitives.together([placed(**person) for person in people])
+    matrices = (torch.tensor(matrix, dtype=torch.float32) for matrix in (intrinsics, world_to_camera))
+    camera = Camera(*matrices, width, height)
+    rendering = march(primitives, camera, MarchSettings(step=step))
+    ahead = (camera.rays()[1] @ camera.world_to_camera[2, :3]).numpy()
+    depth = rendering.first_hit.numpy() * ahead
+    depth[~np.isfinite(depth)] = 1e10
+    np.savez(out, combined=np.concatenate([rendering.rgb, rendering.alpha[..., None]], -1), depth=depth)
+
+
+for line in sys.stdin:
+    request = json.loads(line)
+    if "make" in request:
+        make(Path(request["make"]), request["seed"], request["betas"])
+    else:
+        draw(request["out"], **request["draw"])
+    print("{}", flush=True)

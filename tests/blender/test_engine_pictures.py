@@ -1,0 +1,351 @@
+"""The engine's pictures are the backend's, pixel for pixel, however the camera is set and the armature is moved."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+import synthetic
+from engine_stage import (
+    PYTHON,
+    STEP,
+    Z_UP,
+    Oracle,
+    camera_by_hand,
+    eight_bit,
+    render_exr,
+    render_png,
+    thinned,
+)
+from mathutils import Euler, Matrix
+
+import blender_primdiffusion
+from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.human import armature_of, build_human
+from blender_primdiffusion.scene.keyframes import keyframe_poses
+
+SIZE = (120, 90)
+REST = np.tile(np.eye(3), (24, 1, 1))
+
+
+@pytest.fixture(scope="module")
+def backend(tmp_path_factory):
+    """The oracle, and the folders of two people it has made."""
+    folder = tmp_path_factory.mktemp("people")
+    oracle = Oracle(folder)
+    folders = [folder / "first", folder / "second"]
+    oracle.ask({"make": str(folders[0]), "seed": 1, "betas": [0.0] * 10})
+    oracle.ask({"make": str(folders[1]), "seed": 2, "betas": [1.5, -1.0, 0.5] + [0.0] * 7})
+    for person in folders:
+        thinned(person / "human.npz")
+    yield SimpleNamespace(oracle=oracle, folders=folders)
+    oracle.close()
+
+
+@pytest.fixture(scope="module")
+def extension():
+    """Registered once: the child is kept warm between the tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PRIMDIFFUSION_PYTHON", PYTHON)
+        blender_primdiffusion.register()
+        yield
+        blender_primdiffusion.unregister()
+
+
+@pytest.fixture
+def stage(extension, saved_scene, backend, tmp_path):
+    """One person before a camera, transparent film, colours as they are."""
+    scene = saved_scene.scene
+    scene.render.engine = "PRIMDIFFUSION"
+    scene.render.resolution_x, scene.render.resolution_y = SIZE
+    scene.render.resolution_percentage = 100
+    scene.render.film_transparent = True
+    scene.render.dither_intensity = 0
+    scene.view_settings.view_transform = "Standard"
+    scene.primdiffusion_render.step = STEP
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    camera.location, camera.rotation_euler = (0.5, -3.0, 1.2), (math.radians(84), 0, math.radians(9))
+    person = add_person(saved_scene, backend.folders[0])
+    return SimpleNamespace(
+        scene=scene, camera=camera, person=person, armature=armature_of(person), out=tmp_path / "picture.png"
+    )
+
+
+def add_person(context, folder):
+    return build_human(context, folder / "few.npz", keep=[folder / "person.human.safetensors"])
+
+
+def as_asked(folder, armature, rotations=REST, translation=(0, 0, 0)) -> dict:
+    """A person for the oracle: pose, and the armature's place turned into the backend's axes."""
+    world = Z_UP.T @ np.array(armature.matrix_world) @ Z_UP
+    return {
+        "folder": str(folder),
+        "rotations": np.asarray(rotations).tolist(),
+        "translation": list(translation),
+        "world": world.tolist(),
+    }
+
+
+def expected(stage, backend, people=None, size=SIZE) -> tuple[np.ndarray, np.ndarray]:
+    bpy.context.view_layer.update()
+    render = stage.scene.render
+    camera = camera_by_hand(stage.camera, size, (render.pixel_aspect_x, render.pixel_aspect_y))
+    people = people or [as_asked(backend.folders[0], stage.armature)]
+    return backend.oracle.picture(people, camera, size)
+
+
+def assert_same(given: np.ndarray, wanted: np.ndarray) -> None:
+    assert given.shape == wanted.shape
+    assert 0.02 < (wanted[..., 3] > 0).mean() < 0.98  # the person is in the picture, and so is something else
+    assert np.abs(given - wanted).max() <= 1
+
+
+def strong_pose(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return synthetic.axis_angle(rng.normal(0, 0.4, (24, 3))), rng.normal(0, 0.2, 3)
+
+
+@pytest.mark.parametrize("size", [(120, 90), (64, 128), (333, 97)])
+def test_a_picture_is_the_backends_to_a_255th(stage, backend, size):
+    stage.scene.render.resolution_x, stage.scene.render.resolution_y = size
+    combined, _ = expected(stage, backend, size=size)
+    assert_same(render_png(stage.out), eight_bit(combined))
+
+
+def test_a_percentage_draws_fewer_pixels_of_the_same_view(stage, backend):
+    stage.scene.render.resolution_x, stage.scene.render.resolution_y = 203, 151
+    stage.scene.render.resolution_percentage = 60
+    combined, _ = expected(stage, backend, size=(121, 90))
+    assert_same(render_png(stage.out), eight_bit(combined))
+
+
+@pytest.mark.parametrize("size", [(120, 80), (80, 120)])
+@pytest.mark.parametrize("fit", ["AUTO", "HORIZONTAL", "VERTICAL"])
+def test_lens_shift_sensor_fit_and_pixel_aspect_are_blenders(stage, backend, fit, size):
+    data = stage.camera.data
+    data.lens, data.shift_x, data.shift_y, data.sensor_fit = 42.0, 0.11, -0.07, fit
+    data.sensor_width, data.sensor_height = 31.0, 22.0
+    render = stage.scene.render
+    render.resolution_x, render.resolution_y = size
+    render.pixel_aspect_x, render.pixel_aspect_y = 1.0, 1.4
+    combined, _ = expected(stage, backend, size=size)
+    assert_same(render_png(stage.out), eight_bit(combined))
+
+
+def test_the_cameras_scale_and_parents_do_not_change_the_lens(stage, backend):
+    parent = bpy.data.objects.new("crane", None)
+    stage.scene.collection.objects.link(parent)
+    parent.scale, parent.rotation_euler = (2.0, 2.0, 2.0), (0.1, -0.1, 0.2)
+    stage.camera.parent = parent
+    stage.camera.scale, stage.camera.location = (1.0, 3.0, 0.5), (0.1, -1.5, 0.6)
+    combined, _ = expected(stage, backend)
+    assert_same(render_png(stage.out), eight_bit(combined))
+
+
+def test_a_border_is_the_same_pixels_of_the_whole_picture(stage, backend):
+    render = stage.scene.render
+    render.use_border = True
+    render.border_min_x, render.border_max_x, render.border_min_y, render.border_max_y = 0.27, 0.71, 0.33, 0.93
+    wanted = eight_bit(expected(stage, backend)[0])
+    left, right, bottom, top = int(0.27 * 120), int(0.71 * 120), int(0.33 * 90), int(0.93 * 90)
+    part = wanted[90 - top : 90 - bottom, left:right]
+    render.use_crop_to_border = True
+    assert_same(render_png(stage.out), part)
+    render.use_crop_to_border = False
+    whole = render_png(stage.out)
+    assert whole.shape == wanted.shape
+    assert np.abs(whole[90 - top : 90 - bottom, left:right] - part).max() <= 1
+    assert not whole[: 90 - top].any()
+    assert not whole[:, :left].any()
+
+
+def test_depth_is_the_backends_first_hit_along_the_optical_axis(stage, backend):
+    combined, depth = expected(stage, backend)
+    given, given_depth = render_exr(stage.out.with_suffix(".exr"))
+    np.testing.assert_allclose(given, combined, atol=2e-3)
+    there = depth < 1e9
+    assert (there == (given_depth < 1e9)).mean() > 0.999
+    both = there & (given_depth < 1e9)
+    assert np.abs(depth - given_depth)[both].max() < STEP
+    assert (given_depth[~both] == np.float32(1e10)).any()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_posed_scaled_and_turned_armature_is_drawn_as_posed(stage, backend, seed):
+    rotations, translation = strong_pose(seed)
+    pose_from_joint_rotations(stage.armature, rotations, translation)
+    turn = Euler((0.3, -0.2, 0.8)).to_matrix().to_4x4()
+    stage.armature.matrix_world = Matrix.Translation((0.2, -0.3, 1.1)) @ turn @ Matrix.Scale(0.7, 4)
+    bpy.context.view_layer.update()
+    people = [as_asked(backend.folders[0], stage.armature, rotations, translation)]
+    assert_same(render_png(stage.out), eight_bit(expected(stage, backend, people)[0]))
+
+
+def test_constraints_parents_and_drivers_reach_the_picture(stage, backend):
+    target = bpy.data.objects.new("target", None)
+    parent = bpy.data.objects.new("parent", None)
+    for thing in (target, parent):
+        stage.scene.collection.objects.link(thing)
+    parent.location, parent.rotation_euler = (0.1, 0.4, 0.0), (0.0, 0.0, 0.5)
+    stage.armature.parent = parent
+    turn = synthetic.axis_angle(np.array([0.0, 0.0, 0.9]))
+    bone = stage.armature.pose.bones["left_shoulder"]
+    rest = np.array(stage.armature.data.bones["left_shoulder"].matrix_local.to_3x3())
+    local = rest.T @ (Z_UP[:3, :3] @ turn @ Z_UP[:3, :3].T) @ rest
+    target.rotation_mode = "QUATERNION"
+    target.rotation_quaternion = Matrix(local.tolist()).to_quaternion()
+    constraint = bone.constraints.new("COPY_ROTATION")
+    constraint.target, constraint.owner_space = target, "LOCAL"
+    driver = stage.armature.driver_add("location", 2).driver
+    driver.expression = f"{stage.armature.location.z} + 0.25"
+    rotations = REST.copy()
+    rotations[16] = turn
+    bpy.context.view_layer.update()
+    people = [as_asked(backend.folders[0], stage.armature, rotations)]
+    assert_same(render_png(stage.out), eight_bit(expected(stage, backend, people)[0]))
+
+
+def test_every_frame_of_an_animation_has_its_own_pose(stage, backend, tmp_path):
+    frames = np.arange(1, 4)
+    swing = np.zeros((3, 24, 3))
+    swing[:, 16, 2], swing[:, 1, 0] = [-1.0, 0.0, 1.0], [0.5, 0.0, -0.5]
+    rotations, translations = synthetic.axis_angle(swing), np.outer([0.0, 0.1, 0.2], [1, 0, 0])
+    keyframe_poses(stage.armature, frames, rotations, translations)
+    stage.scene.frame_start, stage.scene.frame_end = 1, 3
+    stage.scene.render.image_settings.file_format = "PNG"
+    stage.scene.render.image_settings.color_mode = "RGBA"
+    stage.scene.render.filepath = str(tmp_path / "frame_")
+    bpy.ops.render.render(animation=True)
+    from engine_stage import pixels
+
+    for index, frame in enumerate(frames):
+        people = [as_asked(backend.folders[0], stage.armature, rotations[index], translations[index])]
+        given = np.round(255 * pixels(tmp_path / f"frame_{frame:04d}.png"))
+        assert_same(given, eight_bit(expected(stage, backend, people)[0]))
+
+
+def test_two_people_share_one_picture_and_the_hidden_are_left_out(stage, backend):
+    second = add_person(bpy.context, backend.folders[1])
+    armature_of(second).location.x += 0.35
+    armature_of(second).location.y += 0.3
+    bpy.context.view_layer.update()
+    first = as_asked(backend.folders[0], stage.armature)
+    other = as_asked(backend.folders[1], armature_of(second))
+    both = eight_bit(expected(stage, backend, [first, other])[0])
+    assert_same(render_png(stage.out), both)
+    layer = bpy.context.view_layer.layer_collection.children[second.name]
+    layer.exclude = True
+    alone = eight_bit(expected(stage, backend, [first])[0])
+    assert_same(render_png(stage.out), alone)
+    layer.exclude = False
+    armature_of(second).hide_render = True
+    assert_same(render_png(stage.out), alone)
+
+
+def test_an_instanced_person_is_drawn_where_the_instance_is(stage, backend):
+    instance = bpy.data.objects.new("again", None)
+    stage.scene.collection.objects.link(instance)
+    instance.instance_type, instance.instance_collection = "COLLECTION", stage.person
+    instance.location = (0.6, 0.2, 0.0)
+    bpy.context.view_layer.update()
+    here = as_asked(backend.folders[0], stage.armature)
+    there = {**here, "world": (Z_UP.T @ np.array(instance.matrix_world @ stage.armature.matrix_world) @ Z_UP).tolist()}
+    assert_same(render_png(stage.out), eight_bit(expected(stage, backend, [here, there])[0]))
+
+
+def test_an_opaque_film_shows_the_worlds_colour_behind_people(stage, backend):
+    world = bpy.data.worlds.new("World")
+    if bpy.app.version < (5, 0):
+        world.use_nodes = True
+    background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
+    background.inputs["Color"].default_value, background.inputs["Strength"].default_value = (0.1, 0.2, 0.4, 1), 1.5
+    stage.scene.world = world
+    stage.scene.render.film_transparent = False
+    combined, _ = expected(stage, backend)
+    over = combined[..., :3] + (1 - combined[..., 3:]) * np.array([0.15, 0.3, 0.6])
+    wanted = eight_bit(np.concatenate([over, np.ones_like(over[..., :1])], -1))
+    for mode in ("RGB", "RGBA"):
+        assert np.abs(render_png(stage.out, mode) - wanted).max() <= 1
+
+
+def test_rgb_without_alpha_is_the_picture_before_black(stage, backend):
+    stage.scene.render.film_transparent = False
+    combined, _ = expected(stage, backend)
+    combined[..., 3] = 1
+    assert np.abs(render_png(stage.out, "RGB") - eight_bit(combined)).max() <= 1
+
+
+def test_the_far_clip_plane_cuts_people_off(stage):
+    assert render_png(stage.out)[..., 3].any()
+    stage.camera.data.clip_end = 2.0
+    assert not render_png(stage.out).any()
+
+
+def test_an_orthographic_camera_keeps_the_scale_of_the_person(stage, backend):
+    data = stage.camera.data
+    stage.camera.location, stage.camera.rotation_euler = (0.0, -3.0, 1.0), (math.pi / 2, 0, 0)
+    data.type, data.ortho_scale, data.shift_x = "ORTHO", 2.4, 0.05
+    given, depth = render_exr(stage.out.with_suffix(".exr"))
+    metres = 2.4 / SIZE[0]
+    # A pinhole of the oracle's own, far away and with a long lens.
+    far = 3000.0
+    axes = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ Z_UP[:3, :3]
+    eye = np.array([0.0, -far, 1.0])
+    camera = {
+        "intrinsics": [[far / metres, 0, 60 - 0.05 * 120], [0, far / metres, 45], [0, 0, 1]],
+        "world_to_camera": np.concatenate([axes, -(axes @ Z_UP[:3, :3].T @ eye)[:, None]], 1).tolist(),
+    }
+    people = [as_asked(backend.folders[0], stage.armature)]
+    combined, far_depth = backend.oracle.picture(people, camera, SIZE)
+    assert np.abs(given - combined)[..., 3].mean() < 0.002
+    there = (depth < 1e9) & (far_depth < 1e9)
+    assert there.mean() > 0.02
+    assert np.abs(depth[there] - (far_depth[there] - far + 3.0)).mean() < STEP
+
+
+def test_betas_on_the_armature_change_the_shape(stage, backend):
+    before = render_png(stage.out)
+    stage.armature["primdiffusion_betas"] = [2.0] + [0.0] * 9
+    stage.armature.update_tag()
+    assert np.abs(render_png(stage.out) - before).max() > 50
+    stage.armature["primdiffusion_betas"] = "tall"
+    stage.armature.update_tag()
+    with pytest.raises(RuntimeError, match=r"primdiffusion_betas.*make it a list of ten numbers"):
+        render_png(stage.out)
+
+
+def test_a_renamed_collection_and_a_blend_saved_elsewhere_keep_their_person(stage, backend, tmp_path):
+    wanted = eight_bit(expected(stage, backend)[0])
+    stage.person.name = "Renamed"
+    (tmp_path / "elsewhere").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "elsewhere" / "other.blend"))
+    assert_same(render_png(stage.out), wanted)
+
+
+def test_a_missing_file_is_one_error_that_names_person_and_file(stage):
+    folder = next(stage.out.parent.glob("shot_humans/Human"))
+    shutil.move(folder / "person.human.safetensors", stage.out.parent)
+    with pytest.raises(RuntimeError, match=r"person 'Human' is missing: .*person\.human\.safetensors") as caught:
+        render_png(stage.out)
+    assert str(caught.value).count("Error:") == 1
+    assert not stage.out.exists()
+    shutil.move(stage.out.parent / "person.human.safetensors", folder)
+    assert render_png(stage.out).any()
+
+
+def test_undo_and_frame_changes_do_not_disturb_the_engine(stage, backend):
+    wanted = eight_bit(expected(stage, backend)[0])
+    bpy.ops.ed.undo_push(message="before")
+    stage.armature.location.x += 1.0
+    bpy.ops.ed.undo_push(message="moved")
+    bpy.context.scene.frame_set(5)
+    render_png(stage.out)
+    bpy.ops.ed.undo()
+    bpy.context.scene.frame_set(1)
+    assert_same(render_png(stage.out), wanted)

@@ -1,0 +1,290 @@
+"""Solid objects in the engine's pictures: which ones, where, in what colours; before, behind and inside a person."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+from engine_stage import PYTHON, Oracle, render_exr, render_png, thinned
+
+import blender_primdiffusion
+from blender_primdiffusion.engine.solids import base_colour, changed_by, scene_solids, stored
+from blender_primdiffusion.scene.human import build_human
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Of a person."""
+    folder = tmp_path_factory.mktemp("people")
+    oracle = Oracle(folder)
+    oracle.ask({"make": str(folder), "seed": 1, "betas": [0.0] * 10})
+    oracle.close()
+    thinned(folder / "human.npz")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def extension():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PRIMDIFFUSION_PYTHON", PYTHON)
+        blender_primdiffusion.register()
+        yield
+        blender_primdiffusion.unregister()
+
+
+@pytest.fixture
+def stage(extension, saved_scene, tmp_path):
+    """A camera at (0, -4, 1) that looks along y; 96 x 96 pixels, transparent."""
+    scene = saved_scene.scene
+    scene.render.engine = "PRIMDIFFUSION"
+    scene.render.resolution_x = scene.render.resolution_y = 96
+    scene.render.film_transparent = True
+    scene.render.dither_intensity = 0
+    scene.view_settings.view_transform = "Standard"
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(camera)
+    camera.location, camera.rotation_euler = (0.0, -4.0, 1.0), (np.pi / 2, 0, 0)
+    scene.camera = camera
+    return SimpleNamespace(scene=scene, out=tmp_path / "picture.png")
+
+
+def cube(name="cube", centre=(0.0, 0.0, 1.0), half=0.2) -> bpy.types.Object:
+    mesh = bpy.data.meshes.new(name)
+    corners = [(x, y, z) for x in (-half, half) for y in (-half, half) for z in (-half, half)]
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    mesh.from_pydata(corners, [], faces)
+    thing = bpy.data.objects.new(name, mesh)
+    thing.location = centre
+    bpy.context.scene.collection.objects.link(thing)
+    return thing
+
+
+def material(colour, name="paint") -> bpy.types.Material:
+    made = bpy.data.materials.new(name)
+    if bpy.app.version < (5, 0):
+        made.use_nodes = True
+    shader = next(node for node in made.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
+    shader.inputs["Base Color"].default_value = (*colour, 1)
+    return made
+
+
+def solids_now():
+    return scene_solids(bpy.context.evaluated_depsgraph_get(), False)
+
+
+def test_a_cubes_triangles_are_in_the_backends_axes(stage):
+    cube(centre=(1.0, 2.0, 3.0))
+    solids = solids_now()
+    assert solids.corners.shape == (12, 3, 3)
+    np.testing.assert_allclose(solids.corners.reshape(-1, 3).mean(0), [1.0, 3.0, -2.0], atol=1e-6)
+    np.testing.assert_allclose(np.ptp(solids.corners.reshape(-1, 3), 0), [0.4] * 3, atol=1e-6)
+
+
+def test_colours_are_the_materials_base_colour_or_the_objects_own(stage):
+    painted, plain = cube("painted"), cube("plain")
+    painted.data.materials.append(material((0.8, 0.1, 0.2)))
+    painted.data.materials.append(None)
+    painted.color = (0.1, 0.9, 0.1, 1)
+    painted.data.polygons[0].material_index = 1
+    plain.color = (0.3, 0.4, 0.5, 1)
+    colours = solids_now().colour
+    rows, repeats = np.unique(np.round(colours.astype(np.float64), 3), axis=0, return_counts=True)
+    counts = dict(zip(map(tuple, rows.tolist()), repeats.tolist(), strict=True))
+    assert counts == {(0.8, 0.1, 0.2): 10, (0.1, 0.9, 0.1): 2, (0.3, 0.4, 0.5): 12}
+
+
+def test_a_base_colour_from_other_nodes_gives_way_to_the_one_of_solid_mode(stage):
+    textured = material((1, 1, 1))
+    textured.diffuse_color = (0.2, 0.3, 0.4, 1)
+    tree = textured.node_tree
+    noise = tree.nodes.new("ShaderNodeTexNoise")
+    shader = next(node for node in tree.nodes if node.type == "BSDF_PRINCIPLED")
+    tree.links.new(noise.outputs[0], shader.inputs["Base Color"])
+    assert base_colour(textured) == pytest.approx((0.2, 0.3, 0.4))
+
+
+def test_curves_texts_metaballs_and_instances_count(stage):
+    curve = bpy.data.curves.new("curve", "CURVE")
+    curve.dimensions, curve.bevel_depth = "3D", 0.1
+    spline = curve.splines.new("POLY")
+    spline.points.add(1)
+    spline.points[1].co = (0, 0, 1, 1)
+    text = bpy.data.curves.new("text", "FONT")
+    text.body = "A"
+    ball = bpy.data.metaballs.new("ball")
+    ball.elements.new()
+    counts = []
+    for data in (curve, text, ball):
+        thing = bpy.data.objects.new(data.name, data)
+        stage.scene.collection.objects.link(thing)
+        counts.append(len(solids_now().corners))
+    assert 0 < counts[0] < counts[1] < counts[2]
+    group = bpy.data.collections.new("group")
+    box = cube("in group")
+    stage.scene.collection.objects.unlink(box)
+    group.objects.link(box)
+    for x in range(3):
+        instance = bpy.data.objects.new(f"instance{x}", None)
+        instance.instance_type, instance.instance_collection = "COLLECTION", group
+        instance.location.x = x
+        stage.scene.collection.objects.link(instance)
+    assert len(solids_now().corners) == counts[2] + 3 * 12
+
+
+def test_a_persons_own_body_is_left_out_even_when_shown(stage, folder):
+    person = build_human(bpy.context, folder / "few.npz", keep=[folder / "person.human.safetensors"])
+    body = next(thing for thing in person.objects if thing.type == "MESH")
+    body.hide_render = body.hide_viewport = False
+    assert len(solids_now().corners) == 0
+
+
+def test_what_is_hidden_in_renders_or_from_the_camera_is_not_drawn(stage):
+    thing = cube()
+    assert render_png(stage.out)[..., 3].any()
+    thing.hide_render = True
+    assert not render_png(stage.out).any()
+    thing.hide_render, thing.visible_camera = False, False
+    assert not render_png(stage.out).any()
+
+
+def test_only_what_may_concern_solids_makes_them_read_anew(stage, folder):
+    thing = cube()
+    seen = []
+    handler = lambda _scene, depsgraph: seen.append(changed_by(depsgraph))  # noqa: E731
+    bpy.app.handlers.depsgraph_update_post.append(handler)
+    try:
+        bpy.context.view_layer.update()
+        seen.clear()
+        for change in (
+            lambda: setattr(stage.scene.camera, "location", (0, -3, 1)),
+            lambda: setattr(thing, "location", (0.1, 0, 1)),
+            lambda: thing.data.vertices[0].co.__setitem__(0, 0.5) or thing.data.update(),
+        ):
+            change()
+            bpy.context.view_layer.update()
+    finally:
+        bpy.app.handlers.depsgraph_update_post.remove(handler)
+    assert seen == [False, True, True]
+
+
+def test_the_file_is_named_by_its_content_and_written_once(stage, tmp_path):
+    cube()
+    path = stored(solids_now(), tmp_path)
+    stamp = path.stat().st_mtime_ns
+    assert stored(solids_now(), tmp_path) == path
+    assert path.stat().st_mtime_ns == stamp
+    bpy.data.objects["cube"].location.x = 0.5
+    bpy.context.view_layer.update()
+    assert stored(solids_now(), tmp_path) != path
+    bpy.data.objects["cube"].hide_viewport = True
+    bpy.context.view_layer.update()
+    assert stored(solids_now(), tmp_path) is None
+
+
+@pytest.fixture
+def pair(stage, folder):
+    """A person at the origin and a cube at the height of the chest."""
+    build_human(bpy.context, folder / "few.npz", keep=[folder / "person.human.safetensors"])
+    box = cube(centre=(0.0, 0.0, 1.2), half=0.1)
+    box.data.materials.append(material((0.9, 0.02, 0.02)))
+    return stage, box
+
+
+def centre_of(box, picture) -> np.ndarray:
+    """The pixel where the cube's middle is seen."""
+    from bpy_extras.object_utils import world_to_camera_view
+
+    seen = world_to_camera_view(bpy.context.scene, bpy.context.scene.camera, box.location)
+    height, width = picture.shape[:2]
+    return picture[int((1 - seen.y) * height), int(seen.x * width)]
+
+
+def test_a_cube_hides_a_person_behind_it_and_is_hidden_by_one_before_it(pair):
+    stage, box = pair
+    box.hide_render = True
+    alone = render_png(stage.out)
+    box.hide_render = False
+    pixels = {}
+    for y in (-0.8, 0.8):
+        box.location.y = y
+        picture = render_png(stage.out)
+        pixels[y] = centre_of(box, picture)
+        assert pixels[y][3] == 255
+    red, hidden = pixels[-0.8], pixels[0.8]
+    assert red[0] > 150 > 90 > red[1]
+    assert np.abs(hidden - centre_of(box, alone)).max() <= 1
+
+
+def test_a_cube_inside_a_person_shows_only_where_it_sticks_out(pair):
+    stage, box = pair
+    box.scale = (6.0, 0.1, 0.5)  # a bar through the chest, wider than the body
+    picture = render_png(stage.out)
+    red = (picture[..., 0] > 120) & (picture[..., 1] < 100) & (picture[..., 3] == 255)
+    row = red[int(48 - 0.2 / 4 * 133)]
+    assert row[:36].any()
+    assert row[60:].any()
+    middle = picture[int(48 - 0.2 / 4 * 133), 48]
+    assert not (middle[0] > 150 and middle[1] < 60)
+
+
+def test_depth_is_the_nearer_of_person_and_cube(pair):
+    stage, box = pair
+    box.location.y = -0.8
+    _, depth = render_exr(stage.out.with_suffix(".exr"))
+    assert centre_of(box, depth) == pytest.approx(4.0 - 0.8 - 0.1, abs=1e-3)
+    assert depth.max() == np.float32(1e10)
+
+
+@pytest.mark.parametrize("way", ["object", "collection", "setting"])
+def test_a_holdout_cuts_a_hole_into_person_and_background(pair, way):
+    stage, box = pair
+    box.location.y = -0.8
+    stage.scene.render.film_transparent = False
+    stage.scene.world = bpy.data.worlds.new("World")
+    if way == "object":
+        box.is_holdout = True
+    elif way == "collection":
+        masks = bpy.data.collections.new("masks")
+        stage.scene.collection.children.link(masks)
+        masks.objects.link(box)
+        stage.scene.collection.objects.unlink(box)
+        bpy.context.view_layer.layer_collection.children["masks"].holdout = True
+    else:
+        stage.scene.primdiffusion_render.solids = "HOLDOUT"
+    picture = render_png(stage.out)
+    assert not centre_of(box, picture).any()
+    assert picture[0, 0, 3] == 255
+
+
+def test_solids_can_be_ignored(pair):
+    stage, box = pair
+    box.hide_render = True
+    alone = render_png(stage.out)
+    box.hide_render = False
+    box.location.y = -0.8
+    stage.scene.primdiffusion_render.solids = "IGNORED"
+    assert np.array_equal(render_png(stage.out), alone)
+
+
+@pytest.mark.parametrize("view", ["DEPTH", "ALPHA", "BOXES"])
+def test_every_view_shows_the_person_in_its_own_way(pair, view):
+    stage, box = pair
+    box.hide_render = True
+    colour = render_png(stage.out)
+    stage.scene.primdiffusion_render.view = view
+    picture = render_png(stage.out)
+    assert picture[..., 3].any()
+    assert np.abs(picture - colour).max() > 50
+    if view == "ALPHA":
+        assert np.abs(picture[..., 0] - colour[..., 3]).max() <= 1
+
+
+def test_a_scene_with_nobody_and_nothing_is_its_background(stage):
+    assert not render_png(stage.out).any()
+    stage.scene.render.film_transparent = False
+    stage.scene.world = None
+    picture = render_png(stage.out)
+    assert not picture[..., :3].any()
+    assert (picture[..., 3] == 255).all()
