@@ -5,7 +5,7 @@ from __future__ import annotations
 import atexit
 
 from ..places import new_backend, preference
-from ..worker.drawing import DrawingChild
+from ..worker.drawing import IDLE_S, DrawingChild
 from .frames import Frames
 
 frames = Frames()
@@ -21,7 +21,7 @@ def drawing_child() -> DrawingChild:
     if _child is None or python != _child_python:
         if _child is not None:
             _child.close()
-        _child, _child_python = DrawingChild(new_backend(python)), python
+        _child, _child_python = DrawingChild(new_backend(python), IDLE_S), python
     return _child
 
 
