@@ -98,6 +98,14 @@ class Render:
     """Which frame of a pose file that holds several."""
     size: int = 512
     """Width and height, pixels."""
+    width: int | None = None
+    """Pixels; without it the size."""
+    height: int | None = None
+    """Pixels; without it the size."""
+    view: Literal["colour", "depth", "alpha", "boxes"] = "colour"
+    """colour; depth in colours, bright where near; alpha: what the person covers, in grey; boxes: the primitives."""
+    step: float = 0.004
+    """Metres between samples of a ray; finer is slower and closer to the truth."""
     background: Literal["black", "white", "transparent"] = "black"
     """What is behind the person."""
     depth: Path | None = None
@@ -105,18 +113,25 @@ class Render:
 
     def run(self) -> None:
         """Draws, and prints the picture's path."""
+        import torch
+
+        from primdiffusion.drawing.draw import draw
+        from primdiffusion.drawing.scene import Look, Scene
         from primdiffusion.human import framing, place
         from primdiffusion.human_file import load_human
         from primdiffusion.pose_file import read_pose
-        from primdiffusion.render.image import depth_to_png, to_png
-        from primdiffusion.render.march import march
+        from primdiffusion.primitives.anchors import default_anchors
+        from primdiffusion.render.image import depth_to_png, rgba_to_png
+        from primdiffusion.render.march import MarchSettings, march
 
-        human = load_human(self.human)
-        primitives = place(human, None if self.pose is None else read_pose(self.pose, self.frame))
-        rendering = march(primitives, framing(primitives, math.radians(self.yaw), self.size, self.size))
-        to_png(self.out, rendering, BACKGROUNDS[self.background])
+        look = Look(self.view, settings=MarchSettings(step=self.step))
+        primitives = place(load_human(self.human), None if self.pose is None else read_pose(self.pose, self.frame))
+        width, height = (self.size if side is None else side for side in (self.width, self.height))
+        camera = framing(primitives, math.radians(self.yaw), width, height)
+        picture = draw(Scene(primitives, chart=default_anchors().chart), camera, look)
+        rgba_to_png(self.out, torch.from_numpy(picture.combined), BACKGROUNDS[self.background])
         if self.depth is not None:
-            depth_to_png(self.depth, rendering)
+            depth_to_png(self.depth, march(primitives, camera, look.settings))
         print(self.out)
 
 

@@ -1,5 +1,6 @@
 """The command line as a user meets it."""
 
+import itertools
 import json
 import subprocess
 import sys
@@ -74,6 +75,31 @@ def test_render_draws_a_pose_at_the_asked_size(person, tmp_path):
     assert (tmp_path / "depth.png").exists()
 
 
+def test_render_draws_each_view_at_any_width_and_height(person, tmp_path):
+    human, pictures = str(person / "person.human.safetensors"), {}
+    for view in ("colour", "depth", "alpha", "boxes"):
+        out = tmp_path / f"{view}.png"
+        cli.run(["render", human, "--out", str(out), "--width", "72", "--height", "48", "--view", view])
+        pictures[view] = np.asarray(Image.open(out)).astype(int)
+        assert pictures[view].shape == (48, 72, 3)
+    grey = pictures["alpha"]
+    assert (grey == grey[..., :1]).all()
+    assert (grey == 255).mean() > 0.02
+    shown = {view: picture.max(-1) > 0 for view, picture in pictures.items()}
+    assert (shown["boxes"] | ~shown["colour"]).all(), "boxes hold the person"
+    for first, second in itertools.combinations(pictures, 2):
+        assert np.abs(pictures[first] - pictures[second]).mean() > 1
+
+
+def test_a_finer_step_changes_little_and_a_coarse_one_much(person, tmp_path):
+    human, pictures = str(person / "person.human.safetensors"), []
+    for step in ("0.001", "0.004", "0.06"):
+        cli.run(["render", human, "--out", str(tmp_path / "a.png"), "--size", "64", "--step", step])
+        pictures.append(np.asarray(Image.open(tmp_path / "a.png")).astype(int))
+    fine, usual, coarse = pictures
+    assert 10 * np.abs(fine - usual).mean() < np.abs(fine - coarse).mean()
+
+
 def test_info_tells_what_a_file_is(person, checkpoint, capsys):
     cli.run(["info", str(person / "person.human.safetensors")])
     assert json.loads(capsys.readouterr().out)["seed"] == 5
@@ -107,6 +133,7 @@ def test_traceback_shows_where_an_error_came_from(tmp_path, capsys):
         ["generate", "--out", "x", "--seed", "-1"],
         ["render", "nobody.human.safetensors", "--out", "x.png"],
         ["render", "nobody.human.safetensors", "--out", "x.png", "--size", "0"],
+        ["render", "nobody.human.safetensors", "--out", "x.png", "--step", "0"],
         ["info", "nothing.safetensors"],
     ],
 )

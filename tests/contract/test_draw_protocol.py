@@ -1,0 +1,200 @@
+"""draw, as the protocol promises it to anyone: a frame in a file, filled from the top, stopped when asked."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conversation import Conversation
+from primdiffusion.human import Human, framing, generate, place, pose_body
+from primdiffusion.human_file import save_human
+from tiny_model import tiny_model
+
+CANCELLED, DOMAIN_ERROR, INVALID_PARAMS = -32001, -32002, -32602
+STILL = torch.eye(3, 4).tolist()
+ids = itertools.count(1)
+
+
+@pytest.fixture(scope="module")
+def child():
+    child = Conversation()
+    yield child
+    child.close()
+
+
+@pytest.fixture(scope="module")
+def person(tmp_path_factory) -> tuple[str, Human]:
+    human = generate(tiny_model(), seed=3, steps=2)
+    path = tmp_path_factory.mktemp("person") / "a ü.human.safetensors"
+    save_human(path, human)
+    return str(path), human
+
+
+@pytest.fixture
+def request_for(person, tmp_path):
+    path, human = person
+    primitives = place(human)
+    joints = pose_body(human.betas).skinning[:, :3].tolist()
+
+    def params(width: int = 48, height: int = 64, **changes) -> dict:
+        camera = framing(primitives, 0.0, width, height)
+        frame = tmp_path / f"{width}x{height}.frame"
+        np.full(width * height * 5, np.nan, np.float32).tofile(frame)
+        return {
+            "frame": str(frame),
+            "width": width,
+            "height": height,
+            "region": None,
+            "intrinsics": camera.intrinsics.tolist(),
+            "world_to_camera": camera.world_to_camera.tolist(),
+            "clip": [0.1, 100.0],
+            "people": [{"human": path, "object": STILL, "joints": joints, "betas": None}],
+            "solids": None,
+            "background": None,
+            "view": "colour",
+            "step": 0.004,
+            **changes,
+        }
+
+    return params
+
+
+def frame_of(params: dict) -> tuple[np.ndarray, np.ndarray]:
+    """Combined and depth, top row first."""
+    width, height = params["width"], params["height"]
+    values = np.fromfile(params["frame"], np.float32)
+    combined = values[: width * height * 4].reshape(height, width, 4)
+    return combined[::-1], values[width * height * 4 :].reshape(height, width)[::-1]
+
+
+def ask(child: Conversation, params: dict) -> tuple[dict, list[dict]]:
+    """The answer, and the progress before it."""
+    id, progress = next(ids), []
+    child.send(id, "draw", **params)
+
+    def answered(message) -> bool:
+        if message.get("method") == "progress":
+            assert message["params"]["id"] == id
+            progress.append(message["params"])
+        return "method" not in message and message["id"] == id
+
+    return child.until(answered), progress
+
+
+@pytest.mark.parametrize("view", ["colour", "depth", "alpha", "boxes"])
+def test_the_child_fills_the_frame(child, request_for, view):
+    params = request_for(view=view)
+    answer, progress = ask(child, params)
+    assert 0 < answer["result"]["seconds_place"] <= answer["result"]["seconds"]
+    assert 0 <= answer["result"]["seconds_march"] <= answer["result"]["seconds"]
+    combined, depth = frame_of(params)
+    assert np.isfinite(combined).all()
+    shown = combined[..., 0] > 0 if view == "alpha" else combined[..., 3] > 0
+    assert 0.03 < shown.mean() < 0.7
+    assert (depth[combined[..., 3] == 0] == np.float32(1e10)).all()
+    assert 0.02 < (depth < 100).mean() < 0.6
+    assert [p["step"] for p in progress] == sorted({p["step"] for p in progress})
+    assert (progress[0]["step"], progress[-1]["step"]) == (0, 64)
+    assert {(p["stage"], p["total"]) for p in progress} == {("draw", 64)}
+    assert progress[-1]["eta_s"] == 0
+
+
+def test_the_second_picture_of_a_scene_is_placed_at_once(child, request_for):
+    params = request_for()
+    ask(child, params)
+    again, _ = ask(child, {**params, "view": "boxes"})
+    assert again["result"]["seconds_place"] < 0.05
+
+
+def test_a_large_picture_comes_in_bands_from_the_top_and_stops_within_one(child, request_for):
+    params = request_for(width=900, height=1200, step=0.0005)
+    id = next(ids)
+    child.send(id, "draw", **params)
+    first = child.until(lambda m: m.get("method") == "progress" and m["params"]["step"] > 0)["params"]
+    assert first["step"] < 600
+    combined, _ = frame_of(params)
+    assert np.isfinite(combined[: first["step"]]).all()
+    assert np.isnan(combined[-1]).all(), "the bottom comes last"
+    assert child.ask(next(ids), "cancel", id=id)["result"] == {"cancelled": True}
+    later = []
+    end = child.until(lambda m: later.append(m) or m.get("id") == id)
+    assert end["error"]["code"] == CANCELLED
+    assert sum(m.get("method") == "progress" for m in later) <= 1
+    assert np.isnan(frame_of(params)[0][-1]).all()
+    answer, _ = ask(child, request_for())
+    assert "result" in answer, "the next picture is drawn"
+
+
+def test_drawing_needs_no_checkpoint(request_for):
+    without = (
+        "import primdiffusion.training.checkpoint as c\n"
+        "def gone(*_): raise FileNotFoundError('no checkpoint here')\n"
+        "c.load_checkpoint = c.default_checkpoint = gone\n"
+        "import primdiffusion.serve.server as s; s.main()"
+    )
+    child = Conversation(("-c", without))
+    answer, _ = ask(child, request_for())
+    child.close()
+    assert "result" in answer
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"width": 0}, "0 x 64"),
+        ({"region": [0, 0, 48, 0]}, "region"),
+        ({"view": "x-ray"}, "x-ray"),
+        ({"world_to_camera": [[float("nan")] * 4] * 3}, "world_to_camera holds nan"),
+        ({"people": [{"human": "h", "object": STILL, "joints": [[[float("nan")] * 4] * 3] * 24}]}, "joints holds nan"),
+        ({"people": [{"human": "h"}]}, "'object'"),
+        ({"colour": 1}, "'colour'"),
+    ],
+)
+def test_wrong_parameters_are_one_sentence(child, request_for, changes, said):
+    answer, _ = ask(child, {**request_for(), **changes})
+    assert answer["error"]["code"] == INVALID_PARAMS
+    assert said in answer["error"]["message"]
+    assert "\n" not in answer["error"]["message"]
+
+
+def test_wrong_files_are_one_sentence_and_the_conversation_goes_on(child, request_for, tmp_path):
+    params = request_for()
+    missing = {**params["people"][0], "human": str(tmp_path / "nobody.human.safetensors")}
+    flat = {**params["people"][0], "object": [[0.0] * 4] * 3}
+    Path(tmp_path / "text.npz").write_text("no arrays")
+    for changes, kind, said in (
+        ({"frame": str(tmp_path / "none.frame")}, "missing_file", "none.frame"),
+        ({"width": 49}, "bad_input", "49 x 64 pixels need 62720"),
+        ({"people": [missing]}, "missing_file", "nobody.human"),
+        ({"people": [flat]}, "bad_input", "scale"),
+        ({"solids": str(tmp_path / "text.npz")}, "bad_input", "text.npz holds no solids"),
+    ):
+        answer, _ = ask(child, {**params, **changes})
+        assert (answer["error"]["code"], answer["error"]["data"]["kind"]) == (DOMAIN_ERROR, kind)
+        assert said in answer["error"]["message"]
+        assert "\n" not in answer["error"]["message"]
+    assert "result" in ask(child, params)[0]
+
+
+def test_a_second_picture_is_refused_while_one_is_drawn(child, request_for):
+    params, id = request_for(width=900, height=1200, step=0.0005), next(ids)
+    child.send(id, "draw", **params)
+    child.until(lambda m: m.get("method") == "progress" and m["params"]["step"] > 0)
+    assert ask_error(child, request_for()) == "busy"
+    child.ask(next(ids), "cancel", id=id)
+    child.answer(id)
+
+
+def ask_error(child: Conversation, params: dict) -> str:
+    return child.ask(next(ids), "draw", **params)["error"]["data"]["kind"]
+
+
+def test_betas_and_the_object_move_the_person(child, request_for):
+    params = request_for()
+    ask(child, params)
+    still = frame_of(params)[0].copy()
+    moved = [[1.0, 0, 0, 0.2], [0, 1, 0, 0], [0, 0, 1, 0]]
+    for change in ({"object": moved}, {"betas": [3.0] + [0.0] * 9}):
+        ask(child, {**params, "people": [{**params["people"][0], **change}]})
+        assert np.abs(frame_of(params)[0] - still).mean() > 0.005
