@@ -80,6 +80,11 @@ class Refinement:
         met = shown is not None and shown.wish is self._wish and shown.coarseness == COARSENESS[-1]
         return self._drawing is None and (self._wish is None or met or bool(self.error))
 
+    @property
+    def starting(self) -> bool:
+        """Nothing to show yet, and a child that is being started for it, which takes a while."""
+        return self.shown is None and self._drawing is not None and self._drawing.state in ("waiting", "starting")
+
     def advance(self) -> bool:
         """Takes in an answer and asks for the next picture; True when there is a new one to show, or an error."""
         news = self._take_answer()

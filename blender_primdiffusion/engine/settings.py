@@ -7,6 +7,11 @@ import bpy
 STEP_M = 0.004
 
 
+def _redraw(settings: bpy.types.PropertyGroup, _context: bpy.types.Context) -> None:
+    """Blender tells viewports of changes to its own data only."""
+    settings.id_data.update_tag()
+
+
 class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
     """`scene.primdiffusion_render`."""
 
@@ -22,6 +27,7 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
         soft_max=0.016,
         step=0.1,
         precision=4,
+        update=_redraw,
     )
     view: bpy.props.EnumProperty(
         name="View",
@@ -33,6 +39,7 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
             ("BOXES", "Primitives", "The boxes that people are made of, shaded, each in a colour of its own"),
         ),
         default="COLOUR",
+        update=_redraw,
     )
     solids: bpy.props.EnumProperty(
         name="Solid Objects",
@@ -47,4 +54,5 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
             ("IGNORED", "Ignored", "People are drawn as if they were not there"),
         ),
         default="SHADED",
+        update=_redraw,
     )

@@ -61,8 +61,7 @@ class Viewport:
         shown = self._refinement.shown
         if shown is not None:
             self._draw_picture(engine, shown, context, depsgraph)
-        error = self._error or self._refinement.error
-        engine.update_stats("", f"PrimDiffusion: {error}" if error else "")
+        engine.update_stats("", self._words())
 
     @property
     def resting(self) -> bool:
@@ -72,6 +71,12 @@ class Viewport:
     def advance(self) -> bool:
         """Follow the child; True when there is something new to draw."""
         return self._refinement.advance()
+
+    def _words(self) -> str:
+        """What the region says in its corner."""
+        if error := self._error or self._refinement.error:
+            return f"PrimDiffusion: {error}"
+        return "Starting the backend" if self._refinement.starting else ""
 
     def _draw_picture(
         self,

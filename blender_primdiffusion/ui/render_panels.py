@@ -23,7 +23,6 @@ _NOT_OURS = ("FREESTYLE", "freestyle", "RENDER_PT_gpencil", "RENDER_PT_grease_pe
 class _OfEngine:
     bl_space_type = "PROPERTIES"
     bl_region_type = "WINDOW"
-    bl_order = -1  # before those that any engine has
     COMPAT_ENGINES = frozenset({ENGINE})
 
     @classmethod
