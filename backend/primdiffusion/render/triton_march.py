@@ -1,0 +1,227 @@
+"""The marcher's forward pass as a Triton kernel: a program is a tile of pixels (SPEC 4).
+
+A tile walks along its rays in chunks of lattice points. Every box of its list that reaches into the chunk adds opacity
+and colour for all points of all pixels at once; the chunk is composited; the tile ends when its rays are opaque or its
+list is done. Of all lattice points the multiples of GAP are used, in SETS sets: point n is in set n / GAP % SETS. Boxes
+whose stride is a multiple of GAP * SETS touch the first set only, so that coarse boxes do not pay for fine ones.
+"""
+
+# pyright: reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
+# Triton's language is Python by its syntax alone.
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from primdiffusion.render.triton_rays import NEVER, cell, channels, ray_in_box, window
+
+
+@triton.jit
+def _add_samples(
+    red, green, blue, opacity, n, n0, stride, row, voxels, px, py, pz, qx, qy, qz, first, last, spacing,
+    WHOLE: tl.constexpr,
+):  # fmt: skip
+    """One box's samples at lattice points n [coarse], on rays p + (n - n0) spacing q [pixels], added to the sums."""
+    t = ((n - n0).to(tl.float32) * spacing)[None, :]
+    x, y, z = px[:, None] + t * qx[:, None], py[:, None] + t * qy[:, None], pz[:, None] + t * qz[:, None]
+    inside = (x > tl.load(row + 20)) & (x < tl.load(row + 23)) & (y > tl.load(row + 21)) & (y < tl.load(row + 24))
+    inside = inside & (z > tl.load(row + 22)) & (z < tl.load(row + 25))
+    inside = inside & (n[None, :] >= first[:, None]) & (n[None, :] <= last[:, None])
+    if not WHOLE:
+        inside = inside & ((n % stride) == 0)[None, :]
+    if tl.max(tl.max(inside.to(tl.int32), 1), 0) > 0:
+        ix, fx = cell(x)
+        iy, fy = cell(y)
+        iz, fz = cell(z)
+        place = (iz * 64 + iy * 8 + ix) * 4
+        channel = tl.arange(0, 4)[None, None, :]
+        corner = voxels + place[:, :, None] + channel
+        mask = inside[:, :, None]
+        value = tl.zeros((x.shape[0], x.shape[1], 4), tl.float32)
+        for k in tl.static_range(8):
+            wx = fx if k % 2 else 1.0 - fx
+            wy = fy if k // 2 % 2 else 1.0 - fy
+            wz = fz if k // 4 else 1.0 - fz
+            weight = wx * wy * wz
+            value += weight[:, :, None] * tl.load(corner + (k % 2 * 4 + k // 2 % 2 * 32 + k // 4 * 256), mask, 0.0)
+        r, g, b, density = channels(tl.reshape(value, (x.shape[0], x.shape[1], 2, 2)))
+        a = density * window(x, y, z) * tl.load(row + 26)
+        a = tl.where(inside, a, 0.0)
+        red += a * r
+        green += a * g
+        blue += a * b
+        opacity += a
+    return red, green, blue, opacity
+
+
+@triton.jit
+def _opaque(before, opacity, n, ends, halves):
+    """The first points, of n and of those found so far, at which `before` plus `opacity` reaches 1 and 1/2."""
+    reached = before + opacity
+    ends = tl.minimum(ends, tl.where((reached >= 1.0) & (opacity > 0), n[None, :], NEVER))
+    halves = tl.minimum(halves, tl.where((reached >= 0.5) & (opacity > 0), n[None, :], NEVER))
+    return ends, halves
+
+
+@triton.jit
+def _weigh(before, red, green, blue, opacity, n, end, base, spacing, sums, final):
+    """Adds points n to `sums`, composited (red, green, blue, moment), and the saturating one to `final`."""
+    mixed = tl.where(opacity > 0, opacity, 1.0)
+    at_end = n[None, :] == end[:, None]
+    kappa = tl.where(at_end, tl.minimum(tl.maximum((1.0 - before) / mixed, 0.0), 1.0), 0.0)
+    share = tl.where(n[None, :] < end[:, None], 1.0, kappa)
+    t = ((n - base).to(tl.float32) * spacing)[None, :]
+    r, g, b, moment = sums
+    r, g, b = r + share * red, g + share * green, b + share * blue
+    moment += share * opacity * t
+    k, lr, lg, lb = final
+    one = tl.where(at_end, 1.0 / mixed, 0.0)
+    return (r, g, b, moment), (k + kappa, lr + one * red, lg + one * green, lb + one * blue)
+
+
+@triton.jit
+def march_tiles(
+    record, indices, voxels, entries, begin, count, reach, out_rgb, out_alpha, out_depth, out_first_hit, kept, ends,
+    boxes, own_boxes, height, width, tiles_across, lists_across, lists, spacing,
+    TILES_OF_LIST: tl.constexpr, HAS_SPAN: tl.constexpr, KEEP: tl.constexpr, WHOLE: tl.constexpr,
+    TILE_WIDTH: tl.constexpr, TILE_HEIGHT: tl.constexpr, COARSE: tl.constexpr, SETS: tl.constexpr, GAP: tl.constexpr,
+):  # fmt: skip
+    """One tile of one view. `kept` [.., 6] and `ends` [.., 2] hold what the backward pass needs of a ray (KEEP)."""
+    view, tile = tl.program_id(1), tl.program_id(0)
+    pixel = tl.arange(0, TILE_WIDTH * TILE_HEIGHT)
+    column = tile % tiles_across * TILE_WIDTH + pixel % TILE_WIDTH
+    line = tile // tiles_across * TILE_HEIGHT + pixel // TILE_WIDTH
+    shown = (column < width) & (line < height)
+    ray = (view.to(tl.int64) * height + line) * width + column
+    u, v = column.to(tl.float32), line.to(tl.float32)
+    if HAS_SPAN:
+        first = tl.load(reach + ray * 2, shown, NEVER)
+        last = tl.load(reach + ray * 2 + 1, shown, 0)
+    else:
+        first = tl.where(shown, 1, NEVER)
+        last = tl.where(shown, NEVER - 1, 0)
+
+    list_ = view * lists + tile // tiles_across // TILES_OF_LIST * lists_across + tile % tiles_across // TILES_OF_LIST
+    number = tl.load(count + list_)
+    own = entries + tl.load(begin + list_)
+    first_box = view.to(tl.int64) * boxes
+    zero = tl.zeros((TILE_WIDTH * TILE_HEIGHT,), tl.float32)
+    never = tl.zeros((TILE_WIDTH * TILE_HEIGHT,), tl.int32) + NEVER
+    r, g, b, moment, kappa, end_r, end_g, end_b = zero, zero, zero, zero, zero, zero, zero, zero
+    reached, end, half = zero, never, never
+    grid = tl.zeros((TILE_WIDTH * TILE_HEIGHT, COARSE), tl.float32)
+    coarse = tl.arange(0, COARSE) * (SETS * GAP)
+
+    open_ = tl.zeros((), tl.int32)
+    next_point = open_
+    if number > 0:
+        next_point = tl.load(indices + (first_box + tl.load(own)) * 16 + 1) // (SETS * GAP) * (SETS * GAP)
+    base = next_point
+    alive = tl.max((first <= last).to(tl.int32), 0)
+    while (open_ < number) & (alive > 0):
+        red0, green0, blue0, opacity0 = grid, grid, grid, grid
+        red1, green1, blue1, opacity1 = grid, grid, grid, grid
+        red2, green2, blue2, opacity2 = grid, grid, grid, grid
+        red3, green3, blue3, opacity3 = grid, grid, grid, grid
+        points = next_point + coarse
+        stop = next_point + COARSE * SETS * GAP
+        entry = open_
+        starts = next_point
+        # Boxes that are done stay before `open_`; the list is ordered by where boxes begin, not by where they end.
+        while (entry < number) & (starts < stop):
+            k = first_box + tl.load(own + entry)
+            starts = tl.load(indices + k * 16 + 1)
+            ends_at = tl.load(indices + k * 16 + 2)
+            if (starts < stop) & (ends_at >= next_point):
+                row = record + k * 32
+                n0 = tl.load(indices + k * 16)
+                stride = tl.load(indices + k * 16 + 3)
+                source = voxels + (view.to(tl.int64) * own_boxes + (k - first_box)) * 2048
+                px, py, pz, qx, qy, qz = ray_in_box(row, u, v)
+                red0, green0, blue0, opacity0 = _add_samples(
+                    red0, green0, blue0, opacity0, points, n0, stride, row, source, px, py, pz, qx, qy, qz,
+                    first, last, spacing, WHOLE,
+                )  # fmt: skip
+                if SETS == 2:  # noqa: SIM102 (known when compiled, while the stride is not)
+                    if stride % (2 * GAP) != 0:
+                        red1, green1, blue1, opacity1 = _add_samples(
+                            red1, green1, blue1, opacity1, points + GAP, n0, stride, row, source,
+                            px, py, pz, qx, qy, qz, first, last, spacing, WHOLE,
+                        )  # fmt: skip
+                if SETS == 4:
+                    if stride % (4 * GAP) != 0:
+                        red2, green2, blue2, opacity2 = _add_samples(
+                            red2, green2, blue2, opacity2, points + 2 * GAP, n0, stride, row, source,
+                            px, py, pz, qx, qy, qz, first, last, spacing, WHOLE,
+                        )  # fmt: skip
+                    if stride % (2 * GAP) != 0:
+                        red1, green1, blue1, opacity1 = _add_samples(
+                            red1, green1, blue1, opacity1, points + GAP, n0, stride, row, source,
+                            px, py, pz, qx, qy, qz, first, last, spacing, WHOLE,
+                        )  # fmt: skip
+                        red3, green3, blue3, opacity3 = _add_samples(
+                            red3, green3, blue3, opacity3, points + 3 * GAP, n0, stride, row, source,
+                            px, py, pz, qx, qy, qz, first, last, spacing, WHOLE,
+                        )  # fmt: skip
+            entry += 1
+
+        total = opacity0
+        if SETS >= 2:
+            total += opacity1
+        if SETS == 4:
+            total += opacity2 + opacity3
+        before0 = reached[:, None] + tl.cumsum(total, 1) - total
+        nothing = (grid, grid, grid, grid)
+        stops, halves = _opaque(before0, opacity0, points, grid.to(tl.int32) + NEVER, grid.to(tl.int32) + NEVER)
+        if SETS >= 2:
+            before1 = before0 + opacity0
+            stops, halves = _opaque(before1, opacity1, points + GAP, stops, halves)
+        if SETS == 4:
+            before2 = before1 + opacity1
+            stops, halves = _opaque(before2, opacity2, points + 2 * GAP, stops, halves)
+            before3 = before2 + opacity2
+            stops, halves = _opaque(before3, opacity3, points + 3 * GAP, stops, halves)
+        end = tl.minimum(end, tl.min(stops, 1))
+        half = tl.minimum(half, tl.min(halves, 1))
+        s, f = _weigh(before0, red0, green0, blue0, opacity0, points, end, base, spacing, nothing, nothing)
+        if SETS >= 2:
+            s, f = _weigh(before1, red1, green1, blue1, opacity1, points + GAP, end, base, spacing, s, f)
+        if SETS == 4:
+            s, f = _weigh(before2, red2, green2, blue2, opacity2, points + 2 * GAP, end, base, spacing, s, f)
+            s, f = _weigh(before3, red3, green3, blue3, opacity3, points + 3 * GAP, end, base, spacing, s, f)
+        r, g, b = r + tl.sum(s[0], 1), g + tl.sum(s[1], 1), b + tl.sum(s[2], 1)
+        moment += tl.sum(s[3], 1)
+        if KEEP:
+            kappa, end_r = kappa + tl.sum(f[0], 1), end_r + tl.sum(f[1], 1)
+            end_g, end_b = end_g + tl.sum(f[2], 1), end_b + tl.sum(f[3], 1)
+        reached = tl.where(end < NEVER, 1.0, tl.minimum(reached + tl.sum(total, 1), 1.0))
+        last = tl.where(end < NEVER, 0, last)
+        alive = tl.max((first <= last).to(tl.int32), 0)
+
+        # The next chunk begins where an unfinished box does, or where this one ended.
+        ends_at = stop - 1
+        while (open_ < number) & (ends_at < stop):
+            k = first_box + tl.load(own + open_)
+            starts = tl.load(indices + k * 16 + 1)
+            ends_at = tl.load(indices + k * 16 + 2)
+            if ends_at < stop:
+                open_ += 1
+        next_point = tl.maximum(stop, starts // (SETS * GAP) * (SETS * GAP))
+
+    tl.store(out_rgb + ray * 3, r, shown)
+    tl.store(out_rgb + ray * 3 + 1, g, shown)
+    tl.store(out_rgb + ray * 3 + 2, b, shown)
+    tl.store(out_alpha + ray, reached, shown)
+    mean = moment / tl.where(reached > 0, reached, 1.0)
+    depth = base.to(tl.float32) * spacing + mean
+    tl.store(out_depth + ray, tl.where(reached > 0, depth, float("inf")), shown)
+    tl.store(out_first_hit + ray, tl.where(half < NEVER, half.to(tl.float32) * spacing, float("inf")), shown)
+    if KEEP:
+        tl.store(kept + ray * 8, kappa, shown)
+        tl.store(kept + ray * 8 + 1, end_r, shown)
+        tl.store(kept + ray * 8 + 2, end_g, shown)
+        tl.store(kept + ray * 8 + 3, end_b, shown)
+        tl.store(kept + ray * 8 + 4, mean, shown)
+        tl.store(kept + ray * 8 + 5, reached, shown)
+        tl.store(ends + ray * 2, end, shown)
+        tl.store(ends + ray * 2 + 1, tl.zeros_like(end) + base, shown)

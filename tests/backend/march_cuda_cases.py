@@ -1,0 +1,342 @@
+"""What march_cuda must do; test_march_cuda.py runs it in Triton's interpreter, and on a CUDA device."""
+
+import dataclasses
+import os
+from typing import Any
+
+import pytest
+import torch
+from march_scenes import camera_at, one_box, random_boxes
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render import cuda
+from primdiffusion.render.compositing import Rendering
+from primdiffusion.render.cuda import Shapes, march_cuda
+from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings, Span
+from primdiffusion.render.reference import march_reference
+from torch import Tensor
+
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+DEVICE = "cpu" if INTERPRETED else "cuda"
+WIDE = Shapes(tile=(16, 16), block=(16, 16), samples=32) if INTERPRETED else Shapes()
+"""The interpreter takes as long for a large program as for a small one."""
+FACE_STEP = 3.4e-4
+"""The window's value at a face, by which a sample that rounding moves in or out of a box changes."""
+ROUGH = MarchSettings(step=0.012)
+"""Few samples, to save the interpreter's time."""
+FIELDS = ("rgb", "density", "position", "rotation", "half_extent")
+VIEW = ("intrinsics", "world_to_camera")
+
+
+def single(record: Any) -> Any:
+    return record.to(device=DEVICE, dtype=torch.float32)
+
+
+def double(record: Any) -> Any:
+    return single(record).to(device="cpu", dtype=torch.float64)
+
+
+def batch(*records: Any) -> Any:
+    """Records stacked along a new first dimension."""
+    names = [field.name for field in dataclasses.fields(records[0])]
+    stacked = {name: torch.stack([getattr(record, name) for record in records]) for name in names[:2]}
+    if isinstance(records[0], Primitives):
+        stacked = {name: torch.stack([getattr(record, name) for record in records]) for name in names}
+    return dataclasses.replace(records[0], **stacked)
+
+
+def draw(boxes, camera, settings=ROUGH, span=None, shapes=WIDE) -> Rendering:
+    """One scene."""
+    spans = None if span is None else single(batch(span))
+    picture = march_cuda(single(batch(boxes)), single(batch(camera)), settings, spans, shapes)
+    return picture.map(lambda tensor: tensor[0])
+
+
+def assert_equals(got: Rendering, expected: Rendering, densest: float, step: float) -> None:
+    """All fields within 2e-5 plus one flipped face sample of the densest box, on average within 2e-6."""
+    largest = 2e-5 + FACE_STEP * min(densest * step, 1)
+    got = got.to(device="cpu", dtype=torch.float64)
+    for name in ("rgb", "alpha"):
+        difference = (getattr(got, name) - getattr(expected, name)).abs()
+        assert difference.max() < largest, name
+        assert difference.mean() < 2e-6, name
+    clear = expected.alpha > 1e-2
+    assert torch.equal(torch.isinf(got.depth)[clear], torch.isinf(expected.depth)[clear])
+    rounding = 2e-7 * expected.depth[clear]
+    assert ((got.depth - expected.depth)[clear].abs() <= largest / expected.alpha[clear] + rounding).all()
+    decided = (got.alpha - 0.5).abs() > 2 * largest
+    both = decided & torch.isfinite(expected.first_hit)
+    assert torch.equal(torch.isinf(got.first_hit)[decided], torch.isinf(expected.first_hit)[decided])
+    # A sum that stands at 0.5 to rounding may reach it one sample later.
+    late = (got.first_hit - expected.first_hit)[both].abs() > 1e-6 + 2e-7 * expected.first_hit[both]
+    assert late.double().mean() < 0.01 if both.any() else True
+
+
+def assert_agree(boxes, camera, settings=ROUGH, span=None, shapes=WIDE) -> None:
+    expected = march_reference(double(boxes), double(camera), settings, None if span is None else double(span))
+    densest = float(boxes.density.max()) if boxes.density.numel() else 0.0
+    assert_equals(draw(boxes, camera, settings, span, shapes), expected, densest, settings.step)
+
+
+def mixed_sizes(count: int, seed: int, density: float) -> Primitives:
+    """Boxes of all three strides of ROUGH: the finest for those under 42 mm, the coarsest from 84 mm on."""
+    return random_boxes(count, seed, smallest=0.03, largest=0.12, density=density)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_agrees_on_overlapping_boxes_from_thin_to_saturating(seed):
+    boxes = mixed_sizes(14, seed, 10.0 * 15**seed)
+    assert_agree(boxes, camera_at((0.2, 0.1, 0.6), fov=0.5, width=18, height=14))
+
+
+def test_agrees_with_the_shapes_that_devices_use():
+    assert_agree(mixed_sizes(5, 3, 60.0), camera_at((0.2, 0.1, 0.6), width=11, height=7), shapes=Shapes())
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        MarchSettings(),
+        UNIFORM_MILLIMETRE,
+        MarchSettings(0.006, (3, 1)),
+        MarchSettings(0.05, (8, 4, 2)),
+        MarchSettings(0.004, (2, 1)),
+    ],
+)
+def test_agrees_at_other_settings(settings):
+    assert_agree(random_boxes(9, 11, density=60.0), camera_at((0.2, 0.1, 0.6), width=14, height=11), settings)
+
+
+@pytest.mark.parametrize("smallest", [0.09, 0.045])
+def test_agrees_where_no_box_needs_the_finest_strides(smallest):
+    boxes = random_boxes(6, 5, smallest=smallest, largest=0.1, density=50.0)
+    assert_agree(boxes, camera_at((0.2, 0.1, 0.6), fov=0.5, width=16, height=12))
+
+
+@pytest.mark.parametrize("position", [(0.01, 0.0, 0.02), (0.0, 0.1, 0.1), (0.15, 0.0, 0.0)])
+def test_agrees_with_the_camera_inside_boxes_and_boxes_across_its_plane(position):
+    boxes = random_boxes(6, 12, density=15.0, smallest=0.05, largest=0.15)
+    assert_agree(boxes, camera_at(position, fov=1.8, width=15, height=16))
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 33), (33, 1)])
+def test_agrees_on_pictures_one_pixel_wide_or_high(width, height):
+    assert_agree(random_boxes(10, 13), camera_at((0.0, 0.1, 0.5), width=width, height=height))
+
+
+def test_agrees_on_far_needles_and_plates():
+    boxes = random_boxes(6, 14, density=200.0)
+    boxes.half_extent[::2, 0] = 0.3
+    boxes.half_extent[::3, 2] = 0.004
+    assert_agree(boxes, camera_at((2.0, 3.0, 5.0), fov=0.1, width=16, height=12))
+
+
+def test_agrees_from_two_kilometres_away():
+    """As an orthographic view is emulated: float32 could not tell a box's voxels apart at this distance."""
+    camera = camera_at((1200.0, 900.0, 1300.0), fov=1.3e-4, width=16, height=16)
+    assert_agree(mixed_sizes(8, 15, 50.0), camera)
+
+
+def test_agrees_where_axes_reflect_and_pixels_are_oblong_and_sheared():
+    boxes, camera = random_boxes(6, 16), camera_at((0.2, 0.1, 0.6), fov=0.5, width=16, height=12)
+    boxes.rotation[::2, :, 0] *= -1
+    camera.intrinsics[0, 0] *= 1.7
+    camera.intrinsics[0, 1] = 3.0
+    camera.intrinsics[0, 2] += 4.3
+    assert_agree(boxes, camera)
+
+
+def test_agrees_within_a_span_with_and_without_ends():
+    boxes, camera = mixed_sizes(8, 17, 40.0), camera_at((0.0, 0.0, 0.6), fov=0.4, width=16, height=12)
+    near = torch.linspace(0.0, 0.7, 16, dtype=torch.float64).expand(12, 16).clone()
+    far = torch.full((12, 16), 0.62, dtype=torch.float64)
+    far[::2] = torch.inf
+    near[3], far[3] = 0.7, 0.5
+    assert_agree(boxes, camera, span=Span(near, far))
+
+
+def test_nothing_gives_an_empty_picture_and_no_gradient():
+    camera = camera_at((0.0, 0.0, 0.5), width=6, height=5)
+    nobody = random_boxes(3).map(lambda tensor: tensor[:0])
+    away = dataclasses.replace(random_boxes(3), position=torch.full((3, 3), 5.0, dtype=torch.float64))
+    empty = dataclasses.replace(random_boxes(3), density=torch.zeros((3, 8, 8, 8), dtype=torch.float64))
+    for boxes in (nobody, away, empty):
+        leaf = single(batch(boxes)).map(lambda tensor: tensor.clone().requires_grad_())
+        got = march_cuda(leaf, single(batch(camera)), settings=ROUGH, shapes=WIDE)
+        assert got.rgb.shape == (1, 5, 6, 3)
+        assert got.rgb.abs().max() == 0
+        assert got.alpha.max() == 0
+        assert torch.isinf(got.depth).all()
+        assert torch.isinf(got.first_hit).all()
+        got.rgb.sum().backward()
+        assert leaf.position.grad is not None
+        assert leaf.position.grad.abs().sum() == 0
+
+
+def test_boxes_without_extent_draw_nothing_and_disturb_nothing():
+    boxes, camera = random_boxes(6, 15), camera_at((0.0, 0.0, 0.5), width=16, height=12)
+    boxes.half_extent[[1, 5]] = torch.tensor([[0.0, 0.1, 0.1], [-0.1, 0.1, 0.1]], dtype=torch.float64)
+    kept = boxes.map(lambda tensor: tensor[[0, 2, 3, 4]])
+    assert torch.equal(draw(boxes, camera).rgb, draw(kept, camera).rgb)
+
+
+def test_lists_of_bins_serve_where_lists_of_tiles_would_be_too_long(monkeypatch):
+    boxes, camera = random_boxes(5, 18), camera_at((0.0, 0.1, 0.5), width=20, height=16)
+    small = dataclasses.replace(WIDE, tile=(8, 8), bin=2)
+    whole = draw(boxes, camera, shapes=small)
+    monkeypatch.setattr(cuda, "LIST_LIMIT", 0)
+    assert (draw(boxes, camera, shapes=small).rgb - whole.rgb).abs().max() < 1e-6
+
+
+def test_a_batch_draws_each_person_from_each_view():
+    people = [random_boxes(4, seed, density=60.0) for seed in (20, 21)]
+    views = [camera_at((0.2, 0.1, 0.6), width=13, height=9), camera_at((-0.4, 0.1, 0.4), width=13, height=9)]
+    scenes = [(person, view) for person in people for view in views]
+    got = march_cuda(
+        single(batch(*(person for person, _ in scenes))),
+        single(batch(*(view for _, view in scenes))),
+        ROUGH,
+        shapes=WIDE,
+    )
+    for i, (person, view) in enumerate(scenes):
+        expected = march_reference(double(person), double(view), ROUGH)
+        assert_equals(got.map(lambda tensor, i=i: tensor[i]), expected, 60.0, ROUGH.step)
+        assert expected.alpha.max() > 0.1
+
+
+def gradients(render, boxes: Primitives, camera: Camera, seed: int = 0) -> dict[str, Tensor]:
+    """Of a random mix of rgb, alpha and finite depths; `render` maps leaves to a picture."""
+    leaves = [record.map(lambda tensor: tensor.detach().clone().requires_grad_()) for record in (boxes, camera)]
+    picture = render(*leaves)
+    generator = torch.Generator().manual_seed(seed)
+
+    def some(value: Tensor) -> Tensor:
+        weight = torch.randn(value.shape, generator=generator, dtype=torch.float64)
+        return (value * weight.to(value)).sum()
+
+    depth = torch.where(torch.isfinite(picture.depth), picture.depth, 0)
+    (some(picture.rgb) + some(picture.alpha) + some(depth)).backward()
+    every = {name: getattr(leaves[0], name).grad for name in FIELDS} | {n: getattr(leaves[1], n).grad for n in VIEW}
+    return {name: grad.cpu().double() for name, grad in every.items()}
+
+
+def assert_same_gradients(got: dict[str, Tensor], expected: dict[str, Tensor], largest: float = 1e-3) -> None:
+    """Cosine at least 0.9999, and a relative error that shows the scale to be right, too."""
+    for name, value in expected.items():
+        other = got[name].reshape(value.shape)
+        norm = value.norm()
+        assert norm > 0, name
+        assert (value * other).sum() / (norm * other.norm()) >= 0.9999, name
+        assert (value - other).norm() / norm < largest, name
+
+
+def assert_gradients_agree(boxes, camera, settings=ROUGH, span=None, shapes=WIDE, **tolerance) -> None:
+    spans = None if span is None else single(batch(span))
+    got = gradients(
+        lambda boxes, camera: march_cuda(boxes, camera, settings, spans, shapes),
+        single(batch(boxes)), single(batch(camera)),
+    )  # fmt: skip
+    slow = None if span is None else double(span)
+    expected = gradients(lambda b, c: march_reference(b, c, settings, slow), double(boxes), double(camera))
+    assert_same_gradients(got, expected, **tolerance)
+
+
+@pytest.mark.parametrize("density", [2.0, 150.0])
+def test_gradients_agree_on_rays_that_stay_open_and_rays_that_saturate(density):
+    boxes, camera = mixed_sizes(8, 30, density), camera_at((0.2, 0.1, 0.6), fov=0.3, width=14, height=12)
+    share = (march_reference(boxes, camera, ROUGH).alpha >= 1).double().mean()
+    assert share > 0.2 if density > 100 else share < 0.01
+    assert_gradients_agree(boxes, camera)
+
+
+def test_gradients_agree_with_the_shapes_that_devices_use():
+    boxes, camera = random_boxes(2, 31, density=80.0), camera_at((0.2, 0.1, 0.6), fov=0.15, width=9, height=4)
+    assert_gradients_agree(boxes, camera, shapes=Shapes())
+
+
+def test_gradients_agree_with_the_camera_inside_boxes_and_beside_them():
+    boxes = random_boxes(4, 32, density=15.0, smallest=0.05, largest=0.15)
+    assert_gradients_agree(boxes, camera_at((0.01, 0.0, 0.05), fov=1.6, width=14, height=14))
+
+
+def test_gradients_agree_at_other_strides_and_within_a_span():
+    boxes, camera = random_boxes(4, 33, density=40.0), camera_at((0.2, 0.1, 0.6), fov=0.4, width=14, height=10)
+    camera.intrinsics[0, 1] = 2.0
+    near, far = torch.full((10, 14), 0.55, dtype=torch.float64), torch.full((10, 14), 0.68, dtype=torch.float64)
+    assert_gradients_agree(boxes, camera, MarchSettings(0.006, (3, 1)), Span(near, far))
+
+
+def test_gradients_agree_from_two_kilometres_away():
+    camera = camera_at((1200.0, 900.0, 1300.0), fov=1.3e-4, width=12, height=12)
+    assert_gradients_agree(mixed_sizes(5, 34, 50.0), camera, largest=5e-3)
+
+
+def test_gradients_of_boxes_that_views_share_are_sums_over_the_views():
+    boxes = random_boxes(3, 35, density=60.0)
+    views = [camera_at((0.2, 0.1, 0.6), width=9, height=7), camera_at((-0.4, 0.1, 0.4), width=9, height=7)]
+
+    def slow(boxes: Primitives, cameras: Camera) -> Rendering:
+        each = [dataclasses.replace(cameras, **{n: getattr(cameras, n)[i] for n in VIEW}) for i in range(2)]
+        pictures = [march_reference(boxes, view, ROUGH) for view in each]
+        names = ("rgb", "alpha", "depth", "first_hit")
+        return Rendering(*(torch.stack([getattr(picture, name) for picture in pictures]) for name in names))
+
+    got = gradients(lambda b, c: march_cuda(b, c, ROUGH, shapes=WIDE), single(batch(boxes)), single(batch(*views)))
+    expected = gradients(slow, double(boxes), double(batch(*views)))
+    assert_same_gradients(got, expected)
+
+
+def test_gradients_do_not_depend_on_how_a_box_is_cut_and_repeat_bit_for_bit():
+    boxes, camera = (
+        single(batch(random_boxes(2, 36, density=60.0))),
+        single(batch(camera_at((0.0, 0.1, 0.5), width=12))),
+    )
+    cut = dataclasses.replace(WIDE, blocks_of_unit=1, block=(8, 8))
+    first, again = (gradients(lambda b, c: march_cuda(b, c, ROUGH, shapes=cut), boxes, camera) for _ in range(2))
+    whole = gradients(lambda b, c: march_cuda(b, c, ROUGH, shapes=WIDE), boxes, camera)
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert_same_gradients(first, whole, largest=1e-4)
+
+
+def test_voxels_without_density_receive_the_gradient_of_their_limit():
+    camera = single(batch(camera_at((0.05, 0.1, 0.5), fov=0.2, width=8, height=8)))
+    grads = []
+    for density in (0.0, 1e-6):
+        boxes = single(batch(one_box(0.04, density)))
+        leaf = dataclasses.replace(boxes, density=boxes.density.clone().requires_grad_())
+        picture = march_cuda(leaf, camera, ROUGH, shapes=WIDE)
+        (picture.rgb.sum() - picture.alpha.sum()).backward()
+        grads.append(leaf.density.grad)
+    assert grads[1].norm() > 0
+    assert (grads[0] - grads[1]).norm() < 1e-4 * grads[1].norm()
+
+
+@pytest.mark.parametrize("name", ["position", "rotation", "half_extent", "rgb", "density"])
+def test_nan_is_refused_by_name(name):
+    boxes = random_boxes(2)
+    getattr(boxes, name).view(-1)[-1] = torch.nan
+    with pytest.raises(ValueError, match=rf"primitives\.{name} holds NaN"):
+        draw(boxes, camera_at((0.0, 0.0, 0.5)))
+
+
+def test_bad_scenes_are_refused_as_check_scene_does():
+    boxes, camera = random_boxes(2), camera_at((0.0, 0.0, 0.5))
+    with pytest.raises(ValueError, match="density falls to -1"):
+        draw(dataclasses.replace(boxes, density=boxes.density * 0 - 1), camera)
+    with pytest.raises(ValueError, match=r"camera\.intrinsics"):
+        draw(boxes, dataclasses.replace(camera, intrinsics=camera.intrinsics * torch.nan))
+    with pytest.raises(ValueError, match="no rotation in box"):
+        draw(dataclasses.replace(boxes, rotation=boxes.rotation * 1.1), camera)
+    with pytest.raises(ValueError, match="0 x 20 pixels"):
+        draw(boxes, dataclasses.replace(camera, width=0))
+    limit = torch.full((20, 24), torch.nan, dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"span\.near holds NaN"):
+        draw(boxes, camera, span=Span(limit, torch.ones_like(limit)))
+    with pytest.raises(ValueError, match="index_order"):
+        draw(boxes, camera, MarchSettings(compositing="index_order"))
+    with pytest.raises(ValueError, match="float32"):
+        march_cuda(batch(boxes), batch(camera))
+    with pytest.raises(ValueError, match="call march"):
+        march_cuda(single(boxes), single(batch(camera)))
+    with pytest.raises(ValueError, match=r"8\^3 voxels"):
+        draw(random_boxes(2, size=4), camera)
