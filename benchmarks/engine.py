@@ -1,0 +1,180 @@
+"""What the render engine in Blender adds to the marcher, and whether its pictures are the backend's.
+
+`python benchmarks/engine.py --json engine.json` renders one person at 512 x 512 through Blender (as a Python module)
+and the engine's warm child. Milliseconds are of wall time, the best of several frames; `_new_pose` poses the armature
+before every frame, otherwise only the camera moves. engine_overhead_ms is the time inside RenderEngine.render without
+the child's march. engine_pixel_error_max is the largest difference of an 8-bit PNG from the backend's own picture, in
+0 ... 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_benchmark_"))
+
+import bpy
+import numpy as np
+import torch
+from march_people import checkered_human
+from primdiffusion.body.model import BodyPose
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.rotation import axis_angle_to_matrix
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.human import Human, place
+from primdiffusion.human_file import export_for_blender, save_human
+from primdiffusion.render.march import march
+from record import tell
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import blender_primdiffusion
+from blender_primdiffusion.engine import final
+from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.human import armature_of, build_human
+
+SIZE = 512
+WARM_UP, FRAMES = 3, 15
+DISTANCE_M, LENS_MM, SENSOR_MM = 3.2, 50.0, 36.0
+BACKEND_FROM_BLENDER = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+
+def stage(human: Human, folder: Path) -> bpy.types.Object:
+    """A scene with the person, all 1024 volumes included, and a camera before it; the armature."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
+    save_human(folder / "person.human.safetensors", human)
+    export_for_blender(folder / "human.npz", human)
+    person = build_human(bpy.context, folder / "human.npz", keep=[folder / "person.human.safetensors"])
+    scene = bpy.context.scene
+    scene.render.engine = "PRIMDIFFUSION"
+    scene.render.resolution_x = scene.render.resolution_y = SIZE
+    scene.render.film_transparent = True
+    scene.render.dither_intensity = 0
+    scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
+    scene.render.filepath = str(folder / "picture.png")
+    scene.view_settings.view_transform = "Standard"
+    scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.camera.data.lens, scene.camera.data.sensor_width = LENS_MM, SENSOR_MM
+    scene.camera.rotation_euler = (np.pi / 2, 0, 0)
+    scene.collection.objects.link(scene.camera)
+    scene.camera.location = (0.0, -DISTANCE_M, 1.0)
+    return armature_of(person)
+
+
+def pose(seed: int) -> np.ndarray:
+    """Joint rotations [24, 3, 3] of a person who moves a little."""
+    turns = np.random.default_rng(seed).normal(0, 0.15, (24, 3))
+    return axis_angle_to_matrix(torch.from_numpy(turns).float()).double().numpy()
+
+
+@contextmanager
+def timed(module: object, name: str, seconds: list[float]) -> Iterator[None]:
+    """Notes how long each call of a function takes while the block runs."""
+    plain: Callable = getattr(module, name)
+
+    def wrapped(*arguments: object, **named: object) -> object:
+        began = time.perf_counter()
+        try:
+            return plain(*arguments, **named)
+        finally:
+            seconds.append(time.perf_counter() - began)
+
+    setattr(module, name, wrapped)
+    try:
+        yield
+    finally:
+        setattr(module, name, plain)
+
+
+def overhead(change: Callable[[int], None]) -> dict[str, float]:
+    """Milliseconds a frame of each part, of the frame with the least overhead; `change(i)` is called before frame i."""
+    drawings: list = []
+    plain = final.render_layer
+
+    def kept(engine: object, depsgraph: object) -> object:
+        drawings.append(plain(engine, depsgraph))
+        return drawings[-1]
+
+    whole, gather, fill = [], [], []
+    final.render_layer = kept
+    try:
+        with (
+            timed(final, "render_layer", whole),
+            timed(final, "picture_of", gather),
+            timed(final, "solids_file", gather),
+            timed(final, "_fill", fill),
+        ):
+            for frame in range(WARM_UP + FRAMES):
+                change(frame)
+                bpy.ops.render.render()
+    finally:
+        final.render_layer = plain
+    rows = []
+    for frame in range(WARM_UP, WARM_UP + FRAMES):
+        child = drawings[frame].result
+        parts = {
+            "render": whole[frame],
+            "march": child["seconds_march"],
+            "place": child["seconds_place"],
+            "rest_of_child": child["seconds"] - child["seconds_place"] - child["seconds_march"],
+            "gather": gather[2 * frame] + gather[2 * frame + 1],
+            "fill": fill[frame],
+        }
+        parts["conversation"] = parts["render"] - child["seconds"] - parts["gather"] - parts["fill"]
+        rows.append({"overhead": parts["render"] - parts["march"], **parts})
+    best = min(rows, key=lambda row: row["overhead"])
+    return {f"{name}_ms": 1e3 * value for name, value in best.items()}
+
+
+def pixel_error(human: Human, armature: bpy.types.Object, rotations: np.ndarray) -> float:
+    """The largest difference between the PNG that Blender saves and the backend's picture, in 0 ... 1."""
+    pose_from_joint_rotations(armature, rotations)
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(bpy.context.scene.render.filepath)
+    given = np.array(image.pixels[:]).reshape(SIZE, SIZE, 4)[::-1]
+    focal = LENS_MM / SENSOR_MM * SIZE
+    eye = BACKEND_FROM_BLENDER @ (np.array(bpy.context.scene.camera.location) - np.array(armature.location))
+    to_camera = np.diag([1.0, -1.0, -1.0])  # the camera looks along -z of the backend, at the person's face
+    camera = Camera(
+        torch.tensor([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]]),
+        torch.from_numpy(np.concatenate([to_camera, -(to_camera @ eye)[:, None]], 1)).float(),
+        SIZE,
+        SIZE,
+    )
+    body_pose = BodyPose(torch.from_numpy(rotations).float(), torch.zeros(3))
+    rendering = march(place(human, body_pose), camera)
+    alpha = rendering.alpha[..., None]
+    straight = (rendering.rgb / torch.where(alpha > 0, alpha, 1)).clamp(0, 1)
+    wanted = np.concatenate([np.asarray(encode_srgb(straight.numpy())), alpha.numpy()], -1)
+    return float(np.abs(given - np.round(255 * wanted) / 255).max())
+
+
+def main() -> None:
+    """Measures, prints and, if asked, writes the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    arguments = parser.parse_args()
+    human = checkered_human()
+    blender_primdiffusion.register()
+    with tempfile.TemporaryDirectory(prefix="primdiffusion_benchmark_") as folder:
+        armature = stage(human, Path(folder))
+        figures: dict[str, float | int | str | None] = {"size": SIZE, "frames": FRAMES}
+        figures["engine_pixel_error_max"] = max(pixel_error(human, armature, pose(seed)) for seed in range(3))
+        camera = bpy.context.scene.camera
+        moved = overhead(lambda frame: setattr(camera.location, "x", 0.01 * frame))
+        posed = overhead(lambda frame: pose_from_joint_rotations(armature, pose(frame)))
+        figures |= {f"engine_{name}": value for name, value in moved.items()}
+        figures |= {f"engine_new_pose_{name}": value for name, value in posed.items()}
+        blender_primdiffusion.unregister()
+    tell(figures, arguments.json)
+
+
+if __name__ == "__main__":
+    main()
