@@ -12,7 +12,6 @@ from primdiffusion.render.cpu import march_cpu
 from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings
 from primdiffusion.render.march import march
 from primdiffusion.render.reference import march_reference
-from primdiffusion.render.tiles import tile_lists
 
 FACE_STEP = 3.4e-4
 """The window's value at a face, by which a sample that rounding moves in or out of a box changes."""
@@ -126,18 +125,6 @@ def test_negative_density_broken_shapes_and_cameras_are_refused():
         march(boxes, dataclasses.replace(camera, width=0))
     with pytest.raises(ValueError, match="strides"):
         MarchSettings(strides=(4, 3))
-
-
-def test_tiles_list_every_box_that_a_pixel_of_theirs_can_see():
-    boxes, camera = random_boxes(60, 16, spread=0.3), camera_at((0.1, 0.3, 0.9), fov=0.8, width=70, height=50)
-    start, listed = tile_lists(boxes, camera)
-    across = -(-camera.width // 16)
-    for k in range(0, 60, 7):
-        alone = boxes.map(lambda tensor, k=k: tensor[k : k + 1])
-        rows, columns = (march_reference(alone, camera).alpha > 0).nonzero(as_tuple=True)
-        for tile in set((rows // 16 * across + columns // 16).tolist()):
-            assert k in listed[start[tile] : start[tile + 1]]
-    assert len(listed) < 0.5 * 60 * (len(start) - 1)  # lists that name everything would pass the loop above
 
 
 def test_the_fast_marcher_repeats_itself_bit_for_bit():

@@ -1,213 +1,277 @@
-"""The fast marcher for CPUs: numba, float32, no gradients; the same rule as `reference.py` (SPEC 4).
+"""The fast marcher for CPUs: numba, float32, differentiable; the same rule as `reference.py` (SPEC 4).
 
-Pixels are worked on in tiles of 16 x 16, each with the list of boxes whose projected corners touch it. A ray finds the
-lattice points at which it enters and leaves each box, then gathers opacity and colour over a chunk of lattice points,
-composites the chunk, and stops when it is opaque.
+Pixels are worked on in tiles, each with the boxes whose projected corners touch it. A ray is tested against its tile's
+boxes, gathers opacity and colour over a chunk of lattice points, composites the chunk, and stops when it is opaque.
 """
 
 from __future__ import annotations
 
-import math
+import dataclasses
 import threading
+from typing import NamedTuple
 
-import numba
 import numpy as np
 import torch
-from jaxtyping import Int64
+from jaxtyping import Bool, Float, Int64
 from numpy import ndarray
+from torch import Tensor
 
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.compositing import SURFACE_OPACITY, Rendering
-from primdiffusion.render.lattice import WINDOW_SHARPNESS, MarchSettings, check_scene, check_unbatched, strides_of
-from primdiffusion.render.tiles import TILE, tile_lists
-
-# numba's disk cache watches this file only: touch it after changing a constant that is imported above.
-CHUNK = 32
-"""Lattice points gathered before they are composited: long enough to amortise the loop, short enough to stop early."""
+from primdiffusion.render.compositing import Rendering
+from primdiffusion.render.cpu_adjoint import Gradients, Upstream, adjoin_boxes
+from primdiffusion.render.cpu_forward import NEVER, Ends, Picture, march_tiles
+from primdiffusion.render.cpu_packing import Scene, dealt, pack
+from primdiffusion.render.lattice import MarchSettings, Span, check_scene, check_unbatched, strides_of
 
 _ONE_AT_A_TIME = threading.Lock()
 """numba's built-in thread pool, all there is on some systems, ends the process when two threads use it at once."""
+LARGEST_PAYLOAD = 256
+"""Voxels along a side: cells are numbered in float32, exact below 2^24."""
 
 
-def march_cpu(primitives: Primitives, camera: Camera, settings: MarchSettings = MarchSettings()) -> Rendering:  # noqa: B008
-    """As `march_reference`, in float32 on the CPU with all of numba's threads; not differentiable.
+@dataclasses.dataclass(frozen=True)
+class SampleCount:
+    """How many samples a picture takes."""
 
-    Ray-box geometry is computed in float64, samples in float32. The first call on a machine compiles (some 10 s); the
-    result is cached on disk. Raises ValueError as `check_scene` does.
+    inside_boxes: int
+    """Samples of the rule (SPEC 4): lattice points in boxes, in each box's stride, up to where rays become opaque."""
+    evaluated: int
+    """Samples that `march_cpu` takes: without cells that hold nothing, but to the end of the chunk of an opaque ray."""
+
+
+def march_cpu(
+    primitives: Primitives,
+    camera: Camera,
+    settings: MarchSettings = MarchSettings(),  # noqa: B008
+    span: Span | None = None,
+) -> Rendering:
+    """As `march_reference`, in float32 on the CPU with all of numba's threads.
+
+    Differentiable, once, in every tensor of `primitives` and `camera`, from rgb, alpha and depth. The first call on a
+    machine compiles (some 10 s, the first backward pass as much again); the result is cached on disk. Memory beyond the
+    inputs: as much again as rgb and density, and some 50 bytes a pixel. Raises ValueError as `march_reference` does.
     """
-    check_scene(primitives, camera)
-    check_unbatched(primitives, camera)
-    solid = (primitives.half_extent > 0).all(-1).nonzero()[:, 0]
-    boxes = primitives.map(lambda tensor: tensor.detach().cpu()[solid])
-    stride = strides_of(boxes, settings).numpy()
-    origin, directions = (value.detach().cpu().double() for value in camera.rays())
+    view = _view(primitives, camera, settings, span)
+    inputs = (primitives.rgb.float(), primitives.density.float(), view.to_local, view.offset, view.pixel_to_world)
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
+        fields = _March.apply(*inputs, view)
+    else:
+        fields = _draw(view, _scene(view, inputs, empty_cells=False), _ends(0))
+    return Rendering(*(field.unflatten(0, (camera.height, camera.width)) for field in fields))
 
-    inverse = (1 / boxes.half_extent.double()).numpy()
-    to_local = boxes.rotation.double().numpy().transpose(0, 2, 1) * inverse[:, :, None]
-    start = np.einsum("kij,kj->ki", to_local, origin.numpy() - boxes.position.double().numpy())
-    voxels = torch.cat([boxes.rgb, boxes.density[:, None]], dim=1).movedim(1, -1).float().contiguous().numpy()
 
-    tile_start, tile_box = tile_lists(boxes, camera)
-    picture = np.zeros((camera.height, camera.width, 6), np.float32)
-    order = _dealt(tile_start)
-    rays, spacing = directions.numpy(), settings.spacing
+def count_samples(
+    primitives: Primitives,
+    camera: Camera,
+    settings: MarchSettings = MarchSettings(),  # noqa: B008
+    span: Span | None = None,
+) -> SampleCount:
+    """How many samples `march_cpu` takes for a picture, and how many the rule asks for; costs two pictures."""
+    view = _view(primitives, camera, settings, span)
+    inputs = (primitives.rgb.float(), primitives.density.float(), view.to_local, view.offset, view.pixel_to_world)
+    counts = []
+    for empty_cells in (True, False):
+        scene = _scene(view, inputs, empty_cells=empty_cells)
+        counts.append(np.zeros((len(scene.order), 2), np.int64))
+        _draw(view, scene, _ends(camera.width * camera.height), counts[-1])
+    return SampleCount(inside_boxes=int(counts[0][:, 1].sum()), evaluated=int(counts[1][:, 0].sum()))
+
+
+class _View(NamedTuple):
+    """A scene without its payload, in float64; the tensors carry gradients to the records they came from."""
+
+    to_local: Float[Tensor, "k 3 3"]
+    offset: Float[Tensor, "k 3"]
+    """From each box's centre to the camera."""
+    pixel_to_world: Float[Tensor, "3 3"]
+    """A pixel's place [u, v, 1] to its ray's direction, not of unit length."""
+    stride: Int64[Tensor, "k"]
+    """In units of the least one, as are all lattice indices here."""
+    solid: Bool[Tensor, "k"]
+    limits: Int64[ndarray, "r 2"]
+    """First and last lattice index of each ray; empty without a span."""
+    spacing: float
+    index_order: bool
+    width: int
+    height: int
+    given: tuple[Primitives, Camera, Span | None]
+
+
+def _view(primitives: Primitives, camera: Camera, settings: MarchSettings, span: Span | None) -> _View:
+    if not _is_one_scene(primitives, camera, span):
+        check_scene(primitives, camera, span)
+        check_unbatched(primitives, camera, span)
+        raise ValueError(
+            f"march_cpu draws boxes of 1 to {LARGEST_PAYLOAD} voxels a side on the CPU; these have "
+            f"{primitives.density.shape[-1]} and lie on {primitives.density.device}"
+        )
+    half_extent = primitives.half_extent
+    solid = (half_extent > 0).all(-1)
+    # Boxes without extent are never drawn; any finite matrix does for them.
+    inverse = 1 / torch.where(half_extent <= 0, 1, half_extent).double()
+    strides = strides_of(primitives, settings)
+    unit = int(strides.min()) if len(strides) else 1
+    spacing = settings.spacing * unit
+    return _View(
+        to_local=inverse[:, :, None] * primitives.rotation.double().mT,
+        offset=camera.map(lambda tensor: tensor.double()).position - primitives.position.double(),
+        pixel_to_world=_pixel_to_world(camera),
+        stride=strides // unit,
+        solid=solid,
+        limits=np.empty((0, 2), np.int64) if span is None else _limits(span, spacing),
+        spacing=spacing,
+        index_order=settings.compositing == "index_order",
+        width=camera.width,
+        height=camera.height,
+        given=(primitives, camera, span),
+    )
+
+
+def _is_one_scene(primitives: Primitives, camera: Camera, span: Span | None) -> bool:
+    """Whether shapes and the small fields are right; boxes are checked where they are packed."""
+    k, size = primitives.position.shape[0] if primitives.position.ndim else 0, primitives.density.shape[-1]
+    shapes = [
+        *((primitives.position, (k, 3)), (primitives.rotation, (k, 3, 3)), (primitives.half_extent, (k, 3))),
+        *((primitives.rgb, (k, 3, size, size, size)), (primitives.density, (k, size, size, size))),
+        *((camera.intrinsics, (3, 3)), (camera.world_to_camera, (3, 4))),
+    ]
+    picture = (camera.height, camera.width)
+    shapes += [] if span is None else [(span.near, picture), (span.far, picture)]
+    if not all(tuple(tensor.shape) == shape and tensor.device.type == "cpu" for tensor, shape in shapes):
+        return False
+    finite = bool(torch.isfinite(camera.intrinsics).all() and torch.isfinite(camera.world_to_camera).all())
+    whole = span is None or not bool(torch.isnan(span.near).any() or torch.isnan(span.far).any())
+    return finite and whole and min(picture) > 0 and 1 <= size <= LARGEST_PAYLOAD
+
+
+def _pixel_to_world(camera: Camera) -> Float[Tensor, "3 3"]:
+    """The matrix behind `Camera.rays`."""
+    k = camera.intrinsics.double()
+    fx, skew, cx, fy, cy = k[0, 0], k[0, 1], k[0, 2], k[1, 1], k[1, 2]
+    none, one = torch.zeros_like(fx), torch.ones_like(fx)
+    rows = [1 / fx, -skew / (fx * fy), (skew * cy / fy - cx) / fx, none, 1 / fy, -cy / fy, none, none, one]
+    return camera.world_to_camera[:, :3].double().T @ torch.stack(rows).reshape(3, 3)
+
+
+def _limits(span: Span, spacing: float) -> Int64[ndarray, "r 2"]:
+    near, far = (value.detach().double().numpy().ravel() / spacing for value in (span.near, span.far))
+    return np.stack([np.ceil(near).clip(1, 2**62), np.floor(far).clip(0, 2**62)], axis=-1).astype(np.int64)
+
+
+Inputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""rgb, density, to_local, offset, pixel_to_world."""
+
+
+def _scene(view: _View, inputs: Inputs, *, empty_cells: bool) -> Scene:
+    rgb, density, to_local, offset, pixel_to_world = (tensor.detach() for tensor in inputs)
+    if density.shape[-1] == 1:  # one voxel is the same everywhere, as two equal ones are
+        rgb, density = rgb.expand(-1, -1, 2, 2, 2), density.expand(-1, 2, 2, 2)
     with _ONE_AT_A_TIME:
-        _march_tiles(picture, rays, to_local, start, voxels, stride, tile_start, tile_box, order, spacing)
-    rgb, alpha, depth, first_hit = torch.from_numpy(picture).split((3, 1, 1, 1), dim=-1)
-    return Rendering(rgb.contiguous(), *(field[..., 0].contiguous() for field in (alpha, depth, first_hit)))
+        scene = pack(
+            rgb, density, to_local, offset, view.given[0].rotation.detach(), view.stride, view.solid, pixel_to_world,
+            view.width, view.height, empty_cells=empty_cells,
+        )  # fmt: skip
+    if scene.suspect:
+        check_scene(*view.given)
+    return scene
 
 
-def _dealt(tile_start: Int64[ndarray, "tiles+1"]) -> Int64[ndarray, "tiles"]:
-    """An order of the tiles in which each thread's contiguous share has about the same number of boxes to look at."""
-    threads = numba.get_num_threads()
-    heavy_first = np.argsort(-np.diff(tile_start), kind="stable")
-    return np.concatenate([heavy_first[thread::threads] for thread in range(threads)])
+def _ends(rays: int) -> Ends:
+    """Room for so many rays."""
+    return Ends(
+        np.empty(rays, np.int64), np.empty(rays, np.int32), np.empty(rays, np.float32), np.empty((rays, 3), np.float32)
+    )
 
 
-@numba.njit(parallel=True, cache=True, fastmath={"contract", "arcp", "nsz", "afn"})
-def _march_tiles(picture, directions, to_local, start, voxels, stride, tile_start, tile_box, order, spacing):
-    height, width = picture.shape[:2]
-    across = (width + TILE - 1) // TILE
-    for i in numba.prange(len(order)):
-        tile = order[i]
-        boxes = tile_box[tile_start[tile] : tile_start[tile + 1]]
-        hit_box = np.empty(len(boxes), np.int64)
-        hit_first = np.empty(len(boxes), np.int64)
-        hit_last = np.empty(len(boxes), np.int64)
-        chunk = np.empty((CHUNK, 4), np.float32)
-        row0, column0 = (tile // across) * TILE, (tile % across) * TILE
-        for row in range(row0, min(row0 + TILE, height)):
-            for column in range(column0, min(column0 + TILE, width)):
-                direction = directions[row, column]
-                hits = _find_hits(hit_box, hit_first, hit_last, direction, boxes, to_local, start, stride, spacing)
-                _march_ray(
-                    picture[row, column], chunk, hit_box[:hits], hit_first[:hits], hit_last[:hits],
-                    direction, to_local, start, voxels, stride, spacing,
-                )  # fmt: skip
+def _draw(
+    view: _View, scene: Scene, ends: Ends, counts: Int64[ndarray, "tiles 2"] | None = None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """rgb, alpha, depth and first hit, a row per pixel. Fills `ends` and `counts` unless they are empty."""
+    rays = view.width * view.height
+    picture = Picture(np.empty((rays, 3), np.float32), *(np.empty(rays, np.float32) for _ in range(3)))
+    counts = np.empty((0, 2), np.int64) if counts is None else counts
+    with _ONE_AT_A_TIME:
+        march_tiles(
+            picture, ends, counts, scene.boxes, scene.size, scene.rectangle, scene.row_start, scene.row_box,
+            scene.order, view.limits, scene.pixel_to_world, view.width, view.height, view.spacing, view.index_order,
+        )  # fmt: skip
+    rgb, alpha, depth, first_hit = map(torch.from_numpy, picture)
+    return rgb, alpha, depth, first_hit
 
 
-@numba.njit(cache=True, fastmath={"contract", "arcp", "nsz"})
-def _find_hits(hit_box, hit_first, hit_last, direction, boxes, to_local, start, stride, spacing):
-    """The boxes a ray meets with their first and last lattice points, sorted by the first; how many there are."""
-    hits = 0
-    for k in boxes:
-        enter, leave = 0.0, np.inf
-        for axis in range(3):
-            p, q = start[k, axis], _dot(to_local[k, axis], direction)
-            if abs(q) < 1e-12:
-                q = 1e-12
-            inverse = 1.0 / q
-            middle, half = -p * inverse, abs(inverse)
-            enter, leave = max(enter, middle - half), min(leave, middle + half)
-        if leave <= enter:
-            continue
-        step = spacing * stride[k]
-        first, last = max(math.ceil(enter / step), 1) * stride[k], math.floor(leave / step) * stride[k]
-        if first > last:
-            continue
-        place = hits
-        while place > 0 and hit_first[place - 1] > first:
-            before = place - 1
-            hit_box[place], hit_first[place], hit_last[place] = hit_box[before], hit_first[before], hit_last[before]
-            place -= 1
-        hit_box[place], hit_first[place], hit_last[place] = k, first, last
-        hits += 1
-    return hits
+class _March(torch.autograd.Function):
+    """The picture as a function of `Inputs`; everything before them is differentiated by torch."""
+
+    @staticmethod
+    def forward(ctx, rgb, density, to_local, offset, pixel_to_world, view):
+        """Keeps where each ray ends, not its samples."""
+        inputs = (rgb, density, to_local, offset, pixel_to_world)
+        ctx.view, ctx.ends = view, _ends(view.width * view.height)
+        fields = _draw(view, _scene(view, inputs, empty_cells=False), ctx.ends)
+        ctx.save_for_backward(*inputs, fields[1], fields[2])
+        ctx.mark_non_differentiable(fields[3])
+        return fields
+
+    @staticmethod
+    def backward(ctx, *cotangents):
+        """The box-parallel adjoint; what no input needs is not summed."""
+        if torch.is_grad_enabled():
+            raise RuntimeError(
+                "march_cpu cannot be differentiated twice: leave out create_graph=True, or call march_reference"
+            )
+        *inputs, alpha, depth = ctx.saved_tensors
+        upstream = _upstream(ctx.ends, ctx.view.spacing, alpha, depth, *cotangents[:3])
+        payload, camera = any(ctx.needs_input_grad[:2]), ctx.needs_input_grad[4]
+        geometry = camera or any(ctx.needs_input_grad[2:4])
+        scene = _scene(ctx.view, tuple(inputs), empty_cells=ctx.needs_input_grad[1])
+        gradients = _adjoin(ctx.view, scene, upstream, payload=payload, geometry=geometry, camera=camera)
+        needed = zip(gradients, ctx.needs_input_grad, strict=False)
+        return *(gradient if wanted else None for gradient, wanted in needed), None
 
 
-@numba.njit(cache=True, fastmath={"contract", "arcp", "nsz", "afn"})
-def _march_ray(pixel, chunk, hit_box, hit_first, hit_last, direction, to_local, start, voxels, stride, spacing):
-    """Composites the boxes of one ray into pixel = (red, green, blue, alpha, depth, first hit)."""
-    red, green, blue, alpha, moment = 0.0, 0.0, 0.0, 0.0, 0.0
-    first_hit = np.inf
-    done = 0  # hits before this one end before the chunk
-    begin = 0
-    while done < len(hit_box) and alpha < 1.0:
-        begin = max(begin, hit_first[done])
-        end = begin + CHUNK
-        chunk[:] = 0
-        for hit in range(done, len(hit_box)):
-            if hit_first[hit] >= end:
-                break
-            if hit_last[hit] >= begin:
-                k = hit_box[hit]
-                first = max(hit_first[hit], (begin + stride[k] - 1) // stride[k] * stride[k])
-                last = min(hit_last[hit], end - 1)
-                _gather(chunk, begin, first, last, k, direction, to_local, start, voxels, stride, spacing)
-        for slot in range(CHUNK):
-            opacity = chunk[slot, 3]
-            if opacity > 0:
-                weight = min(float(opacity), 1.0 - alpha)
-                share = weight / opacity
-                red += share * chunk[slot, 0]
-                green += share * chunk[slot, 1]
-                blue += share * chunk[slot, 2]
-                distance = (begin + slot) * spacing
-                moment += weight * distance
-                alpha += weight
-                if first_hit == np.inf and alpha >= SURFACE_OPACITY:
-                    first_hit = distance
-                if weight < opacity:
-                    alpha = 1.0
-                    break
-        begin = end
-        while done < len(hit_box) and hit_last[done] < begin:
-            done += 1
-    pixel[0], pixel[1], pixel[2], pixel[3] = red, green, blue, alpha
-    pixel[4] = moment / alpha if alpha > 0 else np.inf
-    pixel[5] = first_hit
+def _upstream(
+    ends: Ends, spacing: float, alpha: Tensor, depth: Tensor, g_rgb: Tensor, g_alpha: Tensor, g_depth: Tensor
+) -> Upstream:
+    """What each ray's samples are worth (SPEC 4), with distance as a fourth colour: depth = sum w t / alpha."""
+    opaque = torch.from_numpy(ends.index != NEVER)
+    visible = alpha > 0
+    end = torch.from_numpy(ends.index).double() * spacing
+    nothing = torch.zeros((), dtype=torch.float32)
+    behind = (g_rgb * torch.from_numpy(ends.rgb)).sum(-1)
+    return Upstream(
+        rgb=g_rgb.contiguous().numpy(),
+        distance=torch.where(visible, g_depth / alpha, nothing).numpy(),
+        origin=torch.where(visible, torch.where(opaque, end.float(), depth), nothing).numpy(),
+        constant=torch.where(opaque, -behind, g_alpha).numpy(),
+        end=ends.index,
+        box=ends.box,
+        share=ends.share,
+    )
 
 
-@numba.njit(cache=True, fastmath={"contract", "arcp", "nsz", "afn"})
-def _gather(chunk, begin, first, last, k, direction, to_local, start, voxels, stride, spacing):
-    """Adds box k's samples at lattice points first, first + stride, ..., last to the chunk: a * colour and a."""
-    size = voxels.shape[1]
-    one, half_range, last_cell = np.float32(1), np.float32(0.5 * (size - 1)), np.int32(size - 2)
-    sharpness, length = np.float32(-WINDOW_SHARPNESS), np.float32(stride[k] * spacing)
-    x, y, z = _local(direction, first * spacing, to_local, start, k)
-    x_next, y_next, z_next = _local(direction, (first + stride[k]) * spacing, to_local, start, k)
-    dx, dy, dz = x_next - x, y_next - y, z_next - z
-    box = voxels[k]
-    for i in range((last - first) // stride[k] + 1):
-        along = np.float32(i)
-        lx, ly, lz = x + along * dx, y + along * dy, z + along * dz
-        u, v, w = (lx + one) * half_range, (ly + one) * half_range, (lz + one) * half_range
-        iu = min(max(np.int32(u), np.int32(0)), last_cell)
-        iv = min(max(np.int32(v), np.int32(0)), last_cell)
-        iw = min(max(np.int32(w), np.int32(0)), last_cell)
-        fu, fv, fw = u - np.float32(iu), v - np.float32(iv), w - np.float32(iw)
-        gu, gv, gw = one - fu, one - fv, one - fw
-        a0, b0, c0 = np.uint32(iu), np.uint32(iv), np.uint32(iw)
-        a1, b1, c1 = np.uint32(iu + 1), np.uint32(iv + 1), np.uint32(iw + 1)
-        d00 = box[c0, b0, a0, 3] * gu + box[c0, b0, a1, 3] * fu
-        d01 = box[c0, b1, a0, 3] * gu + box[c0, b1, a1, 3] * fu
-        d10 = box[c1, b0, a0, 3] * gu + box[c1, b0, a1, 3] * fu
-        d11 = box[c1, b1, a0, 3] * gu + box[c1, b1, a1, 3] * fu
-        density = (d00 * gv + d01 * fv) * gw + (d10 * gv + d11 * fv) * fw
-        if density == 0:  # the outer part of a person's boxes is empty
-            continue
-        x4, y4, z4 = lx * lx * lx * lx, ly * ly * ly * ly, lz * lz * lz * lz
-        opacity = density * math.exp(sharpness * (x4 * x4 + y4 * y4 + z4 * z4)) * length
-        slot = np.uint32(first + i * stride[k] - begin)
-        for channel in range(3):
-            e00 = box[c0, b0, a0, channel] * gu + box[c0, b0, a1, channel] * fu
-            e01 = box[c0, b1, a0, channel] * gu + box[c0, b1, a1, channel] * fu
-            e10 = box[c1, b0, a0, channel] * gu + box[c1, b0, a1, channel] * fu
-            e11 = box[c1, b1, a0, channel] * gu + box[c1, b1, a1, channel] * fu
-            chunk[slot, channel] += opacity * ((e00 * gv + e01 * fv) * gw + (e10 * gv + e11 * fv) * fw)
-        chunk[slot, 3] += opacity
-
-
-@numba.njit(cache=True)
-def _local(direction, distance, to_local, start, k):
-    """A point of the ray in box k's coordinates; rounded to float32 only after large terms have cancelled."""
-    x = start[k, 0] + distance * _dot(to_local[k, 0], direction)
-    y = start[k, 1] + distance * _dot(to_local[k, 1], direction)
-    z = start[k, 2] + distance * _dot(to_local[k, 2], direction)
-    return np.float32(x), np.float32(y), np.float32(z)
-
-
-@numba.njit(cache=True)
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+def _adjoin(
+    view: _View, scene: Scene, upstream: Upstream, *, payload: bool, geometry: bool, camera: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """The gradients of `Inputs`; those not asked for are empty."""
+    k, size = len(scene.rectangle), scene.size
+    held, moved = (k if payload else 0), (k if geometry else 0)
+    gradients = Gradients(
+        rgb=np.zeros((held, 3, size**3), np.float32),
+        density=np.zeros((held, size**3), np.float32),
+        to_local=np.zeros((moved, 3, 3)),
+        offset=np.zeros((moved, 3)),
+        pixel_to_world=np.zeros((k if camera else 0, 3, 3)),
+    )
+    columns_rows = scene.rectangle.astype(np.int64)
+    tiles = (columns_rows[:, 1] - columns_rows[:, 0] + 1) * (columns_rows[:, 3] - columns_rows[:, 2] + 1)
+    with _ONE_AT_A_TIME:
+        adjoin_boxes(
+            gradients, upstream, scene.boxes, size, scene.rectangle, dealt(tiles), view.limits, scene.pixel_to_world,
+            view.width, view.height, view.spacing, view.index_order,
+        )  # fmt: skip
+    rgb, density, to_local, offset, parts = map(torch.from_numpy, gradients)
+    rgb, density = (value.unflatten(-1, (size, size, size)) for value in (rgb, density))
+    if view.given[0].density.shape[-1] == 1:
+        rgb, density = (value.sum((-3, -2, -1), keepdim=True) for value in (rgb, density))
+    return rgb, density, to_local, offset, parts.sum(0)

@@ -2,72 +2,89 @@
 
 from __future__ import annotations
 
-import itertools
-
-import numba
 import numpy as np
-import torch
-from jaxtyping import Int64
+from jaxtyping import Int32, Int64
 from numpy import ndarray
 
-from primdiffusion.geometry.camera import Camera
-from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render.cpu_compiled import compiled
 
-TILE = 16
+TILE = 8
 """Pixels along a side of a tile."""
 NEAR = 1e-6
-"""Metres; boxes that come closer to the camera's plane than this cannot be bounded by projected corners."""
+"""Metres along the optical axis: boxes are cut off here, as what lies behind the camera has no place in the picture."""
 MARGIN = 0.01
 """Pixels added around a box's rectangle against rounding."""
+NOTHING = (0, -1, 0, -1)
 
 
-def tile_lists(primitives: Primitives, camera: Camera) -> tuple[Int64[ndarray, "tiles+1"], Int64[ndarray, "hits"]]:
-    """The boxes of tile i (row by row) are the second array from the first one's [i] to [i + 1], in index order.
+def tiles_across(pixels: int) -> int:
+    """Tiles in a row or column of so many pixels."""
+    return -(-pixels // TILE)
 
-    A box is listed in every tile that the rectangle around its eight projected corners touches. One that reaches from
-    in front of the camera to behind it, or holds it, is listed in all tiles; one wholly behind in none.
+
+def row_lists(
+    rectangle: Int32[ndarray, "k 4"], down: int
+) -> tuple[Int64[ndarray, "down+1"], Int32[ndarray, "entries"]]:
+    """The boxes that reach into row i of tiles are the second array from the first one's [i] to [i + 1], in order.
+
+    Lists per row and not per tile: memory grows with boxes x rows at worst.
     """
-    across, down = (-(-camera.width // TILE), -(-camera.height // TILE))
-    return _lists(_tile_rectangles(primitives, camera, across, down), across, down)
+    first, last = rectangle[:, 2].astype(np.int64), rectangle[:, 3].astype(np.int64)
+    return _fill_rows(first, last, down)
 
 
-def _tile_rectangles(primitives: Primitives, camera: Camera, across: int, down: int) -> Int64[ndarray, "k 4"]:
-    """First and last tile column, first and last tile row of each box; last < first for boxes out of sight."""
-    signs = torch.tensor(list(itertools.product((-1.0, 1.0), repeat=3)), dtype=torch.float64)
-    boxes = primitives.to(dtype=torch.float64)
-    offsets = signs * boxes.half_extent[:, None, :]
-    corners = boxes.position[:, None, :] + offsets @ boxes.rotation.transpose(-1, -2)
-    pixels, depth = (value.numpy() for value in camera.map(lambda t: t.detach().cpu().double()).project(corners))
-
-    whole = np.array([0, across - 1, 0, down - 1])
-    crossing = (depth.min(1) <= NEAR) & (depth.max(1) > 0)
-    in_front = depth.min(1) > NEAR
-    rectangles = np.tile(np.array([0, -1, 0, -1]), (len(depth), 1))
-    low, high = pixels[in_front].min(1) - MARGIN, pixels[in_front].max(1) + MARGIN
-    tiles = np.stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1]], axis=1) // TILE
-    limits = np.array([across, across, down, down])
-    tiles = np.clip(tiles, -1, limits).astype(np.int64)
-    tiles[:, [0, 2]] = np.maximum(tiles[:, [0, 2]], 0)
-    tiles[:, [1, 3]] = np.minimum(tiles[:, [1, 3]], limits[[1, 3]] - 1)
-    rectangles[in_front] = tiles
-    rectangles[crossing] = whole
-    return rectangles
+def boxes_per_tile(rectangle: Int32[ndarray, "k 4"], across: int, down: int) -> Int64[ndarray, "tiles"]:
+    """How many boxes each tile can see, row by row: an estimate of its work."""
+    seen = rectangle[(rectangle[:, 0] <= rectangle[:, 1]) & (rectangle[:, 2] <= rectangle[:, 3])]
+    change = np.zeros((down + 1, across + 1), np.int64)
+    np.add.at(change, (seen[:, 2], seen[:, 0]), 1)
+    np.add.at(change, (seen[:, 3] + 1, seen[:, 1] + 1), 1)
+    np.add.at(change, (seen[:, 3] + 1, seen[:, 0]), -1)
+    np.add.at(change, (seen[:, 2], seen[:, 1] + 1), -1)
+    return change.cumsum(0).cumsum(1)[:down, :across].ravel()
 
 
-@numba.njit(cache=True)
-def _lists(rectangles, across, down):
-    start = np.zeros(across * down + 1, np.int64)
-    for k in range(len(rectangles)):
-        for row in range(rectangles[k, 2], rectangles[k, 3] + 1):
-            for column in range(rectangles[k, 0], rectangles[k, 1] + 1):
-                start[row * across + column + 1] += 1
-    start = np.cumsum(start)
-    filled = start[:-1].copy()
-    box = np.empty(start[-1], np.int64)
-    for k in range(len(rectangles)):
-        for row in range(rectangles[k, 2], rectangles[k, 3] + 1):
-            for column in range(rectangles[k, 0], rectangles[k, 1] + 1):
-                tile = row * across + column
-                box[filled[tile]] = k
-                filled[tile] += 1
+@compiled(allocates=True)
+def _fill_rows(first, last, down):
+    start = np.zeros(down + 1, np.int64)
+    for k in range(len(first)):
+        for row in range(first[k], last[k] + 1):
+            start[row + 1] += 1
+    for row in range(down):
+        start[row + 1] += start[row]
+    filled = start.copy()
+    box = np.empty(start[down], np.int32)
+    for k in range(len(first)):
+        for row in range(first[k], last[k] + 1):
+            box[filled[row]] = k
+            filled[row] += 1
     return start, box
+
+
+@compiled()
+def tile_rectangle(corners, across, down):
+    """First and last tile column, first and last tile row around a box with the homogeneous pixel `corners` [8, 3].
+
+    Corner 4 i + 2 j + k lies at the low or high end of the box's three axes as i, j, k are 0 or 1. What reaches behind
+    the camera is cut off at NEAR first. last < first where nothing is in the picture.
+    """
+    left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
+    for i in range(8):
+        if corners[i, 2] >= NEAR:
+            u, v = corners[i, 0] / corners[i, 2], corners[i, 1] / corners[i, 2]
+            left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+        for axis in range(3):
+            other = i | (1 << axis)
+            if (corners[i, 2] < NEAR) != (corners[other, 2] < NEAR):
+                share = (NEAR - corners[i, 2]) / (corners[other, 2] - corners[i, 2])
+                u = (corners[i, 0] + share * (corners[other, 0] - corners[i, 0])) / NEAR
+                v = (corners[i, 1] + share * (corners[other, 1] - corners[i, 1])) / NEAR
+                left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+    first_column, last_column = np.ceil(left - MARGIN - 0.5), np.floor(right + MARGIN - 0.5)
+    first_row, last_row = np.ceil(top - MARGIN - 0.5), np.floor(bottom + MARGIN - 0.5)
+    first_column, last_column = max(first_column, 0.0), min(last_column, across * TILE - 1.0)
+    first_row, last_row = max(first_row, 0.0), min(last_row, down * TILE - 1.0)
+    if not (first_column <= last_column and first_row <= last_row):
+        return NOTHING
+    columns = np.int64(first_column) // TILE, np.int64(last_column) // TILE
+    return columns[0], columns[1], np.int64(first_row) // TILE, np.int64(last_row) // TILE

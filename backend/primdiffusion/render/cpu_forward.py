@@ -1,0 +1,330 @@
+"""The CPU's forward pass: tiles of pixels in parallel, boxes nearest first, lattice points in chunks."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from jaxtyping import Float32, Int32, Int64
+from numpy import ndarray
+
+from primdiffusion.render.compositing import SURFACE_OPACITY
+from primdiffusion.render.cpu_compiled import compiled
+from primdiffusion.render.cpu_sampling import (
+    HIT_ROWS,
+    LANES,
+    PIXELS,
+    SAMPLES,
+    TABLE_ROWS,
+    add_segment,
+    hit_boxes,
+    leave_empty,
+    reference_point,
+    tabulate,
+    tile_rays,
+)
+from primdiffusion.render.tiles import TILE
+
+CHUNK = 32
+"""Lattice points gathered before they are composited: long enough to amortise the loop, short enough to stop early."""
+NEVER = np.iinfo(np.int64).max
+"""The lattice index at which a ray saturates that does not."""
+NO_BOX = np.iinfo(np.int32).max
+
+# Entries of a hit: its box, the reference point, the first, the next and the last lattice point.
+_BOX, _REFERENCE, _FIRST, _NEXT, _LAST = range(5)
+
+
+class Picture(NamedTuple):
+    """What the forward pass fills, a row per pixel."""
+
+    rgb: Float32[ndarray, "r 3"]
+    alpha: Float32[ndarray, "r"]
+    depth: Float32[ndarray, "r"]
+    first_hit: Float32[ndarray, "r"]
+
+
+class Ends(NamedTuple):
+    """Where each ray becomes opaque: all that the adjoint needs of the forward pass. May be empty, then not filled."""
+
+    index: Int64[ndarray, "r"]
+    """The lattice index, in units of the least stride; NEVER where the ray stays transparent."""
+    box: Int32[ndarray, "r"]
+    """With index order: the box that made it opaque. NO_BOX with mixed compositing."""
+    share: Float32[ndarray, "r"]
+    """kappa: the part of that sample's opacity that was used (SPEC 4)."""
+    rgb: Float32[ndarray, "r 3"]
+    """That sample's colour."""
+
+
+@compiled(parallel=True)
+def march_tiles(
+    picture, ends, counts, boxes, size, rectangle, row_start, row_box, order, limits, pixel_to_world, width, height,
+    spacing, index_order,
+):  # fmt: skip
+    """Draws all tiles. limits [r, 2]: first and last lattice index of each ray, may be empty.
+
+    counts [tiles, 2], may be empty: samples evaluated, and samples up to where rays become opaque.
+    """
+    across = (width + TILE - 1) // TILE
+    # Fields are taken out here, as numba counts references whenever it takes an array out of a record or another array.
+    strides, voxels = boxes.stride, boxes.voxels
+    for i in numba.prange(len(order)):
+        tile = order[i]
+        row0, column0 = (tile // across) * TILE, (tile % across) * TILE
+        found = _count(row_box, row_start, rectangle, tile, across)
+        if found == 0:
+            _leave_blank(picture, ends, row0, column0, width, height)
+            continue
+        listed, reference = np.empty(found, np.int64), np.empty(found, np.int64)
+        table = np.empty((found + LANES - 1) // LANES * LANES * TABLE_ROWS, np.float32)
+        rays = np.empty(3 * PIXELS, np.float32)
+        middle = tile_rays(rays, pixel_to_world, row0, column0)
+        _tabulate_tile(listed, reference, table, row_box, row_start, rectangle, tile, across, boxes, middle, spacing)
+        hits, lines = np.empty((found, 5), np.int64), np.empty((found, 6), np.float32)
+        sequence = np.empty(found, np.int64)
+        tests, points = np.empty(HIT_ROWS * LANES, np.float32), np.empty(4 * (CHUNK + 1), np.float32)
+        block = np.empty(8 * SAMPLES, np.float32)
+        for row in range(row0, min(row0 + TILE, height)):
+            for column in range(column0, min(column0 + TILE, width)):
+                ray = row * width + column
+                pixel = (row - row0) * TILE + column - column0
+                first, last = 1, NEVER
+                if len(limits) > 0:
+                    first, last = limits[ray, 0], limits[ray, 1]
+                number = _find_hits(
+                    hits, lines, sequence, tests, table, rays, pixel, listed, reference, strides, first, last
+                )
+                evaluated = _march_ray(
+                    picture, ends, ray, hits, lines, sequence, number, points, block, voxels, strides, size, spacing,
+                    index_order,
+                )  # fmt: skip
+                if len(counts) > 0:
+                    counts[tile, 0] += evaluated
+                    counts[tile, 1] += _needed(hits, number, strides, ends.index[ray])
+
+
+@compiled()
+def _count(row_box, row_start, rectangle, tile, across):
+    row, column = tile // across, tile % across
+    found = 0
+    for entry in range(row_start[row], row_start[row + 1]):
+        k = row_box[entry]
+        found += rectangle[k, 0] <= column <= rectangle[k, 1]
+    return found
+
+
+@compiled()
+def _leave_blank(picture, ends, row0, column0, width, height):
+    for row in range(row0, min(row0 + TILE, height)):
+        for column in range(column0, min(column0 + TILE, width)):
+            ray = row * width + column
+            picture.rgb[ray, 0], picture.rgb[ray, 1], picture.rgb[ray, 2], picture.alpha[ray] = 0, 0, 0, 0
+            picture.depth[ray], picture.first_hit[ray] = np.inf, np.inf
+            if len(ends.index) > 0:
+                ends.index[ray] = NEVER
+
+
+@compiled()
+def _tabulate_tile(listed, reference, table, row_box, row_start, rectangle, tile, across, boxes, middle, spacing):
+    row, column = tile // across, tile % across
+    i = 0
+    for entry in range(row_start[row], row_start[row + 1]):
+        k = np.int64(row_box[entry])
+        if rectangle[k, 0] <= column <= rectangle[k, 1]:
+            listed[i] = k
+            reference[i] = reference_point(boxes, k, middle, spacing)
+            tabulate(table, i // LANES * LANES * TABLE_ROWS + i % LANES, boxes, k, middle, reference[i], spacing)
+            i += 1
+    while i % LANES > 0:
+        leave_empty(table, i // LANES * LANES * TABLE_ROWS + i % LANES)
+        i += 1
+
+
+@compiled()
+def _find_hits(hits, lines, sequence, tests, table, rays, pixel, listed, reference, strides, first, last):
+    """The boxes that a ray meets between two lattice indices; `sequence` sorts them by their first lattice points."""
+    dx, dy, dz = rays[pixel], rays[PIXELS + pixel], rays[2 * PIXELS + pixel]
+    number = 0
+    for begin in range(0, len(listed), LANES):
+        hit_boxes(tests, table, begin * TABLE_ROWS, dx, dy, dz)
+        for j in range(LANES):
+            if tests[6 * LANES + j] > tests[7 * LANES + j]:
+                continue
+            at, stride = reference[begin + j], strides[listed[begin + j]]
+            enter, leave = at + np.int64(tests[6 * LANES + j]) * stride, at + np.int64(tests[7 * LANES + j]) * stride
+            if enter < first:
+                enter += (first - enter + stride - 1) // stride * stride
+            if leave > last:
+                leave -= (leave - last + stride - 1) // stride * stride
+            if enter > leave:
+                continue
+            hits[number, _BOX], hits[number, _REFERENCE] = listed[begin + j], at
+            hits[number, _FIRST], hits[number, _NEXT], hits[number, _LAST] = enter, enter, leave
+            for row in range(6):
+                lines[number, row] = tests[row * LANES + j]
+            place = number
+            while place > 0 and hits[sequence[place - 1], _FIRST] > enter:
+                sequence[place] = sequence[place - 1]
+                place -= 1
+            sequence[place] = number
+            number += 1
+    return number
+
+
+@compiled()
+def _march_ray(
+    picture, ends, ray, hits, lines, sequence, number, points, block, voxels, strides, size, spacing, index_order
+):
+    """Composites one ray; returns how many samples it took."""
+    red, green, blue, alpha, moment, first_hit = 0.0, 0.0, 0.0, 0.0, 0.0, np.inf
+    evaluated, done, begin = 0, 0, 0  # hits before `done` end before the chunk
+    if len(ends.index) > 0:
+        ends.index[ray], ends.box[ray] = NEVER, NO_BOX
+    while done < number and alpha < 1.0:
+        begin = max(begin, hits[sequence[done], _FIRST])
+        points[:] = 0
+        evaluated += _gather(points, begin, hits, lines, sequence, done, number, block, voxels, strides, size, spacing)
+        slot, before = CHUNK, alpha
+        r, g, b, a, m = _sum(points)
+        if alpha + a >= 1.0:
+            slot, r, g, b, a, m = _sum_to_opaque(points, alpha)
+        red, green, blue, alpha, moment = red + r, green + g, blue + b, alpha + a, moment + begin * a + m
+        if slot < CHUNK:
+            moment += (begin + slot) * (1.0 - alpha)
+            k = NO_BOX
+            if index_order:
+                k, r, g, b, a = _in_index_order(
+                    points, slot, begin + slot, alpha, hits, lines, number, block, voxels, strides, size, spacing
+                )
+                red, green, blue, alpha = red + r, green + g, blue + b, alpha + a
+            share = (1.0 - alpha) / points[4 * slot + 3]
+            red, green = red + share * points[4 * slot], green + share * points[4 * slot + 1]
+            blue += share * points[4 * slot + 2]
+            alpha = 1.0
+            if len(ends.index) > 0:
+                _note_end(ends, ray, begin + slot, k, share, points, slot)
+        if before < SURFACE_OPACITY <= alpha:
+            first_hit = begin + _slot_of_surface(points, before, slot)
+        begin += CHUNK
+        while done < number and hits[sequence[done], _NEXT] > hits[sequence[done], _LAST]:
+            done += 1
+    picture.rgb[ray, 0], picture.rgb[ray, 1], picture.rgb[ray, 2], picture.alpha[ray] = red, green, blue, alpha
+    picture.depth[ray] = moment * spacing / alpha if alpha > 0 else np.inf
+    picture.first_hit[ray] = first_hit * spacing
+    return evaluated
+
+
+@compiled()
+def _gather(points, begin, hits, lines, sequence, done, number, block, voxels, strides, size, spacing):
+    """Adds what all boxes have at the lattice points from `begin` to `begin + CHUNK`; returns how many samples."""
+    evaluated, end = 0, begin + CHUNK
+    for place in range(done, number):
+        hit = sequence[place]
+        if hits[hit, _FIRST] >= end:
+            break
+        upcoming, last = hits[hit, _NEXT], min(hits[hit, _LAST], end - 1)
+        if upcoming > last:
+            continue
+        k = hits[hit, _BOX]
+        stride = strides[k]
+        # Division of small whole numbers by way of float32, exact and far faster than the processor's own.
+        inverse = np.float32(1) / np.float32(stride)
+        count = np.int64((np.float32(last - upcoming) + np.float32(0.5)) * inverse) + 1
+        first = np.float32(upcoming - hits[hit, _REFERENCE]) * inverse
+        length = np.float32(stride * spacing)
+        base = 4 * k * size * size * size
+        add_segment(points, upcoming - begin, stride, voxels, base, size, block, lines, hit, first, count, length)
+        hits[hit, _NEXT] = upcoming + count * stride
+        evaluated += count
+    return evaluated
+
+
+@compiled()
+def _sum(points):
+    """The chunk's colour and opacity, and sum of slot * opacity."""
+    r, g, b, a, m = np.float32(0), np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+    for slot in range(CHUNK):
+        r += points[4 * slot]
+        g += points[4 * slot + 1]
+        b += points[4 * slot + 2]
+        a += points[4 * slot + 3]
+        m += points[4 * slot + 3] * np.float32(slot)
+    return r, g, b, a, m
+
+
+@compiled()
+def _sum_to_opaque(points, alpha):
+    """The slot that takes alpha to 1 or beyond, CHUNK if rounding alone did; as `_sum`, of what lies before it."""
+    r, g, b, a, m = 0.0, 0.0, 0.0, 0.0, 0.0
+    for slot in range(CHUNK):
+        opacity = points[4 * slot + 3]
+        if alpha + a + opacity >= 1.0 and opacity > 0:
+            return slot, r, g, b, a, m
+        r, g, b = r + points[4 * slot], g + points[4 * slot + 1], b + points[4 * slot + 2]
+        a, m = a + opacity, m + opacity * slot
+    return CHUNK, r, g, b, a, m
+
+
+@compiled()
+def _slot_of_surface(points, alpha, last):
+    """The slot at which alpha has grown to SURFACE_OPACITY, `last` at the latest."""
+    for slot in range(min(last, CHUNK - 1)):
+        alpha += points[4 * slot + 3]
+        if alpha >= SURFACE_OPACITY:
+            return slot
+    return min(last, CHUNK - 1)
+
+
+@compiled()
+def _in_index_order(points, slot, index, alpha, hits, lines, number, block, voxels, strides, size, spacing):
+    """The boxes of one lattice point one after the other, the lowest index first, until the ray is opaque.
+
+    points[slot] becomes the sample that does it. Returns its box and the colour and opacity of the samples before it.
+    """
+    r, g, b, a = 0.0, 0.0, 0.0, 0.0
+    r_end, g_end, b_end, a_end = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+    box, box_end = np.int64(-1), np.int64(NO_BOX)
+    while alpha + a + a_end < 1.0:
+        following = -1
+        for hit in range(number):
+            inside = hits[hit, _FIRST] <= index <= hits[hit, _LAST]
+            inside = inside and (index - hits[hit, _FIRST]) % strides[hits[hit, _BOX]] == 0
+            if inside and hits[hit, _BOX] > box and (following < 0 or hits[hit, _BOX] < hits[following, _BOX]):
+                following = hit
+        if following < 0:
+            break  # by rounding, all together do not reach 1: the last one counts as the one that does
+        box = hits[following, _BOX]
+        stride = strides[box]
+        scratch = 4 * CHUNK
+        for channel in range(4):
+            points[scratch + channel] = 0
+        first, length = np.float32((index - hits[following, _REFERENCE]) // stride), np.float32(stride * spacing)
+        base = 4 * box * size * size * size
+        add_segment(points, CHUNK, 0, voxels, base, size, block, lines, following, first, 1, length)
+        if points[scratch + 3] > 0:
+            r, g, b, a = r + r_end, g + g_end, b + b_end, a + a_end
+            r_end, g_end, b_end, a_end = points[scratch], points[scratch + 1], points[scratch + 2], points[scratch + 3]
+            box_end = box
+    points[4 * slot], points[4 * slot + 1], points[4 * slot + 2], points[4 * slot + 3] = r_end, g_end, b_end, a_end
+    return box_end, r, g, b, a
+
+
+@compiled()
+def _note_end(ends, ray, index, box, share, points, slot):
+    ends.index[ray], ends.box[ray], ends.share[ray] = index, box, share
+    inverse = np.float32(1) / points[4 * slot + 3]
+    ends.rgb[ray, 0], ends.rgb[ray, 1] = points[4 * slot] * inverse, points[4 * slot + 1] * inverse
+    ends.rgb[ray, 2] = points[4 * slot + 2] * inverse
+
+
+@compiled()
+def _needed(hits, number, strides, end):
+    """Samples of a ray's hits at lattice points up to `end`."""
+    needed = 0
+    for hit in range(number):
+        last = min(hits[hit, _LAST], end)
+        if last >= hits[hit, _FIRST]:
+            needed += (last - hits[hit, _FIRST]) // strides[hits[hit, _BOX]] + 1
+    return needed

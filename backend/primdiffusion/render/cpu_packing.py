@@ -1,0 +1,204 @@
+"""Boxes and camera as the CPU's kernels want them: checked, bounded, interleaved, nearest first."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int32, Int64
+from numpy import ndarray
+from torch import Tensor
+
+from primdiffusion.render.cpu_compiled import compiled
+from primdiffusion.render.cpu_sampling import PackedBoxes
+from primdiffusion.render.lattice import ORTHOGONAL
+from primdiffusion.render.tiles import NOTHING, boxes_per_tile, row_lists, tile_rectangle, tiles_across
+
+
+class Scene(NamedTuple):
+    """One picture's boxes and which of them each part of it can see."""
+
+    boxes: PackedBoxes
+    rectangle: Int32[ndarray, "k 4"]
+    """First and last column, first and last row of tiles of each box; last < first where it is not seen."""
+    row_start: Int64[ndarray, "down+1"]
+    row_box: Int32[ndarray, "entries"]
+    """The boxes of each row of tiles, nearest first (see `row_lists`)."""
+    order: Int64[ndarray, "tiles"]
+    """The tiles, dealt to threads so that each has its share of the work."""
+    pixel_to_world: Float64[ndarray, "3 3"]
+    size: int
+    """Voxels along a side of a box."""
+    suspect: bool
+    """Whether a box may hold NaN, infinite or negative values or no rotation: `check_scene` says which."""
+
+
+def pack(
+    rgb: Float[Tensor, "k 3 s s s"],
+    density: Float[Tensor, "k s s s"],
+    to_local: Float64[Tensor, "k 3 3"],
+    offset: Float64[Tensor, "k 3"],
+    rotation: Float[Tensor, "k 3 3"],
+    stride: Int64[Tensor, "k"],
+    solid: Bool[Tensor, "k"],
+    pixel_to_world: Float64[Tensor, "3 3"],
+    width: int,
+    height: int,
+    *,
+    empty_cells: bool,
+) -> Scene:
+    """The scene of one picture; boxes that are not `solid` are not seen.
+
+    Boxes are cut down to the cells that hold density unless `empty_cells` are wanted too, as for density's gradient.
+    """
+    k, size = density.shape[0], density.shape[-1]
+    across, down = tiles_across(width), tiles_across(height)
+    voxels = np.empty(k * 4 * size**3, np.float32)
+    low, high = np.empty((k, 3), np.float32), np.empty((k, 3), np.float32)
+    rectangle, nearest = np.empty((k, 4), np.int32), np.empty(k)
+    suspect = np.empty(k, np.bool_)
+    local, away, to_world = (value.contiguous().numpy() for value in (to_local, offset, pixel_to_world))
+    _pack_boxes(
+        voxels, low, high, rectangle, nearest, suspect,
+        rgb.contiguous().numpy().reshape(-1), density.contiguous().numpy().reshape(-1), size, local,
+        away, rotation.contiguous().numpy(), solid.numpy(),
+        np.linalg.inv(to_world), across, down, empty_cells,
+    )  # fmt: skip
+    boxes = PackedBoxes(local, away, stride.numpy(), low, high, voxels)
+    seen = np.flatnonzero(rectangle[:, 0] <= rectangle[:, 1])
+    seen = seen[np.argsort(nearest[seen], kind="stable")]
+    row_start, row_place = row_lists(rectangle[seen], down)
+    order = dealt(boxes_per_tile(rectangle, across, down))
+    row_box = seen.astype(np.int32)[row_place]
+    return Scene(boxes, rectangle, row_start, row_box, order, to_world, size, bool(suspect.any()))
+
+
+def dealt(work: Int64[ndarray, "n"]) -> Int64[ndarray, "n"]:
+    """An order in which each thread's contiguous share has about the same amount of work."""
+    threads = numba.get_num_threads()
+    heavy_first = np.argsort(-work, kind="stable")
+    return np.concatenate([heavy_first[thread::threads] for thread in range(threads)])
+
+
+@compiled(parallel=True)
+def _pack_boxes(
+    voxels, low, high, rectangle, nearest, suspect,
+    rgb, density, size, to_local, offset, rotation, solid, world_to_pixel, across, down, empty_cells,
+):  # fmt: skip
+    count = size**3
+    for k in numba.prange(len(solid)):
+        own = density[k * count : (k + 1) * count]
+        colour = rgb[3 * k * count : 3 * (k + 1) * count]
+        suspect[k] = _is_suspect(own, colour, to_local[k], offset[k], rotation[k])
+        rectangle[k, 0], rectangle[k, 1], rectangle[k, 2], rectangle[k, 3] = NOTHING
+        low[k], high[k] = -1, 1
+        if not solid[k] or not (empty_cells or _shrink(low[k], high[k], own, size)):
+            continue
+        corners = np.empty((8, 3))
+        nearest[k] = _place_corners(corners, low[k], high[k], to_local[k], offset[k], world_to_pixel)
+        columns_rows = tile_rectangle(corners, across, down)
+        rectangle[k, 0], rectangle[k, 1], rectangle[k, 2], rectangle[k, 3] = columns_rows
+        if columns_rows[0] <= columns_rows[1]:
+            _interleave(voxels[4 * k * count : 4 * (k + 1) * count], own, colour, count)
+
+
+@compiled()
+def _is_suspect(density, rgb, to_local, offset, rotation):
+    zero, least = np.float32(0), np.float32(0)
+    for i in range(len(density)):
+        zero += density[i] * np.float32(0)
+        least = min(least, density[i])
+    for i in range(len(rgb)):
+        zero += rgb[i] * np.float32(0)
+    excess = 0.0
+    for i in range(3):
+        zero += np.float32(offset[i] * 0.0)
+        if to_local[i, 0] == 0 and to_local[i, 1] == 0 and to_local[i, 2] == 0:
+            return True  # an infinite extent
+        for j in range(3):
+            zero += np.float32(to_local[i, j] * 0.0)
+            product = 0.0
+            for a in range(3):
+                product += rotation[a, i] * rotation[a, j]
+            excess = max(excess, abs(product - (1.0 if i == j else 0.0)))
+    return not (zero == 0 and least >= 0 and excess <= ORTHOGONAL)
+
+
+@compiled(allocates=True)
+def _shrink(low, high, density, size):
+    """Narrows low ... high to where trilinear density can be above 0; False where that is nowhere."""
+    first, last = np.full(3, size, np.int64), np.full(3, -1, np.int64)
+    along_w = np.zeros(size, np.float32)
+    for d in range(size):
+        slab = np.float32(0)
+        for h in range(size):
+            row = np.float32(0)
+            begin = (d * size + h) * size
+            for w in range(size):
+                row = max(row, density[begin + w])
+                along_w[w] = max(along_w[w], density[begin + w])
+            if row > 0:
+                first[1], last[1] = min(first[1], h), max(last[1], h)
+            slab = max(slab, row)
+        if slab > 0:
+            first[2], last[2] = min(first[2], d), max(last[2], d)
+    for w in range(size):
+        if along_w[w] > 0:
+            first[0], last[0] = min(first[0], w), max(last[0], w)
+    for axis in range(3):
+        low[axis] = max(2.0 * (first[axis] - 1) / (size - 1) - 1, -1.0)
+        high[axis] = min(2.0 * (last[axis] + 1) / (size - 1) - 1, 1.0)
+    return last[0] >= 0
+
+
+@compiled(allocates=True)
+def _place_corners(corners, low, high, to_local, offset, world_to_pixel):
+    """The box's corners as homogeneous pixels; returns how near the camera its bounding sphere comes, metres."""
+    to_world = _inverse(to_local)
+    centre = np.empty(3)
+    radius = 0.0
+    for i in range(9):  # the last one is the middle
+        local = np.empty(3)
+        for axis in range(3):
+            upper = 0.5 if i == 8 else float((i >> axis) & 1)
+            local[axis] = low[axis] + upper * (high[axis] - low[axis])
+        world = np.empty(3)
+        for axis in range(3):
+            world[axis] = (
+                to_world[axis, 0] * local[0] + to_world[axis, 1] * local[1] + to_world[axis, 2] * local[2]
+            ) - offset[axis]
+        if i == 8:
+            centre[:] = world
+            continue
+        for axis in range(3):
+            corners[i, axis] = (
+                world_to_pixel[axis, 0] * world[0]
+                + world_to_pixel[axis, 1] * world[1]
+                + world_to_pixel[axis, 2] * world[2]
+            )
+    for axis in range(3):
+        reach = abs(to_world[axis, 0]) + abs(to_world[axis, 1]) + abs(to_world[axis, 2])
+        radius += reach * reach
+    return np.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2) - np.sqrt(radius)
+
+
+@compiled(allocates=True)
+def _inverse(m):
+    result = np.empty((3, 3))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for axis in range(3):
+            b, c = (axis + 1) % 3, (axis + 2) % 3
+            result[axis, i] = m[j, b] * m[k, c] - m[j, c] * m[k, b]
+    determinant = m[0, 0] * result[0, 0] + m[0, 1] * result[1, 0] + m[0, 2] * result[2, 0]
+    return result / determinant
+
+
+@compiled()
+def _interleave(voxels, density, rgb, count):
+    for i in range(count):
+        voxels[4 * i] = rgb[i]
+        voxels[4 * i + 1] = rgb[count + i]
+        voxels[4 * i + 2] = rgb[2 * count + i]
+        voxels[4 * i + 3] = density[i]
