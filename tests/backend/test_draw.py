@@ -118,6 +118,25 @@ def test_before_a_person_a_solid_is_all_there_is_and_behind_it_is_what_is_left(b
     assert np.allclose(behind.depth[~hit], solid.depth[~hit])
 
 
+def test_a_solids_outline_is_smooth_and_where_it_is_nearer_it_hides_people(boxes, camera):
+    """A wall whose edge crosses the picture at a slant, before the people and behind them."""
+    for z in (0.3, -0.3):
+        corners = np.array([[[-9, -9, z], [3, -9, z], [-3, 9, z]], [[-9, -9, z], [-3, 9, z], [-9, 9, z]]])
+        corners += [0.1 * z / 0.6, 0.15 * z / 0.6, 0.0]  # so that the edge passes through the middle of the picture
+        half = Solids(corners.astype(np.float32), np.array([RED] * 2, np.float32), np.zeros(2, bool))
+        alone = draw(Scene(None, half), camera).combined
+        covered = alone[..., 3]
+        assert set(np.unique(covered)) == {0.0, 0.25, 0.5, 0.75, 1.0}
+        people = draw(Scene(boxes), camera).combined
+        got = draw(Scene(boxes, half), camera).combined
+        over = people + (1 - people[..., 3:]) * alone
+        under = alone + (1 - covered[..., None]) * people
+        assert np.abs(over - under).max() > 0.1
+        assert np.allclose(got, under if z > 0 else over, atol=1e-5)
+        depth = draw(Scene(None, half), camera).depth
+        assert np.array_equal(depth < NOTHING, covered >= 0.5)
+
+
 def test_without_a_background_the_picture_is_premultiplied_and_transparent(boxes, camera):
     clear, full = draw(Scene(boxes), camera), draw(Scene(boxes), camera, Look(background=BACKGROUND))
     alpha = clear.combined[..., 3:]

@@ -1,8 +1,7 @@
 """A scene and a camera to a picture: people marched, solids rasterised, both composited by depth.
 
 A ray of the marcher ends where it meets a solid, so a solid may stand before, behind or inside a person; what people
-leave of a ray shows the solid there, or else the background. Solids cover a pixel wholly or not at all (they are seen
-through its centre); render at twice the size where their edges must be smooth.
+leave of a ray shows the solid there, or else the background.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ import torch
 from jaxtyping import Float32
 from numpy import ndarray
 
-from primdiffusion.drawing.scene import NOTHING, Look, Picture, Scene
+from primdiffusion.drawing.compositing import Backdrop, backdrop, over_background, over_solids
+from primdiffusion.drawing.scene import Look, Picture, Scene
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.boxes import draw_boxes
 from primdiffusion.render.image import depth_colours
 from primdiffusion.render.march import Span, march
-from primdiffusion.render.solids import Layer, shade_solids
-from primdiffusion.render.triangles import Nearest, nearest_triangles
+from primdiffusion.render.solids import Layer
 
 
 def draw(scene: Scene, camera: Camera, look: Look = Look()) -> Picture:  # noqa: B008
@@ -43,28 +42,27 @@ def draw(scene: Scene, camera: Camera, look: Look = Look()) -> Picture:  # noqa:
 
 def draw_into(picture: Picture, scene: Scene, camera: Camera, look: Look) -> float:
     """As `draw`, into a picture of the camera's size; returns the seconds of the marcher alone."""
-    solids, nearest, behind, seconds = scene.solids, Nearest.nothing(camera), Layer.nothing(camera), 0.0
-    if solids is not None:
-        nearest = nearest_triangles(solids.corners, camera, look.clip)
-        behind = shade_solids(solids, nearest, camera)
+    behind = None if scene.solids is None else backdrop(scene.solids, camera, look.clip)
+    end = None if behind is None else behind.end
     if scene.primitives is None or scene.primitives.position.shape[0] == 0:
-        people = Layer.nothing(camera)
+        people = People(Layer.nothing(camera), Layer.nothing(camera).depth, 0.0)
     elif look.view == "boxes":
-        people = _hidden(draw_boxes(scene.primitives, camera, scene.chart, look.clip), nearest)
+        people = _boxes(draw_boxes(scene.primitives, camera, scene.chart, look.clip), end)
     else:
-        people, seconds = _people(scene.primitives, camera, look, nearest)
-    if look.view == "alpha":
-        _write_coverage(picture, people, behind)
-        return seconds
-    if look.view == "depth" and solids is not None:
+        people = _marched(scene.primitives, camera, look, end)
+    if look.view == "depth":
         span = depth_span(scene.primitives, camera, look.clip)
-        behind = dataclasses.replace(behind, rgb=_linear_depth(behind.depth, span) * behind.alpha[..., None])
-    wall = np.broadcast_to(np.float32(look.background is not None), nearest.depth.shape)
-    if solids is not None and solids.holdout.any():
-        wall = wall * ~((nearest.triangle >= 0) & solids.holdout[nearest.triangle])
-    colour = np.array(look.background or (0, 0, 0), np.float32)
-    _compose(*_arrays(people), *_arrays(behind), wall, colour, picture.combined, picture.depth)
-    return seconds
+        people, behind = _in_depth(people, span), _solids_in_depth(behind, span)
+    background = look.background
+    if look.view == "alpha":
+        people, behind, background = _in_grey(people), _solids_in_black(behind), (0.0, 0.0, 0.0)
+    if behind is None:
+        over_background(picture, people.layer, background)
+    else:
+        over_solids(picture, people.layer, people.expected, behind, background)
+    if look.view == "alpha":
+        _encode_coverage(picture)
+    return people.seconds
 
 
 def depth_span(primitives: Primitives | None, camera: Camera, clip: tuple[float, float]) -> tuple[float, float]:
@@ -81,20 +79,68 @@ def depth_span(primitives: Primitives | None, camera: Camera, clip: tuple[float,
     return near, max(far, near)
 
 
-def _people(primitives: Primitives, camera: Camera, look: Look, nearest: Nearest) -> tuple[Layer, float]:
-    """The people by marching, in colour or in depth, and the seconds of the marcher."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class People:
+    """The people of a picture, before anything else is in it."""
+
+    layer: Layer
+    expected: Float32[ndarray, "h w"]
+    """Expected depth along the optical axis, inf where nobody is."""
+    seconds: float
+    """Of the marcher."""
+
+
+def _marched(primitives: Primitives, camera: Camera, look: Look, end: ndarray | None) -> People:
     secant = _secants(camera)
-    span = _span(primitives, camera, look.clip, nearest, secant)
+    span = _span(primitives, camera, look.clip, end, secant)
     began = time.perf_counter()
     rendering = march(primitives, camera, look.settings, span=span)
     rgb, alpha, depth, first_hit = (
         field.cpu().numpy() for field in (rendering.rgb, rendering.alpha, rendering.depth, rendering.first_hit)
     )
     seconds = time.perf_counter() - began
-    if look.view == "depth":
-        colours = _linear_depth(depth / secant, depth_span(primitives, camera, look.clip))
-        rgb = np.where(alpha[..., None] > 0, colours, 0) * alpha[..., None]
-    return Layer(rgb, alpha, first_hit / secant), seconds
+    needed = end is not None or look.view == "depth"
+    return People(Layer(rgb, alpha, first_hit / secant), depth / secant if needed else depth, seconds)
+
+
+def _boxes(boxes: Layer, end: ndarray | None) -> People:
+    """Boxes as far as rays go."""
+    if end is None:
+        return People(boxes, boxes.depth, 0.0)
+    seen = boxes.depth < end
+    depth = np.where(seen, boxes.depth, np.float32(np.inf))
+    return People(Layer(boxes.rgb * seen[..., None], boxes.alpha * seen, depth), depth, 0.0)
+
+
+def _in_depth(people: People, span: tuple[float, float]) -> People:
+    alpha = people.layer.alpha[..., None]
+    rgb = np.where(alpha > 0, _linear_depth(people.expected, span), 0) * alpha
+    return dataclasses.replace(people, layer=dataclasses.replace(people.layer, rgb=rgb))
+
+
+def _solids_in_depth(behind: Backdrop | None, span: tuple[float, float]) -> Backdrop | None:
+    if behind is None:
+        return None
+    rgb = _linear_depth(behind.solids.depth, span) * behind.solids.alpha[..., None]
+    return dataclasses.replace(behind, solids=dataclasses.replace(behind.solids, rgb=rgb))
+
+
+def _in_grey(people: People) -> People:
+    alpha = people.layer.alpha
+    rgb = np.ascontiguousarray(np.broadcast_to(alpha[..., None], (*alpha.shape, 3)))
+    return dataclasses.replace(people, layer=dataclasses.replace(people.layer, rgb=rgb))
+
+
+def _solids_in_black(behind: Backdrop | None) -> Backdrop | None:
+    if behind is None:
+        return None
+    return dataclasses.replace(behind, solids=dataclasses.replace(behind.solids, rgb=np.zeros_like(behind.solids.rgb)))
+
+
+def _encode_coverage(picture: Picture) -> None:
+    """Grey that an sRGB screen shows as bright as the coverage, opaque."""
+    picture.combined[..., :3] = decode_srgb(picture.combined[..., :3])
+    picture.combined[..., 3] = 1
 
 
 def _secants(camera: Camera) -> Float32[ndarray, "h w"]:
@@ -114,48 +160,19 @@ def _fill_secants(secant, inverse):
 
 
 def _span(
-    primitives: Primitives, camera: Camera, clip: tuple[float, float], nearest: Nearest, secant: ndarray
+    primitives: Primitives, camera: Camera, clip: tuple[float, float], end: ndarray | None, secant: ndarray
 ) -> Span | None:
     """Where rays begin and end; None where neither planes nor solids can cut a box."""
     near, far = depth_span(primitives, camera, (-math.inf, math.inf))
-    hidden = bool((nearest.depth < far).any())
+    hidden = end is not None and bool((end < far).any())
     if not hidden and (clip[0] <= near or clip[0] == 0) and far <= clip[1]:
         return None
-    ends = np.minimum(nearest.depth, np.float32(clip[1])) * secant
-    limits = (torch.from_numpy(limit).to(primitives.position) for limit in (secant * np.float32(clip[0]), ends))
+    depth = np.full_like(secant, clip[1]) if end is None else np.minimum(end, np.float32(clip[1]))
+    limits = (
+        torch.from_numpy(limit).to(primitives.position) for limit in (secant * np.float32(clip[0]), depth * secant)
+    )
     return Span(*limits)
-
-
-def _hidden(layer: Layer, nearest: Nearest) -> Layer:
-    """What of opaque pixels is not hidden by solids."""
-    seen = layer.depth < nearest.depth
-    return Layer(layer.rgb * seen[..., None], layer.alpha * seen, np.where(seen, layer.depth, np.float32(np.inf)))
 
 
 def _linear_depth(depth: ndarray, span: tuple[float, float]) -> Float32[ndarray, "h w 3"]:
     return decode_srgb(depth_colours(depth, *span).astype(np.float32))
-
-
-def _write_coverage(picture: Picture, people: Layer, behind: Layer) -> None:
-    """Grey that an sRGB screen shows as bright as alpha says."""
-    picture.combined[..., :3] = decode_srgb(people.alpha)[..., None]
-    picture.combined[..., 3] = 1
-    picture.depth[:] = np.minimum(np.minimum(people.depth, behind.depth), np.float32(NOTHING))
-
-
-def _arrays(layer: Layer) -> tuple[ndarray, ndarray, ndarray]:
-    return layer.rgb, layer.alpha, layer.depth
-
-
-@numba.njit(cache=True, nogil=True)
-def _compose(rgb, alpha, hit, behind_rgb, behind_alpha, behind_depth, wall, colour, combined, depth):
-    """People over solids over a wall of one colour where there is one."""
-    for row in range(alpha.shape[0]):
-        for column in range(alpha.shape[1]):
-            left = np.float32(1) - alpha[row, column]
-            through = left * (np.float32(1) - behind_alpha[row, column]) * wall[row, column]
-            for channel in range(3):
-                light = rgb[row, column, channel] + left * behind_rgb[row, column, channel]
-                combined[row, column, channel] = light + through * colour[channel]
-            combined[row, column, 3] = alpha[row, column] + left * behind_alpha[row, column] + through
-            depth[row, column] = min(hit[row, column], behind_depth[row, column], NOTHING)
