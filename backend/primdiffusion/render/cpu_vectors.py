@@ -7,14 +7,13 @@ corners are then four loads instead of thirty-two, which numba's own vectoriser 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-_compiled_call: Callable[[Any], Any] = intrinsic  # its callers do not give the typing context, nor see the real types
+_compiled_call: Any = intrinsic  # its callers do not give the typing context, nor see the real types
 
 _FLOAT, _INT32, _INT64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 _FOUR, _EIGHT = ir.VectorType(_FLOAT, 4), ir.VectorType(_FLOAT, 8)
