@@ -41,7 +41,8 @@ def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph)
         picture = picture_of(depsgraph, solids_file(depsgraph, studio.frames.folder))
         view = camera_view(camera, depsgraph, size, picture.subject)
         frame = studio.frames.take("final", width, height)
-        frame.clear()
+        if not bpy.app.background:
+            frame.clear()  # the rows that are still to come
         params = {**picture.params(), **view.params(), "region": region, "frame": str(frame.path)}
         drawing = studio.drawing_child().draw(params)
         _follow(engine, drawing, result, frame, view)
@@ -62,6 +63,8 @@ def _follow(
         news = drawing.wait(ANSWER_S)
         if engine.test_break():
             drawing.cancel()
+            if drawing.state != "drawing":
+                return  # a child may take a minute to start
         if not news or drawing.finished:
             continue
         engine.update_stats("", _stats(drawing, frame.height))

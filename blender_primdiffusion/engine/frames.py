@@ -6,6 +6,7 @@ import contextlib
 import os
 import shutil
 import tempfile
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -40,30 +41,36 @@ class Frame:
 
 
 class Frames:
-    """A folder in shared memory for frames and what else the child reads; `close` removes it with all that is in it."""
+    """A folder in shared memory for frames and what else the child reads; `close` removes it with all that is in it.
+
+    For any thread: a render and a viewport may both ask.
+    """
 
     def __init__(self) -> None:
+        self._lock = threading.RLock()
         self._folder: Path | None = None
         self._spare: dict[str, Frame] = {}
 
     @property
     def folder(self) -> Path:
         """Made at first use."""
-        if self._folder is None or not self._folder.is_dir():
-            _sweep()
-            place = SHARED_MEMORY if os.access(SHARED_MEMORY, os.W_OK) else None
-            self._folder = Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{os.getpid()}_", dir=place))
-            self._spare.clear()
-        return self._folder
+        with self._lock:
+            if self._folder is None or not self._folder.is_dir():
+                _sweep()
+                place = SHARED_MEMORY if os.access(SHARED_MEMORY, os.W_OK) else None
+                self._folder = Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{os.getpid()}_", dir=place))
+                self._spare.clear()
+            return self._folder
 
     def take(self, name: str, width: int, height: int) -> Frame:
         """The frame of this name; the one of last time if it has this size. OSError where there is no room for it."""
-        frame = self._spare.get(name)
-        if frame is None or (frame.width, frame.height) != (width, height) or not frame.path.exists():
-            self.drop(name)
-            path = self._allocate(name, width * height * CHANNELS * 4)
-            frame = self._spare[name] = Frame(path, width, height)
-        return frame
+        with self._lock:
+            frame = self._spare.get(name)
+            if frame is None or (frame.width, frame.height) != (width, height) or not frame.path.exists():
+                self.drop(name)
+                path = self._allocate(name, width * height * CHANNELS * 4)
+                frame = self._spare[name] = Frame(path, width, height)
+            return frame
 
     def drop(self, name: str) -> None:
         """Removes the frame of this name; who still maps it keeps it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import threading
 
 from ..places import new_backend, preference
 from ..worker.drawing import IDLE_S, DrawingChild
@@ -12,17 +13,19 @@ frames = Frames()
 """Of all renders and viewports."""
 _child: DrawingChild | None = None
 _child_python = ""
+_lock = threading.Lock()
 
 
 def drawing_child() -> DrawingChild:
     """The engine's child, which runs beside the one that generates people; another preference makes another one."""
     global _child, _child_python
     python = preference("backend_python")
-    if _child is None or python != _child_python:
-        if _child is not None:
-            _child.close()
-        _child, _child_python = DrawingChild(new_backend(python), IDLE_S), python
-    return _child
+    with _lock:  # renders ask from a thread of their own
+        if _child is None or python != _child_python:
+            if _child is not None:
+                _child.close()
+            _child, _child_python = DrawingChild(new_backend(python), IDLE_S), python
+        return _child
 
 
 @atexit.register

@@ -45,6 +45,7 @@ def build_human(
         label = collection.name
         armature = build_armature(context, label, points_to_blender(human.joints))
         armature[BETAS] = human.betas.tolist()
+        armature.id_properties_ui(BETAS).update(description="Shape of the body, drawn by the engine PrimDiffusion")
         collection.objects.link(armature)
         vertices = points_to_blender(human.vertices)
         armature.location = (0.0, 0.0, -vertices[:, 2].min())

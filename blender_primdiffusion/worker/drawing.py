@@ -52,7 +52,7 @@ class Drawing:
         return news
 
     def cancel(self) -> None:
-        """Asks for an end, which comes within a band of the picture. Its frame may be written until then."""
+        """Asks for an end, which comes within a band of the picture; before the first, nothing is drawn at all."""
         if self.cancel_asked_at is None:
             self.cancel_asked_at = time.monotonic()
 
@@ -142,6 +142,9 @@ class DrawingChild:
             client = self._backend.connect()
         except Exception as e:
             drawing.become("failed", error=JobError(str(e) or type(e).__name__, "", "environment"))
+            return
+        if drawing.cancel_asked_at is not None:
+            drawing.become("cancelled")
             return
         client.poll()  # what concerned an earlier picture
         drawing.become("drawing" if client.info.get("ready") else "starting")

@@ -106,7 +106,8 @@ def render_png(path: Path, mode: str = "RGBA") -> np.ndarray:
 def render_exr(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """F12 into EXRs: combined [h, w, 4] and depth [h, w], top row first."""
     scene = bpy.context.scene
-    scene.view_layers[0].use_pass_z = True
+    for layer in scene.view_layers:
+        layer.use_pass_z = True
     settings = scene.render.image_settings
     if bpy.app.version >= (5, 0):
         settings.media_type = "MULTI_LAYER_IMAGE"
@@ -125,14 +126,14 @@ def pixels(path: Path) -> np.ndarray:
         bpy.data.images.remove(image)
 
 
-def read_layers(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Combined and depth of a multilayer EXR."""
+def read_layers(path: Path, layer: str = "ViewLayer") -> tuple[np.ndarray, np.ndarray]:
+    """Combined and depth of a view layer in a multilayer EXR."""
     bpy.utils.expose_bundled_modules()
     import OpenImageIO  # Blender's own, importable only after the line above
 
     values = {}
     for part in range(OpenImageIO.ImageBuf(str(path)).nsubimages):  # Blender 5 writes a part for each pass
         image = OpenImageIO.ImageBuf(str(path), part, 0)
-        names = [name.rpartition("ViewLayer.")[2] for name in image.spec().channelnames]
+        names = image.spec().channelnames
         values |= dict(zip(names, np.moveaxis(image.get_pixels(OpenImageIO.FLOAT), -1, 0), strict=True))
-    return np.stack([values[f"Combined.{c}"] for c in "RGBA"], -1), values["Depth.Z"]
+    return np.stack([values[f"{layer}.Combined.{c}"] for c in "RGBA"], -1), values[f"{layer}.Depth.Z"]

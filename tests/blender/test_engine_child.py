@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -102,11 +103,22 @@ def test_progress_and_seconds_left_are_told_band_by_band(stage, monkeypatch):
 
 def test_a_cancel_ends_the_picture_within_a_band(stage, monkeypatch):
     monkeypatch.setenv("FAKE_BAND_S", "0.3")
-    render_seconds = time.monotonic()
-    drawing = final.render_layer(Engine(stop_after_s=0.0), bpy.context.evaluated_depsgraph_get())
+    render()
+    began = time.monotonic()
+    drawing = final.render_layer(Engine(stop_after_s=0.1), bpy.context.evaluated_depsgraph_get())
     assert drawing.state == "cancelled"
-    assert time.monotonic() - render_seconds < 3.0  # starting the child included; four bands would follow
-    monkeypatch.setenv("FAKE_BAND_S", "0")
+    assert time.monotonic() - began < 0.9  # four bands would take 1.2
+
+
+def test_a_cancel_does_not_wait_for_a_child_that_is_still_being_started(stage, monkeypatch):
+    def slowly(*_: object, **__: object) -> BackendPython:
+        time.sleep(3.0)
+        raise AssertionError
+
+    monkeypatch.setattr(places, "find_backend_python", slowly)
+    began = time.monotonic()
+    final.render_layer(Engine(stop_after_s=0.0), bpy.context.evaluated_depsgraph_get())
+    assert time.monotonic() - began < 1.0
 
 
 def test_waiting_leaves_other_threads_their_time(stage, monkeypatch):
@@ -221,6 +233,17 @@ def test_a_frame_is_reused_for_its_size_and_replaced_for_another():
     finally:
         frames.close()
     assert not second.path.parent.exists()
+
+
+def test_threads_share_one_folder():
+    frames, folders = Frames(), set()
+    threads = [threading.Thread(target=lambda: folders.add(frames.folder)) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(folders) == 1
+    frames.close()
 
 
 def test_what_a_killed_blender_left_in_memory_is_removed(tmp_path, monkeypatch):

@@ -17,6 +17,8 @@ from engine_stage import (
     Oracle,
     camera_by_hand,
     eight_bit,
+    pixels,
+    read_layers,
     render_exr,
     render_png,
     thinned,
@@ -25,7 +27,7 @@ from mathutils import Euler, Matrix
 
 import blender_primdiffusion
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.human import armature_of, build_human
+from blender_primdiffusion.scene.human import armature_of, build_human, remove_human
 from blender_primdiffusion.scene.keyframes import keyframe_poses
 
 SIZE = (120, 90)
@@ -222,8 +224,6 @@ def test_every_frame_of_an_animation_has_its_own_pose(stage, backend, tmp_path):
     stage.scene.render.image_settings.color_mode = "RGBA"
     stage.scene.render.filepath = str(tmp_path / "frame_")
     bpy.ops.render.render(animation=True)
-    from engine_stage import pixels
-
     for index, frame in enumerate(frames):
         people = [as_asked(backend.folders[0], stage.armature, rotations[index], translations[index])]
         given = np.round(255 * pixels(tmp_path / f"frame_{frame:04d}.png"))
@@ -257,6 +257,30 @@ def test_an_instanced_person_is_drawn_where_the_instance_is(stage, backend):
     here = as_asked(backend.folders[0], stage.armature)
     there = {**here, "world": (Z_UP.T @ np.array(instance.matrix_world @ stage.armature.matrix_world) @ Z_UP).tolist()}
     assert_same(render_png(stage.out), eight_bit(expected(stage, backend, [here, there])[0]))
+
+
+def test_a_person_linked_from_another_file_is_drawn_from_there(stage, backend, tmp_path):
+    wanted = eight_bit(expected(stage, backend)[0])
+    bpy.ops.wm.save_mainfile()
+    (tmp_path / "other").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other" / "linking.blend"))
+    remove_human(stage.person)
+    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True) as (_, wants):
+        wants.collections = ["Human"]
+    instance = bpy.data.objects.new("linked", None)
+    instance.instance_type, instance.instance_collection = "COLLECTION", wants.collections[0]
+    bpy.context.scene.collection.objects.link(instance)
+    assert_same(render_png(stage.out), wanted)
+
+
+def test_each_view_layer_has_its_own_people(stage, backend):
+    nobody = stage.scene.view_layers.new("Nobody")
+    nobody.layer_collection.children[stage.person.name].exclude = True
+    render_exr(stage.out.with_suffix(".exr"))
+    empty, _ = read_layers(stage.out.with_suffix(".exr"), "Nobody")
+    full, _ = read_layers(stage.out.with_suffix(".exr"), "ViewLayer")
+    assert not empty.any()
+    np.testing.assert_allclose(full, expected(stage, backend)[0], atol=2e-3)
 
 
 def test_an_opaque_film_shows_the_worlds_colour_behind_people(stage, backend):
