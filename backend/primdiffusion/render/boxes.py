@@ -7,7 +7,7 @@ import colorsys
 import numba
 import numpy as np
 import torch
-from jaxtyping import Float32, Int
+from jaxtyping import Float, Float32, Int
 from numpy import ndarray
 from torch import Tensor
 
@@ -62,7 +62,7 @@ def box_colours(count: int, group: Int[Tensor, "k"] | None = None) -> Float32[nd
     return decode_srgb(np.array(colours, np.float32).reshape(-1, 3))
 
 
-def _triangles(position: ndarray, rotation: ndarray, half_extent: ndarray) -> Float32[ndarray, "f 3 3"]:
+def _triangles(position: ndarray, rotation: ndarray, half_extent: ndarray) -> Float[ndarray, "f 3 3"]:
     """Two triangles for each face of each box."""
     faces = np.empty((6, 4, 3))
     around = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
