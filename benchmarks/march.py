@@ -1,119 +1,218 @@
-"""How fast and how exact the CPU marcher is: one person of 1024 boxes that fills the frame.
+"""How fast and how exact the marcher is: people, poses, picture sizes, numbers of boxes, crowds.
 
-`python benchmarks/march.py --json march.json` writes one flat object; `--quick` (under a minute) leaves out the largest
-picture and the truth at a quarter of a millimetre. Seconds are medians of warm calls; errors are in 0 ... 255.
+`python benchmarks/march.py --json march.json --table march.md --plot march.png` measures everything; `--quick` (about a
+minute) leaves out the largest pictures and the engine in Blender. Milliseconds are PROCESSOR time, all threads
+together, the best of several warm calls: on a shared machine the only honest figure. Its roofline (`roofline.py`) is
+measured in the same run. Errors are in 0 ... 1, against `march_reference` in float64.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
-import statistics
+import dataclasses
+import json
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numba
-import numpy as np
 import torch
-from primdiffusion.body.model import default_body
+from march_people import Scene, checkered_human, contorted, in_fewer_boxes, portrait, scenes, standing_person
+from march_table import Row, write_plot, write_table
 from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
-from primdiffusion.primitives.anchors import attach, default_anchors
-from primdiffusion.primitives.from_mesh import from_mesh
+from primdiffusion.human import framing, place
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.cpu import march_cpu
+from primdiffusion.render.cpu import count_samples
 from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings, strides_of
+from primdiffusion.render.march import march
 from primdiffusion.render.reference import march_reference
 from record import tell
+from roofline import float32_operations_per_second, roofline_ms
 from torch import Tensor
 
-
-def standing_person(seed: int = 0) -> Primitives:
-    """The default body's 1024 boxes in the rest pose, filled from its mesh under a random checkered texture."""
-    body = default_body()
-    vertices = body.shape(torch.zeros(10)).vertices
-    frames = attach(default_anchors(), vertices, body.faces)
-    cells = np.random.default_rng(seed).integers(40, 230, (32, 32, 4), dtype=np.uint8)
-    texture = cells.repeat(8, axis=0).repeat(8, axis=1)
-    texture[..., 3] = 255
-    skin = TexturedPart(
-        name="body",
-        vertices=vertices.double().numpy(),
-        faces=body.faces.int().numpy(),
-        corner_uv=body.uv[body.uv_faces].double().numpy(),
-        texture=texture,
-        skin_index=np.zeros((len(vertices), 1), np.int32),
-        skin_weight=np.ones((len(vertices), 1)),
-    )
-    return Primitives.place(frames, from_mesh(TexturedMesh((skin,)), frames))
+HERE = Path(__file__).resolve().parent
+Figures = dict[str, float | int | str | None]
+ENGINE_FIGURES = ("engine_overhead_ms", "engine_pixel_error_max")
+CUDA_FIGURES = ("cuda_forward_4mm_ms", "cuda_forward_1mm_ms", "cuda_backward_ratio")
 
 
-def portrait(size: int) -> Camera:
-    """The whole person in a square picture; the body's origin is near its pelvis."""
-    position, target = torch.tensor([0.6, 0.1, 3.2]), torch.tensor([0.0, -0.3, 0.0])
-    return look_at(position, target, vertical_fov=math.radians(32), width=size, height=size)
-
-
-def seconds(call: Callable[[], object], repeats: int, clock: Callable[[], float] = time.perf_counter) -> float:
-    """The median of `repeats` timed calls."""
-    times = []
+def best(call: Callable[[], object], repeats: int, clock: Callable[[], float] = time.process_time) -> float:
+    """Milliseconds of the fastest of `repeats` calls."""
+    fastest = float("inf")
     for _ in range(repeats):
-        begin = clock()
+        began = clock()
         call()
-        times.append(clock() - begin)
-    return statistics.median(times)
+        fastest = min(fastest, clock() - began)
+    return 1e3 * fastest
 
 
-def errors(a: Tensor, b: Tensor) -> tuple[float, float]:
-    """Largest and mean difference, 0 ... 255."""
-    difference = (a.double() - b.double()).abs() * 255
-    return float(difference.max()), float(difference.mean())
+def leaves(record: Primitives | Camera) -> Primitives | Camera:
+    """The same values as tensors that collect gradients."""
+    return record.map(lambda tensor: tensor.detach().clone().requires_grad_())
 
 
-def measure(quick: bool) -> dict[str, float | int | str | None]:
-    """All figures of this benchmark by name."""
-    person = standing_person()
-    figures: dict[str, float | int | str | None] = {"boxes": len(person.position)}
+def backward_ms(person: Primitives, camera: Camera, repeats: int) -> tuple[float, float]:
+    """Milliseconds of a forward call that keeps what the adjoint needs, and of the adjoint of every input."""
+    forward, backward = float("inf"), float("inf")
+    for _ in range(repeats):
+        boxes, view = leaves(person), leaves(camera)
+        began = time.process_time()
+        picture = march(boxes, view)
+        between = time.process_time()
+        seen = torch.where(picture.alpha > 0, picture.depth, 0)
+        loss = picture.rgb.square().sum() + picture.alpha.sum() + seen.sum()
+        middle = time.process_time()
+        loss.backward()
+        forward, backward = min(forward, between - began), min(backward, time.process_time() - middle)
+    return 1e3 * forward, 1e3 * backward
+
+
+def measured_row(scene: Scene, operations_per_second: float, repeats: int) -> Row:
+    """What one picture costs."""
+    settings = MarchSettings()
+    counted = count_samples(scene.primitives, scene.camera, settings)
+    forward = best(lambda: march(scene.primitives, scene.camera, settings), repeats)
+    alpha = march(scene.primitives, scene.camera, settings).alpha
+    return Row(
+        group=scene.group,
+        name=scene.name,
+        pixels=scene.camera.width * scene.camera.height,
+        boxes=len(scene.primitives.position),
+        hit_share=float((alpha > 0).float().mean()),
+        samples=counted.inside_boxes,
+        evaluated=counted.evaluated,
+        milliseconds=forward,
+        roofline_ms=roofline_ms(counted.inside_boxes, operations_per_second),
+    )
+
+
+def speed(person: Primitives, operations_per_second: float, repeats: int) -> Figures:
+    """The default picture: forward at 4 and 1 mm, the adjoint, the reference."""
+    camera = portrait(512)
+    figures: Figures = {"boxes": len(person.position)}
     stride = strides_of(person, MarchSettings())
     figures |= {f"boxes_of_stride_{s}": int((stride == s).sum()) for s in MarchSettings().strides}
-    figures["first_call_s"] = seconds(lambda: march_cpu(person, portrait(64)), 1)
-    for size in (256, 512) if quick else (256, 512, 1024):
-        camera = portrait(size)
-        figures[f"cpu_{size}_s"] = seconds(lambda camera=camera: march_cpu(person, camera), 3 if quick else 7)
-    camera = portrait(512)
-    # What all threads together computed: on a busy machine the honest figure.
-    figures["cpu_512_processor_s"] = seconds(lambda: march_cpu(person, camera), 3, time.process_time)
-    figures["cpu_512_every_mm_s"] = seconds(lambda: march_cpu(person, camera, UNIFORM_MILLIMETRE), 3)
-
+    for name, settings in (("4mm", MarchSettings()), ("1mm", UNIFORM_MILLIMETRE)):
+        counted = count_samples(person, camera, settings)
+        milliseconds = best(lambda settings=settings: march(person, camera, settings), repeats)
+        floor = roofline_ms(counted.inside_boxes, operations_per_second)
+        figures |= {
+            f"cpu_forward_{name}_ms": milliseconds,
+            f"cpu_samples_{name}": counted.inside_boxes,
+            f"cpu_samples_evaluated_{name}": counted.evaluated,
+            f"cpu_roofline_{name}_ms": floor,
+            f"cpu_roofline_ratio_{name}": milliseconds / floor,
+        }
+    figures["cpu_forward_4mm_wall_ms"] = best(lambda: march(person, camera), repeats, time.perf_counter)
+    forward, backward = backward_ms(person, camera, max(repeats // 2, 2))
+    figures |= {
+        "cpu_forward_recorded_4mm_ms": forward,
+        "cpu_backward_4mm_ms": backward,
+        "cpu_backward_ratio": backward / float(figures["cpu_forward_4mm_ms"] or 0),
+    }
     small = portrait(128)
-    figures["reference_128_s"] = seconds(lambda: march_reference(person, small), 1)
-    figures["cpu_128_s"] = seconds(lambda: march_cpu(person, small), 7)
-    figures["reference_over_cpu_128"] = figures["reference_128_s"] / figures["cpu_128_s"]
-    exact = march_reference(person.to(dtype=torch.float64), small.to(dtype=torch.float64))
-    picture = march_cpu(person, small)
-    figures["hit_share"] = float((picture.alpha > 0).float().mean())
-    figures["cpu_against_float64_reference_max"], figures["cpu_against_float64_reference_mean"] = errors(
-        picture.rgb, exact.rgb
-    )
-    truth_names = [f"{name}_{kind}" for name in ("default", "every_mm") for kind in ("max", "mean")]
-    figures |= dict.fromkeys(truth_names)
-    if not quick:
-        truth = march_cpu(person, small, MarchSettings(step=0.00025, strides=(1,)))
-        figures["default_max"], figures["default_mean"] = errors(picture.rgb, truth.rgb)
-        every_mm = march_cpu(person, small, UNIFORM_MILLIMETRE)
-        figures["every_mm_max"], figures["every_mm_mean"] = errors(every_mm.rgb, truth.rgb)
+    slow = best(lambda: march_reference(person, small), 2)
+    figures["reference_over_cpu_128"] = slow / best(lambda: march(person, small), repeats)
     return figures
 
 
+def largest_error(person: Primitives, camera: Camera) -> float:
+    """Largest difference in rgb from the reference in float64, 0 ... 1."""
+    exact = march_reference(person.to(dtype=torch.float64), camera.to(dtype=torch.float64))
+    return float((march(person, camera).rgb.double() - exact.rgb).abs().max())
+
+
+def least_cosine(person: Primitives, camera: Camera) -> float:
+    """Smallest cosine, over all inputs, between the fast adjoint and torch's through the reference in float64."""
+    generator = torch.Generator().manual_seed(0)
+    weight = torch.randn((camera.height, camera.width, 5), generator=generator, dtype=torch.float64)
+
+    def gradients(boxes: Primitives, view: Camera, draw: Callable[..., object]) -> dict[str, Tensor]:
+        boxes, view = leaves(boxes), leaves(view)
+        picture = draw(boxes, view)
+        depth = torch.where(picture.alpha > 0.05, picture.depth, 0)
+        values = torch.cat([picture.rgb, picture.alpha[..., None], depth[..., None]], dim=-1)
+        (values * weight.to(values.dtype)).sum().backward()
+        tensors = {**vars(boxes), "intrinsics": view.intrinsics, "world_to_camera": view.world_to_camera}
+        return {name: tensor.grad.double().flatten() for name, tensor in tensors.items()}
+
+    fast = gradients(person, camera, march)
+    exact = gradients(person.to(dtype=torch.float64), camera.to(dtype=torch.float64), march_reference)
+    cosines = {name: float(torch.cosine_similarity(fast[name], exact[name], dim=0)) for name in fast}
+    return min(cosines.values())
+
+
+def inside_the_chest(size: int) -> Camera:
+    """A camera within the boxes of the chest, looking at an arm."""
+    return look_at(
+        torch.tensor([0.05, 0.2, 0.05]), torch.tensor([0.6, 0.3, 0.0]), vertical_fov=1.2, width=size, height=size
+    )
+
+
+def exactness(person: Primitives) -> Figures:
+    """Against the reference in float64: from the front, contorted, in fewer boxes, opaque throughout, from within."""
+    posed = place(checkered_human(), contorted())
+    opaque = dataclasses.replace(person, density=person.density * 10)
+    pictures = [
+        (person, portrait(128)),
+        (posed, framing(posed, width=96, height=96)),
+        (in_fewer_boxes(person), portrait(96)),
+        (opaque, portrait(96)),
+        (person, inside_the_chest(64)),
+    ]
+    return {
+        "rgb_error_max": max(largest_error(*picture) for picture in pictures),
+        "gradient_cosine_min": min(least_cosine(boxes, shrunk(view)) for boxes, view in pictures),
+    }
+
+
+def shrunk(camera: Camera, size: int = 48) -> Camera:
+    """The same view in fewer pixels: recorded gradients of the reference need memory for every sample."""
+    scale = camera.intrinsics.new_tensor([size / camera.width, size / camera.height, 1.0])
+    return dataclasses.replace(camera, intrinsics=camera.intrinsics * scale[:, None], width=size, height=size)
+
+
+def from_script(script: str, names: tuple[str, ...], *arguments: str) -> Figures:
+    """Figures `names` of another benchmark's record; None where the script cannot measure them here."""
+    with tempfile.TemporaryDirectory() as folder:
+        record = Path(folder) / "record.json"
+        ran = subprocess.run([sys.executable, str(HERE / script), "--json", str(record), *arguments], check=False)
+        if ran.returncode or not record.is_file():
+            return dict.fromkeys(names)
+        figures = json.loads(record.read_text(encoding="utf-8"))
+        return {name: figures.get(name) for name in names}
+
+
 def main() -> None:
-    """Measures, prints and, if asked, writes the figures."""
+    """Measures, prints and, if asked, writes figures, table and plot."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, help="file for the figures")
-    parser.add_argument("--quick", action="store_true", help="under a minute")
+    parser.add_argument("--table", type=Path, help="markdown file for the table of scenes")
+    parser.add_argument("--plot", type=Path, help="PNG of time against samples")
+    parser.add_argument("--quick", action="store_true", help="about a minute")
     arguments = parser.parse_args()
-    figures = {"threads": numba.get_num_threads()} | measure(arguments.quick)
+    repeats = 5 if arguments.quick else 15
+
+    person = standing_person()
+    figures: Figures = {"threads": numba.get_num_threads()}
+    figures["first_call_s"] = best(lambda: march(person, portrait(64)), 1, time.perf_counter) / 1e3
+    ceiling = float32_operations_per_second()
+    figures["cpu_gflops_per_thread"] = ceiling / 1e9
+    figures |= speed(person, ceiling, repeats)
+    figures |= exactness(person)
+    rows = [measured_row(scene, ceiling, repeats) for scene in scenes(1024 if arguments.quick else 2048)]
+    figures |= dict.fromkeys(CUDA_FIGURES)
+    if torch.cuda.is_available():
+        figures |= from_script("march_cuda.py", CUDA_FIGURES)
+    figures |= dict.fromkeys(ENGINE_FIGURES) if arguments.quick else from_script("engine.py", ENGINE_FIGURES)
     tell(figures, arguments.json)
+    if arguments.table is not None:
+        write_table(arguments.table, rows)
+    if arguments.plot is not None:
+        write_plot(arguments.plot, rows)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,9 @@ import torch
 from march_scenes import camera_at, one_box, random_boxes
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render import cuda
+from primdiffusion.render.compositing import Rendering
+from primdiffusion.render.cpu import march_cpu
 from primdiffusion.render.lattice import RELEASED, MarchSettings, Span
 from primdiffusion.render.march import march
 from primdiffusion.render.reference import march_reference
@@ -128,6 +131,36 @@ def test_gradients_reach_the_boxes_through_the_released_settings_and_backgrounds
     leaves = boxes.map(lambda tensor: tensor.clone().requires_grad_())
     march(leaves, camera, RELEASED, background=(1.0, 1.0, 1.0)).rgb.sum().backward()
     assert all(tensor.grad.abs().sum() > 0 for tensor in vars(leaves).values())
+
+
+def test_on_cuda_devices_a_batch_is_one_call_and_one_person_is_not_copied(monkeypatch):
+    """The call is recorded and answered by the CPU's back end: which tensors go in, and where pictures come out."""
+    calls = []
+
+    def march_cuda(primitives, camera, settings, span):
+        calls.append((primitives.position.shape[0], camera.intrinsics.shape[0], span))
+        people = [one(primitives, i % len(primitives.position)) for i in range(len(camera.intrinsics))]
+        pictures = [march_cpu(person, one(camera, i), settings) for i, person in enumerate(people)]
+        return Rendering(*(torch.stack([getattr(picture, name) for picture in pictures]) for name in FIELDS))
+
+    boxes, cameras = people(0, 1), views(3)
+    scenes = [
+        (boxes.map(lambda tensor: tensor[:, None]), cameras, (6, 6)),
+        (one(boxes, 0), cameras, (1, 3)),
+        (boxes, one(cameras, 1), (2, 2)),
+        (one(boxes, 0), one(cameras, 0), (1, 1)),
+    ]
+    expected = [march(person, view) for person, view, _ in scenes]
+    monkeypatch.setattr(cuda, "available", lambda device: True)
+    monkeypatch.setattr(cuda, "march_cuda", march_cuda)
+    for (person, view, sizes), pictures in zip(scenes, expected, strict=True):
+        got = march(person, view)
+        assert calls[-1] == (*sizes, None)
+        for name in FIELDS:
+            assert torch.equal(getattr(got, name), getattr(pictures, name)), name
+    march(boxes.to(dtype=torch.float64), one(cameras, 0).to(dtype=torch.float64))
+    march(boxes, one(cameras, 0), RELEASED)
+    assert len(calls) == len(scenes)
 
 
 def test_reflected_frames_mirror_what_is_in_the_box():

@@ -13,6 +13,7 @@ from torch import Tensor
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render import cuda
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu import march_cpu
 from primdiffusion.render.lattice import RELEASED, MarchSettings, Span, check_one_device
@@ -48,24 +49,39 @@ def march(
         shift = 0.5 - settings.pixel_centre
         camera = camera.moved_in_picture(shift, shift)
     batch = _batch_shape(primitives, camera, span)
-    boxes = _unbound(primitives, PRIMITIVE_DIMENSIONS, batch)
-    views = _unbound(camera, CAMERA_DIMENSIONS, batch)
-    spans = [None] * len(views) if span is None else _unbound(span, SPAN_DIMENSIONS, batch)
-    if _is_plain(primitives, camera) and span is None and settings.compositing == "mixed":
-        pictures = [march_cpu(person, view, settings) for person, view in zip(boxes, views, strict=True)]
+    if cuda.available(primitives.position.device) and cuda.suits(primitives, camera, settings):
+        rendering = _march_at_once(primitives, camera, settings, span, batch)
     else:
-        scenes = zip(boxes, views, spans, strict=True)
-        pictures = [march_reference(person, view, settings, limits) for person, view, limits in scenes]
-    rendering = _stacked(pictures, batch)
+        rendering = _march_one_by_one(primitives, camera, settings, span, batch)
     return rendering if background is None else _over(rendering, background)
 
 
-def _is_plain(primitives: Primitives, camera: Camera) -> bool:
-    """Whether the fast back end for CPUs takes it."""
+def _march_one_by_one(
+    primitives: Primitives, camera: Camera, settings: MarchSettings, span: Span | None, batch: torch.Size
+) -> Rendering:
     tensors = [*vars(primitives).values(), camera.intrinsics, camera.world_to_camera]
-    differentiable = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
     plain = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
-    return plain and not differentiable
+    draw = march_cpu if plain else march_reference
+    boxes = _unbound(primitives, PRIMITIVE_DIMENSIONS, batch)
+    views = _unbound(camera, CAMERA_DIMENSIONS, batch)
+    spans = [None] * len(views) if span is None else _unbound(span, SPAN_DIMENSIONS, batch)
+    return _stacked(
+        [draw(person, view, settings, limits) for person, view, limits in zip(boxes, views, spans, strict=True)], batch
+    )
+
+
+def _march_at_once(
+    primitives: Primitives, camera: Camera, settings: MarchSettings, span: Span | None, batch: torch.Size
+) -> Rendering:
+    """All pictures by one call of `march_cuda`; one person seen in all of them is not copied."""
+    people = _leading(primitives, PRIMITIVE_DIMENSIONS)
+    pictures = cuda.march_cuda(
+        _flat(primitives, PRIMITIVE_DIMENSIONS, batch if people.numel() > 1 else people),
+        _flat(camera, CAMERA_DIMENSIONS, batch),
+        settings,
+        None if span is None else _flat(span, SPAN_DIMENSIONS, batch),
+    )
+    return pictures.map(lambda tensor: tensor.unflatten(0, tuple(batch)) if batch else tensor[0])
 
 
 PRIMITIVE_DIMENSIONS = {"position": 2, "rotation": 3, "half_extent": 2, "rgb": 5, "density": 4}
@@ -121,6 +137,16 @@ def _unbound(record: Record, dimensions: dict[str, int], batch: torch.Size) -> l
     ]
     place = torch.arange(len(singles)).reshape(lead).expand(batch).flatten()
     return [singles[i] for i in place.tolist()]
+
+
+def _flat(record: Record, dimensions: dict[str, int], batch: torch.Size) -> Record:
+    """The record broadcast to `batch`, as one leading dimension."""
+    fields = {}
+    for name, count in dimensions.items():
+        value = getattr(record, name)
+        own = value.shape[value.ndim - count :]
+        fields[name] = value.expand(*batch, *own).reshape(-1, *own)
+    return dataclasses.replace(record, **fields)
 
 
 def _stacked(pictures: list[Rendering], batch: torch.Size) -> Rendering:
