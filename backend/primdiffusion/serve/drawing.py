@@ -13,14 +13,16 @@ from typing import Any
 import numpy as np
 import torch
 
+from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.drawing.bands import draw_in_bands
 from primdiffusion.drawing.scene import Look, Picture, Scene
 from primdiffusion.failures import PictureOutOfMemory, out_of_memory
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.human import Human, place_skinned
 from primdiffusion.human_file import load_human
-from primdiffusion.primitives.anchors import default_anchors
+from primdiffusion.primitives.anchors import Anchors, default_anchors
 from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render import cuda
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.render.solids import Solids
 from primdiffusion.serve.draw_params import DrawParams
@@ -29,8 +31,8 @@ Report = Callable[[str, int, int, float | None], None]
 """Told (stage, step, total, seconds left); raises to end the job."""
 CHANNELS = 5
 """Of a frame: combined and depth."""
-PEOPLE_KEPT = 16
-"""About 8 MB each, and as much again where they are scaled."""
+PEOPLE_KEPT = 64
+"""About 8 MB each, and a quarter of that again where they are scaled."""
 SOLIDS_KEPT = 2
 
 Stamp = tuple[str, int, int]
@@ -43,8 +45,10 @@ class FrameDrawer:
     """Draws into frames, and keeps the people, their places and the solids of the last pictures."""
 
     def __init__(self, device: torch.device) -> None:
-        self._device = device
-        self._human = functools.lru_cache(PEOPLE_KEPT)(_load_human)
+        """`device` is where to draw if its marcher is the fast one; otherwise pictures are drawn on the CPU."""
+        self._device = device if cuda.available(device) else torch.device("cpu")
+        self._human = functools.lru_cache(PEOPLE_KEPT)(self._load)
+        self._rig = functools.lru_cache(1)(self._body)
         self._placed = functools.lru_cache(PEOPLE_KEPT)(self._place)
         self._everybody = functools.lru_cache(2)(self._together)
         self._solids = functools.lru_cache(SOLIDS_KEPT)(_load_solids)
@@ -88,8 +92,18 @@ class FrameDrawer:
         return placed[0] if len(placed) == 1 else Primitives.together(placed)
 
     def _place(self, file: Stamp, matrix: Numbers, joints: Numbers, betas: Numbers | None) -> Primitives:
-        shape = None if betas is None else torch.tensor(betas, dtype=torch.float32)
-        return place_skinned(self._human(file), torch.tensor(joints), torch.tensor(matrix), shape).to(self._device)
+        skinning, object_to_world = self._tensor(joints), self._tensor(matrix)
+        shape = None if betas is None else self._tensor(betas)
+        return place_skinned(self._human(file), skinning, object_to_world, shape, *self._rig())
+
+    def _tensor(self, numbers: Numbers) -> torch.Tensor:
+        return torch.tensor(numbers, dtype=torch.float32, device=self._device)
+
+    def _body(self) -> tuple[BodyModel, Anchors]:
+        return default_body().to(self._device), default_anchors().to(self._device)
+
+    def _load(self, file: Stamp) -> Human:
+        return load_human(file[0]).to(self._device)
 
     def _fill(self, picture: Picture, scene: Scene, params: DrawParams, report: Report) -> float:
         """Draws into the frame; returns the seconds of the marcher."""
@@ -143,10 +157,6 @@ def _frozen(value: Any) -> Any:
     if value is None:
         return None
     return tuple(map(_frozen, value)) if isinstance(value, list) else float(value)
-
-
-def _load_human(file: Stamp) -> Human:
-    return load_human(file[0])
 
 
 def _load_solids(file: Stamp) -> Solids:
