@@ -12,7 +12,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from march_scenes import camera_at, random_boxes
 from primdiffusion.render import cuda
+from primdiffusion.render.lattice import RELEASED, MarchSettings
 
 CASES = Path(__file__).with_name("march_cuda_cases.py")
 HOPPER = 90
@@ -122,3 +124,36 @@ def test_the_backward_kernel_fits_into_registers_and_uses_tensor_cores(tmp_path)
     assert resources(compiled, tmp_path)["STACK"] == 0
     assert "mma.sync" in compiled.asm["ptx"]
     assert "ld.global.v4" in compiled.asm["ptx"]
+
+
+@with_triton
+def test_the_small_kernels_compile_without_spilling(tmp_path):
+    """Also where an argument is 1 or absent: Triton compiles such kernels anew."""
+    from primdiffusion.render import triton_adjoint, triton_boxes, triton_lists
+
+    place = {"STRIDES": (4, 2, 1), "TILE_WIDTH": 8, "TILE_HEIGHT": 4, "BIN": 8}
+    place |= {"BLOCK_WIDTH": 8, "BLOCK_HEIGHT": 4, "BLOCKS_OF_UNIT": 64, "LANES": cuda.LANES}
+    one = {"boxes": 1, "own_boxes": 1}
+    lists = {"BIN": 8, "LANES": cuda.LANES_OF_TILE}
+    kernels = [
+        (triton_boxes.pack_boxes, "fffil", 0, {}, 4),
+        (triton_boxes.place_boxes, "fffiffdfiil", 4, place, 1),
+        (triton_lists.list_bins, "liilil", 2, lists, 4),
+        (triton_lists.list_bins, "liilil", 0, lists | {"boxes": 1, "across": 1}, 4),
+        (triton_lists.list_tiles, "iliiilil", 4, lists, 1),
+        (triton_adjoint.finish_boxes, "lffffffffff", 3, {}, 4),
+        (triton_adjoint.finish_boxes, "lffffffffff", 0, one | {"views": 1}, 4),
+    ]
+    for kernel, pointers, scalars, constants, warps in kernels:
+        compiled = compile_for_hopper(kernel, pointers, ("i32",) * scalars, constants, num_warps=warps)
+        assert resources(compiled, tmp_path)["STACK"] == 0, kernel
+    compiled = compile_for_hopper(triton_adjoint.seed_rays, "ffffif", ("i32", "fp32"), {"LANES": 256}, num_warps=4)
+    assert resources(compiled, tmp_path)["STACK"] == 0
+
+
+def test_suits_what_it_can_draw():
+    boxes, camera = random_boxes(1).to(dtype=torch.float32), camera_at((0.0, 0.0, 0.5)).to(dtype=torch.float32)
+    assert cuda.suits(boxes, camera, MarchSettings())
+    assert not cuda.suits(boxes, camera, RELEASED)
+    assert not cuda.suits(boxes, camera.to(dtype=torch.float64), MarchSettings())
+    assert not cuda.suits(random_boxes(1, size=4).to(dtype=torch.float32), camera, MarchSettings())

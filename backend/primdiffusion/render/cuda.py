@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives, S
@@ -59,6 +60,13 @@ def available(device: torch.device | str = "cuda") -> bool:
     return torch.device(device).type == "cuda" and importlib.util.find_spec("triton") is not None
 
 
+def suits(primitives: Primitives, camera: Camera, settings: MarchSettings) -> bool:
+    """Whether `march_cuda` draws such a scene: float32, voxels of 8^3, "mixed" compositing."""
+    tensors = [*vars(primitives).values(), camera.intrinsics, camera.world_to_camera]
+    single = all(tensor.dtype == torch.float32 for tensor in tensors)
+    return single and primitives.density.shape[-3:] == (S, S, S) and settings.compositing == "mixed"
+
+
 def march_cuda(
     primitives: Primitives,
     camera: Camera,
@@ -69,9 +77,11 @@ def march_cuda(
     """As `march_reference` with "mixed" compositing, in float32 on a CUDA device; pictures [B, H, W].
 
     `primitives` have one leading dimension, 1 or B (1: all views see the same boxes), `camera` and `span` B.
-    Differentiable in every tensor of primitives and camera, without atomics: the same inputs give the same gradients.
-    The host waits for the device once a call, for the checks and the lists' lengths. Memory beyond inputs and outputs:
-    9 KB a box, and 40 bytes a pixel where gradients are asked for; `LIST_LIMIT` bounds the lists.
+    Differentiable once in every tensor of primitives and camera. No sum is in an order left to chance: the same inputs
+    give the same pictures and gradients. Voxel gradients are summed in tf32 (eleven significant bits a term). The host
+    waits for the device once a call, for the checks and the lists' lengths. Memory beyond inputs and outputs: 9 KB a
+    box and 4 bytes for each tile that a box touches, at most `LIST_LIMIT` of them; for gradients 40 bytes a pixel more,
+    and while they are computed another 32 a pixel and 8 KB a box.
 
     Raises ValueError as `check_scene` does, for other compositing, voxels other than 8^3 and dtypes other than float32;
     ImportError without Triton.
@@ -83,7 +93,8 @@ def march_cuda(
             "torch names (`pip show torch`), or call march_reference"
         )
     tensors = [getattr(primitives, name) for name in BOX_FIELDS] + [camera.intrinsics, camera.world_to_camera]
-    scene = _Scene(primitives, camera, settings, span, shapes)
+    keep = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    scene = _Scene(primitives, camera, settings, span, shapes, keep)
     return Rendering(*_March.apply(scene, *tensors))
 
 
@@ -98,6 +109,8 @@ class _Scene(NamedTuple):
     settings: MarchSettings
     span: Span | None
     shapes: Shapes
+    keep: bool
+    """Whether there will be a backward pass."""
 
     @property
     def unit(self) -> int:
@@ -257,7 +270,7 @@ class _March(torch.autograd.Function):
             check_scene(scene.primitives, scene.camera, scene.span)
             nothing = intrinsics.new_zeros((b, height, width))
             infinity = torch.full_like(nothing, torch.inf)
-            ctx.scene, ctx.shapes = None, [tensor.shape for tensor in tensors]
+            ctx.units, ctx.nothing = None, [tensor.shape for tensor in tensors]
             picture = (nothing[..., None].expand(b, height, width, 3).clone(), nothing, infinity, infinity.clone())
             ctx.mark_non_differentiable(picture[3])
             return picture
@@ -265,9 +278,8 @@ class _March(torch.autograd.Function):
         new = functools.partial(torch.empty, device=intrinsics.device)
         flat = (b, height, width)
         picture = (new((*flat, 3)), new(flat), new(flat), new(flat))
-        keep = any(ctx.needs_input_grad)
-        kept = new((b, height, width, 8)) if keep else new(0)
-        ends = new((b, height, width, 2) if keep else 0, dtype=torch.int32)
+        kept = new((*flat, 8) if scene.keep else 0)
+        ends = new((*flat, 2) if scene.keep else 0, dtype=torch.int32)
         fine = math.gcd(max(scene.strides), 4)
         gap = min(ready.gap, fine)
         across, down = -(-width // shapes.tile[0]), -(-height // shapes.tile[1])
@@ -275,32 +287,33 @@ class _March(torch.autograd.Function):
         _launch(triton_march.march_tiles, (across * down, b), 
             ready.record, ready.indices, ready.voxels, ready.entries, ready.begin, ready.count, ready.reach, *picture,
             kept, ends, k, k if p == b else 0, height, width, across, list_across, ready.begin.shape[1], scene.spacing,
-            TILES_OF_LIST=ready.tiles_of_list, HAS_SPAN=ready.reach is not None, KEEP=keep,
+            TILES_OF_LIST=ready.tiles_of_list, HAS_SPAN=ready.reach is not None, KEEP=scene.keep,
             WHOLE=all(fine % stride == 0 for stride in scene.strides),
             **march_constants(shapes, fine // gap, gap), num_warps=shapes.march_warps, maxnreg=shapes.march_registers,
         )  # fmt: skip
         ctx.mark_non_differentiable(picture[3])
-        ctx.scene, ctx.units = scene, ready.units
+        ctx.shapes, ctx.spacing, ctx.units = shapes, scene.spacing, ready.units
         geometry = (*boxes[:3], intrinsics, world_to_camera)
-        if keep:
+        if scene.keep:
             ctx.save_for_backward(*geometry, ready.voxels, ready.record, ready.indices, ready.reach, kept, ends)
         return picture
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *on_picture: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        if ctx.scene is None:
-            return None, *(on_picture[0].new_zeros(shape) for shape in ctx.shapes)
-        return None, *_adjoint(ctx.scene, ctx.units, *on_picture[:3], *ctx.saved_tensors)
+        if ctx.units is None:
+            return None, *(on_picture[0].new_zeros(shape) for shape in ctx.nothing)
+        return None, *_adjoint(ctx.shapes, ctx.spacing, ctx.units, *on_picture[:3], *ctx.saved_tensors)
 
 
 def _adjoint(
-    scene: _Scene, units: int, on_rgb: Tensor, on_alpha: Tensor, on_depth: Tensor, *saved: Tensor
+    shapes: Shapes, spacing: float, units: int, on_rgb: Tensor, on_alpha: Tensor, on_depth: Tensor, *saved: Tensor
 ) -> tuple[Tensor, ...]:
     """Gradients in the order of `_March.forward`'s tensors."""
     from primdiffusion.render import triton_adjoint
 
     position, rotation, half_extent, intrinsics, world_to_camera, voxels, record, indices, reach, kept, ends = saved
-    shapes, (height, width) = scene.shapes, on_alpha.shape[1:]
+    height, width = on_alpha.shape[1:]
     (p, k), b, device = position.shape[:2], len(intrinsics), position.device
     own_boxes = k if p == b else 0
     new = functools.partial(torch.empty, device=device)
@@ -308,7 +321,7 @@ def _adjoint(
     seeds = new((b, height, width, 8))
     rays = b * height * width
     _launch(triton_adjoint.seed_rays, (-(-rays // LANES_OF_SEEDS),), 
-        on_rgb.contiguous(), on_alpha.contiguous(), on_depth.contiguous(), kept, ends, seeds, rays, scene.spacing,
+        on_rgb.contiguous(), on_alpha.contiguous(), on_depth.contiguous(), kept, ends, seeds, rays, spacing,
         LANES=LANES_OF_SEEDS, num_warps=4,
     )  # fmt: skip
     blocks = indices[..., 12].flatten().long()
@@ -320,8 +333,8 @@ def _adjoint(
     if units:
         _launch(triton_adjoint.adjoint_boxes, (units,), 
             record, indices, voxels, reach, seeds, ends, unit_box, unit_part, rotation, half_extent, intrinsics,
-            world_to_camera, unit_voxels, unit_sums, k, own_boxes, height, width, scene.spacing,
-            HAS_SPAN=scene.span is not None, BLOCK_WIDTH=shapes.block[0], BLOCK_HEIGHT=shapes.block[1],
+            world_to_camera, unit_voxels, unit_sums, k, own_boxes, height, width, spacing,
+            HAS_SPAN=reach is not None, BLOCK_WIDTH=shapes.block[0], BLOCK_HEIGHT=shapes.block[1],
             BLOCKS_OF_UNIT=shapes.blocks_of_unit, num_warps=shapes.adjoint_warps,
         )  # fmt: skip
     on_boxes = [new(shape) for shape in ((p, k, 3), (p, k, 3, 3), (p, k, 3), (p, k, 3, S, S, S), (p, k, S, S, S))]

@@ -81,56 +81,70 @@ def _dot(ax, ay, az, bx, by, bz):
 
 
 @triton.jit
+def _corner(CORNER: tl.constexpr, lx, ly, lz, hx, hy, hz):
+    """One of the eight corners of [l, h]."""
+    return (hx if CORNER % 2 else lx), (hy if CORNER // 2 % 2 else ly), (hz if CORNER // 4 else lz)
+
+
+@triton.jit
+def _other(EDGE: tl.constexpr):
+    """One of the twelve edges of a cube as the numbers of its two corners, 8 * first + second."""
+    AXIS: tl.constexpr = EDGE // 4
+    LOW: tl.constexpr = EDGE % 4
+    FIRST: tl.constexpr = LOW * 2 if AXIS == 0 else (LOW % 2 + LOW // 2 * 4 if AXIS == 1 else LOW)
+    return 8 * FIRST + FIRST + (1 << AXIS)
+
+
+@triton.jit
 def _grow(u0, u1, v0, v1, x, y, z, seen, fx, skew, cx, fy, cy):
     """A rectangle grown to hold the pixel of a point in the camera's coordinates, where `seen`."""
-    safe = tl.where(seen, z, 1.0)
-    v = tl.minimum(tl.maximum(fy * y / safe + cy, -FAR_PIXEL), FAR_PIXEL)
-    u = tl.minimum(tl.maximum((fx * x + skew * y) / safe + cx, -FAR_PIXEL), FAR_PIXEL)
+    inverse = 1.0 / tl.where(seen, z, 1.0)
+    v = tl.minimum(tl.maximum(fy * y * inverse + cy, -FAR_PIXEL), FAR_PIXEL)
+    u = tl.minimum(tl.maximum((fx * x + skew * y) * inverse + cx, -FAR_PIXEL), FAR_PIXEL)
     u0, u1 = tl.where(seen, tl.minimum(u0, u), u0), tl.where(seen, tl.maximum(u1, u), u1)
     v0, v1 = tl.where(seen, tl.minimum(v0, v), v0), tl.where(seen, tl.maximum(v1, v), v1)
     return u0, u1, v0, v1
 
 
 @triton.jit
-def _rectangle(
-    cx_, cy_, cz_, xx, xy, xz, yx, yy, yz, zx, zy, zz, lx, ly, lz, hx, hy, hz, near, width, height, fx, skew, cx, fy, cy
-):
+def _place(a, b, c, centre, x, y, z):
+    """centre + a x + b y + c z of vectors."""
+    return (
+        centre[0] + a * x[0] + b * y[0] + c * z[0],
+        centre[1] + a * x[1] + b * y[1] + c * z[1],
+        centre[2] + a * x[2] + b * y[2] + c * z[2],
+    )
+
+
+@triton.jit
+def _rectangle(centre, x, y, z, lx, ly, lz, hx, hy, hz, near, width, height, fx, skew, cx, fy, cy):
     """First and last pixel column and row that see the part [l, h] of a box, and how far that part reaches.
 
-    The box's centre is c, its half axes x, y, z, all in the camera's coordinates. Edges are cut at the plane z = near.
+    The box's centre and half axes are in the camera's coordinates, in float32. Edges are cut at the plane z = near.
     """
-    u0, u1 = cz_ * 0 + FAR_PIXEL, cz_ * 0 - FAR_PIXEL
-    v0, v1 = cz_ * 0 + FAR_PIXEL, cz_ * 0 - FAR_PIXEL
-    reach = cz_ * 0
-    for edge in tl.static_range(12):
-        axis: tl.constexpr = edge // 4
-        one: tl.constexpr = edge % 2
-        two: tl.constexpr = (edge // 2) % 2
-        # The edge runs along `axis`; bits `one` and `two` choose the ends of the other axes.
-        if axis == 0:
-            ax, ay, az = lx, (hy if one else ly), (hz if two else lz)
-            bx, by, bz = hx, ay, az
-        elif axis == 1:
-            ax, ay, az = (hx if one else lx), ly, (hz if two else lz)
-            bx, by, bz = ax, hy, az
-        else:
-            ax, ay, az = (hx if one else lx), (hy if two else ly), lz
-            bx, by, bz = ax, ay, hz
-        px, py = cx_ + ax * xx + ay * yx + az * zx, cy_ + ax * xy + ay * yy + az * zy
-        pz = cz_ + ax * xz + ay * yz + az * zz
-        qx, qy = cx_ + bx * xx + by * yx + bz * zx, cy_ + bx * xy + by * yy + bz * zy
-        qz = cz_ + bx * xz + by * yz + bz * zz
-        reach = tl.maximum(reach, tl.maximum(px * px + py * py + pz * pz, qx * qx + qy * qy + qz * qz))
+    none = centre[2] * 0
+    u0, u1, v0, v1 = none + FAR_PIXEL, none - FAR_PIXEL, none + FAR_PIXEL, none - FAR_PIXEL
+    reach, nearest, furthest = none, none + float("inf"), none - float("inf")
+    for corner in tl.static_range(8):
+        a, b, c = _corner(corner, lx, ly, lz, hx, hy, hz)
+        px, py, pz = _place(a, b, c, centre, x, y, z)
+        reach = tl.maximum(reach, px * px + py * py + pz * pz)
+        nearest, furthest = tl.minimum(nearest, pz), tl.maximum(furthest, pz)
         u0, u1, v0, v1 = _grow(u0, u1, v0, v1, px, py, pz, pz >= near, fx, skew, cx, fy, cy)
-        u0, u1, v0, v1 = _grow(u0, u1, v0, v1, qx, qy, qz, qz >= near, fx, skew, cx, fy, cy)
-        crosses = (pz < near) != (qz < near)
-        share = (near - pz) / tl.where(crosses, qz - pz, 1.0)
-        kx, ky = px + share * (qx - px), py + share * (qy - py)
-        u0, u1, v0, v1 = _grow(u0, u1, v0, v1, kx, ky, kx * 0 + near, crosses, fx, skew, cx, fy, cy)
-    left = tl.maximum(tl.ceil(u0 - MARGIN - 0.5), 0.0).to(tl.int32)
-    right = tl.minimum(tl.floor(u1 + MARGIN - 0.5), width - 1.0).to(tl.int32)
-    top = tl.maximum(tl.ceil(v0 - MARGIN - 0.5), 0.0).to(tl.int32)
-    bottom = tl.minimum(tl.floor(v1 + MARGIN - 0.5), height - 1.0).to(tl.int32)
+    if tl.max(((nearest < near) & (furthest >= near)).to(tl.int32), 0) > 0:
+        for edge in tl.static_range(12):
+            a, b, c = _corner(_other(edge) // 8, lx, ly, lz, hx, hy, hz)
+            px, py, pz = _place(a, b, c, centre, x, y, z)
+            a, b, c = _corner(_other(edge) % 8, lx, ly, lz, hx, hy, hz)
+            qx, qy, qz = _place(a, b, c, centre, x, y, z)
+            crosses = (pz < near) != (qz < near)
+            share = (near - pz) / tl.where(crosses, qz - pz, 1.0)
+            kx, ky = px + share * (qx - px), py + share * (qy - py)
+            u0, u1, v0, v1 = _grow(u0, u1, v0, v1, kx, ky, none + near, crosses, fx, skew, cx, fy, cy)
+    left = tl.maximum(tl.ceil(u0 - tl.abs(u0) * 1e-5 - (MARGIN + 0.5)), 0.0).to(tl.int32)
+    right = tl.minimum(tl.floor(u1 + tl.abs(u1) * 1e-5 + (MARGIN - 0.5)), width - 1.0).to(tl.int32)
+    top = tl.maximum(tl.ceil(v0 - tl.abs(v0) * 1e-5 - (MARGIN + 0.5)), 0.0).to(tl.int32)
+    bottom = tl.minimum(tl.floor(v1 + tl.abs(v1) * 1e-5 + (MARGIN - 0.5)), height - 1.0).to(tl.int32)
     return left, right, top, bottom, tl.sqrt(reach)
 
 
@@ -224,19 +238,20 @@ def place_boxes(
     along = n0 * spacing
     ex, ey, ez = along * dx - wx, along * dy - wy, along * dz - wz
 
+    i0, i1, i2 = 1.0 / h0, 1.0 / h1, 1.0 / h2
     row = record + target * 32
-    tl.store(row, (_dot(xx, xy, xz, ax, ay, az) / h0).to(tl.float32), here)
-    tl.store(row + 1, (_dot(yx, yy, yz, ax, ay, az) / h1).to(tl.float32), here)
-    tl.store(row + 2, (_dot(zx, zy, zz, ax, ay, az) / h2).to(tl.float32), here)
-    tl.store(row + 3, (_dot(xx, xy, xz, bx, by, bz) / h0).to(tl.float32), here)
-    tl.store(row + 4, (_dot(yx, yy, yz, bx, by, bz) / h1).to(tl.float32), here)
-    tl.store(row + 5, (_dot(zx, zy, zz, bx, by, bz) / h2).to(tl.float32), here)
-    tl.store(row + 6, (_dot(xx, xy, xz, dx, dy, dz) / h0).to(tl.float32), here)
-    tl.store(row + 7, (_dot(yx, yy, yz, dx, dy, dz) / h1).to(tl.float32), here)
-    tl.store(row + 8, (_dot(zx, zy, zz, dx, dy, dz) / h2).to(tl.float32), here)
-    tl.store(row + 9, (_dot(xx, xy, xz, ex, ey, ez) / h0).to(tl.float32), here)
-    tl.store(row + 10, (_dot(yx, yy, yz, ex, ey, ez) / h1).to(tl.float32), here)
-    tl.store(row + 11, (_dot(zx, zy, zz, ex, ey, ez) / h2).to(tl.float32), here)
+    tl.store(row, (_dot(xx, xy, xz, ax, ay, az) * i0).to(tl.float32), here)
+    tl.store(row + 1, (_dot(yx, yy, yz, ax, ay, az) * i1).to(tl.float32), here)
+    tl.store(row + 2, (_dot(zx, zy, zz, ax, ay, az) * i2).to(tl.float32), here)
+    tl.store(row + 3, (_dot(xx, xy, xz, bx, by, bz) * i0).to(tl.float32), here)
+    tl.store(row + 4, (_dot(yx, yy, yz, bx, by, bz) * i1).to(tl.float32), here)
+    tl.store(row + 5, (_dot(zx, zy, zz, bx, by, bz) * i2).to(tl.float32), here)
+    tl.store(row + 6, (_dot(xx, xy, xz, dx, dy, dz) * i0).to(tl.float32), here)
+    tl.store(row + 7, (_dot(yx, yy, yz, dx, dy, dz) * i1).to(tl.float32), here)
+    tl.store(row + 8, (_dot(zx, zy, zz, dx, dy, dz) * i2).to(tl.float32), here)
+    tl.store(row + 9, (_dot(xx, xy, xz, ex, ey, ez) * i0).to(tl.float32), here)
+    tl.store(row + 10, (_dot(yx, yy, yz, ex, ey, ez) * i1).to(tl.float32), here)
+    tl.store(row + 11, (_dot(zx, zy, zz, ex, ey, ez) * i2).to(tl.float32), here)
     tl.store(row + 12, along.to(tl.float32), here)
     tl.store(row + 13, length.to(tl.float32), here)
     tl.store(row + 14, (2 * _dot(mx, my, mz, ax, ay, az)).to(tl.float32), here)
@@ -266,32 +281,32 @@ def place_boxes(
     voxel = (2.0 * tl.where(solid, shortest, 1.0).to(tl.float64) / 7.0).to(tl.float32)
     stride = k * 0 + STRIDES[len(STRIDES) - 1]
     for i in tl.static_range(len(STRIDES)):
-        j: tl.constexpr = len(STRIDES) - 1 - i
-        threshold = tl.load(lattice + 1 + j).to(tl.float32)
-        stride = tl.where(voxel >= threshold, STRIDES[j], stride)
+        threshold = tl.load(lattice + len(STRIDES) - i).to(tl.float32)
+        stride = tl.where(voxel >= threshold, STRIDES[len(STRIDES) - 1 - i], stride)
     tl.store(row + 26, (stride * spacing).to(tl.float32), here)
 
     # Half axes and centre as the camera sees them.
-    hxx, hxy, hxz = _turned(r0x, r0y, r0z, r1x, r1y, r1z, r2x, r2y, r2z, xx * h0, xy * h0, xz * h0)
-    hyx, hyy, hyz = _turned(r0x, r0y, r0z, r1x, r1y, r1z, r2x, r2y, r2z, yx * h1, yy * h1, yz * h1)
-    hzx, hzy, hzz = _turned(r0x, r0y, r0z, r1x, r1y, r1z, r2x, r2y, r2z, zx * h2, zy * h2, zz * h2)
-    near = 1e-4 * spacing
+    axis_x = _turned(r0x, r0y, r0z, r1x, r1y, r1z, r2x, r2y, r2z, xx * h0, xy * h0, xz * h0)
+    axis_y = _turned(r0x, r0y, r0z, r1x, r1y, r1z, r2x, r2y, r2z, yx * h1, yy * h1, yz * h1)
+    axis_z = _turned(r0x, r0y, r0z, r1x, r1y, r1z, r2x, r2y, r2z, zx * h2, zy * h2, zz * h2)
+    centre = (beside.to(tl.float32), below.to(tl.float32), depth.to(tl.float32))
+    near = (1e-4 * spacing).to(tl.float32)
+    f0, f1, f2 = fx.to(tl.float32), skew.to(tl.float32), cx.to(tl.float32)
+    f3, f4 = fy.to(tl.float32), cy.to(tl.float32)
     left, right, top, bottom, reach = _rectangle(
-        beside, below, depth, hxx, hxy, hxz, hyx, hyy, hyz, hzx, hzy, hzz, l0.to(tl.float64), l1.to(tl.float64),
-        l2.to(tl.float64), g0.to(tl.float64), g1.to(tl.float64), g2.to(tl.float64), near, width, height,
-        fx, skew, cx, fy, cy,
-    )  # fmt: skip
+        centre, axis_x, axis_y, axis_z, l0, l1, l2, g0, g1, g2, near, width, height, f0, f1, f2, f3, f4
+    )
     # The nearest point of that part: the origin in the box's coordinates, moved into it.
     nx, ny, nz = (
-        -_dot(xx, xy, xz, wx, wy, wz) / h0,
-        -_dot(yx, yy, yz, wx, wy, wz) / h1,
-        -_dot(zx, zy, zz, wx, wy, wz) / h2,
+        -_dot(xx, xy, xz, wx, wy, wz) * i0,
+        -_dot(yx, yy, yz, wx, wy, wz) * i1,
+        -_dot(zx, zy, zz, wx, wy, wz) * i2,
     )
     nx, ny = nx - tl.minimum(tl.maximum(nx, l0), g0), ny - tl.minimum(tl.maximum(ny, l1), g1)
     nz = nz - tl.minimum(tl.maximum(nz, l2), g2)
     nx, ny, nz = nx * h0, ny * h1, nz * h2
     first = tl.ceil(tl.sqrt(nx * nx + ny * ny + nz * nz) * (1 - 1e-6) / spacing - 0.01)
-    last = tl.floor(reach * (1 + 1e-6) / spacing + 0.01)
+    last = tl.floor(reach.to(tl.float64) * (1 + 1e-6) / spacing + 0.01)
     first = tl.minimum(tl.maximum(first, 1.0), LAST_POINT * 1.0).to(tl.int32)
     last = tl.minimum(last, LAST_POINT * 1.0).to(tl.int32)
     shown = solid & (g0 > l0) & (left <= right) & (top <= bottom) & (first <= last)
@@ -314,11 +329,10 @@ def place_boxes(
     bins = (right // BIN - left // BIN + 1).to(tl.int64) * (bottom // BIN - top // BIN + 1)
 
     # All of it: empty voxels receive gradients too.
-    one = h0 * 0 + 1.0
-    left, right, top, bottom, reach = _rectangle(
-        beside, below, depth, hxx, hxy, hxz, hyx, hyy, hyz, hzx, hzy, hzz, -one, -one, -one, one, one, one, near,
-        width, height, fx, skew, cx, fy, cy,
-    )  # fmt: skip
+    one = l0 * 0 + 1.0
+    left, right, top, bottom, _ = _rectangle(
+        centre, axis_x, axis_y, axis_z, -one, -one, -one, one, one, one, near, width, height, f0, f1, f2, f3, f4
+    )
     met = solid & (left <= right) & (top <= bottom)
     columns, rows = (right - left) // BLOCK_WIDTH + 1, (bottom - top) // BLOCK_HEIGHT + 1
     blocks = tl.where(met, columns * rows, 0)
@@ -335,4 +349,6 @@ def place_boxes(
 
 @triton.jit
 def _turned(r0x, r0y, r0z, r1x, r1y, r1z, r2x, r2y, r2z, x, y, z):
-    return _dot(r0x, r0y, r0z, x, y, z), _dot(r1x, r1y, r1z, x, y, z), _dot(r2x, r2y, r2z, x, y, z)
+    """A vector as the camera sees it, in float32."""
+    a, b, c = _dot(r0x, r0y, r0z, x, y, z), _dot(r1x, r1y, r1z, x, y, z), _dot(r2x, r2y, r2z, x, y, z)
+    return a.to(tl.float32), b.to(tl.float32), c.to(tl.float32)

@@ -1,0 +1,206 @@
+"""How fast and how exact the marcher is on a CUDA device: one person of 1024 boxes that fills the frame.
+
+`python benchmarks/march_cuda.py --json march_cuda.json` prints and writes one flat object. Milliseconds are medians
+between CUDA events around whole calls, launches and the one wait for the device included. The ceilings are measured on
+the same device in the same run; a sample costs `OPERATIONS_PER_SAMPLE` (SPEC 4) and, where nothing is reused, 128 bytes
+of voxels. `--kernels` adds a table of what each kernel takes, `--sweep` of how the work may be cut into programs.
+
+It needs a CUDA device, torch for CUDA, the triton that this torch names, and the package's own requirements; nothing
+is downloaded. From a checkout: `PYTHONPATH=backend python benchmarks/march_cuda.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from march_people import portrait, standing_person
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render.compositing import Rendering
+from primdiffusion.render.cpu import count_samples
+from primdiffusion.render.cuda import Shapes, available, march_cuda
+from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings
+from primdiffusion.render.reference import march_reference
+from record import tell
+from roofline import OPERATIONS_PER_SAMPLE
+from torch import Tensor
+
+FINE, DEFAULT = UNIFORM_MILLIMETRE, MarchSettings()
+SIZES = (256, 512, 1024, 2048)
+BATCHES = (4, 16)
+BYTES_OF_SAMPLE = 8 * 16
+EXACT_SIZE, GRADIENT_SIZE = 128, 96
+"""Pixels along a side of the pictures that are compared to the reference in float64."""
+Figures = dict[str, float | int | bool | str | None]
+
+
+def scene(size: int, views: int = 1, people: int = 1) -> tuple[Primitives, Camera]:
+    """A person, or so many different ones, and as many equal views, on the device."""
+    boxes = [standing_person(seed) for seed in range(people)]
+    names = [field.name for field in dataclasses.fields(Primitives)]
+    batch = Primitives(**{name: torch.stack([getattr(person, name) for person in boxes]) for name in names})
+    camera = portrait(size).map(lambda tensor: tensor.expand(views, *tensor.shape).clone())
+    return batch.to("cuda", torch.float32), camera.to("cuda", torch.float32)
+
+
+def leaves(record: Any) -> Any:
+    """The record with tensors of its own that collect gradients."""
+    return record.map(lambda tensor: tensor.detach().clone().requires_grad_())
+
+
+def forward_ms(boxes: Primitives, camera: Camera, settings: MarchSettings, shapes: Shapes = Shapes()) -> float:  # noqa: B008
+    """Of a picture without gradients."""
+    from cuda_ceilings import median_ms
+
+    with torch.no_grad():
+        return median_ms(lambda: march_cuda(boxes, camera, settings, None, shapes))
+
+
+def training_ms(
+    boxes: Primitives,
+    camera: Camera,
+    settings: MarchSettings,
+    shapes: Shapes = Shapes(),  # noqa: B008
+) -> tuple[float, float]:
+    """Of a forward pass that keeps what the backward pass needs, and of that one, for all gradients."""
+    from cuda_ceilings import median_ms
+
+    boxes, camera = leaves(boxes), leaves(camera)
+    inputs = [*vars(boxes).values(), camera.intrinsics, camera.world_to_camera]
+    forward = median_ms(lambda: march_cuda(boxes, camera, settings, None, shapes))
+    picture = march_cuda(boxes, camera, settings, None, shapes)
+    outputs = [picture.rgb, picture.alpha, picture.depth]
+    weights = [torch.randn_like(output) for output in outputs]
+    backward = median_ms(lambda: torch.autograd.grad(outputs, inputs, weights, retain_graph=True))
+    return forward, backward
+
+
+def speed() -> Figures:
+    """Times and shares of the ceilings."""
+    from cuda_ceilings import cached_bytes_per_second, copied_bytes_per_second, operations_per_second
+
+    operations, copied, cached = operations_per_second(), copied_bytes_per_second(), cached_bytes_per_second()
+    figures: Figures = {
+        "cuda_ceiling_tflops": operations / 1e12,
+        "cuda_ceiling_copy_tb_per_s": copied / 1e12,
+        "cuda_ceiling_cache_read_tb_per_s": cached / 1e12,
+    }
+    for size in SIZES:
+        figures[f"cuda_forward_{size}_ms"] = forward_ms(*scene(size), DEFAULT)
+    boxes, camera = scene(512)
+    figures["cuda_forward_4mm_ms"] = figures["cuda_forward_512_ms"]
+    figures["cuda_forward_1mm_ms"] = forward_ms(boxes, camera, FINE)
+    for name, settings in (("4mm", DEFAULT), ("1mm", FINE)):
+        samples = count_samples(standing_person(), portrait(512), settings).inside_boxes
+        seconds = float(figures[f"cuda_forward_{name}_ms"] or 0) / 1e3
+        figures[f"samples_{name}"] = samples
+        figures[f"cuda_share_of_tflops_{name}"] = samples * OPERATIONS_PER_SAMPLE / operations / seconds
+        figures[f"cuda_share_of_cache_read_{name}"] = samples * BYTES_OF_SAMPLE / cached / seconds
+        moved = boxes.rgb.nbytes + boxes.density.nbytes + camera.width * camera.height * 6 * 4
+        figures[f"cuda_share_of_copy_{name}"] = moved / copied / seconds
+        forward, backward = training_ms(boxes, camera, settings)
+        figures[f"cuda_forward_keeping_{name}_ms"], figures[f"cuda_backward_{name}_ms"] = forward, backward
+        figures[f"cuda_backward_ratio_{name}"] = backward / forward
+    figures["cuda_backward_ratio"] = figures["cuda_backward_ratio_4mm"]
+    for views in BATCHES:
+        figures[f"cuda_forward_{views}_views_ms"] = forward_ms(*scene(512, views), DEFAULT)
+        figures[f"cuda_forward_{views}_people_ms"] = forward_ms(*scene(512, views, views), DEFAULT)
+    return figures
+
+
+def exactness() -> Figures:
+    """Against the reference in float64: the largest difference in rgb (0 ... 1), the smallest cosine of gradients."""
+    boxes, camera = scene(EXACT_SIZE)
+    exact = march_reference(first_in_double(boxes), first_in_double(camera))
+    figures: Figures = {"cuda_rgb_error_max": float((march_cuda(boxes, camera).rgb[0] - exact.rgb).abs().max())}
+
+    boxes, camera = scene(GRADIENT_SIZE)
+    fast = gradients(march_cuda, boxes, camera)
+    slow = gradients(march_reference, first_in_double(boxes), first_in_double(camera))
+    cosines = {name: float(torch.cosine_similarity(fast[name], slow[name], dim=0)) for name in fast}
+    figures |= {f"cuda_gradient_cosine_{name}": cosine for name, cosine in cosines.items()}
+    figures["cuda_gradient_cosine_min"] = min(cosines.values())
+    return figures
+
+
+def first_in_double(record: Any) -> Any:
+    """The first scene of a batch, in float64."""
+    return record.to(dtype=torch.float64).map(lambda tensor: tensor[0])
+
+
+def gradients(draw: Callable[..., Rendering], boxes: Primitives, camera: Camera) -> dict[str, Tensor]:
+    """Of a fixed random mix of rgb, alpha and depth."""
+    boxes, camera = leaves(boxes), leaves(camera)
+    picture = draw(boxes, camera)
+    depth = torch.where(picture.alpha > 0.05, picture.depth, 0)
+    values = torch.cat([picture.rgb, picture.alpha[..., None], depth[..., None]], dim=-1)
+    weights = torch.randn(values.shape[-3:], generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    (values * weights.to(values)).sum().backward()
+    tensors = {**vars(boxes), "intrinsics": camera.intrinsics, "world_to_camera": camera.world_to_camera}
+    return {name: tensor.grad.double().flatten() for name, tensor in tensors.items()}
+
+
+def print_kernels() -> None:
+    """What each kernel of a forward and a backward pass takes, by the profiler."""
+    from torch.profiler import ProfilerActivity, profile
+
+    boxes, camera = (leaves(record) for record in scene(512))
+    march_cuda(boxes, camera).rgb.sum().backward()
+    torch.cuda.synchronize()
+    with profile(activities=[ProfilerActivity.CUDA]) as profiled:
+        march_cuda(boxes, camera).rgb.sum().backward()
+        torch.cuda.synchronize()
+    print(profiled.key_averages().table(row_limit=40, max_name_column_width=60))
+
+
+def variants() -> Iterator[Shapes]:
+    """Other ways to cut the work; the first is the default."""
+    yield Shapes()
+    for tile, samples, warps in (
+        ((8, 4), 8, 8), ((8, 4), 4, 4), ((8, 4), 16, 8), ((8, 8), 4, 4), ((8, 8), 8, 8), ((4, 4), 8, 2), ((16, 4), 4, 4)
+    ):  # fmt: skip
+        for registers in (128, 168, 255):
+            yield Shapes(tile=tile, samples=samples, march_warps=warps, march_registers=registers)
+    for block, warps in (((8, 8), 2), ((16, 8), 4)):
+        yield Shapes(block=block, adjoint_warps=warps)
+    for units in (8, 16, 32):
+        yield Shapes(blocks_of_unit=units)
+    for side in (4, 16):
+        yield Shapes(bin=side)
+
+
+def print_sweep() -> None:
+    """Forward and backward milliseconds of the variants at 512 x 512."""
+    boxes, camera = scene(512)
+    for shapes in variants():
+        forward, backward = training_ms(boxes, camera, DEFAULT, shapes)
+        fine = forward_ms(boxes, camera, FINE, shapes)
+        print(f"{forward:.3f} {backward:.3f} ms, every millimetre {fine:.3f} ms  {shapes}", flush=True)
+
+
+def main() -> None:
+    """Measures, prints and, if asked, writes the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--kernels", action="store_true", help="also print what each kernel takes")
+    parser.add_argument("--sweep", action="store_true", help="also print times of other ways to cut the work")
+    arguments = parser.parse_args()
+    if not torch.cuda.is_available():
+        sys.exit("no CUDA device: torch sees none on this machine, so there is nothing to measure")
+    if not available("cuda"):
+        sys.exit("no triton: install the version that `pip show torch` names")
+    tell(exactness() | speed(), arguments.json)
+    if arguments.kernels:
+        print_kernels()
+    if arguments.sweep:
+        print_sweep()
+
+
+if __name__ == "__main__":
+    main()
