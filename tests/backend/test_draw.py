@@ -137,6 +137,20 @@ def test_a_solids_outline_is_smooth_and_where_it_is_nearer_it_hides_people(boxes
         assert np.array_equal(depth < NOTHING, covered >= 0.5)
 
 
+def test_far_and_narrow_views_find_outlines_too(boxes):
+    """From 2 km, as parallel views are taken: a wall whose edge has people and another wall behind it."""
+    camera = camera_at((0.0, 0.0, 2000.0), fov=0.15 / 1000, width=36, height=36).to(dtype=torch.float32)
+    corners = np.array([[[-9, -9, 0.3], [3, -9, 0.3], [-3, 9, 0.3]], [[-9, -9, 0.3], [-3, 9, 0.3], [-9, 9, 0.3]]])
+    half = Solids(corners.astype(np.float32), np.array([RED] * 2, np.float32), np.zeros(2, bool))
+    far = wall(-0.3)
+    both = Solids(*(np.concatenate([getattr(half, n), getattr(far, n)]) for n in ("corners", "colour", "holdout")))
+    people_before_far, near = draw(Scene(boxes, far), camera).combined, draw(Scene(None, half), camera).combined
+    want = near + (1 - near[..., 3:]) * people_before_far
+    outline = (near[..., 3] > 0) & (near[..., 3] < 1)
+    assert (np.abs(want - draw(Scene(None, both), camera).combined).max(-1) > 0.1)[outline].any(), "people are there"
+    assert np.allclose(draw(Scene(boxes, both), camera).combined, want, atol=1e-4)
+
+
 def test_without_a_background_the_picture_is_premultiplied_and_transparent(boxes, camera):
     clear, full = draw(Scene(boxes), camera), draw(Scene(boxes), camera, Look(background=BACKGROUND))
     alpha = clear.combined[..., 3:]

@@ -22,8 +22,9 @@ from primdiffusion.render.triangles import nearest_triangles
 
 FINER = 2
 """Points of a pixel along each side at which solids are looked for."""
-SMOOTH = 0.02
-"""Depths within a pixel that differ by a smaller share are one surface, as one triangle is at any depths."""
+STEEPEST = 6.0
+"""A pixel shows one surface where depths within it differ by less than this many times the pixel's width there (a slope
+of 80 degrees), or all belong to one triangle. Measured in pixels, so that it holds for far and narrow views as well."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -50,7 +51,7 @@ def backdrop(solids: Solids, camera: Camera, clip: tuple[float, float]) -> Backd
     hole = (nearest.triangle >= 0) & solids.holdout[nearest.triangle] if solids.holdout.any() else None
     end = np.empty((camera.height, camera.width), np.float32)
     outline = np.empty((camera.height, camera.width), np.bool_)
-    _find_ends(nearest.triangle, nearest.depth, end, outline)
+    _find_ends(nearest.triangle, nearest.depth, 1 / float(camera.intrinsics[0, 0]), end, outline)
     shaded = shade_solids(solids, nearest, finer)
     return Backdrop(shaded, np.zeros(shaded.alpha.shape, np.bool_) if hole is None else hole, end, outline)
 
@@ -78,7 +79,7 @@ def over_solids(
 
 
 @numba.njit(cache=True, nogil=True)
-def _find_ends(triangle, depth, end, outline):
+def _find_ends(triangle, depth, pixel, end, outline):
     for row in range(end.shape[0]):
         for column in range(end.shape[1]):
             low, high, inverse, one_triangle = np.inf, 0.0, 0.0, True
@@ -86,7 +87,7 @@ def _find_ends(triangle, depth, end, outline):
                 y, x = row * FINER + i // FINER, column * FINER + i % FINER
                 low, high, inverse = min(low, depth[y, x]), max(high, depth[y, x]), inverse + 1.0 / depth[y, x]
                 one_triangle = one_triangle and triangle[y, x] == triangle[row * FINER, column * FINER]
-            outline[row, column] = not one_triangle and not high - low <= SMOOTH * low
+            outline[row, column] = not one_triangle and not high - low <= STEEPEST * pixel * low
             # On a plane the inverse of the depth is linear in the picture: this mean is the depth at the centre.
             end[row, column] = high if outline[row, column] or inverse == 0.0 else FINER * FINER / inverse
 
