@@ -6,6 +6,7 @@ then, so that this file loads without it. A frame takes the launches of `_prepar
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import importlib.util
@@ -95,7 +96,9 @@ def march_cuda(
     tensors = [getattr(primitives, name) for name in BOX_FIELDS] + [camera.intrinsics, camera.world_to_camera]
     keep = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
     scene = _Scene(primitives, camera, settings, span, shapes, keep)
-    return Rendering(*_March.apply(scene, *tensors))
+    device = primitives.position.device
+    with torch.cuda.device(device) if device.type == "cuda" else contextlib.nullcontext():
+        return Rendering(*_March.apply(scene, *tensors))
 
 
 BOX_FIELDS = ("position", "rotation", "half_extent", "rgb", "density")

@@ -92,7 +92,7 @@ def _other(EDGE: tl.constexpr):
     AXIS: tl.constexpr = EDGE // 4
     LOW: tl.constexpr = EDGE % 4
     FIRST: tl.constexpr = LOW * 2 if AXIS == 0 else (LOW % 2 + LOW // 2 * 4 if AXIS == 1 else LOW)
-    return 8 * FIRST + FIRST + (1 << AXIS)
+    return 8 * FIRST + FIRST + (1 if AXIS == 0 else 2 if AXIS == 1 else 4)
 
 
 @triton.jit
