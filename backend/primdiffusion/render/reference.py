@@ -125,9 +125,7 @@ def _march_rays(
 
     group, first = GROUPING[settings.compositing](ray, n)
     group_opacity = opacity.new_zeros(len(first)).index_add(0, group, opacity)
-    seen = group_opacity > 0
     group_rgb = rgb.new_zeros((len(first), 3)).index_add(0, group, opacity[:, None] * rgb)
-    group_rgb = group_rgb / torch.where(seen, group_opacity, torch.ones_like(group_opacity))[:, None]
     return composite(*_rows(ray[first], len(directions), group_opacity, group_rgb, distance[first]))
 
 
