@@ -1,6 +1,8 @@
 """The fast marcher against the readable one in float64, over the scenes that break marchers."""
 
 import dataclasses
+import time
+import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -8,8 +10,8 @@ import torch
 from march_scenes import camera_at, one_box, random_boxes
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.cpu import march_cpu
-from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings
+from primdiffusion.render.cpu import _scene, _view, count_samples, march_cpu
+from primdiffusion.render.lattice import RELEASED, UNIFORM_MILLIMETRE, MarchSettings, Span
 from primdiffusion.render.march import march
 from primdiffusion.render.reference import march_reference
 
@@ -17,10 +19,18 @@ FACE_STEP = 3.4e-4
 """The window's value at a face, by which a sample that rounding moves in or out of a box changes."""
 
 
-def assert_agree(boxes: Primitives, camera: Camera, settings: MarchSettings = MarchSettings()) -> None:  # noqa: B008
+INDEX_ORDER = MarchSettings(compositing="index_order")
+
+
+def assert_agree(
+    boxes: Primitives,
+    camera: Camera,
+    settings: MarchSettings = MarchSettings(),  # noqa: B008
+    span: Span | None = None,
+) -> None:
     """All fields within 2e-5 plus one flipped face sample of the densest box, on average within 2e-6."""
-    got = march_cpu(boxes.to(dtype=torch.float32), camera.to(dtype=torch.float32), settings)
-    expected = march_reference(boxes.to(dtype=torch.float32).to(dtype=torch.float64), camera, settings)
+    got = march_cpu(boxes.to(dtype=torch.float32), camera.to(dtype=torch.float32), settings, span)
+    expected = march_reference(boxes.to(dtype=torch.float32).to(dtype=torch.float64), camera, settings, span)
     densest = float(boxes.density.max()) if boxes.density.numel() else 0.0
     largest = 2e-5 + FACE_STEP * min(densest * settings.step, 1)
     for name in ("rgb", "alpha"):
@@ -150,3 +160,143 @@ def test_threads_may_march_at_the_same_time():
     with ThreadPoolExecutor(4) as pool:
         together = list(pool.map(lambda _: march_cpu(boxes, camera).rgb, range(8)))
     assert all(torch.equal(rgb, alone) for rgb in together)
+
+
+def half_empty(count: int, seed: int, density: float = 60.0) -> Primitives:
+    """Boxes as a person's: density in an inner slab of cells only; one holds nothing, one a single voxel."""
+    boxes = random_boxes(count, seed, density=density)
+    boxes.density[:, 5:] = 0
+    boxes.density[:, :, :2] = 0
+    boxes.density[::3, :, :, 4:] = 0
+    boxes.density[0] = 0
+    boxes.density[1] = 0
+    boxes.density[1, 3, 4, 2] = density
+    return boxes
+
+
+@pytest.mark.parametrize("settings", [MarchSettings(), MarchSettings(compositing="index_order")])
+def test_leaving_out_empty_cells_does_not_change_the_picture(settings):
+    boxes, camera = half_empty(30, 20), camera_at((0.2, 0.1, 0.6), fov=0.5, width=50, height=37)
+    assert_agree(boxes, camera, settings)
+    counted = count_samples(boxes.to(dtype=torch.float32), camera.to(dtype=torch.float32), settings)
+    assert counted.evaluated < 0.6 * counted.inside_boxes
+
+
+@pytest.mark.parametrize("density", [10.0, 90.0, 800.0])
+@pytest.mark.parametrize("settings", [dataclasses.replace(RELEASED, pixel_centre=0.5), INDEX_ORDER])
+def test_agrees_where_boxes_follow_one_another_in_index_order(density, settings):
+    boxes = random_boxes(30, 21, spread=0.05, density=density)
+    camera = camera_at((0.2, 0.1, 0.6), fov=0.3)
+    assert_agree(boxes, camera, settings)
+    single, view = boxes.to(dtype=torch.float32), camera.to(dtype=torch.float32)
+    mixed = dataclasses.replace(settings, compositing="mixed")
+    differs = (march_cpu(single, view, settings).rgb - march_cpu(single, view, mixed).rgb).abs().max()
+    assert differs > 1e-3 or density == 10.0  # the two rules differ on rays that saturate
+
+
+@pytest.mark.parametrize("settings", [MarchSettings(), INDEX_ORDER])
+def test_agrees_within_spans(settings):
+    boxes, camera = random_boxes(30, 22, density=60.0), camera_at((0.2, 0.1, 0.6), fov=0.5)
+    generator = torch.Generator().manual_seed(2)
+    near = 0.45 + 0.2 * torch.rand((camera.height, camera.width), generator=generator)
+    far = near + 0.3 * torch.rand(near.shape, generator=generator) - 0.03  # some are empty
+    near[0], far[1] = 0.0, torch.inf
+    far[2], near[3] = -1.0, torch.inf
+    assert_agree(boxes, camera, settings, Span(near, far))
+
+
+def test_spans_that_meet_put_a_picture_together():
+    """Thin rays are sums, so what is drawn up to half a metre and from there on is the whole."""
+    boxes, camera = random_boxes(30, 23, density=3.0), camera_at((0.2, 0.1, 0.6), fov=0.5).to(dtype=torch.float32)
+    single = boxes.to(dtype=torch.float32)
+    cut = torch.full((camera.height, camera.width), 0.6404)  # between two lattice points
+    front = march_cpu(single, camera, span=Span(torch.zeros_like(cut), cut))
+    back = march_cpu(single, camera, span=Span(cut, torch.full_like(cut, torch.inf)))
+    whole = march_cpu(single, camera)
+    assert whole.alpha.max() < 1
+    assert front.alpha.max() > 0.01
+    assert back.alpha.max() > 0.01
+    torch.testing.assert_close(front.rgb + back.rgb, whole.rgb, rtol=0, atol=1e-6)
+
+
+def test_a_span_of_the_wrong_shape_or_with_nan_is_refused():
+    boxes, camera = random_boxes(3).to(dtype=torch.float32), camera_at((0.0, 0.0, 0.5)).to(dtype=torch.float32)
+    near, far = torch.zeros(20, 24), torch.ones(20, 24)
+    with pytest.raises(ValueError, match=r"span\.far"):
+        march_cpu(boxes, camera, span=Span(near, far[:, :3]))
+    with pytest.raises(ValueError, match=r"span\.near holds NaN"):
+        march_cpu(boxes, camera, span=Span(near / 0, far))
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 12])
+def test_agrees_on_payloads_of_other_sizes(size):
+    assert_agree(random_boxes(20, 24, size=size), camera_at((0.2, 0.1, 0.6), fov=0.5))
+
+
+@pytest.mark.parametrize("count", [1, 17, 1000])
+def test_agrees_on_any_number_of_boxes(count):
+    boxes = random_boxes(count, 25, spread=0.3, density=5.0, smallest=0.01, largest=0.03, size=3)
+    assert_agree(boxes, camera_at((0.2, 0.1, 0.9), fov=0.8, width=20, height=20))
+
+
+def test_thousands_of_boxes_over_one_pixel_are_all_seen():
+    """No list has room for so many and no more: the opacity of all of them adds up."""
+    count = 20_000
+    generator = torch.Generator().manual_seed(26)
+    boxes = Primitives(
+        position=torch.randn((count, 3), generator=generator) * torch.tensor([1e-3, 1e-3, 0.5]),
+        rotation=torch.eye(3).expand(count, 3, 3).contiguous(),
+        half_extent=torch.full((count, 3), 0.02),
+        rgb=torch.full((count, 3, 2, 2, 2), 0.5),
+        density=torch.full((count, 2, 2, 2), 1e-3),
+    )
+    camera = camera_at((0.0, 0.0, 4.0), fov=1e-3, width=2, height=2).to(dtype=torch.float32)
+    together = march_cpu(boxes, camera)
+    parts = [march_cpu(boxes.map(lambda tensor, i=i: tensor[i::4]), camera).alpha for i in range(4)]
+    assert together.alpha.min() > 0.5
+    torch.testing.assert_close(together.alpha, torch.stack(parts).sum(0), rtol=1e-5, atol=0)
+
+
+def test_the_cost_grows_with_covered_samples_and_not_with_boxes_times_pixels():
+    """Sixteen people of 4096 boxes: a box is looked at in the few tiles it covers, nowhere else."""
+    count = 16 * 4096
+    generator = torch.Generator().manual_seed(27)
+    position = torch.rand((count, 3), generator=generator) * 4 - 2
+    boxes = Primitives(
+        position=position,
+        rotation=torch.eye(3).expand(count, 3, 3),
+        half_extent=torch.full((count, 3), 0.004),
+        rgb=torch.full((count, 3, 2, 2, 2), 0.5),
+        density=torch.full((count, 2, 2, 2), 10.0),
+    )
+    camera = camera_at((0.0, 0.0, 8.0), fov=0.5, width=256, height=256).to(dtype=torch.float32)
+    march_cpu(boxes, camera)
+    begin = time.process_time()
+    march_cpu(boxes, camera)
+    assert time.process_time() - begin < 2.0  # boxes x pixels are 4.3e9 tests
+
+
+def test_a_frame_takes_less_than_64_mb_beyond_its_inputs():
+    boxes = random_boxes(1024, 28, spread=0.4).to(dtype=torch.float32)
+    camera = camera_at((0.2, 0.1, 1.5), fov=0.6, width=512, height=512).to(dtype=torch.float32)
+    march_cpu(boxes, camera)
+    tracemalloc.start()  # numpy's and Python's; what torch makes here are pictures and matrices
+    try:
+        march_cpu(boxes, camera)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert 6e6 < peak < 64e6
+
+
+def test_boxes_across_the_cameras_plane_are_listed_only_where_they_can_be_seen():
+    boxes = one_box(0.05, 20.0)
+    boxes.position[:] = torch.tensor([[0.06, 0.0, 0.5]])  # beside the camera, half of it behind
+    camera = camera_at((0.0, 0.0, 0.5), fov=1.8, width=128, height=128)
+    assert_agree(boxes, camera)
+    single, view = boxes.to(dtype=torch.float32), camera.to(dtype=torch.float32)
+    left = march_cpu(single, view).alpha[:, :60]
+    assert left.max() == 0
+    inputs = _view(single, view, MarchSettings(), None)
+    scene = _scene(inputs, (single.rgb, single.density, *inputs[:3]), empty_cells=False)
+    assert scene.rectangle[0, 0] >= 8  # of 16 columns of tiles

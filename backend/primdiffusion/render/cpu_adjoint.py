@@ -6,6 +6,7 @@ Compositing is additive, so what a sample's opacity is worth follows from the sa
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numba
@@ -29,6 +30,8 @@ from primdiffusion.render.cpu_sampling import (
 from primdiffusion.render.cpu_vectors import adjoin_sample
 from primdiffusion.render.lattice import WINDOW_POWER, WINDOW_SHARPNESS
 from primdiffusion.render.tiles import TILE
+
+ZERO = np.float32(0)
 
 
 class Upstream(NamedTuple):
@@ -58,82 +61,76 @@ class Gradients(NamedTuple):
 
 
 @compiled(parallel=True)
-def adjoin_boxes(
-    gradients, upstream, boxes, size, rectangle, order, limits, pixel_to_world, width, height, spacing, index_order
-):
+def adjoin_boxes(gradients, upstream, boxes, size, rectangle, order, limits, pixel_to_world, width, height, spacing,
+    index_order,
+):  # fmt: skip
     """Fills `gradients`, which must hold zeros. limits as in `march_tiles`."""
-    rgb, density, to_local = gradients.rgb, gradients.density, gradients.to_local
-    d_offset, d_camera = gradients.offset, gradients.pixel_to_world
-    with_camera = len(d_camera) > 0
-    ends, shares, last_box, constant = upstream.end, upstream.share, upstream.box, upstream.constant
-    g_rgb, g_distance, origin = upstream.rgb, upstream.distance, upstream.origin
-    strides, voxels = boxes.stride, boxes.voxels
+    payload, geometry = len(gradients.density) > 0, len(gradients.to_local) > 0
     for i in numba.prange(len(order)):
         k = order[i]
-        if rectangle[k, 1] < rectangle[k, 0]:
-            continue
-        count = size * size * size
-        base = 4 * k * count
-        own = np.zeros(4 * count if len(density) > 0 else 0, np.float32)
-        slopes = np.zeros(24 if len(to_local) > 0 else 0, np.float32)
-        table, rays = np.empty(LANES * TABLE_ROWS, np.float32), np.empty(3 * PIXELS, np.float32)
-        hits, lines = np.empty(HIT_ROWS * LANES, np.float32), np.empty((1, 6), np.float32)
-        block, worth = np.empty(8 * SAMPLES, np.float32), np.empty(SAMPLES, np.float32)
-        slope, slope_along = np.empty(3, np.float32), np.empty(3, np.float32)
-        d_point, d_direction, matrix = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
-        camera = np.zeros((3, 3))
-        length = np.float32(strides[k] * spacing)
-        for tile_row in range(rectangle[k, 2], rectangle[k, 3] + 1):
-            for tile_column in range(rectangle[k, 0], rectangle[k, 1] + 1):
-                row0, column0 = tile_row * TILE, tile_column * TILE
-                middle = tile_rays(rays, pixel_to_world, row0, column0)
-                reference = reference_point(boxes, k, middle, spacing)
-                tabulate(table, 0, boxes, k, middle, reference, spacing)
-                d_point[:] = 0
-                d_direction[:] = 0
-                for begin in range(0, PIXELS, LANES):
-                    hit_rays(hits, table, rays, begin)
-                    for j in range(LANES):
-                        if hits[6 * LANES + j] > hits[7 * LANES + j]:
-                            continue
-                        row, column = row0 + (begin + j) // TILE, column0 + (begin + j) % TILE
-                        if row >= height or column >= width:
-                            continue
-                        ray = row * width + column
-                        enter, leave = _steps(hits, j, reference, strides[k], limits, ray, ends[ray], k, last_box[ray])
-                        if enter > leave:
-                            continue
-                        for entry in range(6):
-                            lines[0, entry] = hits[entry * LANES + j]
-                        start = np.float32(reference * spacing - origin[ray])
-                        share = np.float32(1)
-                        if reference + leave * strides[k] == ends[ray] and (k == last_box[ray] or not index_order):
-                            share = shares[ray]
-                        for axis in range(len(slopes)):
-                            slopes[axis] = 0
-                        _adjoin_segment(
-                            own, slopes, slope, slope_along, voxels, base, size, block, worth, lines, enter, leave,
-                            length, share, g_rgb[ray, 0], g_rgb[ray, 1], g_rgb[ray, 2],
-                            constant[ray] + g_distance[ray] * start, g_distance[ray] * length,
-                        )  # fmt: skip
-                        if len(slopes) > 0:
-                            _turn_and_move(
-                                d_point, d_direction, camera, slope, slope_along, boxes, k, middle, rays, begin + j,
-                                reference * spacing, strides[k] * spacing, pixel_to_world, row, column,
-                                with_camera,
+        if rectangle[k, 0] <= rectangle[k, 1]:
+            _adjoin_box(
+                gradients, upstream, boxes, size, rectangle, k, limits, pixel_to_world, width, height, spacing,
+                index_order,
+                np.zeros(4 * size * size * size if payload else 0, np.float32),
+                np.zeros(24 if geometry else 0, np.float32), np.empty((2, 3), np.float32),
+                np.empty(LANES * TABLE_ROWS, np.float32), np.empty(3 * PIXELS, np.float32),
+                np.empty(HIT_ROWS * LANES, np.float32), np.empty((1, 6), np.float32),
+                np.empty(8 * SAMPLES, np.float32), np.empty(SAMPLES, np.float32), np.zeros(3), np.zeros((3, 3)),
+            )  # fmt: skip
+
+
+@compiled()
+def _adjoin_box(
+    gradients, upstream, boxes, size, rectangle, k, limits, pixel_to_world, width, height, spacing, index_order,
+    own, slopes, slope, table, rays, hits, lines, block, worth, d_point, d_direction,
+):  # fmt: skip
+    """All rays through box k; the arrays after `index_order` are room to work in, own and slopes zeros."""
+    stride, ends, shares, last_box = boxes.stride[k], upstream.end, upstream.share, upstream.box
+    step = stride * spacing
+    length = np.float32(step)
+    for tile_row in range(rectangle[k, 2], rectangle[k, 3] + 1):
+        for tile_column in range(rectangle[k, 0], rectangle[k, 1] + 1):
+            row0, column0 = tile_row * TILE, tile_column * TILE
+            middle = tile_rays(rays, pixel_to_world, row0, column0)
+            reference = reference_point(boxes, k, middle, spacing)
+            distance = reference * spacing
+            tabulate(table, 0, boxes, k, middle, reference, spacing)
+            d_point[:] = 0
+            d_direction[:] = 0
+            for begin in range(0, PIXELS, LANES):
+                hit_rays(hits, table, rays, begin)
+                for j in range(LANES):
+                    row, column = row0 + (begin + j) // TILE, column0 + (begin + j) % TILE
+                    if hits[6 * LANES + j] > hits[7 * LANES + j] or row >= height or column >= width:
+                        continue
+                    ray = row * width + column
+                    enter, leave = _steps(hits, j, reference, stride, limits, ray, ends[ray], k, last_box[ray])
+                    if enter > leave:
+                        continue
+                    for entry in range(6):
+                        lines[0, entry] = hits[entry * LANES + j]
+                    share = np.float32(1)
+                    if reference + leave * stride == ends[ray] and (k == last_box[ray] or not index_order):
+                        share = shares[ray]
+                    per_metre = upstream.distance[ray]
+                    _adjoin_segment(
+                        own, slopes, slope, boxes.voxels, 4 * k * size * size * size, size, block, worth, lines,
+                        enter, leave, length, share, upstream.rgb[ray, 0], upstream.rgb[ray, 1], upstream.rgb[ray, 2],
+                        upstream.constant[ray] + per_metre * np.float32(distance - upstream.origin[ray]),
+                        per_metre * length,
+                    )  # fmt: skip
+                    if len(slopes) > 0:
+                        _turn_and_move(d_point, d_direction, slope, middle, rays, begin + j, distance, step)
+                        if len(gradients.pixel_to_world) > 0:
+                            _aim(
+                                gradients.pixel_to_world, slope, boxes.to_local, k, distance, step, pixel_to_world,
+                                row, column,
                             )  # fmt: skip
-                if len(slopes) > 0:
-                    _add_tile(matrix, d_offset, d_point, d_direction, boxes, k, middle, reference * spacing)
-        if len(density) > 0:
-            _separate(rgb, density, own, k, count)
-        if len(to_local) > 0:
-            for axis in range(3):
-                for other in range(3):
-                    to_local[k, axis, other] = matrix[axis, other]
-        if with_camera:
-            for axis in range(3):
-                for other in range(3):
-                    d_camera[k, axis, other] = camera[axis, other]
+            if len(slopes) > 0:
+                _add_tile(gradients.to_local, gradients.offset, d_point, d_direction, boxes, k, middle, distance)
+    if len(own) > 0:
+        _separate(gradients.rgb, gradients.density, own, k, size * size * size)
 
 
 @compiled(forceinline=True)
@@ -153,18 +150,19 @@ def _steps(hits, lane, reference, stride, limits, ray, end, k, last_box):
 
 @compiled()
 def _adjoin_segment(
-    own, slopes, slope, slope_along, voxels, base, size, block, worth, lines, enter, leave, length, share,
+    own, slopes, slope, voxels, base, size, block, worth, lines, enter, leave, length, share,
     red, green, blue, constant, per_step,
 ):  # fmt: skip
     """The adjoint of one ray in one box.
 
-    own += dL/d(voxels); slope, slope_along = sum dL/dy and sum step * dL/dy. dL/da = <(red, green, blue), colour> +
-    constant + step * per_step.
+    own += dL/d(voxels); slope = sum dL/dy and sum i * dL/dy over the steps i. dL/da = <(red, green, blue), colour> +
+    constant + i * per_step.
     """
-    one = np.float32(1)
     row, half = 4 * size, np.float32(0.5 * (size - 1))
     slab = row * size
-    x0, y0, z0, x1, y1, z1 = one * 0, one * 0, one * 0, one * 0, one * 0, one * 0
+    x0, y0, z0, x1, y1, z1 = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+    for entry in range(len(slopes)):
+        slopes[entry] = 0
     for begin in range(enter, leave + 1, SAMPLES):
         place_samples(block, lines, 0, np.float32(begin), size, length)
         count = min(SAMPLES, leave + 1 - begin)
@@ -184,11 +182,11 @@ def _adjoin_segment(
             a0, b0, c0, a1, b1, c1 = _window_slopes(worth, lines, np.float32(begin))
             x0, y0, z0, x1, y1, z1 = x0 + a0, y0 + b0, z0 + c0, x1 + a1, y1 + b1, z1 + c1
     if len(slopes) > 0:
-        slope[0], slope[1], slope[2], slope_along[0], slope_along[1], slope_along[2] = x0, y0, z0, x1, y1, z1
+        slope[0, 0], slope[0, 1], slope[0, 2], slope[1, 0], slope[1, 1], slope[1, 2] = x0, y0, z0, x1, y1, z1
         for axis in range(3):
             for channel in range(4):
-                slope[axis] += half * slopes[4 * axis + channel]
-                slope_along[axis] += half * slopes[12 + 4 * axis + channel]
+                slope[0, axis] += half * slopes[4 * axis + channel]
+                slope[1, axis] += half * slopes[12 + 4 * axis + channel]
 
 
 @compiled(forceinline=True)
@@ -215,51 +213,50 @@ def _window_slope(y):
 
 
 @compiled()
-def _turn_and_move(
-    d_point, d_direction, camera, slope, slope_along, boxes, k, middle, rays, pixel, distance, step, pixel_to_world,
-    row, column, with_camera,
-):  # fmt: skip
-    """One ray's part of the sums from which the box's and the camera's gradients follow.
+def _turn_and_move(d_point, d_direction, slope, middle, rays, pixel, distance, step):
+    """Adds one ray to a tile's sums of dL/dy and of t * dL/dy times the direction, less distance * middle.
 
-    y = to_local (o - T + t d) with t = distance + step * i; slope and slope_along are sum dL/dy and sum i * dL/dy.
+    y = to_local (o - T + t d) with t = distance + step * i; slope holds sum dL/dy and sum i * dL/dy.
     """
     dx, dy, dz = rays[pixel], rays[PIXELS + pixel], rays[2 * PIXELS + pixel]
     x, y, z = middle[0] + dx, middle[1] + dy, middle[2] + dz
     for axis in range(3):
-        s, along = np.float64(slope[axis]), step * slope_along[axis]
-        d_point[axis] += s
-        # t d = distance * middle (the same for the whole tile) + distance * difference + step * i * d
-        d_direction[axis, 0] += distance * s * dx + along * x
-        d_direction[axis, 1] += distance * s * dy + along * y
-        d_direction[axis, 2] += distance * s * dz + along * z
-    if not with_camera:
-        return
-    vx, vy, vz = 0.0, 0.0, 0.0  # dL/dd
-    for axis in range(3):
-        s = distance * slope[axis] + step * slope_along[axis]
-        vx += boxes.to_local[k, axis, 0] * s
-        vy += boxes.to_local[k, axis, 1] * s
-        vz += boxes.to_local[k, axis, 2] * s
-    u, v = column + 0.5, row + 0.5
-    m = pixel_to_world
-    rx = m[0, 0] * u + m[0, 1] * v + m[0, 2]
-    ry = m[1, 0] * u + m[1, 1] * v + m[1, 2]
-    rz = m[2, 0] * u + m[2, 1] * v + m[2, 2]
-    inverse = 1.0 / np.sqrt(rx * rx + ry * ry + rz * rz)
-    dot = (rx * vx + ry * vy + rz * vz) * inverse * inverse
-    vx, vy, vz = (vx - dot * rx) * inverse, (vy - dot * ry) * inverse, (vz - dot * rz) * inverse
-    camera[0, 0], camera[0, 1], camera[0, 2] = camera[0, 0] + vx * u, camera[0, 1] + vx * v, camera[0, 2] + vx
-    camera[1, 0], camera[1, 1], camera[1, 2] = camera[1, 0] + vy * u, camera[1, 1] + vy * v, camera[1, 2] + vy
-    camera[2, 0], camera[2, 1], camera[2, 2] = camera[2, 0] + vz * u, camera[2, 1] + vz * v, camera[2, 2] + vz
+        far, along = distance * slope[0, axis], step * slope[1, axis]
+        d_point[axis] += slope[0, axis]
+        d_direction[axis, 0] += far * dx + along * x
+        d_direction[axis, 1] += far * dy + along * y
+        d_direction[axis, 2] += far * dz + along * z
 
 
 @compiled()
-def _add_tile(matrix, d_offset, d_point, d_direction, boxes, k, middle, distance):
-    """dL/d(to_local) and dL/d(offset) from a tile's sums."""
+def _aim(d_camera, slope, to_local, k, distance, step, m, row, column):
+    """Adds one ray to dL/d(pixel_to_world): d = r / |r|, r = pixel_to_world [u, v, 1]."""
+    vx, vy, vz = 0.0, 0.0, 0.0  # dL/dd
+    for axis in range(3):
+        s = distance * slope[0, axis] + step * slope[1, axis]
+        vx += to_local[k, axis, 0] * s
+        vy += to_local[k, axis, 1] * s
+        vz += to_local[k, axis, 2] * s
+    u, v = column + 0.5, row + 0.5
+    rx = m[0, 0] * u + m[0, 1] * v + m[0, 2]
+    ry = m[1, 0] * u + m[1, 1] * v + m[1, 2]
+    rz = m[2, 0] * u + m[2, 1] * v + m[2, 2]
+    inverse = 1.0 / math.sqrt(rx * rx + ry * ry + rz * rz)
+    dot = (rx * vx + ry * vy + rz * vz) * inverse * inverse
+    vx, vy, vz = (vx - dot * rx) * inverse, (vy - dot * ry) * inverse, (vz - dot * rz) * inverse
+    for axis, value in enumerate((vx, vy, vz)):
+        d_camera[k, axis, 0] += value * u
+        d_camera[k, axis, 1] += value * v
+        d_camera[k, axis, 2] += value
+
+
+@compiled()
+def _add_tile(d_matrix, d_offset, d_point, d_direction, boxes, k, middle, distance):
+    """Adds a tile's sums to dL/d(to_local) and dL/d(offset)."""
     for axis in range(3):
         for other in range(3):
             near = boxes.offset[k, other] + distance * middle[other]
-            matrix[axis, other] += d_point[axis] * near + d_direction[axis, other]
+            d_matrix[k, axis, other] += d_point[axis] * near + d_direction[axis, other]
             d_offset[k, other] += boxes.to_local[k, axis, other] * d_point[axis]
 
 

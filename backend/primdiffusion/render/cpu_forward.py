@@ -26,7 +26,7 @@ from primdiffusion.render.cpu_sampling import (
 )
 from primdiffusion.render.tiles import TILE
 
-CHUNK = 32
+CHUNK = 16
 """Lattice points gathered before they are composited: long enough to amortise the loop, short enough to stop early."""
 NEVER = np.iinfo(np.int64).max
 """The lattice index at which a ray saturates that does not."""
@@ -68,8 +68,6 @@ def march_tiles(
     counts [tiles, 2], may be empty: samples evaluated, and samples up to where rays become opaque.
     """
     across = (width + TILE - 1) // TILE
-    # Fields are taken out here, as numba counts references whenever it takes an array out of a record or another array.
-    strides, voxels = boxes.stride, boxes.voxels
     for i in numba.prange(len(order)):
         tile = order[i]
         row0, column0 = (tile // across) * TILE, (tile % across) * TILE
@@ -77,32 +75,45 @@ def march_tiles(
         if found == 0:
             _leave_blank(picture, ends, row0, column0, width, height)
             continue
-        listed, reference = np.empty(found, np.int64), np.empty(found, np.int64)
-        table = np.empty((found + LANES - 1) // LANES * LANES * TABLE_ROWS, np.float32)
-        rays = np.empty(3 * PIXELS, np.float32)
-        middle = tile_rays(rays, pixel_to_world, row0, column0)
-        _tabulate_tile(listed, reference, table, row_box, row_start, rectangle, tile, across, boxes, middle, spacing)
-        hits, lines = np.empty((found, 5), np.int64), np.empty((found, 6), np.float32)
-        sequence = np.empty(found, np.int64)
-        tests, points = np.empty(HIT_ROWS * LANES, np.float32), np.empty(4 * (CHUNK + 1), np.float32)
-        block = np.empty(8 * SAMPLES, np.float32)
-        for row in range(row0, min(row0 + TILE, height)):
-            for column in range(column0, min(column0 + TILE, width)):
-                ray = row * width + column
-                pixel = (row - row0) * TILE + column - column0
-                first, last = 1, NEVER
-                if len(limits) > 0:
-                    first, last = limits[ray, 0], limits[ray, 1]
-                number = _find_hits(
-                    hits, lines, sequence, tests, table, rays, pixel, listed, reference, strides, first, last
-                )
-                evaluated = _march_ray(
-                    picture, ends, ray, hits, lines, sequence, number, points, block, voxels, strides, size, spacing,
-                    index_order,
-                )  # fmt: skip
-                if len(counts) > 0:
-                    counts[tile, 0] += evaluated
-                    counts[tile, 1] += _needed(hits, number, strides, ends.index[ray])
+        blocks = (found + LANES - 1) // LANES
+        _march_tile(
+            picture, ends, counts, boxes, size, rectangle, row_start, row_box, tile, limits, pixel_to_world, width,
+            height, spacing, index_order,
+            np.empty(found, np.int64), np.empty(found, np.int64), np.empty(blocks * LANES * TABLE_ROWS, np.float32),
+            np.empty(3 * PIXELS, np.float32), np.empty((found, 5), np.int64), np.empty((found, 6), np.float32),
+            np.empty(found, np.int64), np.empty(HIT_ROWS * LANES, np.float32),
+            np.empty(4 * (CHUNK + 1), np.float32), np.empty(8 * SAMPLES, np.float32),
+        )  # fmt: skip
+
+
+@compiled()
+def _march_tile(
+    picture, ends, counts, boxes, size, rectangle, row_start, row_box, tile, limits, pixel_to_world, width, height,
+    spacing, index_order, listed, reference, table, rays, hits, lines, sequence, tests, points, block,
+):  # fmt: skip
+    """Draws one tile; the arrays after `index_order` are room to work in."""
+    across = (width + TILE - 1) // TILE
+    row0, column0 = (tile // across) * TILE, (tile % across) * TILE
+    strides, voxels = boxes.stride, boxes.voxels
+    middle = tile_rays(rays, pixel_to_world, row0, column0)
+    _tabulate_tile(listed, reference, table, row_box, row_start, rectangle, tile, across, boxes, middle, spacing)
+    for row in range(row0, min(row0 + TILE, height)):
+        for column in range(column0, min(column0 + TILE, width)):
+            ray = row * width + column
+            pixel = (row - row0) * TILE + column - column0
+            first, last = 1, NEVER
+            if len(limits) > 0:
+                first, last = limits[ray, 0], limits[ray, 1]
+            number = _find_hits(
+                hits, lines, sequence, tests, table, rays, pixel, listed, reference, strides, first, last
+            )
+            evaluated = _march_ray(
+                picture, ends, ray, hits, lines, sequence, number, points, block, voxels, strides, size, spacing,
+                index_order,
+            )  # fmt: skip
+            if len(counts) > 0:
+                counts[tile, 0] += evaluated
+                counts[tile, 1] += _needed(hits, number, strides, ends.index[ray])
 
 
 @compiled()

@@ -198,13 +198,12 @@ def _window(x, y, z):
     exponent = max(_DECAY * (x4 * x4 + y4 * y4 + z4 * z4), _EXPONENT)
     whole = np.floor(exponent)
     f = exponent - whole
-    p = np.float32(1.8775767e-3)  # 2^f on [0, 1), minimax
-    p = p * f + np.float32(8.9893397e-3)
-    p = p * f + np.float32(5.5826318e-2)
-    p = p * f + np.float32(2.4015361e-1)
-    p = p * f + np.float32(6.9315308e-1)
-    p = p * f + np.float32(9.9999994e-1)
-    return p * power_of_two(whole)
+    # 2^f on [0, 1), minimax; in pairs, which wait for one another less than Horner's rule does.
+    square = f * f
+    low = np.float32(6.9315308e-1) * f + np.float32(9.9999994e-1)
+    middle = np.float32(5.5826318e-2) * f + np.float32(2.4015361e-1)
+    high = np.float32(1.8775767e-3) * f + np.float32(8.9893397e-3)
+    return (low + square * (middle + square * high)) * power_of_two(whole)
 
 
 @compiled()
