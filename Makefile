@@ -3,6 +3,8 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
+READY_TO_TEST := $(VENV)/ready-to-test
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock
 ASSETS ?=
 TEST_ARGS ?=
 
@@ -11,27 +13,31 @@ TEST_ARGS ?=
 demo: $(READY)
 	$(BIN)/python benchmarks/demo.py --out demo_out
 
-test: $(READY)
+test: $(READY_TO_TEST)
 	$(BIN)/python -m pytest $(TEST_ARGS)
 
-test-all: $(READY)
+test-all: $(READY_TO_TEST)
 	$(BIN)/python -m pytest -m "not gpu" $(TEST_ARGS)
 
-lint: $(READY)
+lint: $(READY_TO_TEST)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/pyright
 
-setup: $(READY)
+setup: $(READY_TO_TEST)
 
 $(READY): pyproject.toml requirements.lock
 	@command -v $(PYTHON) >/dev/null || { echo "Python 3.11 is needed ($(PYTHON) was not found): install it or run make PYTHON=/path/to/python3.11"; exit 1; }
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info[:2] != (3, 11))" || { echo "$(PYTHON) is not Python 3.11, which bpy 5.0 needs: run make PYTHON=/path/to/python3.11"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e ".[training,blender,test]"
+	$(PIP_INSTALL) -e ".[training,blender]"
 	@$(BIN)/python -c "import bpy" || { echo "Blender's module did not load: install the system packages named in README.md"; exit 1; }
 	touch $(READY)
+
+$(READY_TO_TEST): $(READY)
+	$(PIP_INSTALL) -e ".[training,blender,test]"
+	touch $(READY_TO_TEST)
 
 clean:
 	rm -rf demo_out build dist
