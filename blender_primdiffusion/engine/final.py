@@ -76,8 +76,8 @@ def _follow(
 
 
 def _stats(drawing: Drawing, height: int) -> str:
-    if drawing.state in ("waiting", "starting"):
-        return "Starting the backend"
+    if drawing.rows == 0:
+        return "Starting the backend" if drawing.state in ("waiting", "starting") else "Drawing the first rows"
     left = f", {drawing.eta_s:.1f} s left" if drawing.eta_s else ""
     return f"Row {drawing.rows} of {height}{left}"
 

@@ -13,6 +13,8 @@ from .view import View
 
 COARSENESS = (4, 2, 1)
 """Pixels of the window along a side of a drawn one, in the order in which they are drawn."""
+FLUENT_S = 0.05
+"""What a picture may take while things move. Where even a finer one would, on a graphics card, finer ones are drawn."""
 REST_S = 0.12
 """Nothing has moved for this long: time for a finer picture."""
 
@@ -60,6 +62,7 @@ class Refinement:
         self._drawing: Drawing | None = None
         self._pending: Shown | None = None
         self._turn = 0
+        self._moving = COARSENESS[0]
         self.shown: Shown | None = None
         """The newest picture; its frame stays untouched until the next but one."""
         self.error = ""
@@ -70,7 +73,7 @@ class Refinement:
         if self._wish is not None and self._wish.key == wish.key:
             return
         self._wish, self._changed_at, self.error = wish, self._clock(), ""
-        if self._drawing is not None and self._pending is not None and self._pending.coarseness < COARSENESS[0]:
+        if self._drawing is not None and self._pending is not None and self._pending.coarseness < self._moving:
             self._drawing.cancel()
 
     @property
@@ -82,8 +85,8 @@ class Refinement:
 
     @property
     def starting(self) -> bool:
-        """Nothing to show yet, and a child that is being started for it, which takes a while."""
-        return self.shown is None and self._drawing is not None and self._drawing.state in ("waiting", "starting")
+        """The first picture is under way, which takes a while: a child is started for it."""
+        return self.shown is None and self._drawing is not None
 
     def advance(self) -> bool:
         """Takes in an answer and asks for the next picture; True when there is a new one to show, or an error."""
@@ -102,7 +105,7 @@ class Refinement:
 
     def _next_coarseness(self) -> int | None:
         if self.shown is None or self.shown.wish is not self._wish:
-            return COARSENESS[0]
+            return self._moving
         finer = [c for c in COARSENESS if c < self.shown.coarseness]
         rested = self._clock() - self._changed_at >= REST_S
         return finer[0] if finer and rested else None
@@ -130,12 +133,24 @@ class Refinement:
         self._drawing = self._pending = None
         if drawing.state == "done":
             self.shown = pending
+            self._pace(drawing)
             return True
         self._turn = 1 - self._turn  # the frame of what is shown must not be drawn into next
         if drawing.state == "failed" and pending is not None and pending.wish is self._wish:
             self.error = str(drawing.error)
             return True
         return False
+
+    def _pace(self, drawing: Drawing) -> None:
+        """Choose how coarse the pictures are while things move, from what the last of them took."""
+        seconds = drawing.result.get("seconds")
+        if seconds is None or self.shown is None or self.shown.coarseness != self._moving:
+            return
+        place = COARSENESS.index(self._moving)
+        if 4 * seconds < FLUENT_S:
+            self._moving = COARSENESS[min(place + 1, len(COARSENESS) - 1)]
+        elif seconds > 2 * FLUENT_S:
+            self._moving = COARSENESS[max(place - 1, 0)]
 
 
 def _scaled_region(region: tuple[int, int, int, int], full: View, coarse: View) -> list[int]:

@@ -18,6 +18,7 @@ from .solids import changed_by
 from .view import view_from_matrices
 
 TICK_S = 1 / 60
+STARTING = "Starting the backend (the first picture after an installation compiles the marcher: half a minute)"
 _viewports: weakref.WeakSet[Viewport] = weakref.WeakSet()
 _numbers = itertools.count()
 
@@ -76,7 +77,7 @@ class Viewport:
         """What the region says in its corner."""
         if error := self._error or self._refinement.error:
             return f"PrimDiffusion: {error}"
-        return "Starting the backend" if self._refinement.starting else ""
+        return STARTING if self._refinement.starting else ""
 
     def _draw_picture(
         self,

@@ -124,6 +124,18 @@ def test_an_error_is_told_once_and_another_wish_is_tried_anew(bench):
     assert len(bench.asked) == 2
 
 
+def test_where_drawing_is_fast_moving_pictures_become_finer_and_coarser_again_where_it_is_not(bench):
+    widths = []
+    for step, seconds in enumerate([0.004, 0.004, 0.004, 0.2, 0.2, 0.2]):
+        bench.refinement.want(wish(step))
+        bench.refinement.advance()
+        widths.append(bench.asked[-1].params["width"])
+        answer(bench, result={"seconds": seconds})
+        bench.refinement.want(wish(f"next {step}"))
+        bench.refinement._take_answer()
+    assert widths == [-(-SIZE[0] // coarseness) for coarseness in (4, 2, 1, 1, 2, 4)]
+
+
 def test_leaving_cancels_what_is_under_way(bench):
     bench.refinement.want(wish("a"))
     bench.refinement.advance()
