@@ -73,7 +73,7 @@ def adjoin_boxes(gradients, upstream, boxes, size, rectangle, order, limits, pix
                 gradients, upstream, boxes, size, rectangle, k, limits, pixel_to_world, width, height, spacing,
                 index_order,
                 np.zeros(4 * size * size * size if payload else 0, np.float32),
-                np.zeros(24 if geometry else 0, np.float32), np.empty((2, 3), np.float32),
+                np.zeros(8 if geometry else 0, np.float32), np.empty((2, 3), np.float32),
                 np.empty(LANES * TABLE_ROWS, np.float32), np.empty(3 * PIXELS, np.float32),
                 np.empty(HIT_ROWS * LANES, np.float32), np.empty((1, 6), np.float32),
                 np.empty(8 * SAMPLES, np.float32), np.empty(SAMPLES, np.float32), np.zeros(3), np.zeros((3, 3)),
@@ -184,9 +184,8 @@ def _adjoin_segment(
     if len(slopes) > 0:
         slope[0, 0], slope[0, 1], slope[0, 2], slope[1, 0], slope[1, 1], slope[1, 2] = x0, y0, z0, x1, y1, z1
         for axis in range(3):
-            for channel in range(4):
-                slope[0, axis] += half * slopes[4 * axis + channel]
-                slope[1, axis] += half * slopes[12 + 4 * axis + channel]
+            slope[0, axis] += half * slopes[axis]
+            slope[1, axis] += half * slopes[4 + axis]
 
 
 @compiled(forceinline=True)

@@ -53,24 +53,20 @@ HIT_ROWS = 8
 @compiled()
 def tile_rays(rays, pixel_to_world, row0, column0):
     """Fills rays [3, PIXELS] (flat) with each pixel's unit direction less the middle's, which it returns."""
-    half = 0.5 * TILE
-    x, y, z = _direction(pixel_to_world, column0 + half, row0 + half)
-    for row in range(TILE):
-        for column in range(TILE):
-            dx, dy, dz = _direction(pixel_to_world, column0 + column + 0.5, row0 + row + 0.5)
-            rays[row * TILE + column] = dx - x
-            rays[PIXELS + row * TILE + column] = dy - y
-            rays[2 * PIXELS + row * TILE + column] = dz - z
-    return x, y, z
-
-
-@compiled(forceinline=True)
-def _direction(m, u, v):
-    x = m[0, 0] * u + m[0, 1] * v + m[0, 2]
-    y = m[1, 0] * u + m[1, 1] * v + m[1, 2]
-    z = m[2, 0] * u + m[2, 1] * v + m[2, 2]
-    inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
-    return x * inverse, y * inverse, z * inverse
+    m = pixel_to_world
+    ux, uy, uz, vx, vy, vz = m[0, 0], m[1, 0], m[2, 0], m[0, 1], m[1, 1], m[2, 1]
+    u, v = column0 + 0.5 * TILE, row0 + 0.5 * TILE
+    cx, cy, cz = ux * u + vx * v + m[0, 2], uy * u + vy * v + m[1, 2], uz * u + vz * v + m[2, 2]
+    inverse = 1.0 / math.sqrt(cx * cx + cy * cy + cz * cz)
+    middle = (cx * inverse, cy * inverse, cz * inverse)
+    for pixel in range(PIXELS):
+        right, down = pixel % TILE + (0.5 - 0.5 * TILE), pixel // TILE + (0.5 - 0.5 * TILE)
+        x, y, z = cx + right * ux + down * vx, cy + right * uy + down * vy, cz + right * uz + down * vz
+        inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
+        rays[pixel] = x * inverse - middle[0]
+        rays[PIXELS + pixel] = y * inverse - middle[1]
+        rays[2 * PIXELS + pixel] = z * inverse - middle[2]
+    return middle
 
 
 @compiled()

@@ -67,8 +67,8 @@ def adjoin_sample(
     """The adjoint of one sample: returns a * dL/da.
 
     dL/da = <colour, (red, green, blue)> + constant. The box's voxels begin at `base`; its gradient, laid out like them,
-    receives dL/d(voxels); slopes [6, 4] receives dL/d(u, v, w), still to be summed over the channels, and the same
-    times `step`. v and w are the sample's fractions along h and d. An empty gradient or empty slopes are not written.
+    receives dL/d(voxels); slopes [2, 4] receives dL/d(u, v, w) and the same times `step`. v and w are the sample's
+    fractions along h and d. An empty gradient or empty slopes are not written.
     """
     numbers = (types.float32,) * 10
     signature = types.float32(gradient, slopes, voxels, *(types.int64,) * 4, *numbers)
@@ -105,10 +105,9 @@ def adjoin_sample(
             rise = code.mix(builder.fsub(up, near), builder.fsub(far_up, far), gw, w)
             along_v = code.folded(code.multiply(bars, rise))
             along_w = code.folded(code.multiply(bars, builder.fsub(back, front)))
-            times = code.splat(step, _FOUR)
-            for place, slope in enumerate((along_u, along_v, along_w)):
-                code.accumulate(array.data, _INT64(4 * place), slope)
-                code.accumulate(array.data, _INT64(12 + 4 * place), code.multiply(slope, times))
+            slope = code.totals(along_u, along_v, along_w)
+            code.accumulate(array.data, _INT64(0), slope)
+            code.accumulate(array.data, _INT64(4), code.multiply(slope, code.splat(step, _FOUR)))
         return builder.fmul(per_opacity, opacity)
 
     return signature, generate
@@ -184,6 +183,16 @@ class _Vectors:
 
     def mix(self, a, b, at_a, at_b):
         return self.add(self.multiply(a, self.splat(at_a, _EIGHT)), self.multiply(b, self.splat(at_b, _EIGHT)))
+
+    def totals(self, a, b, c):
+        """The sums over the lanes of a, of b and of c, and 0."""
+        none = ir.Constant(_FOUR, [0.0] * 4)
+        ab, cd = self._paired(a, b, (0, 4, 1, 5), (2, 6, 3, 7)), self._paired(c, none, (0, 4, 1, 5), (2, 6, 3, 7))
+        return self._paired(ab, cd, (0, 1, 4, 5), (2, 3, 6, 7))
+
+    def _paired(self, a, b, left, right):
+        first = self.builder.shuffle_vector(a, b, self._lanes(*left))
+        return self.builder.fadd(first, self.builder.shuffle_vector(a, b, self._lanes(*right)))
 
     def total(self, value):
         pairs = self.builder.fadd(value, self._shuffled(value, 2, 3, 0, 1))
