@@ -165,7 +165,7 @@ def variants() -> Iterator[Shapes]:
     for tile, samples, warps in (
         ((8, 4), 8, 8), ((8, 4), 4, 4), ((8, 4), 16, 8), ((8, 8), 4, 4), ((8, 8), 8, 8), ((4, 4), 8, 2), ((16, 4), 4, 4)
     ):  # fmt: skip
-        for registers in (128, 168, 255):
+        for registers in (128, 160, 255):
             yield Shapes(tile=tile, samples=samples, march_warps=warps, march_registers=registers)
     for block, warps in (((8, 8), 2), ((16, 8), 4)):
         yield Shapes(block=block, adjoint_warps=warps)

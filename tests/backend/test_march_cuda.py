@@ -140,13 +140,17 @@ def test_the_small_kernels_compile_without_spilling(tmp_path):
         (triton_boxes.place_boxes, "fffiffdfiil", 4, place, 1),
         (triton_lists.list_bins, "liilil", 2, lists, 4),
         (triton_lists.list_bins, "liilil", 0, lists | {"boxes": 1, "across": 1}, 4),
-        (triton_lists.list_tiles, "iliiilil", 4, lists, 1),
         (triton_adjoint.finish_boxes, "lffffffffff", 3, {}, 4),
         (triton_adjoint.finish_boxes, "lffffffffff", 0, one | {"views": 1}, 4),
     ]
     for kernel, pointers, scalars, constants, warps in kernels:
         compiled = compile_for_hopper(kernel, pointers, ("i32",) * scalars, constants, num_warps=warps)
         assert resources(compiled, tmp_path)["STACK"] == 0, kernel
+    lists = lists | {"TILE_WIDTH": 8, "TILE_HEIGHT": 4}
+    compiled = compile_for_hopper(
+        triton_lists.list_tiles, "ilifiilil", ("i32",) * 4 + ("fp32",), lists, num_warps=1
+    )  # fmt: skip
+    assert resources(compiled, tmp_path)["STACK"] == 0
     compiled = compile_for_hopper(triton_adjoint.seed_rays, "ffffif", ("i32", "fp32"), {"LANES": 256}, num_warps=4)
     assert resources(compiled, tmp_path)["STACK"] == 0
 

@@ -23,8 +23,8 @@ from primdiffusion.primitives.primitives import Primitives, S
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.lattice import MarchSettings, Span, check_scene
 
-LIST_LIMIT = 1 << 26
-"""Entries of tile lists, 4 bytes each; pictures that need more use the lists of bins, which are shorter but coarser."""
+LIST_LIMIT = 1 << 24
+"""Entries of tile lists, 16 bytes each; pictures that need more use the bins' lists, shorter but coarser."""
 LAST_POINT = (1 << 30) - 1
 """Lattice points are counted in 32 bits."""
 LANES = 32
@@ -47,7 +47,7 @@ class Shapes:
     samples: int = 8
     """Samples of a chunk that each pixel takes at once of a box; half as many where boxes of three strides mix."""
     march_warps: int = 4
-    march_registers: int = 168
+    march_registers: int = 160
     """Of a thread; fewer make room for more programs, but spill."""
     block: tuple[int, int] = (8, 4)
     """Pixels of a step of the backward pass."""
@@ -81,8 +81,8 @@ def march_cuda(
     Differentiable once in every tensor of primitives and camera. No sum is in an order left to chance: the same inputs
     give the same pictures and gradients. Voxel gradients are summed in tf32 (eleven significant bits a term). The host
     waits for the device once a call, for the checks and the lists' lengths. Memory beyond inputs and outputs: 9 KB a
-    box and 4 bytes for each tile that a box touches, at most `LIST_LIMIT` of them; for gradients 40 bytes a pixel more,
-    and while they are computed another 32 a pixel and 8 KB a box.
+    box and 16 bytes for each tile that a box touches, at most `LIST_LIMIT` of them; for gradients 40 bytes a pixel
+    more, and while they are computed another 32 a pixel and 8 KB a box.
 
     Raises ValueError as `check_scene` does, for other compositing, voxels other than 8^3 and dtypes other than float32;
     ImportError without Triton.
@@ -138,7 +138,7 @@ class _Prepared(NamedTuple):
     record: Float[Tensor, "b k 32"]
     indices: Int[Tensor, "b k 16"]
     reach: Int[Tensor, "b h w 2"] | None
-    entries: Int[Tensor, "n"]
+    entries: Int[Tensor, "n 4"]
     begin: Int[Tensor, "b lists"]
     count: Int[Tensor, "b lists"]
     tiles_of_list: int
@@ -225,7 +225,7 @@ def _prepare(scene: _Scene, boxes: list[Tensor], intrinsics: Tensor, world_to_ca
     bins, tiles = bins_across * bins_down, across * down
 
     def a_list(entries: int, lists: int) -> tuple[Tensor, Tensor, Tensor]:
-        empty = torch.empty(entries, dtype=torch.int32, device=device)
+        empty = torch.empty((entries, triton_lists.ENTRY), dtype=torch.int32, device=device)
         begin = torch.empty((b, lists), dtype=torch.int64, device=device)
         return empty, begin, torch.empty((b, lists), dtype=torch.int32, device=device)
 
@@ -247,8 +247,8 @@ def _prepare(scene: _Scene, boxes: list[Tensor], intrinsics: Tensor, world_to_ca
         return _Prepared(voxels, record, indices, reach, *bin_lists, shapes.bin, gap, units)
     tile_lists = a_list(in_tiles, tiles)
     _launch(triton_lists.list_tiles, (tiles, b), 
-        *bin_lists, indices, *tile_lists, totals, k, across, bins_across, bins,
-        BIN=shapes.bin, LANES=LANES_OF_TILE, num_warps=1,
+        *bin_lists, record, indices, *tile_lists, totals, k, across, bins_across, bins, scene.spacing,
+        BIN=shapes.bin, TILE_WIDTH=shapes.tile[0], TILE_HEIGHT=shapes.tile[1], LANES=LANES_OF_TILE, num_warps=1,
     )  # fmt: skip
     return _Prepared(voxels, record, indices, reach, *tile_lists, 1, gap, units)
 

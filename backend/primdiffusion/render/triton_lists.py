@@ -1,7 +1,8 @@
 """Triton kernels that list, for each tile of a picture, the boxes seen in it, nearest first.
 
-Bins of BIN x BIN tiles look through all boxes, then tiles through their bin's list. Lists are exactly as long as they
-must be: a program counts, takes that many places from a common counter, and writes.
+Bins of BIN x BIN tiles look through all boxes, then tiles through their bin's list. Lists are made without a limit to
+their length: a program counts, takes that many places from a common counter, and writes. An entry is four integers: the
+box, the first lattice point of its content, by which the list is ordered, and the first and last one in this tile.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
@@ -10,6 +11,12 @@ from __future__ import annotations
 
 import triton
 import triton.language as tl
+
+from primdiffusion.render.triton_rays import ray_in_box
+
+ENTRY = 4
+WIDE_TILE = tl.constexpr(0.5)  # a tile wider than this (radians, about) is not bounded by its middle ray
+BLUR = tl.constexpr(1e-4)  # of a box, against rounding
 
 
 @triton.jit
@@ -23,37 +30,43 @@ def list_bins(
     first_box = view.to(tl.int64) * boxes
     found = tl.zeros((), tl.int32)
     for start in range(0, boxes, LANES):
-        k, here = _some(order, first_box, start, boxes, LANES)
-        found += tl.sum(_meets(indices, first_box, k, here, column, row, BIN).to(tl.int32), 0)
+        i = start + tl.arange(0, LANES)
+        k = tl.load(order + first_box + i, i < boxes, 0).to(tl.int32)
+        found += tl.sum(_meets(indices, first_box, k, i < boxes, column, row, BIN).to(tl.int32), 0)
     place = tl.atomic_add(totals + 4, found.to(tl.int64))
     tl.store(begin + view * tl.num_programs(0) + bin_, place)
     tl.store(count + view * tl.num_programs(0) + bin_, found)
     if found > 0:
         for start in range(0, boxes, LANES):
-            k, here = _some(order, first_box, start, boxes, LANES)
-            here = _meets(indices, first_box, k, here, column, row, BIN)
-            rank = tl.cumsum(here.to(tl.int32), 0) - 1
-            tl.store(entries + place + rank, k, here)
-            place += tl.sum(here.to(tl.int64), 0)
+            i = start + tl.arange(0, LANES)
+            k = tl.load(order + first_box + i, i < boxes, 0).to(tl.int32)
+            here = _meets(indices, first_box, k, i < boxes, column, row, BIN)
+            line = indices + (first_box + k) * 16
+            first, last = tl.load(line + 1, here, 0), tl.load(line + 2, here, 0)
+            place = _write(entries, place, here, k, first, first, last)
 
 
 @triton.jit
 def list_tiles(
-    bin_entries, bin_begin, bin_count, indices, entries, begin, count, totals, boxes, across, bins_across, bins,
-    BIN: tl.constexpr, LANES: tl.constexpr,
+    bin_entries, bin_begin, bin_count, record, indices, entries, begin, count, totals,
+    boxes, across, bins_across, bins, spacing,
+    BIN: tl.constexpr, TILE_WIDTH: tl.constexpr, TILE_HEIGHT: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """One tile of one view: the boxes of its bin that meet it, in the bin's order."""
+    """One tile of one view: the boxes of its bin that its rays meet, in the bin's order."""
     view, tile = tl.program_id(1), tl.program_id(0)
     column, row = tile % across, tile // across
     bin_ = view * bins + (row // BIN) * bins_across + column // BIN
-    candidates = tl.load(bin_begin + bin_)
+    candidates = bin_entries + tl.load(bin_begin + bin_) * 4
     number = tl.load(bin_count + bin_)
     first_box = view.to(tl.int64) * boxes
+    list_ = view * tl.num_programs(0) + tile
     found = tl.zeros((), tl.int32)
     for start in range(0, number, LANES):
-        k, here = _some(bin_entries, candidates, start, number, LANES)
-        found += tl.sum(_meets(indices, first_box, k, here, column, row, 1).to(tl.int32), 0)
-    list_ = view * tl.num_programs(0) + tile
+        i = start + tl.arange(0, LANES)
+        k = tl.load(candidates + i * 4, i < number, 0)
+        here = _meets(indices, first_box, k, i < number, column, row, 1)
+        first, last = _reached(record, indices, first_box + k, column, row, spacing, TILE_WIDTH, TILE_HEIGHT)
+        found += tl.sum((here & (first <= last)).to(tl.int32), 0)
     tl.store(count + list_, found)
     if found == 0:
         tl.store(begin + list_, found.to(tl.int64))
@@ -61,18 +74,23 @@ def list_tiles(
         place = tl.atomic_add(totals + 5, found.to(tl.int64))
         tl.store(begin + list_, place)
         for start in range(0, number, LANES):
-            k, here = _some(bin_entries, candidates, start, number, LANES)
-            here = _meets(indices, first_box, k, here, column, row, 1)
-            rank = tl.cumsum(here.to(tl.int32), 0) - 1
-            tl.store(entries + place + rank, k, here)
-            place += tl.sum(here.to(tl.int64), 0)
+            i = start + tl.arange(0, LANES)
+            k = tl.load(candidates + i * 4, i < number, 0)
+            here = _meets(indices, first_box, k, i < number, column, row, 1)
+            first, last = _reached(record, indices, first_box + k, column, row, spacing, TILE_WIDTH, TILE_HEIGHT)
+            sorted_by = tl.load(candidates + i * 4 + 1, i < number, 0)
+            place = _write(entries, place, here & (first <= last), k, sorted_by, first, last)
 
 
 @triton.jit
-def _some(entries, begin, start, number, LANES: tl.constexpr):
-    """LANES entries of a list, and which of them exist."""
-    i = start + tl.arange(0, LANES)
-    return tl.load(entries + begin + i, i < number, 0).to(tl.int32), i < number
+def _write(entries, place, here, k, sorted_by, first, last):
+    """Entries for those `here`, from `place` on; the place after them."""
+    at = entries + (place + tl.cumsum(here.to(tl.int32), 0) - 1) * 4
+    tl.store(at, k, here)
+    tl.store(at + 1, sorted_by, here)
+    tl.store(at + 2, first, here)
+    tl.store(at + 3, last, here)
+    return place + tl.sum(here.to(tl.int64), 0)
 
 
 @triton.jit
@@ -83,3 +101,51 @@ def _meets(indices, first_box, k, here, column, row, SIZE: tl.constexpr):
     top, bottom = tl.load(line + 6, here, 0), tl.load(line + 7, here, -1)
     across = (left < column + SIZE) & (right >= column)
     return here & across & (top < row + SIZE) & (bottom >= row)
+
+
+@triton.jit
+def _reached(record, indices, k, column, row, spacing, TILE_WIDTH: tl.constexpr, TILE_HEIGHT: tl.constexpr):
+    """First and last lattice point of the boxes' contents that any ray of a tile can meet; last < first for none.
+
+    A ray differs from the tile's middle one by d - d0 = Dm / |m0| + d (|m0| - |m|) / |m0|, where Dm is w a + h b at most,
+    for half a tile of w x h pixels. On an axis of the box the first term is at most A / |m0|, A = w |W a| + h |W b|;
+    with r = |Dm| / |m0| the difference is at most (A / |m0| + |W d0| r) / (1 - r). The middle ray is cut with the box
+    grown by as much at the box's far end.
+    """
+    at, line = record + k * 32, indices + k * 16
+    width: tl.constexpr = (TILE_WIDTH - 1) / 2
+    height: tl.constexpr = (TILE_HEIGHT - 1) / 2
+    u = (column * TILE_WIDTH).to(tl.float32) + width + tl.zeros(k.shape, tl.float32)
+    v = (row * TILE_HEIGHT).to(tl.float32) + height + tl.zeros(k.shape, tl.float32)
+    px, py, pz, qx, qy, qz = ray_in_box(at, u, v)
+    du, dv = (u - tl.load(at + 16)) + (0.5 - tl.load(at + 17)), (v - tl.load(at + 18)) + (0.5 - tl.load(at + 19))
+    length = tl.load(at + 13)
+    more = du * (tl.load(at + 14) + du * tl.load(at + 27) + dv * tl.load(at + 28))
+    more += dv * (tl.load(at + 15) + dv * tl.load(at + 29))
+    inverse = 1.0 / tl.sqrt(length * length + more)
+    r = (tl.sqrt(tl.load(at + 27)) * width + tl.sqrt(tl.load(at + 29)) * height) * inverse
+    n0, first, last = tl.load(line), tl.load(line + 1), tl.load(line + 2)
+    far = last.to(tl.float32) * spacing / (1.0 - tl.minimum(r, WIDE_TILE))
+    low, high = tl.zeros_like(u) - float("inf"), tl.zeros_like(u) + float("inf")
+    low, high = _cut(low, high, px, qx, at, 0, far, inverse, r, width, height)
+    low, high = _cut(low, high, py, qy, at, 1, far, inverse, r, width, height)
+    low, high = _cut(low, high, pz, qz, at, 2, far, inverse, r, width, height)
+    low, high = low / spacing, high / spacing
+    # Beyond 2^29 points float32 cannot be turned into an integer that n0 may be added to.
+    low, high = tl.maximum(low, -5e8), tl.minimum(high, 5e8)
+    missed = low > high
+    low, high = tl.minimum(low, 5e8), tl.maximum(high, -5e8)
+    near = tl.maximum(first, n0 + tl.floor(low - 0.05).to(tl.int32))
+    past = tl.minimum(last, n0 + tl.ceil(high + 0.05).to(tl.int32))
+    past = tl.where(missed, near - 1, past)
+    return tl.where(r < WIDE_TILE, near, first), tl.where(r < WIDE_TILE, past, last)
+
+
+@triton.jit
+def _cut(low, high, p, q, at, AXIS: tl.constexpr, far, inverse, r, width: tl.constexpr, height: tl.constexpr):
+    """[low, high] cut to where p + s q lies between a box's bounds on an axis, grown by how a tile's rays differ."""
+    turn = (tl.abs(tl.load(at + AXIS)) * width + tl.abs(tl.load(at + 3 + AXIS)) * height) * inverse
+    grown = far * (turn + tl.abs(q) * r) + BLUR
+    q = tl.where(tl.abs(q) < 1e-12, 1e-12, q)
+    one, two = (tl.load(at + 20 + AXIS) - grown - p) / q, (tl.load(at + 23 + AXIS) + grown - p) / q
+    return tl.maximum(low, tl.minimum(one, two)), tl.minimum(high, tl.maximum(one, two))

@@ -103,7 +103,7 @@ def march_tiles(
 
     list_ = view * lists + tile // tiles_across // TILES_OF_LIST * lists_across + tile % tiles_across // TILES_OF_LIST
     number = tl.load(count + list_)
-    own = entries + tl.load(begin + list_)
+    own = entries + tl.load(begin + list_) * 4
     first_box = view.to(tl.int64) * boxes
     zero = tl.zeros((TILE_WIDTH * TILE_HEIGHT,), tl.float32)
     never = tl.zeros((TILE_WIDTH * TILE_HEIGHT,), tl.int32) + NEVER
@@ -115,7 +115,7 @@ def march_tiles(
     open_ = tl.zeros((), tl.int32)
     next_point = open_
     if number > 0:
-        next_point = tl.load(indices + (first_box + tl.load(own)) * 16 + 1) // (SETS * GAP) * (SETS * GAP)
+        next_point = tl.load(own + 1) // (SETS * GAP) * (SETS * GAP)
     base = next_point
     alive = tl.max((first <= last).to(tl.int32), 0)
     while (open_ < number) & (alive > 0):
@@ -127,12 +127,15 @@ def march_tiles(
         stop = next_point + COARSE * SETS * GAP
         entry = open_
         starts = next_point
-        # Boxes that are done stay before `open_`; the list is ordered by where boxes begin, not by where they end.
+        following = tl.zeros((), tl.int32) + NEVER
+        # Entries that are done stay after `open_`: the list is ordered by where boxes begin, not by where they end.
         while (entry < number) & (starts < stop):
-            k = first_box + tl.load(own + entry)
-            starts = tl.load(indices + k * 16 + 1)
-            ends_at = tl.load(indices + k * 16 + 2)
-            if (starts < stop) & (ends_at >= next_point):
+            at = own + entry * 4
+            starts = tl.load(at + 1)
+            begins, ends_at = tl.load(at + 2), tl.load(at + 3)
+            following = tl.where(ends_at >= stop, tl.minimum(following, tl.maximum(begins, stop)), following)
+            if (begins < stop) & (ends_at >= next_point):
+                k = first_box + tl.load(at)
                 row = record + k * 32
                 n0 = tl.load(indices + k * 16)
                 stride = tl.load(indices + k * 16 + 3)
@@ -198,15 +201,15 @@ def march_tiles(
         last = tl.where(end < NEVER, 0, last)
         alive = tl.max((first <= last).to(tl.int32), 0)
 
-        # The next chunk begins where an unfinished box does, or where this one ended.
-        ends_at = stop - 1
-        while (open_ < number) & (ends_at < stop):
-            k = first_box + tl.load(own + open_)
-            starts = tl.load(indices + k * 16 + 1)
-            ends_at = tl.load(indices + k * 16 + 2)
-            if ends_at < stop:
+        # The next chunk begins with the next box that has points from there on.
+        following = tl.where(starts >= stop, tl.minimum(following, starts), following)
+        next_point = following // (SETS * GAP) * (SETS * GAP)
+        ends_at = next_point - 1
+        open_ = tl.where(following == NEVER, number, open_)
+        while (open_ < number) & (ends_at < next_point):
+            ends_at = tl.load(own + open_ * 4 + 3)
+            if ends_at < next_point:
                 open_ += 1
-        next_point = tl.maximum(stop, starts // (SETS * GAP) * (SETS * GAP))
 
     tl.store(out_rgb + ray * 3, r, shown)
     tl.store(out_rgb + ray * 3 + 1, g, shown)
