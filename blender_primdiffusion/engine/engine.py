@@ -44,13 +44,13 @@ class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
         """The scene has changed."""
         if self._viewport is None:
             self._viewport = Viewport()
-        self._viewport.update(depsgraph)
+        self._viewport.update(context, depsgraph)
 
     def view_draw(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """Draw the newest picture there is; never waits for one."""
         if self._viewport is None:
             self._viewport = Viewport()
-            self._viewport.update(depsgraph)
+            self._viewport.update(context, depsgraph)
         self._viewport.draw(self, context, depsgraph)
 
     def _fail(self, sentence: str) -> None:

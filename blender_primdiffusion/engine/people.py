@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..scene.convention import transforms_to_backend
 from ..scene.human import BETAS, MARK, person_file
 from ..scene.human_file import JOINT_NAMES
+from .visible import visible_instances
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,19 +40,17 @@ class Posed:
         }
 
 
-def posed_people(depsgraph: bpy.types.Depsgraph) -> list[Posed]:
-    """Everybody whose armature the dependency graph shows, instances included.
+def posed_people(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None) -> list[Posed]:
+    """Everybody whose armature is visible, in a viewport where one is given; instances included.
 
     An armature stands for its person: it is hidden with it and shown wherever it is instanced. Raises FileNotFoundError
     for a person whose file is missing and ValueError for a shape that is no list of numbers.
     """
     owners = dict(_armatures())
     people = []
-    for instance in depsgraph.object_instances:
+    for instance in visible_instances(depsgraph, space):
         thing = instance.object
-        if thing.type != "ARMATURE" or not instance.show_self:
-            continue
-        owner = owners.get(thing.original)
+        owner = owners.get(thing.original) if thing.type == "ARMATURE" else None
         if owner is not None:
             people.append(_posed(thing, np.array(instance.matrix_world), owner))
     return people

@@ -43,12 +43,17 @@ class Picture:
         }
 
 
-def picture_of(depsgraph: bpy.types.Depsgraph, solids: Path | None) -> Picture:
-    """The scene as the dependency graph has it, with `solids_file`'s answer. Raises what `posed_people` raises."""
+def picture_of(
+    depsgraph: bpy.types.Depsgraph, solids: Path | None, space: bpy.types.SpaceView3D | None = None
+) -> Picture:
+    """The scene as the dependency graph, or a viewport, shows it, with `solids_file`'s answer.
+
+    Raises what `posed_people` raises.
+    """
     scene = depsgraph.scene
     settings = scene.primdiffusion_render
     return Picture(
-        tuple(posed_people(depsgraph)),
+        tuple(posed_people(depsgraph, space)),
         solids,
         None if scene.render.film_transparent else world_colour(depsgraph),
         settings.view.lower(),
@@ -56,12 +61,14 @@ def picture_of(depsgraph: bpy.types.Depsgraph, solids: Path | None) -> Picture:
     )
 
 
-def solids_file(depsgraph: bpy.types.Depsgraph, folder: Path) -> Path | None:
+def solids_file(
+    depsgraph: bpy.types.Depsgraph, folder: Path, space: bpy.types.SpaceView3D | None = None
+) -> Path | None:
     """The scene's solid objects as a file in `folder`; None where there are none or where they are to be ignored."""
     wanted = depsgraph.scene.primdiffusion_render.solids
     if wanted == "IGNORED":
         return None
-    return stored(scene_solids(depsgraph, wanted == "HOLDOUT"), folder)
+    return stored(scene_solids(depsgraph, wanted == "HOLDOUT", space), folder)
 
 
 def world_colour(depsgraph: bpy.types.Depsgraph) -> tuple[float, float, float]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..scene.body_mesh import MARK as BODY_MARK
 from ..scene.convention import points_to_backend
+from .visible import visible_instances
 
 SOLID_TYPES = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})
 UNMOVED_BY_THESE = frozenset({"ARMATURE", "CAMERA", "VOLUME", "LIGHT", "LIGHT_PROBE", "SPEAKER"})
@@ -44,13 +45,15 @@ class Solids:
     """[F]: cuts a hole into the picture instead of being seen."""
 
 
-def scene_solids(depsgraph: bpy.types.Depsgraph, everything_holdout: bool) -> Solids:
+def scene_solids(
+    depsgraph: bpy.types.Depsgraph, everything_holdout: bool, space: bpy.types.SpaceView3D | None = None
+) -> Solids:
     """What is visible of meshes, curves, surfaces, texts, metaballs and their instances, except people's own bodies.
 
     A triangle has its material's base colour (see `base_colour`), or without a material the object's. Curves and the
     like are taken as Blender tessellates them. `everything_holdout` makes all of it cut holes.
     """
-    parts = list(_parts(depsgraph))
+    parts = list(_parts(depsgraph, space))
     if not parts:
         return Solids(np.zeros((0, 3, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, bool))
     corners, colour, holdout = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -95,12 +98,14 @@ def base_colour(material: bpy.types.Material) -> tuple[float, float, float]:
     return tuple(material.diffuse_color)[:3]
 
 
-def _parts(depsgraph: bpy.types.Depsgraph) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
+def _parts(
+    depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None
+) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
     """Corners, colours and holdout of each visible object or instance."""
     meshes: dict[object, tuple[NDArray, NDArray]] = {}
-    for instance in depsgraph.object_instances:
+    for instance in visible_instances(depsgraph, space):
         thing = instance.object
-        if thing.type not in SOLID_TYPES or not instance.show_self or BODY_MARK in thing or not thing.visible_camera:
+        if thing.type not in SOLID_TYPES or BODY_MARK in thing or not thing.visible_camera:
             continue
         key = (thing.data.as_pointer(), thing.original.as_pointer())
         if key not in meshes:

@@ -35,25 +35,29 @@ class Viewport:
         )
         self._picture: Picture | None = None
         self._solids: Path | None = None
-        self._solids_known = ""
+        self._known: tuple[str, bool] | None = None
+        """What the solids were read for: the setting, and whether the view is a local one."""
         self._error = ""
         self._texture: tuple[Shown, gpu.types.GPUTexture] | None = None
         _viewports.add(self)
         weakref.finalize(self, _leave, self._refinement, names)
 
-    def update(self, depsgraph: bpy.types.Depsgraph) -> None:
+    def update(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """The scene has changed: read it while the dependency graph may be read."""
+        space = context.space_data
+        wanted = (depsgraph.scene.primdiffusion_render.solids, space.local_view is not None)
         try:
-            wanted = depsgraph.scene.primdiffusion_render.solids
-            if wanted != self._solids_known or changed_by(depsgraph):
-                self._solids, self._solids_known = solids_file(depsgraph, studio.frames.folder), wanted
-            self._picture = picture_of(depsgraph, self._solids)
+            if wanted != self._known or changed_by(depsgraph):
+                self._solids, self._known = solids_file(depsgraph, studio.frames.folder, space), wanted
+            self._picture = picture_of(depsgraph, self._solids, space)
             self._error = ""
         except (ValueError, OSError) as error:
             self._picture, self._error = None, str(error)
 
     def draw(self, engine: bpy.types.RenderEngine, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """Wish for what the region looks at now, and draw the newest picture over the whole of it."""
+        if self._known is not None and self._known[1] != (context.space_data.local_view is not None):
+            self.update(context, depsgraph)  # Blender does not tell
         if self._picture is not None:
             self._refinement.want(_wish(self._picture, context, depsgraph))
             self._refinement.advance()

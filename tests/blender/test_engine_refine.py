@@ -131,8 +131,6 @@ def test_where_drawing_is_fast_moving_pictures_become_finer_and_coarser_again_wh
         bench.refinement.advance()
         widths.append(bench.asked[-1].params["width"])
         answer(bench, result={"seconds": seconds})
-        bench.refinement.want(wish(f"next {step}"))
-        bench.refinement._take_answer()
     assert widths == [-(-SIZE[0] // coarseness) for coarseness in (4, 2, 1, 1, 2, 4)]
 
 
