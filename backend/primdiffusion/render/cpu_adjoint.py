@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 from numpy import ndarray
 
-from primdiffusion.render.cpu_compiled import compiled
+from primdiffusion.render.cpu_compiled import kernel, part
 from primdiffusion.render.cpu_sampling import (
     HIT_ROWS,
     LANES,
@@ -60,7 +60,7 @@ class Gradients(NamedTuple):
     """Each box's part of it."""
 
 
-@compiled(parallel=True)
+@kernel
 def adjoin_boxes(gradients, upstream, boxes, size, rectangle, order, limits, pixel_to_world, width, height, spacing,
     index_order,
 ):  # fmt: skip
@@ -80,7 +80,7 @@ def adjoin_boxes(gradients, upstream, boxes, size, rectangle, order, limits, pix
             )  # fmt: skip
 
 
-@compiled()
+@part()
 def _adjoin_box(
     gradients, upstream, boxes, size, rectangle, k, limits, pixel_to_world, width, height, spacing, index_order,
     own, slopes, slope, table, rays, hits, lines, block, worth, d_point, d_direction,
@@ -133,7 +133,7 @@ def _adjoin_box(
         _separate(gradients.rgb, gradients.density, own, k, size * size * size)
 
 
-@compiled(forceinline=True)
+@part(inline=True)
 def _steps(hits, lane, reference, stride, limits, ray, end, k, last_box):
     """First and last step, from the reference point, of a ray in box k that count."""
     enter, leave = np.int64(hits[6 * LANES + lane]), np.int64(hits[7 * LANES + lane])
@@ -148,7 +148,7 @@ def _steps(hits, lane, reference, stride, limits, ray, end, k, last_box):
     return enter, leave
 
 
-@compiled()
+@part()
 def _adjoin_segment(
     own, slopes, slope, voxels, base, size, block, worth, lines, enter, leave, length, share,
     red, green, blue, constant, per_step,
@@ -188,7 +188,7 @@ def _adjoin_segment(
             slope[1, axis] += half * slopes[4 + axis]
 
 
-@compiled(forceinline=True)
+@part(inline=True)
 def _window_slopes(worth, lines, first):
     """sum worth * d log(window) / dy, and the same times the step, of SAMPLES samples."""
     x0, y0, z0 = np.float32(0), np.float32(0), np.float32(0)
@@ -204,14 +204,14 @@ def _window_slopes(worth, lines, first):
     return x0, y0, z0, x1, y1, z1
 
 
-@compiled(forceinline=True)
+@part(inline=True)
 def _window_slope(y):
     y = min(max(y, np.float32(-1)), np.float32(1))  # lanes past the segment may be anywhere
     cube = y * y * y
     return np.float32(-WINDOW_SHARPNESS * WINDOW_POWER) * (cube * cube * y)
 
 
-@compiled()
+@part()
 def _turn_and_move(d_point, d_direction, slope, middle, rays, pixel, distance, step):
     """Adds one ray to a tile's sums of dL/dy and of t * dL/dy times the direction, less distance * middle.
 
@@ -227,7 +227,7 @@ def _turn_and_move(d_point, d_direction, slope, middle, rays, pixel, distance, s
         d_direction[axis, 2] += far * dz + along * z
 
 
-@compiled()
+@part()
 def _aim(d_camera, slope, to_local, k, distance, step, m, row, column):
     """Adds one ray to dL/d(pixel_to_world): d = r / |r|, r = pixel_to_world [u, v, 1]."""
     vx, vy, vz = 0.0, 0.0, 0.0  # dL/dd
@@ -249,7 +249,7 @@ def _aim(d_camera, slope, to_local, k, distance, step, m, row, column):
         d_camera[k, axis, 2] += value
 
 
-@compiled()
+@part()
 def _add_tile(d_matrix, d_offset, d_point, d_direction, boxes, k, middle, distance):
     """Adds a tile's sums to dL/d(to_local) and dL/d(offset)."""
     for axis in range(3):
@@ -259,7 +259,7 @@ def _add_tile(d_matrix, d_offset, d_point, d_direction, boxes, k, middle, distan
             d_offset[k, other] += boxes.to_local[k, axis, other] * d_point[axis]
 
 
-@compiled()
+@part()
 def _separate(rgb, density, own, k, count):
     """From interleaved voxels to colour and density."""
     for i in range(count):

@@ -1,4 +1,4 @@
-"""numba with a disk cache that notices a change in any of the kernels' sources."""
+"""numba's compiler as the CPU marcher uses it: kernels, which Python calls, and the parts they are made of."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core.dispatcher import Dispatcher
 
 FASTMATH = frozenset({"contract", "arcp", "nsz", "reassoc"})
 """Rounding may differ from the source's; NaN and infinity keep their meaning."""
@@ -15,33 +14,34 @@ FASTMATH = frozenset({"contract", "arcp", "nsz", "reassoc"})
 _njit: Any = numba.njit  # its overloads do not know all options
 _SOURCES = ("cpu_*.py", "tiles.py", "lattice.py", "compositing.py")
 
+Function = Callable[..., Any]
 
-def compiled(
-    *, parallel: bool = False, forceinline: bool = False, allocates: bool = False
-) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit` with `FASTMATH` and the processor's division, cached on disk.
 
-    `forceinline` puts the function into its callers, whose loops can then be vectorised. A function that neither is
-    `parallel` nor `allocates` arrays counts no references: its caller holds them, and the atomic counters would cost
-    more than the samples.
+def kernel(function: Function) -> Any:
+    """Compiled for all threads, and cached on disk.
 
-    numba 0.68 recompiles a cached kernel when the kernel's own file has changed, but not when a function or a constant
-    it takes from another file has. Here the files that hold them are part of the cache's stamp.
+    numba 0.68 compiles a cached kernel again when the kernel's own file has changed, but not when a function or a
+    constant it takes from another file has. Here the files that hold them are part of the cache's stamp.
     """
+    dispatcher = _njit(parallel=True, cache=True, fastmath=set(FASTMATH), error_model="numpy")(function)
+    dispatcher._cache._cache_file._source_stamp = _stamp()
+    return dispatcher
 
-    def compile_(function: Callable[..., Any]) -> Dispatcher:
-        dispatcher = _njit(
-            parallel=parallel,
-            forceinline=forceinline,
-            _nrt=parallel or allocates,
-            fastmath=set(FASTMATH),
-            error_model="numpy",
-            cache=True,
-        )(function)
-        dispatcher._cache._cache_file._source_stamp = _stamp()
-        return dispatcher
 
-    return compile_
+def part(*, inline: bool = False) -> Callable[[Function], Any]:
+    """Compiled for kernels and other parts to call, not for Python.
+
+    `inline` puts the function into its callers, whose loops can then be vectorised. Parts count no references and so
+    cannot allocate: their kernel holds all arrays, and the atomic counters would cost more than the samples.
+    """
+    return _njit(
+        forceinline=inline,
+        _nrt=False,
+        no_cpython_wrapper=True,
+        no_cfunc_wrapper=True,
+        fastmath=set(FASTMATH),
+        error_model="numpy",
+    )
 
 
 def _stamp() -> tuple[tuple[str, int, int], ...]:

@@ -10,7 +10,7 @@ from jaxtyping import Float32, Int32, Int64
 from numpy import ndarray
 
 from primdiffusion.render.compositing import SURFACE_OPACITY
-from primdiffusion.render.cpu_compiled import compiled
+from primdiffusion.render.cpu_compiled import kernel, part
 from primdiffusion.render.cpu_sampling import (
     HIT_ROWS,
     LANES,
@@ -58,7 +58,7 @@ class Ends(NamedTuple):
     """That sample's colour."""
 
 
-@compiled(parallel=True)
+@kernel
 def march_tiles(
     picture, ends, counts, boxes, size, rectangle, row_start, row_box, order, limits, pixel_to_world, width, height,
     spacing, index_order,
@@ -86,7 +86,7 @@ def march_tiles(
         )  # fmt: skip
 
 
-@compiled()
+@part()
 def _march_tile(
     picture, ends, counts, boxes, size, rectangle, row_start, row_box, tile, limits, pixel_to_world, width, height,
     spacing, index_order, listed, reference, table, rays, hits, lines, sequence, tests, points, block,
@@ -116,7 +116,7 @@ def _march_tile(
                 counts[tile, 1] += _needed(hits, number, strides, ends.index[ray])
 
 
-@compiled()
+@part()
 def _count(row_box, row_start, rectangle, tile, across):
     row, column = tile // across, tile % across
     found = 0
@@ -126,7 +126,7 @@ def _count(row_box, row_start, rectangle, tile, across):
     return found
 
 
-@compiled()
+@part()
 def _leave_blank(picture, ends, row0, column0, width, height):
     for row in range(row0, min(row0 + TILE, height)):
         for column in range(column0, min(column0 + TILE, width)):
@@ -137,7 +137,7 @@ def _leave_blank(picture, ends, row0, column0, width, height):
                 ends.index[ray] = NEVER
 
 
-@compiled()
+@part()
 def _tabulate_tile(listed, reference, table, row_box, row_start, rectangle, tile, across, boxes, middle, spacing):
     row, column = tile // across, tile % across
     i = 0
@@ -153,7 +153,7 @@ def _tabulate_tile(listed, reference, table, row_box, row_start, rectangle, tile
         i += 1
 
 
-@compiled()
+@part()
 def _find_hits(hits, lines, sequence, tests, table, rays, pixel, listed, reference, strides, first, last):
     """The boxes that a ray meets between two lattice indices; `sequence` sorts them by their first lattice points."""
     dx, dy, dz = rays[pixel], rays[PIXELS + pixel], rays[2 * PIXELS + pixel]
@@ -184,7 +184,7 @@ def _find_hits(hits, lines, sequence, tests, table, rays, pixel, listed, referen
     return number
 
 
-@compiled()
+@part()
 def _march_ray(
     picture, ends, ray, hits, lines, sequence, number, points, block, voxels, strides, size, spacing, index_order
 ):
@@ -227,7 +227,7 @@ def _march_ray(
     return evaluated
 
 
-@compiled()
+@part()
 def _gather(points, begin, hits, lines, sequence, done, number, block, voxels, strides, size, spacing):
     """Adds what all boxes have at the lattice points from `begin` to `begin + CHUNK`; returns how many samples."""
     evaluated, end = 0, begin + CHUNK
@@ -252,7 +252,7 @@ def _gather(points, begin, hits, lines, sequence, done, number, block, voxels, s
     return evaluated
 
 
-@compiled()
+@part()
 def _sum(points):
     """The chunk's colour and opacity, and sum of slot * opacity."""
     r, g, b, a, m = np.float32(0), np.float32(0), np.float32(0), np.float32(0), np.float32(0)
@@ -265,7 +265,7 @@ def _sum(points):
     return r, g, b, a, m
 
 
-@compiled()
+@part()
 def _sum_to_opaque(points, alpha):
     """The slot that takes alpha to 1 or beyond, CHUNK if rounding alone did; as `_sum`, of what lies before it."""
     r, g, b, a, m = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -278,7 +278,7 @@ def _sum_to_opaque(points, alpha):
     return CHUNK, r, g, b, a, m
 
 
-@compiled()
+@part()
 def _slot_of_surface(points, alpha, last):
     """The slot at which alpha has grown to SURFACE_OPACITY, `last` at the latest."""
     for slot in range(min(last, CHUNK - 1)):
@@ -288,7 +288,7 @@ def _slot_of_surface(points, alpha, last):
     return min(last, CHUNK - 1)
 
 
-@compiled()
+@part()
 def _in_index_order(points, slot, index, alpha, hits, lines, number, block, voxels, strides, size, spacing):
     """The boxes of one lattice point one after the other, the lowest index first, until the ray is opaque.
 
@@ -322,7 +322,7 @@ def _in_index_order(points, slot, index, alpha, hits, lines, number, block, voxe
     return box_end, r, g, b, a
 
 
-@compiled()
+@part()
 def _note_end(ends, ray, index, box, share, points, slot):
     ends.index[ray], ends.box[ray], ends.share[ray] = index, box, share
     inverse = np.float32(1) / points[4 * slot + 3]
@@ -330,7 +330,7 @@ def _note_end(ends, ray, index, box, share, points, slot):
     ends.rgb[ray, 2] = points[4 * slot + 2] * inverse
 
 
-@compiled()
+@part()
 def _needed(hits, number, strides, end):
     """Samples of a ray's hits at lattice points up to `end`."""
     needed = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numba
@@ -10,7 +11,7 @@ from jaxtyping import Bool, Float, Float64, Int32, Int64
 from numpy import ndarray
 from torch import Tensor
 
-from primdiffusion.render.cpu_compiled import compiled
+from primdiffusion.render.cpu_compiled import kernel, part
 from primdiffusion.render.cpu_sampling import PackedBoxes
 from primdiffusion.render.lattice import ORTHOGONAL
 from primdiffusion.render.tiles import NOTHING, boxes_per_tile, row_lists, tile_rectangle, tiles_across
@@ -81,7 +82,7 @@ def dealt(work: Int64[ndarray, "n"]) -> Int64[ndarray, "n"]:
     return np.concatenate([heavy_first[thread::threads] for thread in range(threads)])
 
 
-@compiled(parallel=True)
+@kernel
 def _pack_boxes(
     voxels, low, high, rectangle, nearest, suspect,
     rgb, density, size, to_local, offset, rotation, solid, world_to_pixel, across, down, empty_cells,
@@ -92,18 +93,20 @@ def _pack_boxes(
         colour = rgb[3 * k * count : 3 * (k + 1) * count]
         suspect[k] = _is_suspect(own, colour, to_local[k], offset[k], rotation[k])
         rectangle[k, 0], rectangle[k, 1], rectangle[k, 2], rectangle[k, 3] = NOTHING
-        low[k], high[k] = -1, 1
+        for axis in range(3):
+            low[k, axis], high[k, axis] = -1, 1
         if not solid[k] or not (empty_cells or _shrink(low[k], high[k], own, size)):
             continue
-        corners = np.empty((8, 3))
-        nearest[k] = _place_corners(corners, low[k], high[k], to_local[k], offset[k], world_to_pixel)
+        corners, to_world = np.empty((8, 3)), np.empty((3, 3))
+        _invert(to_world, to_local[k])
+        nearest[k] = _place_corners(corners, to_world, low[k], high[k], offset[k], world_to_pixel)
         columns_rows = tile_rectangle(corners, across, down)
         rectangle[k, 0], rectangle[k, 1], rectangle[k, 2], rectangle[k, 3] = columns_rows
         if columns_rows[0] <= columns_rows[1]:
             _interleave(voxels[4 * k * count : 4 * (k + 1) * count], own, colour, count)
 
 
-@compiled()
+@part()
 def _is_suspect(density, rgb, to_local, offset, rotation):
     zero, least = np.float32(0), np.float32(0)
     for i in range(len(density)):
@@ -125,77 +128,76 @@ def _is_suspect(density, rgb, to_local, offset, rotation):
     return not (zero == 0 and least >= 0 and excess <= ORTHOGONAL)
 
 
-@compiled(allocates=True)
+@part()
 def _shrink(low, high, density, size):
     """Narrows low ... high to where trilinear density can be above 0; False where that is nowhere."""
-    first, last = np.full(3, size, np.int64), np.full(3, -1, np.int64)
-    along_w = np.zeros(size, np.float32)
+    first_w, last_w, first_h, last_h, first_d, last_d = size, -1, size, -1, size, -1
     for d in range(size):
-        slab = np.float32(0)
         for h in range(size):
-            row = np.float32(0)
             begin = (d * size + h) * size
+            densest = np.float32(0)
             for w in range(size):
-                row = max(row, density[begin + w])
-                along_w[w] = max(along_w[w], density[begin + w])
-            if row > 0:
-                first[1], last[1] = min(first[1], h), max(last[1], h)
-            slab = max(slab, row)
-        if slab > 0:
-            first[2], last[2] = min(first[2], d), max(last[2], d)
-    for w in range(size):
-        if along_w[w] > 0:
-            first[0], last[0] = min(first[0], w), max(last[0], w)
-    for axis in range(3):
-        low[axis] = max(2.0 * (first[axis] - 1) / (size - 1) - 1, -1.0)
-        high[axis] = min(2.0 * (last[axis] + 1) / (size - 1) - 1, 1.0)
-    return last[0] >= 0
+                densest = max(densest, density[begin + w])
+            if densest > 0:
+                first_h, last_h, first_d, last_d = min(first_h, h), max(last_h, h), min(first_d, d), d
+                w = 0
+                while density[begin + w] == 0:
+                    w += 1
+                first_w = min(first_w, w)
+                w = size - 1
+                while density[begin + w] == 0:
+                    w -= 1
+                last_w = max(last_w, w)
+    _narrow(low, high, 0, first_w, last_w, size)
+    _narrow(low, high, 1, first_h, last_h, size)
+    _narrow(low, high, 2, first_d, last_d, size)
+    return last_d >= 0
 
 
-@compiled(allocates=True)
-def _place_corners(corners, low, high, to_local, offset, world_to_pixel):
+@part()
+def _narrow(low, high, axis, first, last, size):
+    low[axis] = max(2.0 * (first - 1) / (size - 1) - 1, -1.0)
+    high[axis] = min(2.0 * (last + 1) / (size - 1) - 1, 1.0)
+
+
+@part()
+def _place_corners(corners, to_world, low, high, offset, world_to_pixel):
     """The box's corners as homogeneous pixels; returns how near the camera its bounding sphere comes, metres."""
-    to_world = _inverse(to_local)
-    centre = np.empty(3)
-    radius = 0.0
-    for i in range(9):  # the last one is the middle
-        local = np.empty(3)
-        for axis in range(3):
-            upper = 0.5 if i == 8 else float((i >> axis) & 1)
-            local[axis] = low[axis] + upper * (high[axis] - low[axis])
-        world = np.empty(3)
-        for axis in range(3):
-            world[axis] = (
-                to_world[axis, 0] * local[0] + to_world[axis, 1] * local[1] + to_world[axis, 2] * local[2]
-            ) - offset[axis]
-        if i == 8:
-            centre[:] = world
-            continue
-        for axis in range(3):
-            corners[i, axis] = (
-                world_to_pixel[axis, 0] * world[0]
-                + world_to_pixel[axis, 1] * world[1]
-                + world_to_pixel[axis, 2] * world[2]
-            )
+    distance, radius = 0.0, 0.0
     for axis in range(3):
-        reach = abs(to_world[axis, 0]) + abs(to_world[axis, 1]) + abs(to_world[axis, 2])
+        place, reach = -offset[axis], 0.0
+        for other in range(3):
+            place += to_world[axis, other] * 0.5 * (low[other] + high[other])
+            reach += abs(to_world[axis, other])
+        distance += place * place
         radius += reach * reach
-    return np.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2) - np.sqrt(radius)
+    for i in range(8):
+        x = high[0] if i & 1 else low[0]
+        y = high[1] if i & 2 else low[1]
+        z = high[2] if i & 4 else low[2]
+        a = to_world[0, 0] * x + to_world[0, 1] * y + to_world[0, 2] * z - offset[0]
+        b = to_world[1, 0] * x + to_world[1, 1] * y + to_world[1, 2] * z - offset[1]
+        c = to_world[2, 0] * x + to_world[2, 1] * y + to_world[2, 2] * z - offset[2]
+        for axis in range(3):
+            corners[i, axis] = world_to_pixel[axis, 0] * a + world_to_pixel[axis, 1] * b + world_to_pixel[axis, 2] * c
+    return math.sqrt(distance) - math.sqrt(radius)
 
 
-@compiled(allocates=True)
-def _inverse(m):
-    result = np.empty((3, 3))
+@part()
+def _invert(result, m):
+    """result = the inverse of m [3, 3]."""
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         for axis in range(3):
             b, c = (axis + 1) % 3, (axis + 2) % 3
             result[axis, i] = m[j, b] * m[k, c] - m[j, c] * m[k, b]
-    determinant = m[0, 0] * result[0, 0] + m[0, 1] * result[1, 0] + m[0, 2] * result[2, 0]
-    return result / determinant
+    inverse = 1.0 / (m[0, 0] * result[0, 0] + m[0, 1] * result[1, 0] + m[0, 2] * result[2, 0])
+    for i in range(3):
+        for axis in range(3):
+            result[i, axis] *= inverse
 
 
-@compiled()
+@part()
 def _interleave(voxels, density, rgb, count):
     for i in range(count):
         voxels[4 * i] = rgb[i]

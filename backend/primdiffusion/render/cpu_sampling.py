@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
-from primdiffusion.render.cpu_compiled import compiled
+from primdiffusion.render.cpu_compiled import part
 from primdiffusion.render.cpu_vectors import add_sample, power_of_two
 from primdiffusion.render.lattice import WINDOW_SHARPNESS
 from primdiffusion.render.tiles import TILE
@@ -50,7 +50,7 @@ TABLE_ROWS = 23
 HIT_ROWS = 8
 
 
-@compiled()
+@part()
 def tile_rays(rays, pixel_to_world, row0, column0):
     """Fills rays [3, PIXELS] (flat) with each pixel's unit direction less the middle's, which it returns."""
     m = pixel_to_world
@@ -69,7 +69,7 @@ def tile_rays(rays, pixel_to_world, row0, column0):
     return middle
 
 
-@compiled()
+@part()
 def reference_point(boxes, k, middle, spacing):
     """The lattice index, a multiple of the box's stride, nearest to box k's centre on the tile's middle ray."""
     o = boxes.offset[k]
@@ -78,7 +78,7 @@ def reference_point(boxes, k, middle, spacing):
     return max(np.int64(along / step + 0.5), 0) * boxes.stride[k]
 
 
-@compiled(forceinline=True)
+@part(inline=True)
 def tabulate(table, place, boxes, k, middle, reference, spacing):
     """Writes box k's row entries at `place`, seen along the tile's middle ray from its reference point."""
     stride = boxes.stride[k]
@@ -100,7 +100,7 @@ def tabulate(table, place, boxes, k, middle, reference, spacing):
     table[place + _FIRST * LANES] = 1 - steps
 
 
-@compiled()
+@part()
 def leave_empty(table, place):
     """A lane that no ray hits."""
     for row in range(TABLE_ROWS):
@@ -108,7 +108,7 @@ def leave_empty(table, place):
     table[place + _FIRST * LANES] = np.inf
 
 
-@compiled()
+@part()
 def hit_boxes(hits, table, block, dx, dy, dz):
     """One ray (by its difference from the middle) against LANES boxes: fills hits [HIT_ROWS, LANES], flat."""
     place = np.int64(np.uint32(block))  # not negative: what the vectoriser must know
@@ -116,7 +116,7 @@ def hit_boxes(hits, table, block, dx, dy, dz):
         _hit(hits, j, table, place + j, dx, dy, dz)
 
 
-@compiled()
+@part()
 def hit_rays(hits, table, rays, first):
     """LANES rays from `first` on against the table's first box: fills hits [HIT_ROWS, LANES], flat."""
     place = np.int64(np.uint32(first))
@@ -124,7 +124,7 @@ def hit_rays(hits, table, rays, first):
         _hit(hits, j, table, 0, rays[place + j], rays[PIXELS + place + j], rays[2 * PIXELS + place + j])
 
 
-@compiled(forceinline=True)
+@part(inline=True)
 def _hit(hits, lane, table, place, dx, dy, dz):
     ex, qx, enter_x, leave_x = _axis_hit(table, place, 0, dx, dy, dz)
     ey, qy, enter_y, leave_y = _axis_hit(table, place, 1, dx, dy, dz)
@@ -135,7 +135,7 @@ def _hit(hits, lane, table, place, dx, dy, dz):
     hits[7 * LANES + lane] = np.floor(min(min(leave_x, leave_y), leave_z))
 
 
-@compiled(forceinline=True)
+@part(inline=True)
 def _axis_hit(table, place, axis, dx, dy, dz):
     along = (
         table[place + (_TO_LOCAL + 3 * axis) * LANES] * dx
@@ -151,7 +151,7 @@ def _axis_hit(table, place, axis, dx, dy, dz):
     return e, q, min(a, b), max(a, b)
 
 
-@compiled(forceinline=True)
+@part(inline=True)
 def place_samples(block, lines, hit, first, size, length):
     """Cells, weights and windows of SAMPLES samples from step `first` on: fills block [8, SAMPLES], flat.
 
@@ -180,14 +180,14 @@ def place_samples(block, lines, hit, first, size, length):
         block[7 * SAMPLES + j] = (cw * width + cv) * width + cu
 
 
-@compiled(forceinline=True)
+@part(inline=True)
 def _cell(y, half, last):
     place = y * half + half
     cell = min(max(np.floor(place), np.float32(0)), last)
     return cell, place - cell
 
 
-@compiled(forceinline=True)
+@part(inline=True)
 def _window(x, y, z):
     """exp(-8 sum |y|^8), to 2e-7 relative."""
     x4, y4, z4 = x * x * (x * x), y * y * (y * y), z * z * (z * z)
@@ -202,7 +202,7 @@ def _window(x, y, z):
     return (low + square * (middle + square * high)) * power_of_two(whole)
 
 
-@compiled()
+@part()
 def add_segment(points, slot, slots, voxels, base, size, block, lines, hit, first, count, length):
     """Adds `count` samples of one box, from step `first` on, to points[slot], points[slot + slots], ..."""
     row = size * 4

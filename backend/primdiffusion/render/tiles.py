@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int32, Int64
 from numpy import ndarray
 
-from primdiffusion.render.cpu_compiled import compiled
+from primdiffusion.render.cpu_compiled import part
 
 TILE = 8
 """Pixels along a side of a tile."""
@@ -30,7 +30,13 @@ def row_lists(
     Lists per row and not per tile: memory grows with boxes x rows at worst.
     """
     first, last = rectangle[:, 2].astype(np.int64), rectangle[:, 3].astype(np.int64)
-    return _fill_rows(first, last, down)
+    count = np.maximum(last - first + 1, 0)
+    box = np.repeat(np.arange(len(rectangle), dtype=np.int32), count)
+    row = np.arange(len(box)) - np.repeat(np.cumsum(count) - count - first, count)
+    order = np.argsort(row.astype(np.int16 if down < 2**15 else np.int64), kind="stable")
+    start = np.zeros(down + 1, np.int64)
+    np.cumsum(np.bincount(row, minlength=down), out=start[1:])
+    return start, box[order]
 
 
 def boxes_per_tile(rectangle: Int32[ndarray, "k 4"], across: int, down: int) -> Int64[ndarray, "tiles"]:
@@ -44,24 +50,7 @@ def boxes_per_tile(rectangle: Int32[ndarray, "k 4"], across: int, down: int) -> 
     return change.cumsum(0).cumsum(1)[:down, :across].ravel()
 
 
-@compiled(allocates=True)
-def _fill_rows(first, last, down):
-    start = np.zeros(down + 1, np.int64)
-    for k in range(len(first)):
-        for row in range(first[k], last[k] + 1):
-            start[row + 1] += 1
-    for row in range(down):
-        start[row + 1] += start[row]
-    filled = start.copy()
-    box = np.empty(start[down], np.int32)
-    for k in range(len(first)):
-        for row in range(first[k], last[k] + 1):
-            box[filled[row]] = k
-            filled[row] += 1
-    return start, box
-
-
-@compiled()
+@part()
 def tile_rectangle(corners, across, down):
     """First and last tile column, first and last tile row around a box with the homogeneous pixel `corners` [8, 3].
 
