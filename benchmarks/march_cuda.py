@@ -169,7 +169,7 @@ def variants() -> Iterator[Shapes]:
             yield Shapes(tile=tile, samples=samples, march_warps=warps, march_registers=registers)
     for block, warps in (((8, 8), 2), ((16, 8), 4)):
         yield Shapes(block=block, adjoint_warps=warps)
-    for units in (8, 16, 32):
+    for units in (8, 32, 64):
         yield Shapes(blocks_of_unit=units)
     for side in (4, 16):
         yield Shapes(bin=side)

@@ -118,8 +118,8 @@ def test_the_backward_kernel_fits_into_registers_and_uses_tensor_cores(tmp_path)
     shapes = cuda.Shapes()
     constants = {"HAS_SPAN": False, "BLOCK_WIDTH": shapes.block[0], "BLOCK_HEIGHT": shapes.block[1]}
     compiled = compile_for_hopper(
-        triton_adjoint.adjoint_boxes, "fififillffffff", ("i32",) * 4 + ("fp32",),
-        constants | {"BLOCKS_OF_UNIT": shapes.blocks_of_unit}, num_warps=shapes.adjoint_warps,
+        triton_adjoint.adjoint_boxes, "fififillffffff", ("i32",) * 5 + ("fp32",),
+        constants, num_warps=shapes.adjoint_warps,
     )  # fmt: skip
     assert resources(compiled, tmp_path)["STACK"] == 0
     assert "mma.sync" in compiled.asm["ptx"]
@@ -132,12 +132,12 @@ def test_the_small_kernels_compile_without_spilling(tmp_path):
     from primdiffusion.render import triton_adjoint, triton_boxes, triton_lists
 
     place = {"STRIDES": (4, 2, 1), "TILE_WIDTH": 8, "TILE_HEIGHT": 4, "BIN": 8}
-    place |= {"BLOCK_WIDTH": 8, "BLOCK_HEIGHT": 4, "BLOCKS_OF_UNIT": 64, "LANES": cuda.LANES}
+    place |= {"BLOCK_WIDTH": 8, "BLOCK_HEIGHT": 4, "LANES": cuda.LANES}
     one = {"boxes": 1, "own_boxes": 1}
     lists = {"BIN": 8, "LANES": cuda.LANES_OF_TILE}
     kernels = [
         (triton_boxes.pack_boxes, "fffil", 0, {}, 4),
-        (triton_boxes.place_boxes, "fffiffdfiil", 4, place, 1),
+        (triton_boxes.place_boxes, "fffiffdfiil", 5, place, 1),
         (triton_lists.list_bins, "liilil", 2, lists, 4),
         (triton_lists.list_bins, "liilil", 0, lists | {"boxes": 1, "across": 1}, 4),
         (triton_adjoint.finish_boxes, "lffffffffff", 3, {}, 4),

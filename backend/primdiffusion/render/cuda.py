@@ -51,9 +51,13 @@ class Shapes:
     """Of a thread; fewer make room for more programs, but spill."""
     block: tuple[int, int] = (8, 4)
     """Pixels of a step of the backward pass."""
-    blocks_of_unit: int = 64
-    """Steps of a program of the backward pass."""
+    blocks_of_unit: int = 16
+    """Steps of a program of the backward pass in pictures of up to 512 x 512; more in larger ones."""
     adjoint_warps: int = 1
+
+    def blocks_for(self, pixels: int) -> int:
+        """Blocks of a program of the backward pass: enough programs at any size, and no more memory for them."""
+        return self.blocks_of_unit * max(pixels, 512 * 512) // (512 * 512)
 
 
 def available(device: torch.device | str = "cuda") -> bool:
@@ -82,7 +86,8 @@ def march_cuda(
     give the same pictures and gradients. Voxel gradients are summed in tf32 (eleven significant bits a term). The host
     waits for the device once a call, for the checks and the lists' lengths. Memory beyond inputs and outputs: 9 KB a
     box and 16 bytes for each tile that a box touches, at most `LIST_LIMIT` of them; for gradients 40 bytes a pixel
-    more, and while they are computed another 32 a pixel and 8 KB a box.
+    more, and while they are computed another 32 a pixel and 8 KB for every 512 pixels of a box, or more pixels in
+    larger pictures.
 
     Raises ValueError as `check_scene` does, for other compositing, voxels other than 8^3 and dtypes other than float32;
     ImportError without Triton.
@@ -204,9 +209,9 @@ def _prepare(scene: _Scene, boxes: list[Tensor], intrinsics: Tensor, world_to_ca
     lattice = _lattice(scene.spacing, tuple(stride * fineness for stride in scene.strides), device)
     _launch(triton_boxes.place_boxes, (-(-k // LANES), b), 
         position, rotation, half_extent, bounds, intrinsics, world_to_camera, lattice, record, indices, first_point,
-        totals, k, own_boxes, width, height, STRIDES=scene.strides, TILE_WIDTH=shapes.tile[0],
-        TILE_HEIGHT=shapes.tile[1], BIN=shapes.bin, BLOCK_WIDTH=shapes.block[0], BLOCK_HEIGHT=shapes.block[1],
-        BLOCKS_OF_UNIT=shapes.blocks_of_unit, LANES=LANES, num_warps=1,
+        totals, k, own_boxes, width, height, shapes.blocks_for(b * height * width),
+        STRIDES=scene.strides, TILE_WIDTH=shapes.tile[0], TILE_HEIGHT=shapes.tile[1], BIN=shapes.bin,
+        BLOCK_WIDTH=shapes.block[0], BLOCK_HEIGHT=shapes.block[1], LANES=LANES, num_warps=1,
     )  # fmt: skip
     order = torch.argsort(first_point, dim=-1, stable=True)
     reach = None
@@ -328,7 +333,8 @@ def _adjoint(
         LANES=LANES_OF_SEEDS, num_warps=4,
     )  # fmt: skip
     blocks = indices[..., 12].flatten().long()
-    units_of_box = (blocks + shapes.blocks_of_unit - 1) // shapes.blocks_of_unit
+    blocks_of_unit = shapes.blocks_for(b * height * width)
+    units_of_box = (blocks + blocks_of_unit - 1) // blocks_of_unit
     unit_end = units_of_box.cumsum(0)
     unit_box = torch.repeat_interleave(units_of_box, output_size=units)
     unit_part = torch.arange(units, device=device) - (unit_end - units_of_box)[unit_box]
@@ -336,9 +342,9 @@ def _adjoint(
     if units:
         _launch(triton_adjoint.adjoint_boxes, (units,), 
             record, indices, voxels, reach, seeds, ends, unit_box, unit_part, rotation, half_extent, intrinsics,
-            world_to_camera, unit_voxels, unit_sums, k, own_boxes, height, width, spacing,
-            HAS_SPAN=reach is not None, BLOCK_WIDTH=shapes.block[0], BLOCK_HEIGHT=shapes.block[1],
-            BLOCKS_OF_UNIT=shapes.blocks_of_unit, num_warps=shapes.adjoint_warps,
+            world_to_camera, unit_voxels, unit_sums, k, own_boxes, height, width, blocks_of_unit,
+            spacing, HAS_SPAN=reach is not None, BLOCK_WIDTH=shapes.block[0], BLOCK_HEIGHT=shapes.block[1],
+            num_warps=shapes.adjoint_warps,
         )  # fmt: skip
     on_boxes = [new(shape) for shape in ((p, k, 3), (p, k, 3, 3), (p, k, 3), (p, k, 3, S, S, S), (p, k, S, S, S))]
     on_camera = new((b, k, 12))

@@ -113,10 +113,10 @@ def _on_direction(rotation, half_extent, lens, camera, column, down, x, y, z):
 def adjoint_boxes(
     record, indices, voxels, reach, seeds, ends, unit_box, unit_part,
     rotation, half_extent, intrinsics, world_to_camera, out_voxels, out_sums,
-    boxes, own_boxes, height, width, spacing,
-    HAS_SPAN: tl.constexpr, BLOCK_WIDTH: tl.constexpr, BLOCK_HEIGHT: tl.constexpr, BLOCKS_OF_UNIT: tl.constexpr,
+    boxes, own_boxes, height, width, blocks_of_unit, spacing,
+    HAS_SPAN: tl.constexpr, BLOCK_WIDTH: tl.constexpr, BLOCK_HEIGHT: tl.constexpr,
 ):  # fmt: skip
-    """One unit: up to BLOCKS_OF_UNIT blocks of the pixels that a box covers in a view."""
+    """One unit: up to `blocks_of_unit` blocks of the pixels that a box covers in a view."""
     unit = tl.program_id(0).to(tl.int64)
     k = tl.load(unit_box + unit).to(tl.int64)
     view = k // boxes
@@ -127,8 +127,8 @@ def adjoint_boxes(
     left, right, top, bottom = tl.load(line + 8), tl.load(line + 9), tl.load(line + 10), tl.load(line + 11)
     length = tl.load(row + 26)
     across = (right - left) // BLOCK_WIDTH + 1
-    begin = tl.load(unit_part + unit).to(tl.int32) * BLOCKS_OF_UNIT
-    stop = tl.minimum(begin + BLOCKS_OF_UNIT, tl.load(line + 12))
+    begin = tl.load(unit_part + unit).to(tl.int32) * blocks_of_unit
+    stop = tl.minimum(begin + blocks_of_unit, tl.load(line + 12))
     camera, lens = world_to_camera + view * 12, intrinsics + view * 9
     step = spacing * stride.to(tl.float32)
     along = tl.load(row + 12)

@@ -151,9 +151,9 @@ def _rectangle(centre, x, y, z, lx, ly, lz, hx, hy, hz, near, width, height, fx,
 @triton.jit
 def place_boxes(
     position, rotation, half_extent, bounds, intrinsics, world_to_camera, lattice, record, indices, first_point, totals,
-    boxes, own_boxes, width, height,
+    boxes, own_boxes, width, height, blocks_of_unit,
     STRIDES: tl.constexpr, TILE_WIDTH: tl.constexpr, TILE_HEIGHT: tl.constexpr, BIN: tl.constexpr,
-    BLOCK_WIDTH: tl.constexpr, BLOCK_HEIGHT: tl.constexpr, BLOCKS_OF_UNIT: tl.constexpr, LANES: tl.constexpr,
+    BLOCK_WIDTH: tl.constexpr, BLOCK_HEIGHT: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     """LANES boxes in one view: their records (see RECORD, INDICES), and the totals by which lists are allocated.
 
@@ -341,7 +341,7 @@ def place_boxes(
     tl.store(line + 10, top, here)
     tl.store(line + 11, bottom, here)
     tl.store(line + 12, blocks, here)
-    units = (blocks + BLOCKS_OF_UNIT - 1) // BLOCKS_OF_UNIT
+    units = (blocks + blocks_of_unit - 1) // blocks_of_unit
     tl.atomic_add(totals + 1, tl.sum(tl.where(shown, bins, 0), 0))
     tl.atomic_add(totals + 2, tl.sum(tl.where(shown, tiles, 0), 0))
     tl.atomic_add(totals + 3, tl.sum(units, 0).to(tl.int64))

@@ -107,8 +107,8 @@ def _meets(indices, first_box, k, here, column, row, SIZE: tl.constexpr):
 def _reached(record, indices, k, column, row, spacing, TILE_WIDTH: tl.constexpr, TILE_HEIGHT: tl.constexpr):
     """First and last lattice point of the boxes' contents that any ray of a tile can meet; last < first for none.
 
-    A ray differs from the tile's middle one by d - d0 = Dm / |m0| + d (|m0| - |m|) / |m0|, where Dm is w a + h b at most,
-    for half a tile of w x h pixels. On an axis of the box the first term is at most A / |m0|, A = w |W a| + h |W b|;
+    A ray differs from the tile's middle one by d - d0 = Dm / |m0| + d (|m0| - |m|) / |m0|, Dm at most w a + h b for
+    half a tile of w x h pixels. On an axis of the box the first term is at most A / |m0|, A = w |W a| + h |W b|;
     with r = |Dm| / |m0| the difference is at most (A / |m0| + |W d0| r) / (1 - r). The middle ray is cut with the box
     grown by as much at the box's far end.
     """
