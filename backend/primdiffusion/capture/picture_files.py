@@ -1,0 +1,64 @@
+"""The pictures of a capture as values of files, and PNGs without an imaging library.
+
+This file is the same in the backend and in the extension, which import nothing of each other: numpy and the standard
+library only.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .layout import replacing
+
+DEPTH_UNIT = 0.00025
+"""Metres a step of a depth file: up to 16.38 m."""
+_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\x00\x00\x00\x00IEND\xaeB\x60\x82"
+_JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+
+
+def write_png(path: Path, pixels: NDArray) -> None:
+    """A PNG of [H, W] or [H, W, 3] values, uint8 or uint16, unfiltered: lossless and the same bytes everywhere."""
+    pixels = np.asarray(pixels)
+    if pixels.dtype not in (np.uint8, np.uint16) or pixels.shape[2:] not in ((), (3,)):
+        raise ValueError(
+            f"a PNG of {pixels.dtype} {pixels.shape} cannot be written: give uint8 or uint16 [H, W] or [H, W, 3]"
+        )
+    bits, (height, width) = 8 * pixels.dtype.itemsize, pixels.shape[:2]
+    rows = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder(">"))).view(np.uint8).reshape(height, -1)
+    filtered = np.concatenate([np.zeros((height, 1), np.uint8), rows], axis=1)
+    header = struct.pack(">IIBBBBB", width, height, bits, 0 if pixels.ndim == 2 else 2, 0, 0, 0)
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(filtered.tobytes(), 6))]
+    with replacing(path) as partial, partial.open("wb") as file:
+        file.write(_PNG)
+        for kind, data in chunks:
+            file.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
+        file.write(_PNG_END)
+
+
+def depth_steps(depth: NDArray) -> NDArray[np.uint16]:
+    """Metres along the optical axis as a depth file's values; nothing where not finite or out of range."""
+    steps = np.where(np.isfinite(depth), np.round(np.nan_to_num(depth, posinf=0) / DEPTH_UNIT), 0)
+    return np.where((steps > 0) & (steps < 65536), steps, 0).astype(np.uint16)
+
+
+def normal_bytes(normal: NDArray, covered: NDArray) -> NDArray[np.uint8]:
+    """World normals [H, W, 3] as a normal file's values, zero where not `covered` [H, W]."""
+    return np.where(covered[..., None], np.round((np.clip(normal, -1, 1) + 1) * 127.5), 0).astype(np.uint8)
+
+
+def is_whole_picture(path: Path) -> bool:
+    """Whether a .png or .jpg is there from its first to its last byte; does not decode it."""
+    head, tail = (_PNG, _PNG_END) if path.suffix == ".png" else (_JPEG, _JPEG_END)
+    try:
+        with path.open("rb") as file:
+            begins = file.read(len(head)) == head
+            file.seek(-len(tail), os.SEEK_END)
+            return begins and file.read() == tail
+    except OSError:
+        return False

@@ -1,0 +1,1 @@
+"""Multi-view captures of people, rendered in Cycles."""

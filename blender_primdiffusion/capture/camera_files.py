@@ -1,0 +1,100 @@
+"""The cameras of a capture as the projects that read them want them: released code, OpenCV, NeRF, COLMAP.
+
+This file is the same in the backend and in the extension, which import nothing of each other: numpy and the standard
+library only.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .layout import picture_path, replacing
+from .rig import View
+
+_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
+
+
+def write_cameras(subject: Path, views: Sequence[View]) -> None:
+    """cameras.json, from which the released code reads."""
+    named = {
+        f"camera{i:04d}": {"K": v.intrinsics.tolist(), "R": v.rotation.tolist(), "T": v.translation.tolist()}
+        for i, v in enumerate(views)
+    }
+    with replacing(subject / "cameras.json") as path:
+        path.write_text(json.dumps(named, indent=1), encoding="utf-8")
+
+
+def write_opencv(subject: Path, views: Sequence[View]) -> None:
+    """K, R, T of all cameras as arrays."""
+    with replacing(subject / "opencv" / "cameras.npz") as path:
+        np.savez(
+            path,
+            K=np.stack([view.intrinsics for view in views]),
+            R=np.stack([view.rotation for view in views]),
+            T=np.stack([view.translation for view in views]),
+            width=np.array([view.width for view in views]),
+            height=np.array([view.height for view in views]),
+        )
+
+
+def write_nerf(subject: Path, views: Sequence[View], frame: int) -> None:
+    """transforms.json of one frame, as instant-ngp and nerfstudio read it."""
+    frames = []
+    for i, view in enumerate(views):
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = view.rotation.T @ _FROM_OPENGL, view.position
+        path = os.path.relpath(picture_path(subject, "img", i, frame), subject / "nerf" / f"{frame:04d}")
+        k = view.intrinsics
+        frames.append(
+            {
+                "file_path": Path(path).as_posix(),
+                "transform_matrix": matrix.tolist(),
+                **{"fl_x": k[0, 0], "fl_y": k[1, 1], "cx": k[0, 2], "cy": k[1, 2]},
+                **{"w": view.width, "h": view.height},
+            }
+        )
+    first = views[0]
+    angle = 2 * float(np.arctan(first.width / (2 * first.intrinsics[0, 0])))
+    with replacing(subject / "nerf" / f"{frame:04d}" / "transforms.json") as path:
+        path.write_text(json.dumps({"camera_model": "OPENCV", "camera_angle_x": angle, "frames": frames}, indent=1))
+
+
+def write_colmap(subject: Path, views: Sequence[View], frame: int) -> None:
+    """COLMAP's text model of one frame, without points; picture names are relative to the folder img."""
+    cameras, images = (
+        ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"],
+        ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, ID, NAME"],
+    )
+    for i, view in enumerate(views, start=1):
+        k, q, t = view.intrinsics, _quaternion(view.rotation), view.translation
+        size = f"{view.width} {view.height}"
+        cameras.append(f"{i} PINHOLE {size} {k[0, 0]:.17g} {k[1, 1]:.17g} {k[0, 2]:.17g} {k[1, 2]:.17g}")
+        pose = " ".join(f"{value:.17g}" for value in (*q, *t))
+        name = picture_path(subject, "img", i - 1, frame).relative_to(subject / "img").as_posix()
+        images += [f"{i} {pose} {i} {name}", ""]
+    files = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": ["# no points"]}
+    for file, lines in files.items():
+        with replacing(subject / "colmap" / f"{frame:04d}" / file) as path:
+            path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _quaternion(rotation: NDArray) -> NDArray[np.float64]:
+    """w, x, y, z with w >= 0: the eigenvector of Bar-Itzhack's matrix that belongs to its largest eigenvalue."""
+    m = rotation
+    matrix = np.array(
+        [
+            [m[0, 0] - m[1, 1] - m[2, 2], 0, 0, 0],
+            [m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], 0, 0],
+            [m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1], 0],
+            [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], m[0, 0] + m[1, 1] + m[2, 2]],
+        ]
+    )
+    x, y, z, w = np.linalg.eigh(matrix)[1][:, -1]
+    q = np.array([w, x, y, z])
+    return -q if w < 0 else q

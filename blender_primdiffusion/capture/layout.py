@@ -1,0 +1,186 @@
+"""Captures on disk: the released code's folders (SPEC 5), with passes, joints and other projects' camera files beside.
+
+    root/dataset.json                              what the captures are: settings, axes, passes, names of parts
+    root/release_human_list.txt                    one subject a line
+    root/{id}/img/cameraNNNN/FFFF.jpg              sRGB over the background
+    root/{id}/mask/cameraNNNN/FFFF.png             8 bits: share of the pixel that the person covers
+    root/{id}/depth/cameraNNNN/FFFF.png            16 bits, in units of 0.25 mm along the optical axis; 0: nothing
+    root/{id}/normal/cameraNNNN/FFFF.png           8 bits: (world normal + 1) / 2; 0, 0, 0: nothing
+    root/{id}/part/cameraNNNN/FFFF.png             8 bits: 1 + the joint that moves the surface most; 0: nothing
+    root/{id}/cameras.json                         {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}
+    root/{id}/joints.npz                           world [F,24,3], pixel [C,F,24,2], depth [C,F,24]
+    root/{id}/outputs_re_fitting/refit_smpl_2nd.npz        "smpl": the released code's pickled dictionary
+    root/{id}/outputs_re_fitting/refit_smpl_2nd_plain.npz  the same as plain arrays: read this one
+    root/{id}/nerf/FFFF/transforms.json            camera to world, OpenGL axes; one static scene a frame
+    root/{id}/opencv/cameras.npz                   K [C,3,3], R [C,3,3], T [C,3], width, height
+    root/{id}/colmap/FFFF/{cameras,images,points3D}.txt    picture names relative to root/{id}/img
+    root/{id}/complete.json                        every file's size and CRC-32: written last
+
+This file is the same in the backend and in the extension, which import nothing of each other: numpy and the standard
+library only. World: metres, y up, the person faces +z. Files are written under a temporary name, then renamed; several
+processes may write different subjects, or views, of one dataset. `camera_files` and `picture_files` write the rest.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .rig import View
+
+FORMAT, VERSION = "primdiffusion-captures", 1
+ENDINGS = {"img": ".jpg", "mask": ".png", "depth": ".png", "normal": ".png", "part": ".png"}
+"""Passes and the endings of their files."""
+SMPL_FOLDER, SMPL_FILE, SMPL_PLAIN_FILE = "outputs_re_fitting", "refit_smpl_2nd.npz", "refit_smpl_2nd_plain.npz"
+RELEASED_REFERENCE = "seq_000016-rp_alison_rigged_002"
+"""The subject from which the released code takes the rest sizes of primitives, by this name."""
+LIST_FILE, DATASET_FILE, COMPLETE_FILE = "release_human_list.txt", "dataset.json", "complete.json"
+
+
+class CaptureFolderError(ValueError):
+    """A folder that holds something else than the captures that were to be written or read."""
+
+
+def picture_path(subject: Path, kind: str, camera: int, frame: int) -> Path:
+    """Where a picture of pass `kind` lies."""
+    return subject / kind / f"camera{camera:04d}" / f"{frame:04d}{ENDINGS[kind]}"
+
+
+def view_seed(seed: int, subject: str, frame: int, camera: int) -> int:
+    """The seed of one picture's noise, 0 ... 2^31 - 1: the same whoever renders it, in whatever order."""
+    digest = hashlib.sha256(f"{seed}/{subject}/{frame}/{camera}".encode()).digest()
+    return int.from_bytes(digest[:4], "big") >> 1
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place when the block ends, and vanishes when it fails."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield partial
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def claim(root: Path, about: Mapping[str, Any]) -> None:
+    """Make `root` the dataset of these settings, or find that it is.
+
+    `about` is what must agree between all who write to it. Raises CaptureFolderError where the folder holds another
+    dataset, or anything that is no dataset.
+    """
+    wanted = {"format": FORMAT, "version": VERSION, **json.loads(json.dumps(about))}
+    if not (root / DATASET_FILE).exists():
+        if root.is_dir() and any(not thing.name.startswith(".") for thing in root.iterdir()):
+            raise CaptureFolderError(
+                f"{root} is not empty and holds no {DATASET_FILE}: choose a new folder for the captures"
+            )
+        root.mkdir(parents=True, exist_ok=True)
+        unlike = root / f".{DATASET_FILE}.{os.getpid()}"
+        unlike.write_text(json.dumps(wanted, indent=1), encoding="utf-8")
+        try:  # a link fails where another process was first, which a rename would not
+            with contextlib.suppress(FileExistsError):
+                os.link(unlike, root / DATASET_FILE)
+        finally:
+            unlike.unlink(missing_ok=True)
+    present = read_about(root)
+    differing = [key for key in {**present, **wanted} if present.get(key) != wanted.get(key)]
+    if differing:
+        key = differing[0]
+        raise CaptureFolderError(
+            f"{root} holds other captures: its {key} is {present.get(key)!r}, wanted is {wanted.get(key)!r}; choose "
+            "another folder, or the same settings"
+        )
+
+
+def read_about(root: Path) -> dict[str, Any]:
+    """The settings of a dataset. Raises CaptureFolderError where there are none that can be read."""
+    try:
+        about = json.loads((root / DATASET_FILE).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise CaptureFolderError(f"{root} holds no captures: there is no {DATASET_FILE} in it") from None
+    except (OSError, ValueError) as e:
+        raise CaptureFolderError(f"{root / DATASET_FILE} cannot be read ({e}): render the captures again") from e
+    if not isinstance(about, dict) or about.get("format") != FORMAT:
+        raise CaptureFolderError(f"{root / DATASET_FILE} is not the {DATASET_FILE} of captures: choose another folder")
+    if about.get("version") != VERSION:
+        raise CaptureFolderError(f"{root} is of version {about.get('version')}: this program reads version {VERSION}")
+    return about
+
+
+def write_list(root: Path, subjects: Sequence[str]) -> None:
+    """The list of subjects, sorted."""
+    with replacing(root / LIST_FILE) as path:
+        path.write_text("".join(f"{name}\n" for name in sorted(subjects)), encoding="utf-8")
+
+
+def write_smpl(subject: Path, global_orient: NDArray, body_pose: NDArray, betas: NDArray, translation: NDArray) -> None:
+    """The person's parameters: axis-angle [F,3] and [F,69], betas [B], metres [F,3]; frame 0 is the near-T pose."""
+    arrays = {
+        "global_orient": np.asarray(global_orient, np.float32),
+        "body_pose": np.asarray(body_pose, np.float32),
+        "betas": np.asarray(betas, np.float32).reshape(1, -1),
+        "transl": np.asarray(translation, np.float32),
+    }
+    with replacing(subject / SMPL_FOLDER / SMPL_PLAIN_FILE) as path:
+        np.savez(path, **arrays)  # type: ignore[arg-type]
+    with replacing(subject / SMPL_FOLDER / SMPL_FILE) as path:
+        np.savez(path, smpl=np.array(arrays, dtype=object))
+
+
+def write_joints(subject: Path, views: Sequence[View], world: NDArray) -> None:
+    """The joints [F,24,3] in the world and in every picture."""
+    projected = [view.project(world) for view in views]
+    with replacing(subject / "joints.npz") as path:
+        np.savez(
+            path,
+            world=np.asarray(world, np.float32),
+            pixel=np.stack([pixel for pixel, _ in projected]).astype(np.float32),
+            depth=np.stack([depth for _, depth in projected]).astype(np.float32),
+        )
+
+
+def complete(subject: Path) -> None:
+    """Note every file of a finished subject with its size and checksum."""
+    files = {
+        path.relative_to(subject).as_posix(): [path.stat().st_size, _crc(path)]
+        for path in sorted(subject.rglob("*"))
+        if path.is_file() and not path.name.startswith(".") and path.name != COMPLETE_FILE
+    }
+    with replacing(subject / COMPLETE_FILE) as path:
+        path.write_text(json.dumps(files, indent=0), encoding="utf-8")
+
+
+def damaged(subject: Path, *, checksums: bool = True) -> list[str]:
+    """What is wrong with a finished subject, a sentence a file; empty where nothing is.
+
+    An unfinished subject, without a readable complete.json, is one sentence. Without `checksums` only sizes count.
+    """
+    try:
+        files = json.loads((subject / COMPLETE_FILE).read_text(encoding="utf-8"))
+        noted = {subject / name: (int(size), int(crc)) for name, (size, crc) in files.items()}
+    except (OSError, ValueError, AttributeError, TypeError):
+        return [f"{subject}: not finished"]
+    wrong = []
+    for path, (size, crc) in noted.items():
+        if not path.is_file():
+            wrong.append(f"{path}: missing")
+        elif path.stat().st_size != size:
+            wrong.append(f"{path}: {path.stat().st_size} bytes instead of {size}")
+        elif checksums and _crc(path) != crc:
+            wrong.append(f"{path}: altered")
+    return wrong
+
+
+def _crc(path: Path) -> int:
+    return zlib.crc32(path.read_bytes())

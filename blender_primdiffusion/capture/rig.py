@@ -1,0 +1,134 @@
+"""Where the cameras of a capture stand: rings, spheres, hemispheres around a person.
+
+This file is the same in the backend and in the extension, which import nothing of each other: numpy only. World:
+metres, y up, the person faces +z. Cameras as OpenCV has them: x right, y down, z forward, pixel centres at +0.5.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Arrangement = Literal["rings", "sphere", "hemisphere"]
+_GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+_LOWEST = -0.2
+"""Sine of the lowest elevation of a hemisphere: a little below the horizon."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class View:
+    """One camera: `x_pixel ~ intrinsics @ (rotation @ x_world + translation)`."""
+
+    intrinsics: NDArray[np.float64]
+    """[3, 3], pixels."""
+    rotation: NDArray[np.float64]
+    """[3, 3], world to camera."""
+    translation: NDArray[np.float64]
+    """[3], metres."""
+    width: int
+    height: int
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """The centre of projection [3], metres."""
+        return -self.rotation.T @ self.translation
+
+    def project(self, points: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Pixels [..., 2] and depth along the optical axis [...] of points [..., 3]; behind the camera it is <= 0."""
+        in_camera = np.asarray(points, np.float64) @ self.rotation.T + self.translation
+        homogeneous = in_camera @ self.intrinsics.T
+        return homogeneous[..., :2] / homogeneous[..., 2:], in_camera[..., 2]
+
+
+@dataclasses.dataclass(frozen=True)
+class Rig:
+    """Cameras of one kind on a sphere about a target; all see it in the middle of their pictures."""
+
+    arrangement: Arrangement = "rings"
+    count: int = 36
+    elevations: tuple[float, ...] = (-10.0, 15.0, 40.0)
+    """Of rings: degrees above the horizon, one a ring; the cameras are dealt evenly to the rings."""
+    vertical_fov: float = 30.0
+    """Degrees."""
+    width: int = 512
+    height: int = 512
+    margin: float = 1.05
+    """How much larger than the person's bounding sphere the picture is."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for numbers no camera can have."""
+        wrong = {
+            "count": self.count < 1,
+            "elevations": not self.elevations or not all(-89 <= angle <= 89 for angle in self.elevations),
+            "vertical_fov": not 1 <= self.vertical_fov <= 150,
+            "width": not 1 <= self.width <= 16384,
+            "height": not 1 <= self.height <= 16384,
+            "margin": not 0 < self.margin <= 100,
+        }
+        for name in wrong:
+            if wrong[name]:
+                raise ValueError(
+                    f"{name} of the camera rig is {getattr(self, name)}: at least one camera, elevations within 89 "
+                    "degrees, a field of view of 1 to 150 degrees, pictures of 1 to 16384 pixels a side"
+                )
+
+    def views(self, target: NDArray, radius: float) -> list[View]:
+        """The cameras about `target` [3], as far away as shows a sphere of `radius` metres whole.
+
+        Raises ValueError where target or radius are not finite, or the radius is not positive.
+        """
+        target = np.asarray(target, np.float64)
+        if not (np.isfinite(target).all() and np.isfinite(radius) and radius > 0):
+            raise ValueError(f"a rig about {target.tolist()} with radius {radius}: the person has no finite size")
+        narrow = min(1.0, self.width / self.height) * math.tan(math.radians(self.vertical_fov) / 2)
+        distance = self.margin * radius / math.sin(math.atan(narrow))
+        return [
+            look_at(target + distance * direction, target, math.radians(self.vertical_fov), self.width, self.height)
+            for direction in self.directions()
+        ]
+
+    def directions(self) -> NDArray[np.float64]:
+        """Unit vectors [count, 3] from the target to the cameras; the first of a ring stands in front of the face."""
+        if self.arrangement == "rings":
+            return _rings(self.count, self.elevations)
+        lowest = -1.0 if self.arrangement == "sphere" else _LOWEST
+        height = lowest + (1 - lowest) * (np.arange(self.count) + 0.5) / self.count
+        return _on_sphere(np.arange(self.count) * _GOLDEN_ANGLE, height)
+
+
+def look_at(position: NDArray, target: NDArray, vertical_fov: float, width: int, height: int) -> View:
+    """A camera at `position` with `target` in the middle of its picture; `vertical_fov` in radians, square pixels."""
+    forward = np.asarray(target, np.float64) - position
+    forward = forward / np.linalg.norm(forward)
+    up = (0.0, 1.0, 0.0) if abs(forward[1]) < 1 - 1e-9 else (0.0, 0.0, math.copysign(1.0, -forward[1]))
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    focal = height / (2 * math.tan(vertical_fov / 2))
+    intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return View(intrinsics, rotation, -rotation @ position, width, height)
+
+
+def bounding_sphere(points: NDArray) -> tuple[NDArray[np.float64], float]:
+    """Centre [3] of the box around points [..., 3] and the radius about it that holds them all, metres."""
+    points = np.asarray(points, np.float64).reshape(-1, 3)
+    centre = (points.min(0) + points.max(0)) / 2
+    return centre, float(np.linalg.norm(points - centre, axis=1).max())
+
+
+def _rings(count: int, elevations: tuple[float, ...]) -> NDArray[np.float64]:
+    rings = len(elevations)
+    members = [len(range(ring, count, rings)) for ring in range(rings)]
+    azimuth = np.concatenate([2 * math.pi * np.arange(n) / max(n, 1) for n in members])
+    height = np.repeat(np.sin(np.radians(elevations)), members)
+    return _on_sphere(azimuth, height)
+
+
+def _on_sphere(azimuth: NDArray, height: NDArray) -> NDArray[np.float64]:
+    """Azimuth 0 is in front of the face (+z), a quarter turn at the person's left (+x)."""
+    across = np.sqrt(np.maximum(1 - height**2, 0))
+    return np.stack([across * np.sin(azimuth), height, across * np.cos(azimuth)], -1).astype(np.float64)

@@ -1,0 +1,1 @@
+"""Poses and motion from files, as joint rotations."""

@@ -1,0 +1,150 @@
+"""The file format both programs write, and the cameras of a rig."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from primdiffusion.capture import camera_files, layout, picture_files, rig
+from primdiffusion.geometry.camera import look_at
+from scipy.spatial.transform import Rotation
+
+ROOT = Path(__file__).resolve().parents[2]
+SMALL = rig.Rig(count=7, width=40, height=60)
+
+
+@pytest.mark.parametrize("name", ["rig.py", "layout.py", "camera_files.py", "picture_files.py"])
+def test_both_programs_hold_the_same_file(name):
+    here = (ROOT / "backend/primdiffusion/capture" / name).read_bytes()
+    assert (ROOT / "blender_primdiffusion/capture" / name).read_bytes() == here
+
+
+@pytest.mark.parametrize("arrangement", ["rings", "sphere", "hemisphere"])
+def test_every_camera_sees_the_whole_sphere_and_has_its_centre_in_the_middle(arrangement):
+    target, radius = np.array([0.1, 0.9, -0.2]), 1.1
+    generator = np.random.default_rng(0)
+    points = generator.standard_normal((500, 3))
+    points = target + radius * points / np.linalg.norm(points, axis=1, keepdims=True)
+    views = rig.Rig(arrangement, 36, width=300, height=500).views(target, radius)
+    assert len(views) == 36
+    for view in views:
+        middle, depth = view.project(target)
+        assert np.allclose(middle, (150, 250))
+        assert depth > radius
+        assert np.allclose(view.rotation @ view.rotation.T, np.eye(3))
+        assert np.linalg.det(view.rotation) > 0
+        pixels, _ = view.project(points)
+        assert (pixels > 0).all()
+        assert (pixels < (300, 500)).all()
+
+
+def test_a_camera_is_the_backends_camera():
+    position, target = np.array([1.0, 2.0, 3.0]), np.array([0.2, 0.9, 0.1])
+    ours = rig.look_at(position, target, 0.6, 320, 200)
+    theirs = look_at(torch.tensor(position), torch.tensor(target), vertical_fov=0.6, width=320, height=200)
+    assert np.allclose(ours.intrinsics, theirs.intrinsics)
+    assert np.allclose(np.c_[ours.rotation, ours.translation], theirs.world_to_camera)
+
+
+def test_a_camera_straight_above_is_possible():
+    view = rig.look_at(np.array([0.0, 5.0, 0.0]), np.zeros(3), 0.6, 10, 10)
+    assert np.isfinite(view.rotation).all()
+    assert np.allclose(view.project(np.zeros(3))[0], 5)
+
+
+@pytest.mark.parametrize("wrong", [{"count": 0}, {"vertical_fov": 0.0}, {"width": 0}, {"elevations": (90.0,)}])
+def test_impossible_rigs_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        rig.Rig(**wrong)
+
+
+def test_colmaps_quaternions_and_nerfs_matrices_are_the_same_cameras(tmp_path):
+    subject = tmp_path / "one"
+    views = rig.Rig("sphere", 9).views(np.zeros(3), 1.0)
+    camera_files.write_colmap(subject, views, 3)
+    camera_files.write_nerf(subject, views, 3)
+    lines = (subject / "colmap/0003/images.txt").read_text().splitlines()[1::2]
+    frames = json.loads((subject / "nerf/0003/transforms.json").read_text())["frames"]
+    for i, (view, line, frame) in enumerate(zip(views, lines, frames, strict=True)):
+        _, w, x, y, z, *translation, _, name = line.split()
+        rotation = Rotation.from_quat([float(value) for value in (x, y, z, w)]).as_matrix()
+        assert np.allclose(rotation, view.rotation, atol=1e-12)
+        assert np.allclose(np.array(translation, float), view.translation)
+        assert name == f"camera{i:04d}/0003.jpg"
+        assert (subject / "nerf/0003" / frame["file_path"]).resolve() == subject / "img" / name
+        to_world = np.array(frame["transform_matrix"])
+        in_opengl = np.linalg.inv(to_world) @ [0.3, 0.2, 0.1, 1]
+        assert np.allclose(in_opengl[:3] * (1, -1, -1), view.rotation @ [0.3, 0.2, 0.1] + view.translation)
+
+
+def test_pngs_are_what_another_reader_reads(tmp_path):
+    generator = np.random.default_rng(0)
+    for dtype, shape in ((np.uint8, (7, 5)), (np.uint8, (7, 5, 3)), (np.uint16, (7, 5))):
+        pixels = generator.integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
+        picture_files.write_png(tmp_path / "a.png", pixels)
+        assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), pixels)
+        assert picture_files.is_whole_picture(tmp_path / "a.png")
+
+
+def test_smpl_parameters_are_read_plain_and_as_the_released_code_does(tmp_path):
+    generator = np.random.default_rng(0)
+    layout.write_smpl(tmp_path, *(generator.random(shape) for shape in ((4, 3), (4, 69), (10,), (4, 3))))
+    plain = np.load(tmp_path / layout.SMPL_FOLDER / layout.SMPL_PLAIN_FILE, allow_pickle=False)
+    pickled = np.load(tmp_path / layout.SMPL_FOLDER / layout.SMPL_FILE, allow_pickle=True)["smpl"].item()
+    assert set(plain.files) == set(pickled) == {"global_orient", "body_pose", "betas", "transl"}
+    assert all(np.array_equal(plain[name], pickled[name]) for name in pickled)
+
+
+def test_a_folder_is_claimed_once(tmp_path):
+    layout.claim(tmp_path / "a", {"seed": 1, "size": (3, 4)})
+    layout.claim(tmp_path / "a", {"seed": 1, "size": (3, 4)})
+    with pytest.raises(layout.CaptureFolderError, match="its seed is 1, wanted is 2"):
+        layout.claim(tmp_path / "a", {"seed": 2, "size": (3, 4)})
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "thesis.tex").touch()
+    with pytest.raises(layout.CaptureFolderError, match="not empty"):
+        layout.claim(tmp_path / "b", {"seed": 1})
+
+
+def test_damage_is_found(tmp_path):
+    views = SMALL.views(np.zeros(3), 1.0)
+    camera_files.write_cameras(tmp_path, views)
+    layout.write_joints(tmp_path, views, np.zeros((2, 24, 3)))
+    for camera in range(3):
+        picture_files.write_png(layout.picture_path(tmp_path, "mask", camera, 0), np.zeros((60, 40), np.uint8))
+    assert layout.damaged(tmp_path) == [f"{tmp_path}: not finished"]
+    layout.complete(tmp_path)
+    assert layout.damaged(tmp_path) == []
+    paths = [layout.picture_path(tmp_path, "mask", camera, 0) for camera in range(3)]
+    paths[0].unlink()
+    paths[1].write_bytes(paths[1].read_bytes()[:-5])
+    changed = bytearray(paths[2].read_bytes())
+    changed[40] ^= 1
+    paths[2].write_bytes(changed)
+    assert [sentence.split(": ")[1] for sentence in layout.damaged(tmp_path)] == [
+        "missing",
+        f"{paths[1].stat().st_size} bytes instead of {paths[1].stat().st_size + 5}",
+        "altered",
+    ]
+    assert len(layout.damaged(tmp_path, checksums=False)) == 2
+    assert not picture_files.is_whole_picture(paths[1])
+
+
+def test_nothing_is_left_of_a_file_that_failed(tmp_path):
+    with pytest.raises(ValueError, match="uint8"):
+        picture_files.write_png(tmp_path / "a.png", np.zeros((2, 2)))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_depth_far_or_absent_is_nothing():
+    assert picture_files.depth_steps(np.array([np.inf, 0.5, 20.0, np.nan])).tolist() == [0, 2000, 0, 0]
+
+
+def test_pictures_have_noise_of_their_own():
+    seeds = {layout.view_seed(0, f"p{p}", f, c) for p in range(5) for f in range(5) for c in range(5)}
+    assert len(seeds) == 125
+    assert all(0 <= seed < 2**31 for seed in seeds)
