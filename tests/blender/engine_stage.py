@@ -59,6 +59,28 @@ def thinned(npz: Path) -> Path:
     return target
 
 
+def cube(name="cube", centre=(0.0, 0.0, 1.0), half=0.2) -> bpy.types.Object:
+    """A mesh of twelve triangles in the scene; `half` an edge long to each side."""
+    mesh = bpy.data.meshes.new(name)
+    corners = [(x, y, z) for x in (-half, half) for y in (-half, half) for z in (-half, half)]
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    mesh.from_pydata(corners, [], faces)
+    thing = bpy.data.objects.new(name, mesh)
+    thing.location = centre
+    bpy.context.scene.collection.objects.link(thing)
+    return thing
+
+
+def material(colour, name="paint") -> bpy.types.Material:
+    """A Principled shader of this linear colour."""
+    made = bpy.data.materials.new(name)
+    if bpy.app.version < (5, 0):
+        made.use_nodes = True
+    shader = next(node for node in made.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
+    shader.inputs["Base Color"].default_value = (*colour, 1)
+    return made
+
+
 def camera_by_hand(camera: bpy.types.Object, size: tuple[int, int], aspect: tuple[float, float] = (1, 1)) -> dict:
     """Blender's perspective camera as its manual describes it, OpenCV in the backend's axes.
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 import pytest
-from engine_stage import PYTHON, Oracle, render_exr, render_png, thinned
+from engine_stage import PYTHON, Oracle, cube, material, render_exr, render_png, thinned
 
 import blender_primdiffusion
 from blender_primdiffusion.engine.solids import base_colour, changed_by, scene_solids, stored
@@ -48,26 +48,6 @@ def stage(extension, saved_scene, tmp_path):
     camera.location, camera.rotation_euler = (0.0, -4.0, 1.0), (np.pi / 2, 0, 0)
     scene.camera = camera
     return SimpleNamespace(scene=scene, out=tmp_path / "picture.png")
-
-
-def cube(name="cube", centre=(0.0, 0.0, 1.0), half=0.2) -> bpy.types.Object:
-    mesh = bpy.data.meshes.new(name)
-    corners = [(x, y, z) for x in (-half, half) for y in (-half, half) for z in (-half, half)]
-    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    mesh.from_pydata(corners, [], faces)
-    thing = bpy.data.objects.new(name, mesh)
-    thing.location = centre
-    bpy.context.scene.collection.objects.link(thing)
-    return thing
-
-
-def material(colour, name="paint") -> bpy.types.Material:
-    made = bpy.data.materials.new(name)
-    if bpy.app.version < (5, 0):
-        made.use_nodes = True
-    shader = next(node for node in made.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
-    shader.inputs["Base Color"].default_value = (*colour, 1)
-    return made
 
 
 def solids_now():

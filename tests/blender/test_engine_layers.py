@@ -1,0 +1,133 @@
+"""People over a picture of Cycles', the documented way: a linked scene with holdouts, put on top by Alpha Over."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+from engine_stage import PYTHON, Oracle, cube, material, pixels, render_exr, thinned
+
+import blender_primdiffusion
+from blender_primdiffusion.scene.human import build_human
+
+SIDE = 96
+BEFORE, BEHIND, TORSO = (37, 48), (37, 60), (44, 43)
+"""Pixels (row, column) of the cube before the person, of the one behind that looks out beside it, of bare torso."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Of a person."""
+    folder = tmp_path_factory.mktemp("people")
+    oracle = Oracle(folder)
+    oracle.ask({"make": str(folder), "seed": 1, "betas": [0.0] * 10})
+    oracle.close()
+    thinned(folder / "human.npz")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def extension():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PRIMDIFFUSION_PYTHON", PYTHON)
+        blender_primdiffusion.register()
+        yield
+        blender_primdiffusion.unregister()
+
+
+@pytest.fixture
+def shot(extension, saved_scene, folder, tmp_path):
+    """Two scenes with the same person, a red cube before, a blue one behind: one for Cycles, one for the engine."""
+    solid = saved_scene.scene
+    person = build_human(bpy.context, folder / "few.npz", keep=[folder / "person.human.safetensors"])
+    cube("before", (0.0, -0.6, 1.2), 0.1).data.materials.append(material((0.8, 0.05, 0.05)))
+    cube("behind", (0.15, 0.6, 1.2), 0.3).data.materials.append(material((0.05, 0.05, 0.8), "blue"))
+    lamp = bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "SUN"))
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    camera.location, camera.rotation_euler = (0.0, -4.0, 1.0), (np.pi / 2, 0, 0)
+    lamp.rotation_euler = (0.9, 0, 0.3)
+    for thing in (lamp, camera):
+        solid.collection.objects.link(thing)
+    solid.camera, solid.name = camera, "Solid"
+    solid.render.resolution_x = solid.render.resolution_y = SIDE
+    solid.render.dither_intensity = 0
+    solid.view_settings.view_transform = "Standard"
+    solid.render.engine = "CYCLES"
+    solid.cycles.samples, solid.cycles.device, solid.cycles.seed = 4, "CPU", 1
+    bpy.ops.scene.new(type="LINK_COPY")
+    people = bpy.context.scene
+    assert people is not solid
+    people.render.engine = "PRIMDIFFUSION"
+    people.primdiffusion_render.solids = "HOLDOUT"
+    people.render.film_transparent = True
+    in_solid = solid.view_layers[0].layer_collection.children[person.name]
+    next(child for child in in_solid.children if child.name.endswith("_primitives")).exclude = True
+    return SimpleNamespace(solid=solid, people=people, out=tmp_path / "picture")
+
+
+def layers(shot, scene) -> tuple[np.ndarray, np.ndarray]:
+    """Combined [h, w, 4] and depth [h, w] of one scene by itself."""
+    bpy.context.window.scene = scene
+    return render_exr(shot.out.with_suffix(".exr"))
+
+
+def put_together(shot) -> np.ndarray:
+    """The solid scene's picture [h, w, 4] with the people's over it, by Blender's compositor."""
+    scene = shot.solid
+    if bpy.app.version >= (5, 0):
+        tree = scene.compositing_node_group = bpy.data.node_groups.new("over", "CompositorNodeTree")
+        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+        out = tree.nodes.new("NodeGroupOutput")
+    else:
+        scene.use_nodes = True
+        tree = scene.node_tree
+        tree.nodes.clear()
+        out = tree.nodes.new("CompositorNodeComposite")
+    over = tree.nodes.new("CompositorNodeAlphaOver")
+    pictures = [socket for socket in over.inputs if socket.type == "RGBA"]
+    for socket, source in zip(pictures, (shot.solid, shot.people), strict=True):
+        render_layers = tree.nodes.new("CompositorNodeRLayers")
+        render_layers.scene = source
+        tree.links.new(render_layers.outputs["Image"], socket)
+    tree.links.new(over.outputs[0], out.inputs[0])
+    settings = scene.render.image_settings
+    if bpy.app.version >= (5, 0):
+        settings.media_type = "IMAGE"
+    settings.file_format, settings.color_depth, settings.color_mode = "OPEN_EXR", "32", "RGBA"
+    scene.render.filepath = str(shot.out.with_name("together.exr"))
+    bpy.context.window.scene = scene
+    assert bpy.ops.render.render(write_still=True) == {"FINISHED"}
+    return pixels(shot.out.with_name("together.exr"))
+
+
+def test_alpha_over_shows_what_stands_before_people_the_people_and_what_is_behind(shot):
+    below, _ = layers(shot, shot.solid)
+    above, _ = layers(shot, shot.people)
+    together = put_together(shot)
+    np.testing.assert_allclose(together[..., :3], (above + (1 - above[..., 3:]) * below)[..., :3], atol=2e-3)
+    for pixel in (BEFORE, BEHIND):
+        assert above[(*pixel, 3)] == 0
+    assert above[(*TORSO, 3)] > 0.99
+    assert below[BEFORE][0] > 3 * below[BEFORE][2]
+    assert below[BEHIND][2] > 3 * below[BEHIND][0]
+
+
+def test_depth_of_solids_is_cycles_to_a_centimetre(shot):
+    for name, turn in (("before", (0.3, 0.2, 0.5)), ("behind", (0.1, 0.4, -0.6))):
+        bpy.data.objects[name].rotation_euler = turn
+    shot.people.primdiffusion_render.solids = "SHADED"
+    next(thing for thing in shot.people.objects if thing.type == "ARMATURE").hide_render = True
+    _, given = layers(shot, shot.people)
+    _, cycles = layers(shot, shot.solid)
+    both = (given < 1e9) & (cycles < 1e9)
+    assert both.mean() > 0.03
+    assert ((given < 1e9) != (cycles < 1e9)).mean() < 0.01
+    edge = np.zeros_like(both)
+    for axis in (0, 1):
+        jump = np.abs(np.diff(np.where(both, cycles, 99.0), axis=axis)) > 0.1
+        edge |= np.insert(jump, 0, False, axis) | np.append(jump, np.zeros_like(jump.take([0], axis)), axis)
+    inside = both & ~edge
+    assert inside.sum() > 0.5 * both.sum()
+    assert np.abs(given - cycles)[inside].max() < 0.01
