@@ -130,6 +130,7 @@ def overhead(change: Callable[[int], None]) -> dict[str, float]:
         parts["conversation"] = parts["render"] - child["seconds"] - parts["gather"] - parts["fill"]
         rows.append({"overhead": parts["render"] - parts["march"], **parts})
     best = min(rows, key=lambda row: row["overhead"])
+    best["overhead_median"] = float(np.median([row["overhead"] for row in rows]))
     return {f"{name}_ms": 1e3 * value for name, value in best.items()}
 
 
@@ -138,7 +139,7 @@ def pixel_error(human: Human, armature: bpy.types.Object, rotations: np.ndarray)
     pose_from_joint_rotations(armature, rotations)
     bpy.ops.render.render(write_still=True)
     image = bpy.data.images.load(bpy.context.scene.render.filepath)
-    given = np.array(image.pixels[:]).reshape(SIZE, SIZE, 4)[::-1]
+    given = np.round(255 * np.array(image.pixels[:])).reshape(SIZE, SIZE, 4)[::-1]
     focal = LENS_MM / SENSOR_MM * SIZE
     eye = BACKEND_FROM_BLENDER @ (np.array(bpy.context.scene.camera.location) - np.array(armature.location))
     to_camera = np.diag([1.0, -1.0, -1.0])  # the camera looks along -z of the backend, at the person's face
@@ -153,7 +154,7 @@ def pixel_error(human: Human, armature: bpy.types.Object, rotations: np.ndarray)
     alpha = rendering.alpha[..., None]
     straight = (rendering.rgb / torch.where(alpha > 0, alpha, 1)).clamp(0, 1)
     wanted = np.concatenate([np.asarray(encode_srgb(straight.numpy())), alpha.numpy()], -1)
-    return float(np.abs(given - np.round(255 * wanted) / 255).max())
+    return float(np.abs(given - np.round(255 * wanted)).max() / 255)
 
 
 def main() -> None:
