@@ -23,16 +23,16 @@ _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
 
 def write_png(path: Path, pixels: NDArray) -> None:
-    """A PNG of [H, W] or [H, W, 3] values, uint8 or uint16, unfiltered: lossless and the same bytes everywhere."""
+    """A PNG of [H, W], [H, W, 3] or [H, W, 4], uint8 or uint16, unfiltered: lossless and the same bytes everywhere."""
     pixels = np.asarray(pixels)
-    if pixels.dtype not in (np.uint8, np.uint16) or pixels.shape[2:] not in ((), (3,)):
+    if pixels.dtype not in (np.uint8, np.uint16) or pixels.shape[2:] not in ((), (3,), (4,)):
         raise ValueError(
-            f"a PNG of {pixels.dtype} {pixels.shape} cannot be written: give uint8 or uint16 [H, W] or [H, W, 3]"
+            f"a PNG of {pixels.dtype} {pixels.shape} cannot be written: give uint8 or uint16 [H, W(, 3 or 4)]"
         )
     bits, (height, width) = 8 * pixels.dtype.itemsize, pixels.shape[:2]
     rows = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder(">"))).view(np.uint8).reshape(height, -1)
     filtered = np.concatenate([np.zeros((height, 1), np.uint8), rows], axis=1)
-    header = struct.pack(">IIBBBBB", width, height, bits, 0 if pixels.ndim == 2 else 2, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, bits, {(): 0, (3,): 2, (4,): 6}[pixels.shape[2:]], 0, 0, 0)
     chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(filtered.tobytes(), 6))]
     with replacing(path) as partial, partial.open("wb") as file:
         file.write(_PNG)

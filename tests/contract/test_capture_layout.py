@@ -148,3 +148,18 @@ def test_pictures_have_noise_of_their_own():
     seeds = {layout.view_seed(0, f"p{p}", f, c) for p in range(5) for f in range(5) for c in range(5)}
     assert len(seeds) == 125
     assert all(0 <= seed < 2**31 for seed in seeds)
+
+
+def test_a_completion_mark_cannot_name_files_elsewhere(tmp_path):
+    subject = tmp_path / "one"
+    subject.mkdir()
+    (tmp_path / "thesis.tex").write_text("mine")
+    for name in ("../thesis.tex", str(tmp_path / "thesis.tex"), "a/../../thesis.tex"):
+        (subject / layout.COMPLETE_FILE).write_text(json.dumps({name: [1, 1]}))
+        assert layout.damage(subject) == {subject: "not finished"}
+
+
+def test_pngs_have_alpha(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 255, (7, 5, 4), np.uint8)
+    picture_files.write_png(tmp_path / "a.png", pixels)
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), pixels)

@@ -7,6 +7,7 @@
     root/{id}/depth/cameraNNNN/FFFF.png            16 bits, in units of 0.25 mm along the optical axis; 0: nothing
     root/{id}/normal/cameraNNNN/FFFF.png           8 bits: (world normal + 1) / 2; 0, 0, 0: nothing
     root/{id}/part/cameraNNNN/FFFF.png             8 bits: 1 + the joint that moves the surface most; 0: nothing
+    root/{id}/rgba/cameraNNNN/FFFF.png             sRGB with straight alpha; only where the background is transparent
     root/{id}/cameras.json                         {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}
     root/{id}/joints.npz                           world [F,24,3], pixel [C,F,24,2], depth [C,F,24]
     root/{id}/outputs_re_fitting/refit_smpl_2nd.npz        "smpl": the released code's pickled dictionary
@@ -38,7 +39,7 @@ from numpy.typing import NDArray
 from .rig import View
 
 FORMAT, VERSION = "primdiffusion-captures", 1
-ENDINGS = {"img": ".jpg", "mask": ".png", "depth": ".png", "normal": ".png", "part": ".png"}
+ENDINGS = {"img": ".jpg", "mask": ".png", "depth": ".png", "normal": ".png", "part": ".png", "rgba": ".png"}
 """Passes and the endings of their files."""
 SMPL_FOLDER, SMPL_FILE, SMPL_PLAIN_FILE = "outputs_re_fitting", "refit_smpl_2nd.npz", "refit_smpl_2nd_plain.npz"
 RELEASED_REFERENCE = "seq_000016-rp_alison_rigged_002"
@@ -166,20 +167,31 @@ def damaged(subject: Path, *, checksums: bool = True) -> list[str]:
 
     An unfinished subject, without a readable complete.json, is one sentence. Without `checksums` only sizes count.
     """
+    return [f"{path}: {what}" for path, what in damage(subject, checksums=checksums).items()]
+
+
+def damage(subject: Path, *, checksums: bool = True) -> dict[Path, str]:
+    """As `damaged`, by the files; of an unfinished subject the folder itself. Never names a file outside of it."""
     try:
         files = json.loads((subject / COMPLETE_FILE).read_text(encoding="utf-8"))
-        noted = {subject / name: (int(size), int(crc)) for name, (size, crc) in files.items()}
+        noted = {_inside(subject, name): (int(size), int(crc)) for name, (size, crc) in files.items()}
     except (OSError, ValueError, AttributeError, TypeError):
-        return [f"{subject}: not finished"]
-    wrong = []
+        return {subject: "not finished"}
+    wrong = {}
     for path, (size, crc) in noted.items():
         if not path.is_file():
-            wrong.append(f"{path}: missing")
+            wrong[path] = "missing"
         elif path.stat().st_size != size:
-            wrong.append(f"{path}: {path.stat().st_size} bytes instead of {size}")
+            wrong[path] = f"{path.stat().st_size} bytes instead of {size}"
         elif checksums and _crc(path) != crc:
-            wrong.append(f"{path}: altered")
+            wrong[path] = "altered"
     return wrong
+
+
+def _inside(subject: Path, name: str) -> Path:
+    if Path(name).is_absolute() or ".." in Path(name).parts or "\\" in name:
+        raise ValueError(f"{name!r} is no file of {subject}")
+    return subject / name
 
 
 def _crc(path: Path) -> int:

@@ -1,0 +1,123 @@
+"""What to capture and how: one frozen record, checked when it is made."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from ..scene.human_file import JOINT_NAMES
+from .layout import ENDINGS
+from .picture_files import DEPTH_UNIT
+from .rig import Rig, View
+
+Light = Literal["uniform", "dome", "hdri"]
+Background = Literal["black", "transparent"]
+Device = Literal["auto", "cpu", "gpu"]
+PASSES = ("img", "mask", "depth", "normal", "part")
+LAYOUTS = ("nerf", "opencv", "colmap")
+"""Camera files of other projects; the released code's files are always written."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CaptureSettings:
+    """What to render of everybody. Raises ValueError where that is impossible."""
+
+    out: Path
+    """The dataset's folder."""
+    seed: int = 0
+    """Of the dataset: choice of poses, and the noise of every view (`layout.view_seed`)."""
+    rig: Rig = dataclasses.field(default_factory=Rig)
+    """Cameras about each person; its picture size holds for `cameras` too."""
+    cameras: tuple[View, ...] = ()
+    """Cameras that stand still while people change, instead of the rig's."""
+    pose_files: tuple[Path, ...] = ()
+    """Motion and pose files; none: the built-in poses."""
+    pose_count: int = 20
+    passes: tuple[str, ...] = PASSES
+    light: Light = "uniform"
+    """uniform: every surface shows its own colour; dome: a white sky; hdri: the picture `hdri`."""
+    hdri: Path | None = None
+    background: Background = "black"
+    """transparent: one pass more, "rgba", with straight alpha; img stays over black."""
+    samples: int = 16
+    """Of a pixel."""
+    denoise: bool = False
+    """Of img under a dome or HDRI light; masks and the passes of pixel centres never are."""
+    device: Device = "auto"
+    shard: tuple[int, int] = (0, 1)
+    """(i, n): the subjects i, i + n, i + 2 n, ... of the sorted list."""
+    layouts: tuple[str, ...] = LAYOUTS
+    released_reference: bool = False
+    """Whether the first subject is also there under the name that the released code looks for."""
+
+    def __post_init__(self) -> None:
+        index, count = self.shard
+        wrong = {
+            f"pass {next((kind for kind in self.passes if kind not in PASSES), 'none')}: choose of {', '.join(PASSES)}":
+                not self.passes or not set(self.passes) <= set(PASSES),
+            f"layouts {self.layouts}: choose of {', '.join(LAYOUTS)}": not set(self.layouts) <= set(LAYOUTS),
+            f"light {self.light}: choose of {', '.join(get_args(Light))}": self.light not in get_args(Light),
+            "the HDRI light needs a picture: name its file": self.light == "hdri" and self.hdri is None,
+            f"background {self.background}: choose of {', '.join(get_args(Background))}":
+                self.background not in get_args(Background),
+            f"{self.samples} samples: one or more": self.samples < 1,
+            f"{self.pose_count} poses: 1 to 10000": not 1 <= self.pose_count <= 10000,
+            f"shard {index}/{count}: 0/{count} to {count - 1}/{count}": not 0 <= index < count,
+            f"device {self.device}: choose of {', '.join(get_args(Device))}": self.device not in get_args(Device),
+        }  # fmt: skip
+        for sentence, is_so in wrong.items():
+            if is_so:
+                raise ValueError(sentence)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the pictures."""
+        return self.rig.width, self.rig.height
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The passes to write, the one that marks a view as done last."""
+        last = "img" if "img" in self.passes else self.passes[-1]
+        more = ("rgba",) if self.background == "transparent" else ()
+        return (*(kind for kind in ENDINGS if kind in (*self.passes, *more) and kind != last), last)
+
+    @property
+    def camera_count(self) -> int:
+        """Cameras that see each pose."""
+        return len(self.cameras) or self.rig.count
+
+    def about(self, frames: int) -> dict[str, Any]:
+        """What everybody who writes to the dataset must agree on: its dataset.json."""
+        return {
+            "seed": self.seed,
+            "rig": _about_views(self.cameras) if self.cameras else dataclasses.asdict(self.rig),
+            "frames": frames,
+            "passes": [kind for kind in ENDINGS if kind in self.kinds],
+            "light": f"hdri:{self.hdri.name}" if self.light == "hdri" and self.hdri else self.light,
+            "background": self.background,
+            "renderer": "cycles",
+            "samples": self.samples,
+            "denoise": self.denoise,
+            "world": "metres, y up, facing +z",
+            "depth": {"kind": "z", "unit_m": DEPTH_UNIT},
+            "part_names": list(JOINT_NAMES),
+            "released_reference": self.released_reference,
+        }
+
+
+def _about_views(views: Sequence[View]) -> dict[str, Any]:
+    digest = hashlib.sha256()
+    for view in views:
+        for array in (view.intrinsics, view.rotation, view.translation):
+            digest.update(array.round(9).tobytes())
+    first = views[0]
+    return {
+        "arrangement": "custom",
+        "count": len(views),
+        "width": first.width,
+        "height": first.height,
+        "digest": digest.hexdigest()[:16],
+    }
