@@ -1,0 +1,52 @@
+"""Motion: what the 24 joints do, frame by frame, whoever does it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .rotation import to_axis_angle
+from .skeleton import joint_positions
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+    """Poses of SMPL's skeleton; y up, facing +z where the pelvis' rotation is the identity."""
+
+    rotations: NDArray[np.float64]
+    """Each joint about the world's rest axes, relative to its parent [F, 24, 3, 3]; the first is the whole body's."""
+    translations: NDArray[np.float64]
+    """Of the whole body [F, 3], metres, after the rotations."""
+    fps: float
+    """Frames a second; 1 for poses that are no motion."""
+    name: str
+    """Where it is from."""
+    notes: tuple[str, ...] = ()
+    """What was found out or assumed on reading, a sentence each."""
+
+    def __post_init__(self) -> None:
+        frames = len(self.rotations)
+        if self.rotations.shape != (frames, 24, 3, 3) or self.translations.shape != (frames, 3):
+            raise ValueError(
+                f"a motion of {frames} frames has rotations [{frames}, 24, 3, 3] and translations [{frames}, 3]; given "
+                f"are {self.rotations.shape} and {self.translations.shape}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.rotations)
+
+    def axis_angle(self) -> NDArray[np.float64]:
+        """The rotations as SMPL's files hold them [F, 24, 3], radians."""
+        return to_axis_angle(self.rotations)
+
+    def frames(self, indices: Sequence[int] | NDArray) -> Motion:
+        """Some of the frames, in the order given."""
+        chosen = np.asarray(indices, np.int64)
+        return dataclasses.replace(self, rotations=self.rotations[chosen], translations=self.translations[chosen])
+
+    def joints(self) -> NDArray[np.float64]:
+        """Where the joints of an average person are [F, 24, 3], metres."""
+        return joint_positions(self.rotations, self.translations)

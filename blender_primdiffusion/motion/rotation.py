@@ -1,0 +1,71 @@
+"""Rotation matrices from and to the other ways of writing rotations; any batch shape, radians, column vectors."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene.quaternion import matrix_to_quaternion
+
+
+def from_axis_angle(vector: NDArray) -> NDArray[np.float64]:
+    """Rotations [..., 3, 3] of axis-angle vectors [..., 3] (Rodrigues)."""
+    vector = np.asarray(vector, np.float64)
+    angle = np.linalg.norm(vector, axis=-1)[..., None, None]
+    cross = _cross(vector)
+    # sin(x)/x and (1 - cos(x))/x^2 by sinc, which is right at 0
+    first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    return np.eye(3) + first * cross + second * (cross @ cross)
+
+
+def to_axis_angle(rotation: NDArray) -> NDArray[np.float64]:
+    """Axis-angle vectors [..., 3], at most half a turn long, of rotations [..., 3, 3]."""
+    quaternion = matrix_to_quaternion(rotation)
+    sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, quaternion[..., :1])
+    return quaternion[..., 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
+
+
+def from_quaternion(quaternion: NDArray) -> NDArray[np.float64]:
+    """Rotations [..., 3, 3] of quaternions [..., 4], w first, of any length but 0."""
+    q = np.asarray(quaternion, np.float64)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    cross = _cross(q[..., 1:])
+    return np.eye(3) + 2 * q[..., :1, None] * cross + 2 * (cross @ cross)
+
+
+def about_axis(axis: int, angle: NDArray | float) -> NDArray[np.float64]:
+    """Rotations [..., 3, 3] by angles [...] about the axis x, y or z (0, 1, 2)."""
+    angle = np.asarray(angle, np.float64)
+    vector = np.zeros((*angle.shape, 3))
+    vector[..., axis] = angle
+    return from_axis_angle(vector)
+
+
+def between(start: NDArray, end: NDArray) -> NDArray[np.float64]:
+    """The smallest rotation [3, 3] that takes the direction `start` [3] to `end` [3]; neither may be zero."""
+    a, b = np.asarray(start, np.float64), np.asarray(end, np.float64)
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    axis, cosine = np.cross(a, b), float(a @ b)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9:
+        if cosine > 0:
+            return np.eye(3)
+        axis = np.cross(a, np.eye(3)[int(np.abs(a).argmin())])  # half a turn about anything at right angles
+        sine = float(np.linalg.norm(axis))
+        return from_axis_angle(axis / sine * np.pi)
+    return from_axis_angle(axis / sine * np.arctan2(sine, cosine))
+
+
+def nearest(matrix: NDArray) -> NDArray[np.float64]:
+    """The rotations [..., 3, 3] closest to matrices [..., 3, 3] (by the singular values)."""
+    left, _, right = np.linalg.svd(np.asarray(matrix, np.float64))
+    flip = np.ones((*left.shape[:-2], 3))
+    flip[..., 2] = np.sign(np.linalg.det(left @ right))
+    return (left * flip[..., None, :]) @ right
+
+
+def _cross(vector: NDArray) -> NDArray[np.float64]:
+    x, y, z = np.moveaxis(np.asarray(vector, np.float64), -1, 0)
+    o = np.zeros_like(x)
+    return np.stack([o, -z, y, z, o, -x, -y, x, o], -1).reshape(*x.shape, 3, 3)
