@@ -1,0 +1,148 @@
+"""People on disk: skinned .glb files in the default body's rest pose, as `primdiffusion people` writes them."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from primdiffusion.body.model import JOINT_NAMES, J
+from primdiffusion.capture.glb import Glb, GlbError, read_glb
+from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+
+SUBJECT_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
+OURS = "primdiffusion"
+"""Key of the extras that hold betas and body."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SkinnedPerson:
+    """A dressed person in the rest pose of the default body."""
+
+    mesh: TexturedMesh
+    betas: Float[np.ndarray, "n"]
+
+
+def find_people(folder: str | Path) -> dict[str, Path]:
+    """The .glb of every person in a folder, by name, sorted: NAME/person.glb or NAME.glb; several are told apart.
+
+    Raises:
+        FileNotFoundError: there is no such folder, or nobody in it.
+    """
+    folder = Path(folder)
+    inner = [p for p in folder.iterdir() if p.is_dir() and p.name == "people"] if folder.is_dir() else []
+    found: dict[str, Path] = {}
+    for place in (folder, *inner):
+        for path in [*place.glob("*/person.glb"), *place.glob("*.glb")]:
+            name = path.parent.name if path.name == "person.glb" and path.parent != folder else path.stem
+            if SUBJECT_NAME.fullmatch(name):
+                found.setdefault(name, path)
+    if not found:
+        raise FileNotFoundError(
+            f"there are no people (NAME/person.glb) in {folder}: make some with primdiffusion people"
+        )
+    return dict(sorted(found.items()))
+
+
+def read_person(path: str | Path) -> SkinnedPerson:
+    """A person of such a file.
+
+    Raises:
+        FileNotFoundError: there is none.
+        GlbError: it is no whole .glb, or not rigged with the 24 joints, or does not say whose body it is.
+    """
+    glb = read_glb(path)
+    try:
+        return SkinnedPerson(TexturedMesh(_parts(glb)), _betas(glb))
+    except GlbError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError) as e:
+        raise GlbError(f"{path} is no person of the default body ({type(e).__name__}: {e}): make it again") from e
+
+
+def _betas(glb: Glb) -> Float[np.ndarray, "n"]:
+    scenes = glb.content.get("scenes", [])
+    places = [glb.content.get("asset", {}), *scenes]
+    extras: Any = next((p["extras"][OURS] for p in places if OURS in (p.get("extras") or {})), None)
+    if extras is None:
+        raise GlbError(f"{glb.path} does not say its betas: only files of primdiffusion people are read")
+    if extras.get("body", "default") != "default":
+        raise GlbError(f"{glb.path} is rigged on the body {extras['body']!r}: only the default body is known here")
+    betas = np.asarray(extras["betas"], np.float64)
+    if betas.ndim != 1 or not np.isfinite(betas).all():
+        raise GlbError(f"{glb.path} has betas of shape {betas.shape}, or not finite: make the person again")
+    return betas
+
+
+def _parts(glb: Glb) -> tuple[TexturedPart, ...]:
+    nodes, parts = glb.content["nodes"], []
+    for node in nodes:
+        if "mesh" not in node:
+            continue
+        if "skin" not in node:
+            raise GlbError(f"{glb.path}: the mesh {node.get('name')!r} is not rigged: make the person again")
+        joints = _joints(glb, node["skin"])
+        for number, primitive in enumerate(glb.content["meshes"][node["mesh"]]["primitives"]):
+            name = str(node.get("name", f"part {len(parts)}")) + (f" {number}" if number else "")
+            parts.append(_part(glb, name, primitive, joints))
+    if not parts:
+        raise GlbError(f"{glb.path} holds no mesh: make the person again")
+    return tuple(parts)
+
+
+def _joints(glb: Glb, skin: int) -> Int[np.ndarray, "n"]:
+    """SMPL's number of each joint of a skin."""
+    names = [glb.content["nodes"][node].get("name") for node in glb.content["skins"][skin]["joints"]]
+    if unknown := sorted({str(name) for name in names if name not in JOINT_NAMES}):
+        raise GlbError(f"{glb.path} has joints {', '.join(unknown[:3])}, not SMPL's {J}: rig it with these")
+    return np.array([JOINT_NAMES.index(name) for name in names], np.int32)
+
+
+def _part(glb: Glb, name: str, primitive: dict[str, Any], joints: Int[np.ndarray, "n"]) -> TexturedPart:
+    attributes = primitive["attributes"]
+    vertices = glb.array(attributes["POSITION"]).astype(np.float64)
+    faces = glb.array(primitive["indices"]) if "indices" in primitive else np.arange(len(vertices))
+    if primitive.get("mode", 4) != 4 or len(faces) % 3 or int(faces.max(initial=-1)) >= len(vertices):
+        raise GlbError(f"{glb.path}: the faces of {name!r} are no triangles of its vertices: make the person again")
+    faces = faces.reshape(-1, 3).astype(np.int32)
+    uv = glb.array(attributes["TEXCOORD_0"]) if "TEXCOORD_0" in attributes else np.zeros((len(vertices), 2), np.float32)
+    index = joints[glb.array(attributes["JOINTS_0"]).astype(np.int64)]
+    weight = glb.array(attributes["WEIGHTS_0"]).astype(np.float64)
+    total = weight.sum(1, keepdims=True)
+    if not np.isfinite(vertices).all() or not (total > 0).all():
+        raise GlbError(f"{glb.path}: {name!r} has vertices that are not finite or follow no joint: make it again")
+    return TexturedPart(
+        name=name,
+        vertices=vertices,
+        faces=faces,
+        corner_uv=np.stack([uv[..., 0], 1 - uv[..., 1]], -1)[faces].astype(np.float32),  # glTF's v points down
+        texture=_texture(glb, primitive),
+        skin_index=index.astype(np.int32),
+        skin_weight=weight / total,
+    )
+
+
+def _texture(glb: Glb, primitive: dict[str, Any]) -> UInt8[np.ndarray, "H W 4"]:
+    """Base colour times factor; alpha only where the material cuts out."""
+    material = glb.content["materials"][primitive["material"]] if "material" in primitive else {}
+    surface = material.get("pbrMetallicRoughness", {})
+    picture = np.full((1, 1, 4), 255, np.uint8)
+    if "baseColorTexture" in surface:
+        picture = glb.picture(glb.content["textures"][surface["baseColorTexture"]["index"]]["source"]).copy()
+    factor = np.asarray(surface.get("baseColorFactor", (1, 1, 1, 1)), np.float64)
+    if not (factor[:3] == 1).all():
+        linear = decode_srgb(picture[..., :3] / 255.0) * factor[:3]
+        picture[..., :3] = np.round(encode_srgb(np.clip(linear, 0, 1)) * 255)
+    if material.get("alphaMode", "OPAQUE") == "OPAQUE":
+        picture[..., 3] = 255
+    else:
+        # The cutoff moves to one half, where drawing tests.
+        cutoff = float(material.get("alphaCutoff", 0.5)) if material["alphaMode"] == "MASK" else 0.5
+        scaled = picture[..., 3] * (factor[3] * 0.5 / max(cutoff, 1e-3))
+        picture[..., 3] = np.round(np.clip(scaled, 0, 255))
+    return picture
