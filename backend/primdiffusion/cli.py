@@ -168,12 +168,17 @@ class Info:
 
 @dataclasses.dataclass(frozen=True)
 class People:
-    """Make dressed people from a MakeHuman asset folder, as training data (own --help)."""
+    """Make dressed, rigged people (glTF) from a MakeHuman asset folder, to render captures from (own --help)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Payloads:
+    """Make such people as primitives, to train the diffusion model on (own --help)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train the diffusion model on such people (own --help)."""
+    """Train the diffusion model on such primitives (own --help)."""
 
 
 Command = (
@@ -181,14 +186,21 @@ Command = (
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[People, tyro.conf.subcommand("people")]
+    | Annotated[Payloads, tyro.conf.subcommand("payloads")]
     | Annotated[Train, tyro.conf.subcommand("train")]
 )
 
 
 def _people(arguments: Sequence[str]) -> None:
-    from primdiffusion.people.command import PeopleCommand, run
+    from primdiffusion.people.command import PeopleCommand, run_people
 
-    run(tyro.cli(PeopleCommand, args=arguments, prog="primdiffusion people"))
+    run_people(tyro.cli(PeopleCommand, args=arguments, prog="primdiffusion people"))
+
+
+def _payloads(arguments: Sequence[str]) -> None:
+    from primdiffusion.people.command import PayloadsCommand, run_payloads
+
+    run_payloads(tyro.cli(PayloadsCommand, args=arguments, prog="primdiffusion payloads"))
 
 
 def _train(arguments: Sequence[str]) -> None:
@@ -201,7 +213,7 @@ def _train(arguments: Sequence[str]) -> None:
     train(tyro.cli(TrainingConfig, args=arguments, prog="primdiffusion train"))
 
 
-FORWARDED = {"people": _people, "train": _train}
+FORWARDED = {"people": _people, "payloads": _payloads, "train": _train}
 """Commands whose parameters their own modules state; importing these takes a second, so only when asked for."""
 
 
@@ -211,7 +223,7 @@ def run(arguments: Sequence[str]) -> None:
         FORWARDED[arguments[0]](arguments[1:])
         return
     command = tyro.cli(Command, args=arguments or ["--help"], prog="primdiffusion", description=DESCRIPTION)
-    assert isinstance(command, Generate | Render | Info), "people and train are forwarded"
+    assert isinstance(command, Generate | Render | Info), "the others are forwarded"
     command.run()
 
 

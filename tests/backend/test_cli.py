@@ -169,8 +169,8 @@ def test_an_interrupt_is_130_without_a_traceback_and_leaves_nothing(monkeypatch,
     assert not (tmp_path / "out").exists()
 
 
-def test_people_and_train_are_forwarded_to_their_own_parameters(capsys):
-    for command, parameter in (("people", "--variants"), ("train", "--data")):
+def test_people_payloads_and_train_are_forwarded_to_their_own_parameters(capsys):
+    for command, parameter in (("people", "--workers"), ("payloads", "--variants"), ("train", "--data")):
         with pytest.raises(SystemExit):
             cli.main([command, "--help"])
         assert parameter in capsys.readouterr().out

@@ -265,8 +265,9 @@ def test_processes_make_the_same_files_as_one(assets, tmp_path):
 
 @pytest.mark.slow
 def test_workers_end_when_the_command_is_killed(assets, tmp_path):
-    command = [sys.executable, "-m", "primdiffusion.people", "--assets", str(assets.root), "--out", str(tmp_path)]
-    process = subprocess.Popen([*command, "--count", "50", "--workers", "2"], stdout=subprocess.DEVNULL)
+    command = [sys.executable, "-m", "primdiffusion.cli", "payloads", "--assets", str(assets.root)]
+    options = ["--out", str(tmp_path), "--count", "50", "--workers", "2"]
+    process = subprocess.Popen([*command, *options], stdout=subprocess.DEVNULL)
     try:
         assert _within(60, lambda: any(tmp_path.glob("*.npz")))
         workers = psutil.Process(process.pid).children(recursive=True)

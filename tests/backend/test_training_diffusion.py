@@ -260,5 +260,5 @@ def test_a_damaged_person_is_named(tmp_path, people):
 
 
 def test_an_empty_folder_is_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match="primdiffusion people"):
+    with pytest.raises(FileNotFoundError, match="primdiffusion payloads"):
         find_people(tmp_path)

@@ -54,6 +54,12 @@ class Assets:
             )
         return _decoded(path, size)
 
+    def files(self, name: str) -> tuple[str, ...]:
+        """Everything of an asset that people are made from, as paths in the folder: mesh, fitting, pictures."""
+        meshes = [f"{name}{ending}" for ending in (".mhclo", ".obj") if (self.root / f"{name}{ending}").is_file()]
+        pictures = [_picture_path(self.root, f"{name}{ending}") for ending in ("", "_diffuse", "_ao")]
+        return (*meshes, *(path.relative_to(self.root).as_posix() for path in pictures if path))
+
     def pictures(self, folder: str, contains: str = "") -> tuple[str, ...]:
         """Names (without ending, sorted) of the pictures in a folder whose file name contains a word."""
         found = {

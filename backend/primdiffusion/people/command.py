@@ -1,20 +1,38 @@
-"""The command `primdiffusion people`: make a training set from an asset folder."""
+"""The commands that make people from an asset folder: rigged files to render, or primitives to train on."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
+import sys
 from pathlib import Path
 
 from tqdm import tqdm
 
 from primdiffusion.people.assets import open_assets
+from primdiffusion.people.folder import PeopleSet, make_people, unknown_licences
 from primdiffusion.people.payloads import make_payloads
 from primdiffusion.people.wardrobe import required_meshes
 
 
 @dataclasses.dataclass(frozen=True)
 class PeopleCommand:
+    """Make dressed, rigged people as glTF files: what captures are rendered from."""
+
+    out: Path
+    """Folder to write person_NNNNNN/person.glb and manifest.json into; people that are whole in it are kept."""
+    assets: Path | None = None
+    """MakeHuman asset folder (CC0); without it the environment variable PRIMDIFFUSION_ASSETS is asked."""
+    count: int = 100
+    """People to make."""
+    seed: int = 0
+    """Seed of the first person; the next has the next."""
+    workers: int = os.cpu_count() or 1
+    """Processes; each takes a core and about 1 GB."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PayloadsCommand:
     """Make dressed people as primitives: the training set of the diffusion model."""
 
     out: Path
@@ -31,10 +49,27 @@ class PeopleCommand:
     """Processes; each takes a core and about 1 GB."""
 
 
-def run(command: PeopleCommand) -> None:
-    """Make the people and show how far it is."""
+def run_people(command: PeopleCommand) -> None:
+    """Makes the people, shows how far it is, and prints the folder."""
+    people = PeopleSet(command.out, command.seed, command.count)
     assets = open_assets(command.assets, required_meshes())
-    with tqdm(total=command.count, unit="person", desc="people") as bar:
+    with tqdm(total=command.count, unit="person", desc="people", disable=None) as bar:
+        for done in make_people(assets, people, command.workers):
+            bar.update(done - bar.n)
+    unknown = unknown_licences(command.out)
+    if unknown:
+        print(
+            f"primdiffusion: {len(unknown)} asset files state no licence ({unknown[0]}, ...): the manifest calls it "
+            "unknown; list them in a LICENSES.txt beside the asset folder",
+            file=sys.stderr,
+        )
+    print(command.out)
+
+
+def run_payloads(command: PayloadsCommand) -> None:
+    """Makes the payloads and shows how far it is."""
+    assets = open_assets(command.assets, required_meshes())
+    with tqdm(total=command.count, unit="person", desc="payloads") as bar:
 
         def report(done: int, total: int) -> None:
             bar.update(done - bar.n)

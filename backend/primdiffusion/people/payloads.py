@@ -8,14 +8,10 @@ at all; a second run keeps the whole ones.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import multiprocessing
 import os
-import threading
 import zipfile
-from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -27,13 +23,13 @@ from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.person import make_person, recolour
+from primdiffusion.people.pool import each
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Frames, K, Payload, S
 
 VARIANT_STRIDE = 1 << 32
 """Variant j of the person with seed s is coloured with seed s + j * VARIANT_STRIDE."""
-THREAD_COUNTS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 KEYS = ("voxels", "betas", "attributes", "full_density", "seed")
 
 
@@ -54,6 +50,7 @@ def make_payloads(
     Raises:
         ValueError: a count that is not positive.
         AssetsMissingError, ProxyFileError: the asset folder lacks files or has damaged ones.
+        WorkerKilledError: a worker process was killed.
     """
     for name, value in (("count", count), ("variants", variants), ("workers", workers)):
         if value < 1:
@@ -67,23 +64,9 @@ def make_payloads(
     ]
     done = count - len(jobs)
     report(done, count)
-    if workers == 1:
-        for path, person_seed in jobs:
-            write_person(assets, path, variants, person_seed)
-            done += 1
-            report(done, count)
-        return paths
-    context = multiprocessing.get_context("spawn")
-    with _single_threaded_children(), ProcessPoolExecutor(workers, context, _begin_worker) as pool:
-        waiting = {pool.submit(write_person, assets, path, variants, person_seed) for path, person_seed in jobs}
-        while waiting:
-            finished, waiting = wait(waiting, timeout=1.0, return_when=FIRST_EXCEPTION)
-            for future in finished:
-                if future.exception() is not None:
-                    pool.shutdown(wait=False, cancel_futures=True)
-                future.result()
-            done += len(finished)
-            report(done, count)
+    for _ in each(write_person, [(assets, path, variants, person_seed) for path, person_seed in jobs], workers):
+        done += 1
+        report(done, count)
     return paths
 
 
@@ -134,34 +117,3 @@ def is_complete(path: Path, variants: int, seed: int) -> bool:
             )
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return False
-
-
-@contextlib.contextmanager
-def _single_threaded_children() -> Iterator[None]:
-    """Processes started meanwhile keep numpy and numba to one thread: there are as many processes as cores."""
-    before = {name: os.environ.get(name) for name in THREAD_COUNTS}
-    os.environ.update(dict.fromkeys(THREAD_COUNTS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _begin_worker() -> None:
-    """One thread for torch, which does not heed all of the environment; no life after the process that gives the work.
-
-    A pool's workers outlive a parent that is killed, and keep its place on the processors.
-    """
-    torch.set_num_threads(1)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)

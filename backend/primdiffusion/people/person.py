@@ -43,7 +43,7 @@ class Person:
     attributes: dict[str, str | float]
     """What can be said of the person: sex, skin tone, garments and their colours."""
     sources: tuple[str, ...]
-    """Meshes and pictures of the asset folder that the person is made of."""
+    """Files of the asset folder that the person is made of, as paths in it."""
     choice: Choice
     assets: Assets
     base: BaseMesh
@@ -162,9 +162,9 @@ def _coloured(assets: Assets, base: BaseMesh, choice: Choice, mesh: TexturedMesh
         "eyes": eyes.rsplit("/", 1)[-1],
         "height": round(float(mesh.parts[0].vertices[:, 1].max() - mesh.bounds[0, 1]), 4),
     }
-    sources = (choice.outfit.path, choice.shoes.path, choice.eyebrows, choice.eyelashes, complexion.base,
-               complexion.other, eyes, *([hair_path(choice.hair)] if choice.hair else []),
-               *([choice.hat] if choice.hat else []))  # fmt: skip
+    used = (choice.outfit.path, choice.shoes.path, choice.eyebrows, choice.eyelashes, EYES, complexion.base,
+            complexion.other, eyes, choice.hair and hair_path(choice.hair), choice.hat)  # fmt: skip
+    sources = tuple(dict.fromkeys(file for name in used if name for file in assets.files(name)))
     return Person(TexturedMesh(parts), choice.betas, attributes, sources, choice, assets, base)
 
 

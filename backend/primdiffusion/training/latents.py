@@ -21,7 +21,7 @@ from primdiffusion.primitives.primitives import K, S
 from primdiffusion.training.config import CodecConfig
 
 _DAMAGED = (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile)
-_NO_PERSON = "{path} is no person's payload ({error}): make it again with `primdiffusion people`"
+_NO_PERSON = "{path} is no person's payload ({error}): make it again with `primdiffusion payloads`"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +74,7 @@ def find_people(folder: Path) -> list[Path]:
     paths = sorted(folder.glob("*.npz"))
     if len(paths) < 2:
         raise FileNotFoundError(
-            f"{folder} holds {len(paths)} people (*.npz): make some with `primdiffusion people --out {folder}`"
+            f"{folder} holds {len(paths)} people (*.npz): make some with `primdiffusion payloads --out {folder}`"
         )
     return paths
 

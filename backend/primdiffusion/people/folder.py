@@ -1,0 +1,217 @@
+"""A folder of people as rigged glTF files: what captures are rendered from.
+
+    manifest.json                    seed, count, people, and the licence of every asset used; written last
+    person_NNNNNN/person.glb         NNNNNN is the person's seed
+    person_NNNNNN/person.json        seed, betas, attributes, sources with licences, and the .glb's SHA-256
+
+A person's folder appears whole or not at all, so a killed run is taken up where it stopped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import torch
+
+from primdiffusion.body.model import JOINT_NAMES, default_body
+from primdiffusion.people.assets import Assets
+from primdiffusion.people.base_mesh import load_base_mesh
+from primdiffusion.people.gltf import Skeleton, glb
+from primdiffusion.people.licences import UNKNOWN, licence_of
+from primdiffusion.people.person import Person, make_person
+from primdiffusion.people.pool import each
+from primdiffusion.staging import written_whole
+
+FORMAT, VERSION = "primdiffusion-people", 1
+MANIFEST, GLB, CARD = "manifest.json", "person.glb", "person.json"
+BODY = "default"
+JOINT_GRID = 2.0**20
+"""Joints are rounded to 1 / JOINT_GRID m: sums in another order give the same file."""
+PERSON = re.compile(r"person_\d{6,}")
+PARTIAL = re.compile(r"\.person_\d+\.(\d+)\.partial")
+
+
+class OtherPeopleError(ValueError):
+    """A folder that holds a different set of people."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PeopleSet:
+    """Which people a folder is to hold: those of seeds seed ... seed + count - 1."""
+
+    root: Path
+    seed: int
+    count: int
+
+    def __post_init__(self) -> None:
+        """Refuse a set without people.
+
+        Raises:
+            ValueError: count is not positive, or seed is negative.
+        """
+        if self.count < 1:
+            raise ValueError(f"count is {self.count}; ask for one person or more.")
+        if self.seed < 0:
+            raise ValueError(f"seed is {self.seed}; give 0 or more.")
+
+    @property
+    def seeds(self) -> range:
+        """Each person's seed."""
+        return range(self.seed, self.seed + self.count)
+
+    def folder(self, seed: int) -> Path:
+        """Where a person is."""
+        return self.root / name_of(seed)
+
+
+def name_of(seed: int) -> str:
+    """The name of a person's folder."""
+    return f"person_{seed:06d}"
+
+
+def make_people(assets: Assets, people: PeopleSet, workers: int) -> Iterator[int]:
+    """Makes those who are not there yet, then the manifest; yields how many are done, first of all those kept.
+
+    A person takes about a second of one core. The same seed gives the same bytes, however many workers make them.
+
+    Raises:
+        OtherPeopleError: the folder holds other people.
+        AssetsMissingError, ProxyFileError: the asset folder lacks files or has damaged ones.
+        WorkerKilledError: a worker process was killed.
+        OSError: a file cannot be written.
+    """
+    if workers < 1:
+        raise ValueError(f"workers is {workers}; it must be 1 or more.")
+    _refuse_others(people)
+    people.root.mkdir(parents=True, exist_ok=True)
+    _remove_leftovers(people.root)
+    missing = [seed for seed in people.seeds if not is_whole(people.folder(seed), seed)]
+    done = people.count - len(missing)
+    yield done
+    jobs = [(assets, people.folder(seed), seed) for seed in missing]
+    for _ in each(write_person, jobs, max(1, min(workers, len(jobs)))):
+        done += 1
+        yield done
+    _write_manifest(people)
+
+
+def write_person(assets: Assets, folder: Path, seed: int) -> None:
+    """Makes one person and stores it, whole or not at all; what was in the folder is replaced."""
+    person = make_person(assets, load_base_mesh(), seed)
+    binary = glb(person.mesh, skeleton_of(person), {"primdiffusion": _identity(person, seed)})
+    card = {
+        **_identity(person, seed),
+        "attributes": person.attributes,
+        "sources": [{"path": path, "licence": licence_of(assets.root, path)} for path in person.sources],
+        "sha256": hashlib.sha256(binary).hexdigest(),
+    }
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    try:
+        partial.mkdir()
+        (partial / GLB).write_bytes(binary)
+        (partial / CARD).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+        shutil.rmtree(folder, ignore_errors=True)
+        partial.replace(folder)
+    except OSError as error:
+        # Python names no file where a disk is full.
+        raise OSError(error.errno, error.strerror or "cannot be written", str(folder)) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def skeleton_of(person: Person) -> Skeleton:
+    """The default body's joints at a person's betas."""
+    body = default_body()
+    vertices = body.template.double() + torch.einsum(
+        "vcn,n->vc", body.shape_basis[..., : len(person.betas)].double(), torch.from_numpy(person.betas)
+    )
+    joints = (body.joint_regressor.double() @ vertices).numpy()
+    return Skeleton(JOINT_NAMES, body.parents.tolist(), np.rint(joints * JOINT_GRID) / JOINT_GRID)
+
+
+def is_whole(folder: Path, seed: int) -> bool:
+    """Whether a folder holds this person undamaged."""
+    card = _read_card(folder)
+    try:
+        return (
+            card is not None
+            and card["seed"] == seed
+            and card["sha256"] == hashlib.sha256((folder / GLB).read_bytes()).hexdigest()
+        )
+    except (OSError, KeyError):
+        return False
+
+
+def unknown_licences(root: Path) -> list[str]:
+    """Assets in a folder's manifest whose licence is not known."""
+    manifest = json.loads((root / MANIFEST).read_text(encoding="utf-8"))
+    return [asset["path"] for asset in manifest["assets"] if asset["licence"] == UNKNOWN]
+
+
+def _identity(person: Person, seed: int) -> dict[str, Any]:
+    return {"seed": seed, "betas": person.betas.tolist(), "body": BODY}
+
+
+def _refuse_others(people: PeopleSet) -> None:
+    """A folder's people are one set: same first seed, and nobody from outside the range."""
+    remedy = "choose another folder, or ask for the same seed and at least as many people"
+    asked = f"{people.count} people from seed {people.seed} were asked for"
+    manifest = _read_json(people.root / MANIFEST)
+    if manifest is not None and manifest.get("seed") != people.seed:
+        raise OtherPeopleError(
+            f"{people.root} holds {manifest.get('count')} people from seed {manifest.get('seed')}, "
+            f"but {asked}; {remedy}."
+        )
+    expected = {name_of(seed) for seed in people.seeds}
+    found = [path.name for path in people.root.glob("person_*") if PERSON.fullmatch(path.name)]
+    strangers = sorted(set(found) - expected)
+    if strangers:
+        raise OtherPeopleError(f"{people.root} holds {strangers[0]} ({len(strangers)} such), but {asked}; {remedy}.")
+
+
+def _remove_leftovers(root: Path) -> None:
+    """Removes what killed processes were writing."""
+    for path in root.glob(".person_*.partial"):
+        owner = PARTIAL.fullmatch(path.name)
+        if owner and not psutil.pid_exists(int(owner[1])):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _write_manifest(people: PeopleSet) -> None:
+    licences: dict[str, str] = {}
+    for seed in people.seeds:
+        card = _read_card(people.folder(seed))
+        licences |= {source["path"]: source["licence"] for source in card["sources"]} if card else {}
+    manifest = {
+        "format": FORMAT,
+        "version": VERSION,
+        "seed": people.seed,
+        "count": people.count,
+        "assets": [{"path": path, "licence": licences[path]} for path in sorted(licences)],
+        "people": [name_of(seed) for seed in people.seeds],
+    }
+    with written_whole(people.root / MANIFEST) as path:
+        path.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+
+
+def _read_card(folder: Path) -> dict[str, Any] | None:
+    return _read_json(folder / CARD)
+
+
+def _read_json(path: Path) -> dict[str, Any] | None:
+    """A JSON object, None where there is none or a damaged one."""
+    with contextlib.suppress(OSError, ValueError):
+        value = json.loads(path.read_text(encoding="utf-8"))
+        return value if isinstance(value, dict) else None
+    return None

@@ -1,0 +1,93 @@
+"""Under which licence each file of an asset folder is: what the file says itself, or a LICENSES.txt that lists it.
+
+MakeHuman's text files (.mhclo, .obj, .mhmat) open with comments that name their release. Pictures cannot; they are
+listed in a LICENSES.txt in or above the folder (a table `path | ... | licence | ...`), or else named by a
+material beside them that states its own.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from pathlib import Path
+
+UNKNOWN = "unknown"
+LIST = "LICENSES.txt"
+LEVELS = 3
+"""Folders in which a list is looked for: the asset folder and those above it."""
+HEADER_BYTES = 4096
+STATED = (
+    (re.compile(r"\b(?:released as|licen[cs]ed? (?:under|is|:)?)\s*\W{0,3}(?:CC0\b|CC-0\b)", re.IGNORECASE), "CC0-1.0"),
+    (re.compile(r"\bCC[- ]?BY(?:[- ](?:SA|NC|ND))*(?:[- ]\d\.\d)?", re.IGNORECASE), ""),
+    (re.compile(r"\bA?GPL[- ]?v?\d(?:\.\d)?", re.IGNORECASE), ""),
+    (re.compile(r"\bCC0\b"), "CC0-1.0"),
+)
+"""What a header may say, and the name of that licence; where that is empty, the words themselves."""
+
+
+def licence_of(root: Path, path: str) -> str:
+    """The licence of a file of the asset folder, "unknown" where none is stated.
+
+    Args:
+        root: the asset folder.
+        path: the file's place in it, with "/".
+    """
+    listed = _listed(root)
+    if path in listed:
+        return listed[path]
+    file = root / path
+    if file.suffix in (".mhclo", ".obj", ".mhmat"):
+        return _stated(file)
+    for material in sorted(file.parent.glob("*.mhmat")):
+        if file.name.rsplit(".", 1)[0] in _head(material):
+            return _stated(material)
+    return UNKNOWN
+
+
+@functools.lru_cache(maxsize=4)
+def _listed(root: Path) -> dict[str, str]:
+    """Licences by path in the asset folder, from the lists in and above it; the nearest list has the last word."""
+    licences: dict[str, str] = {}
+    for folder in reversed((root, *root.parents)[:LEVELS]):
+        if (folder / LIST).is_file():
+            for path, licence in _table((folder / LIST).read_text(encoding="utf-8", errors="replace")).items():
+                for start in (folder, root):
+                    if (start / path).is_relative_to(root):
+                        licences[(start / path).relative_to(root).as_posix()] = licence
+    return licences
+
+
+def _table(text: str) -> dict[str, str]:
+    """The columns "path" and "licence" of a table with a heading, cells parted by "|"."""
+    licences: dict[str, str] = {}
+    columns: list[str] = []
+    for line in text.splitlines():
+        cells = [cell.strip() for cell in line.split("|")]
+        if len(cells) < 2:
+            continue
+        if not columns:
+            names = [cell.lower().replace("license", "licence") for cell in cells]
+            columns = names if {"path", "licence"} <= set(names) else []
+        elif len(cells) >= len(columns):
+            licences[cells[columns.index("path")]] = cells[columns.index("licence")].split(" (")[0]
+    return licences
+
+
+@functools.lru_cache(maxsize=1024)
+def _stated(file: Path) -> str:
+    """The licence that a text file's opening comments name."""
+    comments = " ".join(line.lstrip("# ") for line in _head(file).splitlines() if line.startswith("#"))
+    for pattern, name in STATED:
+        found = pattern.search(comments)
+        if found:
+            return name or found[0]
+    return UNKNOWN
+
+
+@functools.lru_cache(maxsize=1024)
+def _head(file: Path) -> str:
+    try:
+        with file.open("rb") as stream:
+            return stream.read(HEADER_BYTES).decode("utf-8", errors="replace")
+    except OSError:
+        return ""
