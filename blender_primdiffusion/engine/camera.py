@@ -14,7 +14,8 @@ def camera_view(
 ) -> View:
     """What a camera object sees in a picture of `size` (width, height), by Blender's own projection.
 
-    So lens, shift, sensor fit and the pixels' aspect are Blender's. Raises ValueError for a panoramic camera.
+    So lens, shift, sensor fit and the pixels' aspect are Blender's. Raises ValueError for a panoramic camera, one
+    that is scaled to nothing and one that clips everything.
     """
     evaluated = camera.evaluated_get(depsgraph)
     data = evaluated.data
@@ -24,12 +25,19 @@ def camera_view(
             f"the camera {camera.name!r} is of type {kind}; PrimDiffusion draws perspective and orthographic cameras: "
             "change its lens type, or choose another camera"
         )
+    if not data.clip_start < data.clip_end:
+        raise ValueError(
+            f"the camera {camera.name!r} clips everything, from {data.clip_start:.4g} m to {data.clip_end:.4g} m: "
+            "let its Clip End be beyond its Clip Start"
+        )
+    axes = without_scale(evaluated.matrix_world)
+    if not abs(np.linalg.det(axes)) > 0:
+        raise ValueError(f"the camera {camera.name!r} or a parent of it is scaled to zero: give it a scale")
     render = depsgraph.scene.render
     projection = camera.calc_matrix_camera(
         depsgraph, x=size[0], y=size[1], scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
     )
-    world_to_view = np.linalg.inv(without_scale(evaluated.matrix_world))
-    return view_from_matrices(projection, world_to_view, (data.clip_start, data.clip_end), size, subject)
+    return view_from_matrices(projection, np.linalg.inv(axes), (data.clip_start, data.clip_end), size, subject)
 
 
 def wanted_region(render: bpy.types.RenderSettings, size: tuple[int, int]) -> list[int] | None:

@@ -15,6 +15,9 @@ from ..scene.human import BETAS, MARK, person_file
 from ..scene.human_file import JOINT_NAMES
 from .visible import visible_instances
 
+SMALLEST_SCALE = 1e-4
+"""Animators hide things by scaling them to nothing: below this a person is smaller than a hair is thick."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Posed:
@@ -43,16 +46,18 @@ class Posed:
 def posed_people(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None) -> list[Posed]:
     """Everybody whose armature is visible, in a viewport where one is given; instances included.
 
-    An armature stands for its person: it is hidden with it and shown wherever it is instanced. Raises FileNotFoundError
-    for a person whose file is missing and ValueError for a shape that is no list of numbers.
+    An armature stands for its person: it is hidden with it and shown wherever it is instanced. One that is scaled to
+    nothing has nothing to show. Raises FileNotFoundError for a person whose file is missing and ValueError for a shape
+    that is no list of numbers or a pose that holds NaN.
     """
     owners = dict(_armatures())
     people = []
     for instance in visible_instances(depsgraph, space):
         thing = instance.object
         owner = owners.get(thing.original) if thing.type == "ARMATURE" else None
-        if owner is not None:
-            people.append(_posed(thing, np.array(instance.matrix_world), owner))
+        matrix = np.array(instance.matrix_world, np.float64)
+        if owner is not None and not abs(np.linalg.det(matrix[:3, :3])) < SMALLEST_SCALE**3:
+            people.append(_posed(thing, matrix, owner))
     return people
 
 
@@ -70,6 +75,8 @@ def _posed(armature: bpy.types.Object, matrix: NDArray, owner: bpy.types.Collect
     bones = armature.pose.bones
     posed = np.array([bones[name].matrix for name in JOINT_NAMES], np.float64)
     rest = np.array([bones[name].bone.matrix_local for name in JOINT_NAMES], np.float64)
+    if not (np.isfinite(posed).all() and np.isfinite(matrix).all()):
+        raise ValueError(f"the armature of {owner.name!r} holds NaN or infinite numbers: check its pose and drivers")
     return Posed(
         person_file(owner),
         transforms_to_backend(matrix),

@@ -62,6 +62,8 @@ class Refinement:
         self._drawing: Drawing | None = None
         self._pending: Shown | None = None
         self._turn = 0
+        self._died = False
+        """The child has died since the last picture."""
         self._moving = COARSENESS[0]
         self.shown: Shown | None = None
         """The newest picture; its frame stays untouched until the next but one."""
@@ -132,14 +134,17 @@ class Refinement:
             return False
         self._drawing = self._pending = None
         if drawing.state == "done":
-            self.shown = pending
+            self.shown, self._died = pending, False
             self._pace(drawing)
             return True
         self._turn = 1 - self._turn  # the frame of what is shown must not be drawn into next
-        if drawing.state == "failed" and pending is not None and pending.wish is self._wish:
-            self.error = str(drawing.error)
-            return True
-        return False
+        if drawing.error is None or pending is None or pending.wish is not self._wish:
+            return False
+        if drawing.error.kind == "died" and not self._died:
+            self._died = True  # the next drawing starts another; should that die too, the user is told
+            return False
+        self.error = str(drawing.error)
+        return True
 
     def _pace(self, drawing: Drawing) -> None:
         """Choose how coarse the pictures are while things move, from what the last of them took."""

@@ -51,7 +51,8 @@ def scene_solids(
     """What is visible of meshes, curves, surfaces, texts, metaballs and their instances, except people's own bodies.
 
     A triangle has its material's base colour (see `base_colour`), or without a material the object's. Curves and the
-    like are taken as Blender tessellates them. `everything_holdout` makes all of it cut holes.
+    like are taken as Blender tessellates them. `everything_holdout` makes all of it cut holes. Raises ValueError for an
+    object whose corners hold NaN.
     """
     parts = list(_parts(depsgraph, space))
     if not parts:
@@ -115,6 +116,8 @@ def _parts(
             continue
         matrix = np.array(instance.matrix_world, np.float64)
         world = points_to_backend(local @ matrix[:3, :3].T + matrix[:3, 3])
+        if not np.isfinite(world).all():
+            raise ValueError(f"the object {thing.name!r} holds NaN or infinite numbers: repair its mesh, or hide it")
         owner = (instance.parent or thing).original
         holdout = thing.is_holdout or owner.holdout_get(view_layer=depsgraph.view_layer)
         yield world.astype(np.float32), colour, np.full(len(local), holdout)

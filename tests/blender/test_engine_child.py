@@ -181,6 +181,33 @@ def test_a_camera_that_cannot_be_drawn_is_one_clear_error(stage, kind):
         render()
 
 
+def test_a_camera_that_shows_nothing_is_one_clear_error(stage):
+    camera = stage.scene.camera
+    camera.data.clip_start, camera.data.clip_end = 5.0, 1.0
+    with pytest.raises(RuntimeError, match="clips everything, from 5 m to 1 m"):
+        render()
+    camera.data.clip_end, camera.scale = 100.0, (0, 0, 0)
+    with pytest.raises(RuntimeError, match="scaled to zero: give it a scale"):
+        render()
+
+
+def test_blender_itself_refuses_a_picture_without_camera_or_pixels_and_the_next_one_works(stage):
+    camera, settings = stage.scene.camera, stage.scene.render
+    stage.scene.camera = None
+    with pytest.raises(RuntimeError, match="no camera"):
+        render()
+    stage.scene.camera, settings.use_border = camera, True
+    for edges in ((0.5, 0.5), (0.5, 0.501), (0.7, 0.3)):
+        settings.border_min_x, settings.border_max_x = edges
+        with pytest.raises(RuntimeError, match="too small"):
+            render()
+    settings.use_border, settings.resolution_percentage = False, 1
+    with pytest.raises(RuntimeError, match="too small"):
+        render()
+    settings.resolution_percentage = 100
+    assert render() == {"FINISHED"}
+
+
 def test_unregistering_ends_the_child_removes_the_frames_and_leaves_the_scene_a_usable_engine(stage):
     render()
     folder, pid = studio.frames.folder, studio.drawing_child().pid
@@ -216,6 +243,43 @@ def test_blender_exits_while_the_engine_is_the_active_one():
     command = [sys.executable, "-c", program]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=60, check=True)
     assert not Path(done.stdout.strip().splitlines()[-1]).exists()
+
+
+EXIT_WHILE_DRAWING = """
+import sys, os, threading, time
+from pathlib import Path
+import bpy, blender_primdiffusion as b
+from blender_primdiffusion import places
+from blender_primdiffusion.worker.environment import BackendPython
+places.find_backend_python = lambda *_, **__: BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
+places.backend_module_path = lambda: Path(sys.argv[1])
+b.register()
+from blender_primdiffusion.engine import studio
+frame = studio.frames.take("view", 8, 8)
+drawing = studio.drawing_child().draw({"frame": str(frame.path), "region": None, "width": 8, "height": 8})
+while drawing.rows == 0:
+    time.sleep(0.01)
+print(studio.drawing_child().pid, studio.frames.folder, flush=True)
+if sys.argv[2] == "killed":
+    os.kill(os.getpid(), 9)
+"""
+
+
+@pytest.mark.parametrize("how", ["quit", "killed"])
+def test_blender_that_ends_while_a_picture_is_drawn_leaves_no_process_and_no_memory(how):
+    command = [sys.executable, "-c", EXIT_WHILE_DRAWING, str(FAKE), how]
+    root, environment = Path(__file__).parents[2], {**os.environ, "FAKE_BAND_S": "1.0"}
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    pid, folder = done.stdout.strip().splitlines()[-1].split()
+    end = time.monotonic() + 8
+    while Path(f"/proc/{pid}").exists() and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{pid}").exists()
+    if how == "killed":
+        frames = Frames()  # nobody could: the next Blender does
+        assert frames.folder.exists()
+        frames.close()
+    assert not Path(folder).exists()
 
 
 def test_a_frame_is_reused_for_its_size_and_replaced_for_another():

@@ -344,6 +344,26 @@ def test_betas_on_the_armature_change_the_shape(stage, backend):
         render_png(stage.out)
 
 
+def test_a_person_scaled_to_nothing_is_not_there_and_nan_is_an_error(stage):
+    for scale in ((0, 0, 0), (1, 1, 0)):
+        stage.armature.scale = scale
+        assert not render_png(stage.out).any()
+    stage.armature.scale = (1, 1, 1)
+    stage.armature.location.x = float("nan")
+    with pytest.raises(RuntimeError, match="armature of 'Human' holds NaN"):
+        render_png(stage.out)
+
+
+def test_one_percent_and_the_smallest_picture_are_drawn(stage, backend):
+    render = stage.scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = 1200, 900, 1
+    assert_same(render_png(stage.out), eight_bit(expected(stage, backend, size=(12, 9))[0]))
+    render.resolution_x = render.resolution_y = 1  # Blender makes it 4
+    render.resolution_percentage = 100
+    wanted = eight_bit(expected(stage, backend, size=(4, 4))[0])
+    assert np.abs(render_png(stage.out) - wanted).max() <= 1
+
+
 def test_a_renamed_collection_and_a_blend_saved_elsewhere_keep_their_person(stage, backend, tmp_path):
     wanted = eight_bit(expected(stage, backend)[0])
     stage.person.name = "Renamed"

@@ -124,6 +124,27 @@ def test_an_error_is_told_once_and_another_wish_is_tried_anew(bench):
     assert len(bench.asked) == 2
 
 
+def test_a_child_that_died_is_replaced_once_before_the_user_is_told(bench):
+    bench.refinement.want(wish("a"))
+    bench.refinement.advance()
+    for _ in range(2):
+        assert bench.refinement.error == ""
+        answer(bench, "failed", error=JobError("the child has died", "", "died"))
+        bench.refinement.advance()
+    assert len(bench.asked) == 2
+    assert bench.refinement.error == "The child has died."
+    bench.refinement.want(wish("b"))
+    bench.refinement.advance()
+    answer(bench)
+    bench.refinement.advance()
+    assert bench.refinement.shown.wish.key == "b"
+    bench.refinement.want(wish("c"))
+    bench.refinement.advance()
+    answer(bench, "failed", error=JobError("the child has died", "", "died"))
+    bench.refinement.advance()
+    assert bench.refinement.error == ""
+
+
 def test_where_drawing_is_fast_moving_pictures_become_finer_and_coarser_again_where_it_is_not(bench):
     widths = []
     for step, seconds in enumerate([0.004, 0.004, 0.004, 0.2, 0.2, 0.2]):

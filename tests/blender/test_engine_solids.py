@@ -163,6 +163,12 @@ def test_the_file_is_named_by_its_content_and_written_once(stage, tmp_path):
     assert stored(solids_now(), tmp_path) is None
 
 
+def test_a_mesh_with_nan_is_an_error_that_names_the_object(stage):
+    cube("broken").data.vertices[0].co.z = float("nan")
+    with pytest.raises(RuntimeError, match=r"'broken' holds NaN.*repair its mesh"):
+        render_png(stage.out)
+
+
 @pytest.fixture
 def pair(stage, folder):
     """A person at the origin and a cube at the height of the chest."""
