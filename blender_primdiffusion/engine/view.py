@@ -64,8 +64,8 @@ def view_from_matrices(
     """
     projection, view = np.asarray(projection, np.float64), np.asarray(view, np.float64)
     width, height = size
-    rotation: NDArray[np.float64] = _FLIP @ view[:3, :3]
-    translation: NDArray[np.float64] = _FLIP @ view[:3, 3]
+    rotation = _FLIP @ view[:3, :3]
+    translation = _FLIP @ view[:3, 3]
     half = np.array([width, height]) / 2
     scale = np.array([projection[0, 0], projection[1, 1]]) * half
     if projection[3, 2] != 0:
