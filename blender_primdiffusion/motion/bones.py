@@ -67,7 +67,8 @@ RIGS: dict[str, dict[str, str]] = {
         "pelvis": "hips", "hip": "{left}hip|{left}upleg", "knee": "{left}knee|{left}lowleg",
         "ankle": "{left}ankle|{left}foot", "foot": "{left}toe", "spine1": "chest|lowerback|torso",
         "spine2": "chest2", "spine3": "chest3", "neck": "neck", "head": "head", "collar": "{left}collar",
-        "shoulder": "{left}shoulder|{left}uparm", "elbow": "{left}elbow|{left}lowarm", "wrist": "{left}wrist|{left}hand",
+        "shoulder": "{left}shoulder|{left}uparm", "elbow": "{left}elbow|{left}lowarm",
+        "wrist": "{left}wrist|{left}hand",
     },
 }  # fmt: skip
 """Rigs people have: SMPL's part of the body -> the bone's name without separators, lower case; `{l}` and `{left}` stand

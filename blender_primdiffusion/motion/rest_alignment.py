@@ -19,7 +19,8 @@ _SHORTEST = 1e-6
 def facing(heads: Mapping[str, NDArray]) -> NDArray[np.float64]:
     """Rotation [3, 3] whose columns are the left, the up and the front of a person in the rig's own axes.
 
-    `heads` are the joints' places by SMPL's names. Raises ValueError where they lie on a line.
+    `heads` are the joints' places by SMPL's names. People stand upright at rest, so the nearest axis is up unless it is
+    far off, and likewise for a left that is all but an axis. Raises ValueError where the joints lie on a line.
     """
     hips = (heads["left_hip"] + heads["right_hip"]) / 2
     shoulders = (heads["left_shoulder"] + heads["right_shoulder"]) / 2
@@ -27,11 +28,23 @@ def facing(heads: Mapping[str, NDArray]) -> NDArray[np.float64]:
     left = heads["left_hip"] - heads["right_hip"] + heads["left_shoulder"] - heads["right_shoulder"]
     up = (shoulders - hips) + (hips - ankles)
     height = np.linalg.norm(up)
-    left = left - up * (left @ up) / max(float(height**2), 1e-30)
-    if height < _SHORTEST or np.linalg.norm(left) < 1e-3 * height:
+    up = _towards_axis(up / max(float(height), 1e-30), 30.0)
+    left = left - up * (left @ up)
+    width = np.linalg.norm(left)
+    if height < _SHORTEST or width < 1e-3 * height:
         raise ValueError("hips, shoulders and ankles lie on a line: the rest pose is no person's")
-    up, left = up / height, left / np.linalg.norm(left)
+    left = _towards_axis(left / width, 5.0)
+    left = left - up * (left @ up)
+    left /= np.linalg.norm(left)
     return np.stack([left, up, np.cross(left, up)], -1)
+
+
+def _towards_axis(direction: NDArray, degrees: float) -> NDArray[np.float64]:
+    """The nearest axis, where it is within `degrees` of a unit vector [3]; else the vector."""
+    axis = np.zeros(3)
+    largest = int(np.abs(direction).argmax())
+    axis[largest] = np.sign(direction[largest])
+    return axis if axis @ direction > np.cos(np.radians(degrees)) else direction
 
 
 def rig_from_smpl(

@@ -1,0 +1,226 @@
+"""Scans of people in the scene, posed by SMPL's joint rotations whatever rig they came with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+from numpy.typing import NDArray
+
+from ..motion.bones import BoneMap, map_bones
+from ..motion.rest_alignment import facing, rig_from_smpl
+from ..motion.rotation import to_axis_angle
+from ..scene.convention import points_to_blender
+from ..scene.human_file import JOINT_NAMES
+from ..scene.quaternion import matrix_to_quaternion
+from .belongings import Belongings
+from .bind import bind_static
+from .body import Body
+from .fit import ShapeFit, fit_joints
+from .importing import import_file
+from .rigged import (
+    add_root,
+    affine,
+    bone_heads,
+    find_armature,
+    free_bones,
+    set_at_rest,
+    skeleton_of,
+    split_meshes,
+    to_backend,
+    uniform_scale,
+)
+from .scan_files import ScanError, ScanFile, find_scans, own_betas
+from .skeleton import Skeleton
+from .surface_sample import SurfaceSample, mesh_points, sample_surface
+from .textures import complete_colours
+from .upright import stand_up
+
+__all__ = ["Scan", "ScanError", "ScanFile", "find_scans", "load_scan"]
+
+_POOR_FIT_M = 0.05
+_EXACT_M = 0.001
+_T_REST_DEG = 10.0
+_ROUNDS = 2
+"""Of fitting the shape and turning the limbs to that shape's rest."""
+_OWN_NAMES = {name: name for name in JOINT_NAMES}
+
+
+class Scan:
+    """A person in the scene. `remove` it: its data-blocks stay in the file until then."""
+
+    def __init__(
+        self,
+        name: str,
+        objects: Sequence[bpy.types.Object],
+        armature: bpy.types.Object,
+        skeleton: Skeleton,
+        betas: NDArray,
+        body: str,
+        notes: Sequence[str],
+        belongings: Belongings,
+    ) -> None:
+        self.name = name
+        self.objects = list(objects)
+        """Its meshes."""
+        self.armature = armature
+        self.skeleton = skeleton
+        self.betas: NDArray[np.float64] = np.asarray(betas, np.float64)
+        """Shape of the body that stands for the person [10]."""
+        self.body = body
+        """Name of that body."""
+        self.notes = list(notes)
+        """What was found out and done on loading, a sentence each."""
+        self._belongings = belongings
+        self._sample: SurfaceSample = sample_surface(self.objects, skeleton.names)
+
+    def pose(self, rotations: NDArray, translation: NDArray) -> NDArray[np.float64]:
+        """Take a pose: joint rotations [24, 3, 3] about the rest axes, y up, and a translation [3] in metres.
+
+        Returns the joints [24, 3] in the world, y up, metres: the heads of the rig's own bones.
+        """
+        transforms = self.skeleton.transforms(rotations, translation)
+        turns, moves = self.skeleton.bases(transforms)
+        size = uniform_scale(self.armature)
+        for name, quaternion, move in zip(self.skeleton.names, matrix_to_quaternion(turns), moves, strict=True):
+            bone = self.armature.pose.bones[name]
+            bone.rotation_mode = "QUATERNION"
+            bone.rotation_quaternion = quaternion
+            bone.location = move / size
+        bpy.context.view_layer.update()
+        return self.skeleton.joints(transforms)
+
+    def bounds(self, rotations: NDArray, translations: NDArray) -> NDArray[np.float64]:
+        """The outermost points [n, 3] of the surface over poses [F, 24, 3, 3] and [F, 3], y up, metres."""
+        found = [
+            self._sample.outermost(self.skeleton.transforms(*pose))
+            for pose in zip(rotations, translations, strict=True)
+        ]
+        return np.concatenate(found)
+
+    def joint_of_group(self, name: str) -> int | None:
+        """The SMPL joint that moves the vertex group of this name: the bone's, or its nearest parent's."""
+        if name not in self.skeleton.names:
+            return None
+        bone = self.skeleton.names.index(name)
+        while bone >= 0:
+            if self.skeleton.joint[bone] >= 0:
+                return int(self.skeleton.joint[bone])
+            bone = self.skeleton.parents[bone]
+        return None
+
+    def remove(self) -> None:
+        """Take everything that loading made out of the file."""
+        self._belongings.remove()
+
+
+def load_scan(context: bpy.types.Context, scan_file: ScanFile, body: Body) -> Scan:
+    """Import a person into the context's scene: upright, facing forward, in metres, ready to be posed.
+
+    A skinned person keeps its rig; `body` is fitted to its joints. A person without a rig needs SMPL parameters of
+    `body` beside it and gets a rig. Raises ScanError, and then nothing of it stays in the file.
+    """
+    belongings = Belongings()
+    try:
+        with belongings:
+            things = import_file(scan_file.path)
+            armature = find_armature(things, scan_file)
+            if armature is None:
+                return _load_static(context, scan_file, body, things, belongings)
+            return _load_rigged(context, scan_file, body, things, armature, belongings)
+    except BaseException:
+        belongings.remove()
+        raise
+
+
+def _load_static(context, scan_file: ScanFile, body: Body, things, belongings: Belongings) -> Scan:
+    """A scan without a rig: bound to the body in the pose of its parameters, and brought back to rest."""
+    moving, still = split_meshes(things, scan_file)
+    meshes = [*moving, *still]
+    bound = bind_static(context, scan_file, body, meshes)
+    _discard(things, meshes)
+    notes = [*bound.notes, *complete_colours(meshes, scan_file.path)]
+    skeleton = skeleton_of(bound.armature, _OWN_NAMES, _no_turns(), body.rest(bound.betas)[1])
+    return Scan(scan_file.name, meshes, bound.armature, skeleton, bound.betas, body.name, notes, belongings)
+
+
+def _load_rigged(context, scan_file: ScanFile, body: Body, things, armature, belongings: Belongings) -> Scan:
+    meshes, loose = split_meshes(things, scan_file)
+    set_at_rest(armature, meshes)
+    try:
+        bones = map_bones([bone.name for bone in armature.data.bones])
+        axes = facing(bone_heads(armature, bones.joints))
+    except ValueError as e:
+        raise ScanError(f"{scan_file.path}: {e}") from e
+    free_bones(armature, list(bones.joints.values()))
+    standing = stand_up(axes, mesh_points(meshes), str(scan_file.path))
+    root = add_root(context, things, scan_file.name, affine(standing.rotation * standing.scale, np.zeros(3)))
+    skeleton, betas, told = _fit_rig(context, root, armature, bones, scan_file, body)
+    notes = [*standing.notes, *told]
+    if bones.rig != "SMPL":
+        notes.append(f"bones as {bones.rig} names them")
+    if loose:
+        notes.append(f"left out, as no bone moves it: {', '.join(mesh.name for mesh in loose)}")
+    _discard(things, [*meshes, armature])
+    notes += complete_colours(meshes, scan_file.path)
+    return Scan(scan_file.name, meshes, armature, skeleton, betas, body.name, notes, belongings)
+
+
+def _fit_rig(context, root, armature, bones: BoneMap, scan_file: ScanFile, body: Body):
+    """The rig as a skeleton, moved to where the body of its person is at rest; that body's betas; notes."""
+    heads, tips = to_backend(bone_heads(armature, bones.joints)), to_backend(bone_heads(armature, bones.tips))
+    known = own_betas(scan_file.path)
+    if known is not None and known[1] == body.name:
+        joints = body.rest(np.array(known[0]))[1]
+        if all(np.abs(heads[name] - joints[JOINT_NAMES.index(name)]).max() < _EXACT_M for name in heads):
+            skeleton = skeleton_of(armature, bones.joints, _no_turns(), joints)
+            return skeleton, np.array(known[0]), ["shape as its file tells"]
+    rest_joints = body.rest(np.zeros(0))[1]
+    for _ in range(_ROUNDS):
+        at_rest = rig_from_smpl(heads, tips, rest_joints)
+        if bones.rig == "SMPL" and _largest_turn(at_rest) < _T_REST_DEG:
+            at_rest = _no_turns()
+        rig = skeleton_of(armature, bones.joints, at_rest, rest_joints)
+        in_t = rig.joints(rig.transforms(_no_turns(), np.zeros(3)))
+        fit = fit_joints(body, {name: in_t[JOINT_NAMES.index(name)] for name in heads})
+        rest_joints = body.rest(fit.betas)[1]
+    moved = affine(np.eye(3) * fit.scale, points_to_blender(fit.shift)) @ np.array(root.matrix_world)
+    root.matrix_world = Matrix(moved.tolist())
+    context.view_layer.update()
+    return skeleton_of(armature, bones.joints, at_rest, rest_joints), fit.betas, _fit_notes(fit, at_rest)
+
+
+def _fit_notes(fit: ShapeFit, at_rest: NDArray) -> list[str]:
+    notes = [f"shape fitted to its joints, {fit.residual * 1000:.0f} mm off on average"]
+    if fit.residual > _POOR_FIT_M:
+        notes.append("no body is like this person: masks and pictures are right, the parameters only nearly")
+    if abs(fit.scale - 1) > 0.005:
+        notes.append(f"scaled by {fit.scale:.2f} to the size of a body")
+    if _largest_turn(at_rest) > _T_REST_DEG:
+        notes.append(
+            f"its rest is no T pose, limbs are up to {_largest_turn(at_rest):.0f} degrees off: taken into account"
+        )
+    return notes
+
+
+def _largest_turn(rotations: NDArray) -> float:
+    return float(np.degrees(np.linalg.norm(to_axis_angle(rotations), axis=-1).max()))
+
+
+def _no_turns() -> NDArray[np.float64]:
+    return np.tile(np.eye(3), (len(JOINT_NAMES), 1, 1))
+
+
+def _discard(things: Sequence[bpy.types.Object], kept: Sequence[bpy.types.Object]) -> None:
+    """Remove imported objects that are not the person: cameras, lights, leftover meshes; parents stay."""
+    parents = set()
+    for thing in kept:
+        above = thing.parent
+        while above is not None:
+            parents.add(above)
+            above = above.parent
+    for thing in things:
+        if thing not in kept and thing not in parents:
+            bpy.data.objects.remove(thing)

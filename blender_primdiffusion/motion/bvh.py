@@ -1,0 +1,219 @@
+"""BVH files (Biovision hierarchies) of CMU, Mixamo, MakeHuman, Blender and others, as motion of SMPL's skeleton."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene.human_file import JOINT_NAMES, PARENTS
+from .bones import BoneMap, UnknownBonesError, map_bones
+from .motion import Motion
+from .rest_alignment import facing, rig_from_smpl
+from .rotation import about_axis
+from .skeleton import REST_JOINTS, unchain
+
+LARGEST_BYTES = 256 * 2**20
+_CHANNELS = {f"{axis}{kind}": (kind, "XYZ".index(axis)) for axis in "XYZ" for kind in ("position", "rotation")}
+_UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "decimetres": 0.1}
+
+
+class BvhError(ValueError):
+    """A BVH file that cannot be used; one sentence that names the file."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Hierarchy:
+    """The skeleton of a BVH file at rest, and its numbers."""
+
+    names: list[str]
+    """Of the joints, parents first; an end site has its joint's name and "_end"."""
+    parents: list[int]
+    """Of each joint, -1 for the root."""
+    offsets: NDArray[np.float64]
+    """From the parent [n, 3], the file's units."""
+    channels: list[list[str]]
+    """Of each joint, in the order of the numbers, which is also the order of the rotations."""
+    values: NDArray[np.float64]
+    """A row a frame [F, number of channels]."""
+    frame_time: float
+    """Seconds."""
+
+    def rest(self) -> NDArray[np.float64]:
+        """Joints at rest [n, 3]."""
+        places = np.array(self.offsets)
+        for joint, parent in enumerate(self.parents):
+            if parent >= 0:
+                places[joint] += places[parent]
+        return places
+
+    def world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Rotations in the world [F, n, 3, 3] and the root's places [F, 3].
+
+        A joint turns as its channels are written: the first is the outermost, R = R_1 R_2 R_3.
+        """
+        frames, column = len(self.values), 0
+        rotations = np.tile(np.eye(3), (frames, len(self.names), 1, 1))
+        places = np.tile(self.offsets[0], (frames, 1))
+        for joint, channels in enumerate(self.channels):
+            for channel in channels:
+                kind, axis = _CHANNELS[channel]
+                numbers = self.values[:, column]
+                column += 1
+                if kind == "rotation":
+                    rotations[:, joint] = rotations[:, joint] @ about_axis(axis, np.radians(numbers))
+                elif joint == 0:
+                    places[:, axis] = numbers
+            if self.parents[joint] >= 0:
+                rotations[:, joint] = rotations[:, self.parents[joint]] @ rotations[:, joint]
+        return rotations, places
+
+
+def read_bvh(path: Path) -> Motion:
+    """The motion of a BVH file on SMPL's skeleton; y is up as far as the rest pose tells.
+
+    Each part turns in the world as the file's does; where the file's rest pose is not SMPL's T, the difference counts
+    as a turn (`rest_alignment`). The root's path is scaled by the length of the legs, so feet slip little. Places of
+    other joints than the root are left out. Raises BvhError.
+    """
+    hierarchy = parse_bvh(path)
+    try:
+        bones = map_bones([name for name in hierarchy.names if not name.endswith("_end")])
+        return _retarget(hierarchy, bones, path)
+    except (UnknownBonesError, ValueError) as e:
+        raise BvhError(f"{path}: {e}") from e
+
+
+def parse_bvh(path: Path) -> Hierarchy:
+    """The hierarchy and the numbers of a BVH file as they are. Raises BvhError where it is none, or cut short."""
+    if path.stat().st_size > LARGEST_BYTES:
+        raise BvhError(f"{path} is larger than {LARGEST_BYTES // 2**20} MB: cut the motion into pieces")
+    text = path.read_text("utf-8", errors="replace")
+    head, found, tail = text.partition("MOTION")
+    if not found or "HIERARCHY" not in head:
+        raise BvhError(f"{path} is not a BVH file: it has no HIERARCHY followed by MOTION")
+    try:
+        names, parents, offsets, channels = _parse_hierarchy(head.split("HIERARCHY", 1)[1].split())
+        values, frame_time = _parse_motion(tail, sum(map(len, channels)))
+    except (ValueError, IndexError, KeyError) as e:
+        raise BvhError(f"{path} is not a whole BVH file ({e}): export it again") from e
+    if not (np.isfinite(values).all() and np.isfinite(offsets).all()):
+        raise BvhError(f"{path} holds NaN or infinite numbers: export the motion again")
+    if not names:
+        raise BvhError(f"{path} has no ROOT: export the motion again")
+    return Hierarchy(names, parents, offsets, channels, values, frame_time)
+
+
+def _parse_hierarchy(words: list[str]) -> tuple[list[str], list[int], NDArray, list[list[str]]]:
+    names: list[str] = []
+    parents: list[int] = []
+    offsets: list[list[float]] = []
+    channels: list[list[str]] = []
+    open_joints: list[int] = []
+    at = 0
+    while at < len(words):
+        word = words[at].upper()
+        if word in ("ROOT", "JOINT", "END"):
+            brace = words.index("{", at)
+            name = " ".join(words[at + 1 : brace]) if word != "END" else f"{names[open_joints[-1]]}_end"
+            if word == "ROOT" and names:
+                raise ValueError("a second ROOT: one skeleton a file is read")
+            parents.append(open_joints[-1] if open_joints else -1)
+            names.append(name)
+            offsets.append([0.0, 0.0, 0.0])
+            channels.append([])
+            open_joints.append(len(names) - 1)
+            at = brace + 1
+        elif word == "OFFSET":
+            offsets[open_joints[-1]] = [float(number) for number in words[at + 1 : at + 4]]
+            at += 4
+        elif word == "CHANNELS":
+            count = int(words[at + 1])
+            given = words[at + 2 : at + 2 + count]
+            unknown = [channel for channel in given if channel not in _CHANNELS]
+            if unknown:
+                raise ValueError(f"the channel {unknown[0]!r} is unknown")
+            channels[open_joints[-1]] = given
+            at += 2 + count
+        elif word == "}":
+            open_joints.pop()
+            at += 1
+        else:
+            raise ValueError(f"{words[at]!r} where a joint was expected")
+    if open_joints:
+        raise ValueError("a brace is not closed")
+    return names, parents, np.array(offsets, np.float64).reshape(-1, 3), channels
+
+
+def _parse_motion(text: str, columns: int) -> tuple[NDArray[np.float64], float]:
+    words = text.split()
+    frames_at, time_at = words.index("Frames:"), words.index("Time:")
+    frames, frame_time = int(words[frames_at + 1]), float(words[time_at + 1])
+    numbers = np.array(words[time_at + 2 :], np.float64)
+    if frames < 1 or numbers.size < frames * columns:
+        raise ValueError(f"{frames} frames of {columns} numbers are promised, {numbers.size} numbers are there")
+    return numbers[: frames * columns].reshape(frames, columns), frame_time
+
+
+def _retarget(hierarchy: Hierarchy, bones: BoneMap, path: Path) -> Motion:
+    rest = hierarchy.rest()
+    index = {name: number for number, name in reversed(list(enumerate(hierarchy.names)))}
+    heads = {joint: rest[index[bone]] for joint, bone in bones.joints.items()}
+    tips = {joint: rest[index[bone]] for joint, bone in bones.tips.items()}
+    for joint in ("left_wrist", "right_wrist"):
+        end = f"{bones.joints[joint]}_end"
+        if joint not in tips and end in index:
+            tips[joint] = rest[index[end]]
+    backend_from_file = facing(heads).T
+    heads = {joint: backend_from_file @ place for joint, place in heads.items()}
+    tips = {joint: backend_from_file @ place for joint, place in tips.items()}
+    at_rest = rig_from_smpl(heads, tips)
+
+    turned, root = hierarchy.world()
+    world = np.tile(np.eye(3), (len(turned), len(JOINT_NAMES), 1, 1))
+    for joint, name in enumerate(JOINT_NAMES):
+        if name in bones.joints:
+            bone = backend_from_file @ turned[:, index[bones.joints[name]]] @ backend_from_file.T
+            world[:, joint] = bone @ at_rest[joint]
+        elif joint:
+            world[:, joint] = world[:, PARENTS[joint]]
+    metres, unit = _unit(heads)
+    pelvis = _pelvis(hierarchy, turned, root, rest, index[bones.joints["pelvis"]]) @ backend_from_file.T
+    fps, notes = 1 / hierarchy.frame_time if hierarchy.frame_time > 0 else 30.0, [f"bones as {bones.rig} names them"]
+    if not hierarchy.frame_time > 0:
+        notes.append("tells no frame rate: 30 frames a second are assumed")
+    notes.append(f"lengths in {unit}, 1 taken as {metres:.4g} m so that the legs are an average person's")
+    return Motion(unchain(world), pelvis * metres - REST_JOINTS[0], fps, path.stem, tuple(notes))
+
+
+def _pelvis(hierarchy: Hierarchy, turned: NDArray, root: NDArray, rest: NDArray, pelvis: int) -> NDArray[np.float64]:
+    """Places of the pelvis [F, 3], which need not be the root."""
+    way = []
+    while pelvis > 0:
+        way.append(pelvis)
+        pelvis = hierarchy.parents[pelvis]
+    place = np.array(root)
+    for joint in reversed(way):
+        place += turned[:, hierarchy.parents[joint]] @ hierarchy.offsets[joint]
+    return place
+
+
+def _unit(heads: dict[str, NDArray]) -> tuple[float, str]:
+    """Metres that a unit of the file stands for on an average person, and the nearest unit's name."""
+
+    def leg(place: dict[str, NDArray]) -> float:
+        lengths = [
+            np.linalg.norm(place[f"{side}_{a}"] - place[f"{side}_{b}"])
+            for side in ("left", "right")
+            for a, b in (("hip", "knee"), ("knee", "ankle"))
+        ]
+        return float(sum(lengths))
+
+    length = leg(heads)
+    if not length > 0:
+        raise ValueError("the legs have no length: the rest pose is no person's")
+    metres = leg(dict(zip(JOINT_NAMES, REST_JOINTS, strict=True))) / length
+    nearest = min(_UNITS, key=lambda name: abs(np.log(_UNITS[name] / metres)))
+    return metres, nearest if abs(np.log(_UNITS[nearest] / metres)) < 0.4 else "a unit of its own"

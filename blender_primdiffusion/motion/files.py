@@ -1,0 +1,209 @@
+"""Poses and motion from the files people have: AMASS, pose npz and npy, JSON, BVH."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .arrays import ArrayFileError, array_names, read_npy, read_npz
+from .bvh import BvhError, read_bvh
+from .motion import Motion
+from .rotation import from_axis_angle, nearest
+from .up_axis import find_up, turn_y_up
+
+DEFAULT_FPS = 30.0
+"""Frames a second of a motion whose file does not tell."""
+_POSES = ("poses", "pose", "theta", "fullpose")
+_ROOT, _REST = ("global_orient", "root_orient"), ("body_pose", "pose_body")
+_TRANSLATIONS = ("trans", "transl", "translation")
+_RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate")
+POSE_KEYS = (*_POSES, *_ROOT, *_REST, *_TRANSLATIONS, *_RATES)
+"""What arrays of poses are called in the files that are read."""
+_BODY_JOINTS = 22
+"""Joints before the hands, the same in SMPL, SMPL-H and SMPL-X."""
+
+
+class MotionFileError(ValueError):
+    """A file of poses that cannot be used; one sentence: what is wrong, and what to do."""
+
+
+def read_motion(path: str | Path) -> Motion:
+    """The motion in a file, y up.
+
+    - .npz of AMASS: `poses` [F, 72 | 156 | 165] (SMPL, SMPL-H, SMPL-X; fingers, jaw and eyes are left out), `trans`,
+      `mocap_framerate`, `mocap_frame_rate` or `fps`. Its z axis is up; which one really is, is found from the pelvis.
+    - .npz of poses, y up: `global_orient` with `body_pose`, or `pose`; axis-angle or matrices; `transl` if wanted.
+    - .npy: [F, 72], [72], [F, 24, 3] or [F, 24, 3, 3]. .json: the same as lists, or an object with the names above.
+    - .bvh: any rig that `bones` knows.
+
+    Without a rate it is `DEFAULT_FPS`, with a note. Raises MotionFileError where there is no such file, where it holds
+    pickles, NaN or something else.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MotionFileError(f"there is no pose file {path}: check the path")
+    readers = {".npz": _read_npz, ".npy": _read_npy, ".json": _read_json, ".bvh": _read_bvh}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise MotionFileError(f"{path} is no pose file: .npz, .npy, .json and .bvh files are")
+    try:
+        motion = reader(path)
+    except (ArrayFileError, BvhError) as e:
+        raise MotionFileError(str(e)) from e
+    if len(motion) == 0:
+        raise MotionFileError(f"{path} holds no frame: export it again")
+    return motion
+
+
+def _read_bvh(path: Path) -> Motion:
+    return _upright(read_bvh(path))
+
+
+def _read_npz(path: Path) -> Motion:
+    names = array_names(path)
+    arrays = read_npz(path, POSE_KEYS)
+    if "smpl" in names and not any(key in arrays for key in (*_POSES, *_REST)):
+        raise MotionFileError(f"{path} holds pickled objects, which are never read: use its twin of plain arrays")
+    if not any(key in arrays for key in (*_POSES, *_REST)):
+        raise MotionFileError(
+            f"{path} holds no poses: in it is {_listed(names)}, wanted are 'poses', or 'global_orient' and 'body_pose'"
+        )
+    motion = motion_from_arrays(arrays, path)
+    return _upright(motion) if _is_amass(arrays) else motion
+
+
+def _is_amass(arrays: Mapping[str, NDArray]) -> bool:
+    return "trans" in arrays and ("poses" in arrays or "pose_body" in arrays)
+
+
+def _read_npy(path: Path) -> Motion:
+    return motion_from_arrays({"pose": read_npy(path)}, path)
+
+
+def _read_json(path: Path) -> Motion:
+    try:
+        content = json.loads(path.read_text("utf-8"))
+    except (ValueError, OSError, RecursionError) as e:
+        raise MotionFileError(f"{path} is not JSON ({e}): export it again") from e
+    if not isinstance(content, dict):
+        content = {"pose": content}
+    try:
+        arrays = {key: np.asarray(content[key], np.float64) for key in POSE_KEYS if key in content}
+    except (ValueError, TypeError) as e:
+        raise MotionFileError(f"{path} holds something else than lists of numbers of equal length ({e})") from e
+    if not any(key in arrays for key in (*_POSES, *_REST)):
+        raise MotionFileError(f"{path} holds no poses: it needs 'pose', or 'global_orient' and 'body_pose'")
+    return motion_from_arrays(arrays, path)
+
+
+def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
+    """A motion out of arrays with the names people use, axes as they are; `path` is what errors call it.
+
+    Raises MotionFileError where the arrays are no poses.
+    """
+    for key, array in arrays.items():
+        if array.dtype.kind not in "iuf":
+            raise MotionFileError(f"{path}: {key!r} holds {array.dtype} where numbers are wanted")
+        if not np.isfinite(array).all():
+            raise MotionFileError(f"{path}: {key!r} holds NaN or infinite numbers; export the motion again")
+    rest = _first(arrays, _REST)
+    if rest is None:
+        rotations = _rotations(_given(arrays, _POSES), path)
+    else:
+        body = _rotations(rest, path, joints_before=1)
+        root = _first(arrays, _ROOT)
+        if root is not None:
+            first = _matrices(root, path)[:, 0]
+            if len(first) not in (1, len(body)):
+                raise MotionFileError(f"{path}: {len(first)} frames of global_orient but {len(body)} of body_pose")
+            body[:, 0] = first
+        rotations = body
+    frames, notes = len(rotations), []
+    translations = _first(arrays, _TRANSLATIONS)
+    translations = np.zeros((frames, 3)) if translations is None else np.asarray(translations, np.float64)
+    if translations.size not in (3, 3 * frames):
+        raise MotionFileError(f"{path}: {frames} frames of poses but translations of shape {translations.shape}")
+    translations = np.array(np.broadcast_to(translations.reshape(-1, 3), (frames, 3)))
+    rate = _first(arrays, _RATES)
+    if rate is None or rate.size != 1 or not float(rate.ravel()[0]) > 0:
+        fps = DEFAULT_FPS
+        if frames > 1:
+            notes.append(f"tells no frame rate: {DEFAULT_FPS:g} frames a second are assumed")
+    else:
+        fps = float(rate.ravel()[0])
+    return Motion(rotations, translations, fps, path.stem, tuple(notes))
+
+
+def _upright(motion: Motion) -> Motion:
+    """The motion with y up, whichever axis of its file was."""
+    up = find_up(motion.rotations[:, 0])
+    if not up:
+        return _noted(motion, "does not tell which axis is up: y is assumed")
+    rotations, translations = turn_y_up(motion.rotations, motion.translations, up)
+    return _noted(Motion(rotations, translations, motion.fps, motion.name, motion.notes), f"{up} is up in the file")
+
+
+def _noted(motion: Motion, note: str) -> Motion:
+    return Motion(motion.rotations, motion.translations, motion.fps, motion.name, (*motion.notes, note))
+
+
+def _rotations(values: NDArray, path: Path, joints_before: int = 0) -> NDArray[np.float64]:
+    """Rotations [F, 24, 3, 3] of poses that lack the first `joints_before` joints; joints that are missing do not turn.
+
+    SMPL-H and SMPL-X have fingers where SMPL has its two hand joints, so of them only the body's 22 are taken.
+    """
+    given = _matrices(values, path)
+    count = given.shape[1] + joints_before
+    if count == 24:
+        taken = 24
+    elif count == _BODY_JOINTS or count > 24:
+        taken = _BODY_JOINTS
+    else:
+        raise MotionFileError(
+            f"{path} holds poses of {count} joints (shape {values.shape}): wanted are SMPL's 24, 22 without hands, or "
+            "those of SMPL-H or SMPL-X"
+        )
+    rotations = np.tile(np.eye(3), (len(given), 24, 1, 1))
+    rotations[:, joints_before:taken] = given[:, : taken - joints_before]
+    return rotations
+
+
+def _matrices(values: NDArray, path: Path) -> NDArray[np.float64]:
+    """Rotation matrices [F, n, 3, 3] of axis-angle numbers [3 n], [F, 3 n], [F, n, 3], or of matrices [F, n, 3, 3]."""
+    values = np.asarray(values, np.float64)
+    if values.ndim >= 3 and values.shape[-2:] == (3, 3) and not (values.ndim == 3 and _is_axis_angle(values)):
+        given = values if values.ndim == 4 else values[None]
+        if np.abs(given @ np.swapaxes(given, -1, -2) - np.eye(3)).max(initial=0) > 1e-2:
+            raise MotionFileError(f"{path} holds matrices that are no rotations: export the poses again")
+        return nearest(given)
+    if values.ndim == 1:
+        values = values[None]
+    if values.ndim == 2 and values.shape[1] == 3 and values.shape[0] in (_BODY_JOINTS, 23, 24, 52, 55):
+        values = values.reshape(1, -1)  # one pose, a row a joint
+    if values.ndim not in (2, 3) or values.shape[-1] % 3 or (values.ndim == 3 and values.shape[-1] != 3):
+        raise MotionFileError(
+            f"{path} holds poses of shape {values.shape}: wanted are 72 axis-angle numbers a frame (24 joints x 3)"
+        )
+    return from_axis_angle(values.reshape(len(values), -1, 3))
+
+
+def _is_axis_angle(values: NDArray) -> bool:
+    """Whether [n, 3, 3] is n frames of 3 joints rather than n matrices."""
+    return bool(np.abs(values @ np.swapaxes(values, -1, -2) - np.eye(3)).max(initial=0) > 0.5)
+
+
+def _first(arrays: Mapping[str, NDArray], keys: Iterable[str]) -> NDArray | None:
+    return next((arrays[key] for key in keys if key in arrays), None)
+
+
+def _given(arrays: Mapping[str, NDArray], keys: Iterable[str]) -> NDArray[Any]:
+    return next(arrays[key] for key in keys if key in arrays)
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(repr(name) for name in names[:8]) or "nothing"

@@ -1,0 +1,37 @@
+"""Which way is up in a motion, and the same motion with y up."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .rotation import between
+from .skeleton import REST_JOINTS
+
+_CLEAR = 0.6
+"""Mean cosine between the pelvis' own up and an axis from which on that axis counts as up."""
+
+
+def find_up(pelvis: NDArray) -> str:
+    """The axis, such as "z" or "-y", along which pelvises [F, 3, 3] stand on average; "" where none is clear.
+
+    People stand, sit and walk more than they lie, so over a motion the mean is along the world's vertical.
+    """
+    mean = np.asarray(pelvis)[:, :, 1].mean(0)
+    axis = int(np.abs(mean).argmax())
+    if abs(mean[axis]) < _CLEAR:
+        return ""
+    return ("-" if mean[axis] < 0 else "") + "xyz"[axis]
+
+
+def turn_y_up(rotations: NDArray, translations: NDArray, up: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Joint rotations [F, 24, 3, 3] and translations [F, 3] of a world in which `up` is up, with y up.
+
+    A translation is that of SMPL's files: it moves a body whose pelvis is at its rest place, not at the origin.
+    """
+    axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
+    turn = between(axis, np.array([0.0, 1.0, 0.0]))
+    rotations = np.array(rotations, np.float64)
+    rotations[:, 0] = turn @ rotations[:, 0]
+    pelvis = REST_JOINTS[0]
+    return rotations, (np.asarray(translations) + pelvis) @ turn.T - pelvis
