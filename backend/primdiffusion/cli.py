@@ -177,6 +177,11 @@ class Payloads:
 
 
 @dataclasses.dataclass(frozen=True)
+class Captures:
+    """Pictures of such people from many sides: render, verify, info, pack, sheet (own --help)."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Train:
     """Train the diffusion model on such primitives (own --help)."""
 
@@ -187,6 +192,7 @@ Command = (
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[People, tyro.conf.subcommand("people")]
     | Annotated[Payloads, tyro.conf.subcommand("payloads")]
+    | Annotated[Captures, tyro.conf.subcommand("captures")]
     | Annotated[Train, tyro.conf.subcommand("train")]
 )
 
@@ -203,6 +209,12 @@ def _payloads(arguments: Sequence[str]) -> None:
     run_payloads(tyro.cli(PayloadsCommand, args=arguments, prog="primdiffusion payloads"))
 
 
+def _captures(arguments: Sequence[str]) -> None:
+    from primdiffusion.capture.command import run
+
+    run(arguments)
+
+
 def _train(arguments: Sequence[str]) -> None:
     import logging
 
@@ -213,7 +225,7 @@ def _train(arguments: Sequence[str]) -> None:
     train(tyro.cli(TrainingConfig, args=arguments, prog="primdiffusion train"))
 
 
-FORWARDED = {"people": _people, "payloads": _payloads, "train": _train}
+FORWARDED = {"people": _people, "payloads": _payloads, "captures": _captures, "train": _train}
 """Commands whose parameters their own modules state; importing these takes a second, so only when asked for."""
 
 

@@ -12,6 +12,7 @@ import pathlib
 import pickle
 import re
 import struct
+from typing import IO
 
 import numpy as np
 import scipy.sparse
@@ -124,20 +125,42 @@ def read_pickle(path: pathlib.Path) -> dict[str, object]:
         BodyFileError: it is no pickle, is cut short, or does not hold a dictionary.
     """
     with open(path, "rb") as file:
-        try:
-            content = _Unpickler(file, encoding="latin1").load()
-        except UnsafePickleError:
-            raise
-        except (
-            pickle.UnpicklingError, EOFError, TypeError, ValueError, AttributeError, LookupError, RecursionError,
-            MemoryError, OverflowError, struct.error,
-        ) as error:  # fmt: skip
-            raise BodyFileError(f"{path} is not a whole pickle file ({error}); download it again.") from error
+        content = load_restricted(file, str(path))
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         raise BodyFileError(
             f"{path} holds no dictionary of named arrays but a {type(content).__name__}; is it an SMPL file?"
         )
     return content
+
+
+def load_restricted(file: IO[bytes], name: str) -> object:
+    """What a pickle describes, with inert records in place of objects; `name` is what an error calls it.
+
+    Raises:
+        UnsafePickleError: the pickle names a global outside the list above.
+        BodyFileError: it is no pickle, or is cut short.
+    """
+    try:
+        return _Unpickler(file, encoding="latin1").load()
+    except UnsafePickleError:
+        raise
+    except (
+        pickle.UnpicklingError, EOFError, TypeError, ValueError, AttributeError, LookupError, RecursionError,
+        MemoryError, OverflowError, struct.error,
+    ) as error:  # fmt: skip
+        raise BodyFileError(f"{name} is not a whole pickle file ({error}); download it again.") from error
+
+
+def array_of_objects(value: object) -> list[object]:
+    """The objects in a pickled array of objects, such as the dictionary that `np.save` puts into one of no dimension.
+
+    Raises:
+        ValueError: the value is something else.
+    """
+    match value:
+        case _Array(state=(_, tuple(), _NumberType(arguments=("O8" | "O", *_)), _, list() as objects)):
+            return objects
+    raise ValueError(f"a {type(value).__name__.strip('_')} stands where an array of objects belongs")
 
 
 def as_array(value: object, nesting: int = 0) -> np.ndarray:

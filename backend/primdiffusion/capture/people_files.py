@@ -106,8 +106,8 @@ def _joints(glb: Glb, skin: int) -> Int[np.ndarray, "n"]:
 def _part(glb: Glb, name: str, primitive: dict[str, Any], joints: Int[np.ndarray, "n"]) -> TexturedPart:
     attributes = primitive["attributes"]
     vertices = glb.array(attributes["POSITION"]).astype(np.float64)
-    faces = glb.array(primitive["indices"]) if "indices" in primitive else np.arange(len(vertices))
-    if primitive.get("mode", 4) != 4 or len(faces) % 3 or int(faces.max(initial=-1)) >= len(vertices):
+    faces = glb.array(primitive["indices"]).astype(np.int64) if "indices" in primitive else np.arange(len(vertices))
+    if primitive.get("mode", 4) != 4 or len(faces) % 3 or int(faces.max(initial=0)) >= len(vertices):
         raise GlbError(f"{glb.path}: the faces of {name!r} are no triangles of its vertices: make the person again")
     faces = faces.reshape(-1, 3).astype(np.int32)
     uv = glb.array(attributes["TEXCOORD_0"]) if "TEXCOORD_0" in attributes else np.zeros((len(vertices), 2), np.float32)

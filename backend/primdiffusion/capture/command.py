@@ -1,0 +1,221 @@
+"""The command `primdiffusion captures`: render, verify, info, pack, sheet."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tqdm import tqdm
+
+from primdiffusion.capture import layout
+from primdiffusion.capture.people_files import find_people
+from primdiffusion.capture.poses import choose_poses, read_motion
+from primdiffusion.capture.rasterised import PASSES, Job, render
+from primdiffusion.capture.rig import Arrangement, Rig
+
+DESCRIPTION = "Pictures of people from many sides, to train on."
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderCaptures:
+    """Draw people of `primdiffusion people` in many poses from many sides, without light, by the fast rasteriser.
+
+    What is there already is kept: the same command goes on where it was stopped.
+    """
+
+    people: Path
+    """Folder of people."""
+    out: Path
+    """Folder of the captures."""
+    poses: tuple[Path, ...] = ()
+    """Motion files (AMASS and other .npz, .npy, .json); without any the built-in poses."""
+    pose_count: int = 20
+    """Poses of each person, the near-T pose first; 0: every frame of the motion files, in order, where it is."""
+    cameras: int = 36
+    """Views of each pose."""
+    size: int = 512
+    """Pixels a side."""
+    arrangement: Arrangement = "rings"
+    """Of the cameras."""
+    elevations: tuple[float, ...] = (-10.0, 15.0, 40.0)
+    """Of rings, degrees above the horizon."""
+    passes: tuple[str, ...] = PASSES
+    """What to write."""
+    samples: int = 3
+    """Of a pixel's side: 3 are 9 samples a pixel. Odd."""
+    seed: int = 0
+    """Of the choice of poses."""
+    workers: int = 1
+    """Processes; each takes a core and about 1 GB."""
+    shard: str = "0/1"
+    """i/n: only every n-th person from the i-th on, i = 0 ... n - 1, for several machines."""
+    released_reference: bool = False
+    """Draw the first person a second time under the name that the released code looks for."""
+
+    def run(self) -> None:
+        """Renders, and prints what became of everybody.
+
+        Raises:
+            ValueError: settings are impossible, or somebody could not be rendered (see the report).
+        """
+        index, count = parse_shard(self.shard)
+        people = find_people(self.people)
+        if self.released_reference:
+            people = {**people, layout.RELEASED_REFERENCE: next(iter(people.values()))}
+        names = sorted(people)[index::count]
+        if self.pose_count == 0 and len(self.poses) != 1:
+            raise ValueError("pose_count 0 takes all frames of one motion file: give one with --poses")
+        poses = choose_poses(self.poses, self.pose_count, self.seed) if self.pose_count else read_motion(self.poses[0])
+        job = Job(
+            people={name: people[name] for name in names},
+            poses=poses,
+            out=self.out,
+            rig=Rig(self.arrangement, self.cameras, self.elevations, width=self.size, height=self.size),
+            passes=self.passes,
+            samples=self.samples,
+            seed=self.seed,
+            released_reference=self.released_reference,
+            part="report" if count == 1 else f"report-{index}-of-{count}",
+        )
+        outcomes = Counter()
+        for outcome in tqdm(render(job, self.workers), total=len(names), unit="person", disable=None):
+            outcomes[outcome.what] += 1
+            print(f"{outcome.subject}  {outcome.what}  {outcome.why or f'{outcome.views} views'}", flush=True)
+        if outcomes["failed"]:
+            raise ValueError(f"{outcomes['failed']} of {len(names)} people failed: {self.out / job.part}.json says why")
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """i and n of "i/n".
+
+    Raises:
+        ValueError: it is something else, or i is not of 0 ... n - 1.
+    """
+    try:
+        index, count = (int(number) for number in text.split("/"))
+    except ValueError:
+        index, count = -1, 0
+    if not 0 <= index < count:
+        raise ValueError(f"shard {text!r}: write i/n with i from 0 to n - 1, such as 0/4")
+    return index, count
+
+
+@dataclasses.dataclass(frozen=True)
+class VerifyCaptures:
+    """Look for damaged, missing and unfinished files."""
+
+    root: tyro.conf.Positional[Path]
+    """Folder of captures."""
+    repair: bool = False
+    """Remove what is damaged, so that the command that rendered it makes it again."""
+    quick: bool = False
+    """Compare sizes, not checksums."""
+
+    def run(self) -> None:
+        """Prints a line for each thing that is wrong.
+
+        Raises:
+            ValueError: something is wrong.
+        """
+        from primdiffusion.capture.verify import repair, subject_folders, verify
+
+        findings = verify(self.root, checksums=not self.quick)
+        for finding in findings:
+            print(finding)
+        if not findings:
+            print(f"{self.root}: {len(subject_folders(self.root))} subjects, nothing wrong")
+            return
+        remedy = "--repair removes what is damaged, to be rendered again"
+        if self.repair:
+            repair(self.root, findings)
+            remedy = "damaged files are removed: give the command that rendered them again"
+        raise ValueError(f"{len(findings)} things are wrong in {self.root}: {remedy}")
+
+
+@dataclasses.dataclass(frozen=True)
+class InfoOfCaptures:
+    """Say what a folder of captures holds, as JSON."""
+
+    root: tyro.conf.Positional[Path]
+    """Folder of captures, of this program or in the released layout."""
+
+    def run(self) -> None:
+        """Prints one JSON object."""
+        from primdiffusion.capture.pack import open_pack
+        from primdiffusion.capture.reader import open_captures
+
+        captures = open_captures(self.root)
+        first = captures.subject(captures.subjects[0])
+        view = first.views[0]
+        about = {
+            "subjects": len(captures.subjects),
+            "frames": first.frames,
+            "cameras": len(first.views),
+            "size": [view.width, view.height],
+            "passes": captures.passes,
+            "packed": sum(open_pack(captures.subject(name)) is not None for name in captures.subjects),
+            "first_subject": first.name,
+            "dataset": captures.about or "released layout, without dataset.json",
+        }
+        print(json.dumps(about, indent=2))
+
+
+@dataclasses.dataclass(frozen=True)
+class PackCaptures:
+    """Store pictures and masks as one array a subject, which training maps into memory: large, but quick to read."""
+
+    root: tyro.conf.Positional[Path]
+    """Folder of captures; the arrays go to its folder packed."""
+
+    def run(self) -> None:
+        """Packs, and prints a line for each subject."""
+        from primdiffusion.capture.pack import pack
+        from primdiffusion.capture.reader import open_captures
+
+        captures = open_captures(self.root)
+        for packing in tqdm(pack(captures), total=len(captures.subjects), unit="person", disable=None):
+            print(f"{packing.subject}  {'kept' if packing.kept else 'packed'}  {packing.gigabytes:.3f} GB", flush=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class SheetOfCaptures:
+    """Draw many views side by side with the joints on them."""
+
+    root: tyro.conf.Positional[Path]
+    """Folder of captures."""
+    out: Path
+    """PNG to write."""
+    rows: int = 8
+    """Poses: those of all people, evenly spaced."""
+    columns: int = 12
+    """Cameras, evenly spaced."""
+    size: int = 160
+    """Height of a picture on the sheet, pixels."""
+
+    def run(self) -> None:
+        """Draws, and prints the sheet's path and the largest error of the joints' pixels."""
+        from primdiffusion.capture.reader import open_captures
+        from primdiffusion.capture.sheet import draw_sheet
+
+        captures = open_captures(self.root)
+        error = draw_sheet(captures, self.out, self.rows, self.columns, self.size)
+        print(f"{self.out}  joints drawn, largest error {error:.4f} px")
+
+
+Command = (
+    Annotated[RenderCaptures, tyro.conf.subcommand("render")]
+    | Annotated[VerifyCaptures, tyro.conf.subcommand("verify")]
+    | Annotated[InfoOfCaptures, tyro.conf.subcommand("info")]
+    | Annotated[PackCaptures, tyro.conf.subcommand("pack")]
+    | Annotated[SheetOfCaptures, tyro.conf.subcommand("sheet")]
+)
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parses and runs one line."""
+    tyro.cli(Command, args=arguments or ["--help"], prog="primdiffusion captures", description=DESCRIPTION).run()

@@ -1,0 +1,225 @@
+"""Captures as training samples of stage 1: some views to encode a person from, others to compare with.
+
+What a sample holds follows from (seed, epoch, index) alone: any number of workers gives the same batches, and training
+goes on from a `Position` as if it had never stopped.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int64, UInt8
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from primdiffusion.body.model import BodyPose
+from primdiffusion.capture.pack import open_pack
+from primdiffusion.capture.reader import Captures, Subject, as_camera
+from primdiffusion.capture.windows import Window, resample, through, whole
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.records import TensorRecord
+
+Record = TypeVar("Record", bound=TensorRecord)
+
+
+class Position(NamedTuple):
+    """Where in the endless order of samples training is."""
+
+    epoch: int = 0
+    index: int = 0
+
+
+FIRST = Position()
+
+
+@dataclasses.dataclass(frozen=True)
+class SampleSettings:
+    """What a sample holds."""
+
+    conditioning: int = 4
+    """Views to encode the person from."""
+    targets: int = 4
+    """Views to compare with; others than the conditioning ones where there are enough cameras."""
+    size: int = 512
+    """Pixels a side."""
+    framing: Literal["whole", "crop"] = "whole"
+    """whole: pictures as they are; crop: of targets random squares about the person, no smaller than `size` pixels."""
+    conditioning_frame: Literal["first", "same", "any"] = "first"
+    """The pose of the conditioning views: near T, that of the targets, or any."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for samples without views or pixels."""
+        for name in ("conditioning", "targets", "size"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} of the samples is {getattr(self, name)}: it must be 1 or more")
+
+
+@dataclasses.dataclass(frozen=True)
+class Views(TensorRecord):
+    """Pictures of one person in one pose, or a batch of such."""
+
+    image: UInt8[Tensor, "*b v H W 3"]
+    """sRGB-encoded, over black."""
+    mask: UInt8[Tensor, "*b v H W"]
+    """Share of the pixel that the person covers, of 255."""
+    camera: Camera
+    """A batch of views [*b, v]."""
+    pose: BodyPose
+    """[*b]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingSample(TensorRecord):
+    """One person: what is given, and what is to come out; or a batch of such."""
+
+    conditioning: Views
+    target: Views
+    betas: Float32[Tensor, "*b B"]
+    subject: Int64[Tensor, "*b"]
+    """Number in the dataset's `captures.subjects`."""
+    frame: Int64[Tensor, "*b"]
+    """Of the targets."""
+
+
+class CaptureDataset(Dataset[TrainingSample]):
+    """Samples by `Position`; an epoch shows every pose of everybody once."""
+
+    def __init__(self, captures: Captures, settings: SampleSettings | None = None, seed: int = 0) -> None:
+        """Raises what `Captures.subject` does where frames must be counted (datasets without dataset.json)."""
+        self.captures, self.settings, self.seed = captures, settings or SampleSettings(), seed
+        frames = captures.about.get("frames")
+        counts = [frames or captures.subject(name).frames for name in captures.subjects]
+        self._pairs = np.array([(s, f) for s, count in enumerate(counts) for f in range(count)], np.int64)
+        self._packs: dict[str, np.ndarray | None] = {}
+        self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, np.int64))
+
+    def __len__(self) -> int:
+        """Samples of an epoch."""
+        return len(self._pairs)
+
+    def __getitem__(self, position: tuple[int, int]) -> TrainingSample:
+        """The sample at a position.
+
+        Raises:
+            FileNotFoundError, CaptureFileError, NpzError, BodyFileError: a file is missing or damaged.
+        """
+        epoch, index = position
+        if self._order[0] != epoch:
+            shuffled = np.random.default_rng((self.seed, epoch)).permutation(len(self))
+            self._order = (epoch, shuffled)
+        number, frame = (int(value) for value in self._pairs[self._order[1][index]])
+        subject = self.captures.subject(self.captures.subjects[number])
+        draws = np.random.default_rng((self.seed, epoch, index))
+        given, wanted = self._choose_cameras(len(subject.views), draws)
+        given_frame = {"first": 0, "same": frame, "any": int(draws.integers(subject.frames))}
+        settings = self.settings
+        return TrainingSample(
+            conditioning=self._views(subject, given_frame[settings.conditioning_frame], given, None),
+            target=self._views(subject, frame, wanted, draws if settings.framing == "crop" else None),
+            betas=torch.from_numpy(subject.smpl.betas),
+            subject=torch.tensor(number),
+            frame=torch.tensor(frame),
+        )
+
+    def _choose_cameras(self, count: int, draws: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        given, wanted = self.settings.conditioning, self.settings.targets
+        order = draws.permutation(count)
+        return np.resize(order, given), np.resize(np.roll(order, -given), wanted)
+
+    def _views(self, subject: Subject, frame: int, cameras: np.ndarray, crops: np.random.Generator | None) -> Views:
+        size, pictures, seen = self.settings.size, [], []
+        for camera in cameras:
+            rgba, view = self._rgba(subject, frame, int(camera)), subject.views[camera]
+            window = whole(view) if crops is None else _about_the_person(rgba, size, crops)
+            pictures.append(resample(rgba, window, size))
+            seen.append(through(view, window, size))
+        rgba = torch.from_numpy(np.stack(pictures))
+        camera = stack([as_camera(view) for view in seen])
+        return Views(rgba[..., :3].contiguous(), rgba[..., 3].contiguous(), camera, subject.smpl.pose(frame))
+
+    def _rgba(self, subject: Subject, frame: int, camera: int) -> np.ndarray:
+        if subject.name not in self._packs:
+            self._packs[subject.name] = open_pack(subject)
+        packed = self._packs[subject.name]
+        if packed is not None:
+            return np.asarray(packed[frame, camera])
+        image, mask = (subject.picture(kind, frame, camera) for kind in ("img", "mask"))
+        return np.concatenate([image, mask[..., None]], axis=-1)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Worker processes map the packs themselves."""
+        return {**self.__dict__, "_packs": {}}
+
+
+class _Order(Sampler[Position]):
+    """Positions from `start` on, without end."""
+
+    def __init__(self, length: int, start: Position) -> None:
+        self._length, self._start = length, start
+
+    def __iter__(self) -> Iterator[Position]:
+        position = self._start
+        while True:
+            yield position
+            position = _after(position, 1, self._length)
+
+
+def batches(
+    dataset: CaptureDataset, size: int, start: Position = FIRST, workers: int = 0
+) -> Iterator[tuple[TrainingSample, Position]]:
+    """Batches without end, each with the position behind it: save it, and `start` there to go on.
+
+    Raises:
+        ValueError: the batch size is not positive.
+        FileNotFoundError, CaptureFileError, NpzError, BodyFileError: a file is missing or damaged.
+    """
+    if size < 1:
+        raise ValueError(f"a batch of {size} samples: ask for one or more")
+    loader = DataLoader(
+        dataset,
+        batch_size=size,
+        sampler=_Order(len(dataset), Position(*start)),
+        num_workers=workers,
+        collate_fn=stack,
+        pin_memory=torch.cuda.is_available(),
+    )
+    position = Position(*start)
+    for batch in loader:
+        position = _after(position, size, len(dataset))
+        yield batch, position
+
+
+def stack(records: Sequence[Record]) -> Record:
+    """Records of one kind as one with a batch dimension in front; what is no tensor is the first one's."""
+    first = records[0]
+    stacked = {}
+    for field in dataclasses.fields(first):
+        values = [getattr(record, field.name) for record in records]
+        if isinstance(values[0], Tensor):
+            stacked[field.name] = torch.stack(values)
+        elif isinstance(values[0], TensorRecord):
+            stacked[field.name] = stack(values)
+    return dataclasses.replace(first, **stacked)
+
+
+def _after(position: Position, samples: int, length: int) -> Position:
+    total = position.index + samples
+    return Position(position.epoch + total // length, total % length)
+
+
+def _about_the_person(rgba: np.ndarray, size: int, draws: np.random.Generator) -> Window:
+    """A random square inside of the picture whose middle is a place in the person's bounding box, as far as it can."""
+    height, width = rgba.shape[:2]
+    largest = min(width, height)
+    side = float(draws.uniform(min(size, largest), largest))
+    rows, columns = rgba[..., 3].any(1).nonzero()[0], rgba[..., 3].any(0).nonzero()[0]
+    edges = []
+    for covered, length in ((columns, width), (rows, height)):
+        low, high = (covered[0], covered[-1] + 1) if len(covered) else (0, length)
+        middle = draws.uniform(low, high)
+        edges.append(float(np.clip(middle - side / 2, 0, length - side)))
+    return Window(edges[0], edges[1], side, side)

@@ -1,0 +1,260 @@
+"""Captures read back: our layout (layout.py) and the released code's (SPEC 5), which is its core."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float32, UInt8
+from PIL import Image
+from torch import Tensor
+
+from primdiffusion.body.model import BodyPose
+from primdiffusion.capture import layout
+from primdiffusion.capture.people_files import SUBJECT_NAME
+from primdiffusion.capture.picture_files import DEPTH_UNIT
+from primdiffusion.capture.rig import View
+from primdiffusion.capture.smpl_parameters import SmplParameters, read_smpl
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.records import TensorRecord
+
+CAMERAS_FILE = "cameras.json"
+PASSES_OF_RELEASED = ("img", "mask")
+
+
+class CaptureFileError(ValueError):
+    """A file of a capture that is damaged or not what it should be; one sentence that names it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CapturedView(TensorRecord):
+    """One picture of a person and what is known of it."""
+
+    image: UInt8[Tensor, "H W 3"]
+    """sRGB-encoded, over black."""
+    mask: UInt8[Tensor, "H W"]
+    """Share of the pixel that the person covers, of 255."""
+    camera: Camera
+    pose: BodyPose
+    betas: Float32[Tensor, "B"]
+    depth: Float32[Tensor, "H W"] | None = None
+    """Metres along the optical axis; 0: nothing."""
+    normal: Float32[Tensor, "H W 3"] | None = None
+    """Of the world; 0: nothing."""
+    part: UInt8[Tensor, "H W"] | None = None
+    """1 + the joint that moves the surface most; 0: nothing."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Subject:
+    """One person's captures."""
+
+    folder: Path
+    views: tuple[View, ...]
+    smpl: SmplParameters
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self.folder.name
+
+    @property
+    def frames(self) -> int:
+        """How many poses."""
+        return len(self.smpl.theta)
+
+    def camera(self, camera: int) -> Camera:
+        """One of its cameras, float32."""
+        return as_camera(self.views[camera])
+
+    def picture(self, kind: str, frame: int, camera: int) -> np.ndarray:
+        """The values of a picture file as they are stored.
+
+        Raises:
+            FileNotFoundError: there is none.
+            CaptureFileError: it is damaged, or of another size than the camera's.
+        """
+        path = layout.picture_path(self.folder, kind, camera, frame)
+        view = self.views[camera]
+        return read_picture(path, kind, view.width, view.height)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Captures:
+    """A dataset on disk. Subjects are read when asked for and kept."""
+
+    root: Path
+    subjects: tuple[str, ...]
+    """Names, sorted."""
+    about: Mapping[str, Any]
+    """dataset.json; empty for the released layout, which has none."""
+    _read: dict[str, Subject] = dataclasses.field(default_factory=dict, repr=False)
+
+    @property
+    def passes(self) -> tuple[str, ...]:
+        """Kinds of pictures that every view has."""
+        return tuple(self.about.get("passes", PASSES_OF_RELEASED))
+
+    def subject(self, name: str) -> Subject:
+        """One person.
+
+        Raises:
+            KeyError: there is nobody of this name.
+            FileNotFoundError, CaptureFileError, NpzError, BodyFileError: a file is missing or damaged.
+        """
+        if name not in self.subjects:
+            raise KeyError(f"{self.root} has no subject {name!r}")
+        if name not in self._read:
+            folder = self.root / name
+            self._read[name] = Subject(folder, tuple(_read_views(folder)), read_smpl(folder))
+        return self._read[name]
+
+    def view(self, subject: str, frame: int, camera: int) -> CapturedView:
+        """One picture with all its passes.
+
+        Raises:
+            KeyError, IndexError: there is no such subject, frame or camera.
+            FileNotFoundError, CaptureFileError, NpzError, BodyFileError: a file is missing or damaged.
+        """
+        person = self.subject(subject)
+        if not (0 <= frame < person.frames and 0 <= camera < len(person.views)):
+            raise IndexError(
+                f"{subject} has {person.frames} frames and {len(person.views)} cameras, not frame {frame} of camera "
+                f"{camera}"
+            )
+        pictures = {kind: person.picture(kind, frame, camera) for kind in self.passes if kind in _KINDS}
+        values = {kind: torch.from_numpy(_KINDS[kind](picture)) for kind, picture in pictures.items()}
+        view = person.views[camera]
+        return CapturedView(
+            image=values.pop("img") if "img" in values else torch.zeros(view.height, view.width, 3, dtype=torch.uint8),
+            mask=values.pop("mask") if "mask" in values else _no_mask(view),
+            camera=person.camera(camera),
+            pose=person.smpl.pose(frame),
+            betas=torch.from_numpy(person.smpl.betas),
+            **values,
+        )
+
+
+def open_captures(root: str | Path) -> Captures:
+    """The captures of a folder: those in its list, or, where there is none, of all folders that hold cameras.
+
+    Raises:
+        FileNotFoundError: there is no such folder, or nobody in it.
+        CaptureFolderError: its dataset.json is damaged or of another version.
+        CaptureFileError: the list names what cannot be a subject.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise FileNotFoundError(f"there is no folder of captures {root}: check the path")
+    about = layout.read_about(root) if (root / layout.DATASET_FILE).exists() else {}
+    listed = root / layout.LIST_FILE
+    if listed.is_file():
+        names = [line.strip() for line in listed.read_text(encoding="utf-8", errors="replace").splitlines()]
+        names = sorted({name for name in names if name})
+    else:
+        names = sorted(path.parent.name for path in root.glob(f"*/{CAMERAS_FILE}"))
+    if wrong := next((name for name in names if not SUBJECT_NAME.fullmatch(name)), None):
+        raise CaptureFileError(f"{listed} names {wrong!r}, which is no name of a subject: letters, digits, . _ - only")
+    if not names:
+        raise FileNotFoundError(f"there are no finished captures in {root}: render some, or check the path")
+    return Captures(root, tuple(names), about)
+
+
+def as_camera(view: View) -> Camera:
+    """A view as the backend's camera, float32."""
+    world_to_camera = np.concatenate([view.rotation, view.translation[:, None]], axis=1)
+    return Camera(
+        torch.from_numpy(view.intrinsics).float(), torch.from_numpy(world_to_camera).float(), view.width, view.height
+    )
+
+
+def read_picture(path: Path, kind: str, width: int, height: int) -> np.ndarray:
+    """The values of a picture file: [H, W, 3] uint8 of img and normal, [H, W] uint8 of mask and part, uint16 of depth.
+
+    Raises:
+        FileNotFoundError: there is none.
+        CaptureFileError: it is damaged or has another size.
+    """
+    try:
+        with Image.open(path, formats=("JPEG", "PNG")) as picture:
+            if picture.size != (width, height):
+                raise CaptureFileError(
+                    f"{path} has {picture.size[0]} x {picture.size[1]} pixels, its camera {width} x {height}: render "
+                    "it again"
+                )
+            if kind == "depth":
+                return np.asarray(picture).astype(np.uint16)
+            return np.array(picture.convert("RGB" if kind in ("img", "normal") else "L"))
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path} is missing: render the subject again") from None
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as e:
+        if isinstance(e, CaptureFileError):
+            raise
+        raise CaptureFileError(f"{path} is no whole picture ({e}): render it again") from e
+
+
+def _read_views(folder: Path) -> list[View]:
+    """cameras.json, which says nothing of sizes: those are the pictures'."""
+    path = folder / CAMERAS_FILE
+    try:
+        named = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path} is missing: render the subject again") from None
+    except (OSError, ValueError, RecursionError) as e:
+        raise CaptureFileError(f"{path} cannot be read ({e}): render the subject again") from e
+    views = []
+    try:
+        for camera in range(len(named)):
+            about = named[f"camera{camera:04d}"]
+            k, r, t = (np.asarray(about[key], np.float64) for key in ("K", "R", "T"))
+            width, height = _size(folder, camera, k)
+            t = t.reshape(3)
+            if k.shape != (3, 3) or r.shape != (3, 3) or not all(np.isfinite(a).all() for a in (k, r, t)):
+                raise ValueError(f"camera {camera} is not finite, or of another shape than K 3x3, R 3x3, T 3")
+            views.append(View(k, r, t, width, height))
+    except FileNotFoundError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError) as e:
+        if isinstance(e, CaptureFileError):
+            raise
+        raise CaptureFileError(f"{path} is not a list of cameras ({e}): render the subject again") from e
+    if not views:
+        raise CaptureFileError(f"{path} names no camera: render the subject again")
+    return views
+
+
+def _size(folder: Path, camera: int, intrinsics: np.ndarray) -> tuple[int, int]:
+    """Width and height of a camera's pictures, from the header of its first."""
+    for kind in ("img", "mask"):
+        pictures = sorted((folder / kind / f"camera{camera:04d}").glob(f"[0-9]*{layout.ENDINGS[kind]}"))
+        for path in pictures[:1]:
+            try:
+                with Image.open(path, formats=("JPEG", "PNG")) as picture:
+                    return picture.size
+            except (OSError, SyntaxError, ValueError) as e:
+                raise CaptureFileError(f"{path} is no whole picture ({e}): render it again") from e
+    raise FileNotFoundError(f"{folder} has no pictures of camera {camera}: render the subject again")
+
+
+def _no_mask(view: View) -> Tensor:
+    return torch.full((view.height, view.width), 255, dtype=torch.uint8)
+
+
+def _depth(steps: np.ndarray) -> np.ndarray:
+    return steps.astype(np.float32) * np.float32(DEPTH_UNIT)
+
+
+def _normal(values: np.ndarray) -> np.ndarray:
+    return np.where(values.any(-1, keepdims=True), values.astype(np.float32) / 127.5 - 1, 0).astype(np.float32)
+
+
+def _as_stored(values: np.ndarray) -> np.ndarray:
+    return values
+
+
+_KINDS = {"img": _as_stored, "mask": _as_stored, "depth": _depth, "normal": _normal, "part": _as_stored}

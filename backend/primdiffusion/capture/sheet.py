@@ -1,0 +1,110 @@
+"""A sheet of views with skeletons drawn on them: what captures look like, and whether cameras and poses fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image, ImageDraw
+
+from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.capture.layout import replacing
+from primdiffusion.capture.plain_npz import NpzError, read_npz
+from primdiffusion.capture.reader import Captures, Subject
+
+BONE, JOINT = (255, 255, 255), (255, 64, 64)
+
+
+def draw_sheet(captures: Captures, out: Path, rows: int, columns: int, size: int) -> float:
+    """Write the sheet, a pose a row; returns the largest `reprojection_error` of the people on it, pixels.
+
+    Raises:
+        ValueError: there is no row, column or pixel.
+        FileNotFoundError, CaptureFileError, NpzError, BodyFileError: a file is missing or damaged.
+    """
+    if min(rows, columns, size) < 1:
+        raise ValueError(f"a sheet of {rows} x {columns} pictures of {size} pixels: ask for one or more of each")
+    poses = [(name, frame) for name in captures.subjects for frame in range(captures.subject(name).frames)]
+    chosen = [poses[i] for i in _evenly(len(poses), rows)]
+    lines = []
+    for name, frame in chosen:
+        subject = captures.subject(name)
+        joints = joints_of(subject)[frame]
+        cameras = _evenly(len(subject.views), columns)
+        lines.append([_thumbnail(subject, frame, camera, joints, size) for camera in cameras])
+    widths = max(sum(picture.width for picture in line) for line in lines)
+    sheet = Image.new("RGB", (widths, size * len(lines)))
+    for row, line in enumerate(lines):
+        left = 0
+        for picture in line:
+            sheet.paste(picture, (left, size * row))
+            left += picture.width
+    with replacing(out) as path:
+        sheet.save(path, format="PNG")
+    return max(reprojection_error(captures.subject(name)) for name in {name for name, _ in chosen})
+
+
+def joints_of(subject: Subject) -> Float[np.ndarray, "F J 3"]:
+    """The joints in the world as they were noted; of the default body's where nothing was (released layout).
+
+    Raises:
+        NpzError: joints.npz is damaged.
+    """
+    try:
+        return read_npz(subject.folder / "joints.npz", ("world",))["world"]
+    except FileNotFoundError:
+        return default_joints(subject)
+
+
+def default_joints(subject: Subject) -> Float[np.ndarray, "F J 3"]:
+    """The joints [F, 24, 3] of the default body in the subject's shape and poses, worked out anew."""
+    smpl = subject.smpl
+    pose = BodyPose.from_axis_angle(torch.from_numpy(smpl.theta), torch.from_numpy(smpl.translation))
+    return default_body().shape(torch.from_numpy(smpl.betas)).pose(pose).joints[..., :3, 3].double().numpy()
+
+
+def reprojection_error(subject: Subject) -> float:
+    """Largest distance in pixels of the joints noted in joints.npz from the projection of the joints in the world.
+
+    The cameras are read from cameras.json. 0 where nothing was noted.
+
+    Raises:
+        NpzError: joints.npz is damaged or of another number of cameras.
+    """
+    path = subject.folder / "joints.npz"
+    try:
+        noted = read_npz(path, ("world", "pixel"))
+    except FileNotFoundError:
+        return 0.0
+    if noted["pixel"].shape != (len(subject.views), *noted["world"].shape[:2], 2):
+        raise NpzError(
+            f"{path} has joints of {noted['pixel'].shape}, not of {len(subject.views)} cameras: render again"
+        )
+    errors = [
+        view.project(noted["world"])[0] - pixel for view, pixel in zip(subject.views, noted["pixel"], strict=True)
+    ]
+    return float(np.linalg.norm(errors, axis=-1).max())
+
+
+def _thumbnail(subject: Subject, frame: int, camera: int, joints: Float[np.ndarray, "J 3"], size: int) -> Image.Image:
+    picture = Image.fromarray(subject.picture("img", frame, camera))
+    scale = size / picture.height
+    picture = picture.resize((max(1, round(picture.width * scale)), size), Image.Resampling.BOX)
+    pixels, depth = subject.views[camera].project(joints)
+    draw = ImageDraw.Draw(picture)
+    places = [tuple(pixel * scale) for pixel in pixels]
+    for joint, parent in enumerate(default_body().parents.tolist()):
+        if parent >= 0 and min(depth[joint], depth[parent]) > 0:
+            draw.line([places[parent], places[joint]], fill=BONE)
+    radius = max(size / 160, 1)
+    for (x, y), z in zip(places, depth, strict=True):
+        if z > 0:
+            draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=JOINT)
+    return picture
+
+
+def _evenly(count: int, wanted: int) -> list[int]:
+    """At most `wanted` of `count` numbers, evenly spaced, the first among them."""
+    return sorted({int(i * count / min(wanted, count)) for i in range(min(wanted, count))})

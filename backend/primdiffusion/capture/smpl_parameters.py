@@ -1,0 +1,88 @@
+"""A subject's SMPL parameters: the plain twin, or the released code's pickled file through the restricted reader."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from primdiffusion.body.model import BodyPose, J
+from primdiffusion.body.smpl_pickle import BodyFileError, array_of_objects, as_array, load_restricted
+from primdiffusion.capture.layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE
+from primdiffusion.capture.plain_npz import NpzError, read_member, read_npz
+
+KEYS = ("global_orient", "body_pose", "betas", "transl")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SmplParameters:
+    """A person's shape and poses."""
+
+    theta: Float32[np.ndarray, "F n"]
+    """72 axis-angle numbers a frame, the pelvis first."""
+    translation: Float32[np.ndarray, "F 3"]
+    """Metres."""
+    betas: Float32[np.ndarray, "B"]
+
+    def pose(self, frame: int) -> BodyPose:
+        """What the joints do in a frame."""
+        return BodyPose.from_axis_angle(torch.from_numpy(self.theta[frame]), torch.from_numpy(self.translation[frame]))
+
+
+def read_smpl(subject: Path) -> SmplParameters:
+    """The parameters of a subject's folder.
+
+    Raises:
+        FileNotFoundError: neither file is there.
+        NpzError: the file is damaged, or not of this form.
+        BodyFileError: its pickle is damaged, or asks for more than arrays.
+    """
+    plain, pickled = subject / SMPL_FOLDER / SMPL_PLAIN_FILE, subject / SMPL_FOLDER / SMPL_FILE
+    if plain.is_file():
+        return _checked(plain, read_npz(plain, KEYS))
+    if pickled.is_file():
+        return _checked(pickled, _read_pickled(pickled))
+    raise FileNotFoundError(f"there is no {plain.name} nor {pickled.name} in {plain.parent}: render it again")
+
+
+def _read_pickled(path: Path) -> dict[str, np.ndarray]:
+    """The dictionary in an array without dimensions; nothing in it is run."""
+    data = read_member(path, "smpl.npy")
+    assert data is not None
+    stream = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        _, _, kind = read(stream)
+        if not kind.hasobject:
+            raise ValueError(f"it holds {kind}")
+        (content,) = array_of_objects(load_restricted(stream, str(path)))
+        if not isinstance(content, dict):
+            raise ValueError(f"it holds a {type(content).__name__}")
+        return {key: as_array(content[key]) for key in KEYS}
+    except BodyFileError:
+        raise
+    except KeyError as e:
+        raise NpzError(f"{path} lacks {e}: render the subject again, or take the file from its publisher") from e
+    except (ValueError, SyntaxError, TypeError) as e:
+        raise NpzError(f"{path} holds no dictionary of SMPL parameters ({e}): take it from its publisher again") from e
+
+
+def _checked(path: Path, arrays: dict[str, np.ndarray]) -> SmplParameters:
+    frames = len(arrays["global_orient"])
+    shapes = {"global_orient": (frames, 3), "body_pose": (frames, 3 * (J - 1)), "transl": (frames, 3)}
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape:
+            raise NpzError(f"{path}: {name} has shape {arrays[name].shape}, not {shape}: make it again")
+    betas = arrays["betas"].reshape(-1)
+    if not all(np.isfinite(array).all() for array in arrays.values()) or not frames or arrays["betas"].ndim > 2:
+        raise NpzError(f"{path} holds no frame, or NaN or infinite numbers: make it again")
+    return SmplParameters(
+        theta=np.concatenate([arrays["global_orient"], arrays["body_pose"]], axis=1).astype(np.float32),
+        translation=arrays["transl"].astype(np.float32),
+        betas=betas.astype(np.float32),
+    )
