@@ -1,0 +1,277 @@
+"""Twenty poses of our own, and poses chosen out of motion so that they differ much."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene.human_file import JOINT_NAMES
+from .motion import Motion
+from .rotation import about_axis
+from .skeleton import FLOOR, REST_JOINTS, joint_positions
+
+X, Y, Z = 0, 1, 2
+_CLEARANCE = REST_JOINTS[:, 1] - FLOOR
+_TOUCHING = {"knee": 0.06, "elbow": 0.04, "wrist": 0.03, "hand": 0.03, "pelvis": 0.12, "head": 0.12}
+"""Metres from joints to the skin under them; ankles and feet stand as high as at rest."""
+_POOL = 4000
+"""Frames among which poses are chosen."""
+_NEAR_T_M = 0.2
+
+
+@dataclasses.dataclass(frozen=True)
+class Arm:
+    """An arm in degrees, seen from the T pose, the same for both sides."""
+
+    down: float = 75.0
+    """From level to the side; negative is up."""
+    front: float = 0.0
+    """About the vertical, then."""
+    swing: float = 0.0
+    """Forward in the direction of walking, last."""
+    twist: float = 0.0
+    """About itself, first: positive turns the thumb down."""
+    elbow: float = 12.0
+    """Bent forward."""
+    forearm: float = 0.0
+    """Twist of the forearm, as `twist`."""
+    wrist: float = 0.0
+    """Bent towards the palm."""
+    shrug: float = 0.0
+    """The shoulder raised."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Leg:
+    """A leg in degrees, seen from standing, the same for both sides."""
+
+    front: float = 0.0
+    """The thigh raised to the front; negative to the back."""
+    out: float = 3.0
+    """To the side."""
+    turn: float = 6.0
+    """The toes turned out."""
+    knee: float = 4.0
+    ankle: float = 0.0
+    """The toes raised; negative pointed."""
+    toes: float = 0.0
+    """Bent up."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pose:
+    """A pose in degrees: arms, legs, and how far the trunk and the head bend forward, turn and lean to the left."""
+
+    left_arm: Arm
+    right_arm: Arm
+    left_leg: Leg
+    right_leg: Leg
+    trunk: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    head: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    whole: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of the pelvis, and all with it."""
+
+    def rotations(self) -> NDArray[np.float64]:
+        """SMPL's joint rotations [24, 3, 3]."""
+        turned = {"pelvis": _bend(*self.whole)}
+        for spine in ("spine1", "spine2", "spine3"):
+            turned[spine] = _bend(*(angle / 3 for angle in self.trunk))
+        for part in ("neck", "head"):
+            turned[part] = _bend(*(angle / 2 for angle in self.head))
+        for side, sign, arm, leg in (
+            ("left", 1, self.left_arm, self.left_leg),
+            ("right", -1, self.right_arm, self.right_leg),
+        ):
+            turned |= {f"{side}_{part}": turn for part, turn in (_arm(arm, sign) | _leg(leg, sign)).items()}
+        return np.array([turned.get(name, np.eye(3)) for name in JOINT_NAMES])
+
+
+def _bend(forward: float, left: float, lean: float) -> NDArray[np.float64]:
+    return _turn(Y, left) @ _turn(Z, -lean) @ _turn(X, forward)
+
+
+def _arm(arm: Arm, sign: int) -> dict[str, NDArray[np.float64]]:
+    """Along +x for the left arm; a mirrored turn about y or z is the opposite one, about x the same."""
+    return {
+        "collar": _turn(Z, sign * arm.shrug),
+        "shoulder": _turn(X, -arm.swing)
+        @ _turn(Y, -sign * arm.front)
+        @ _turn(Z, -sign * arm.down)
+        @ _turn(X, arm.twist),
+        "elbow": _turn(Y, -sign * arm.elbow) @ _turn(X, arm.forearm),
+        "wrist": _turn(Z, -sign * arm.wrist),
+    }
+
+
+def _leg(leg: Leg, sign: int) -> dict[str, NDArray[np.float64]]:
+    return {
+        "hip": _turn(X, -leg.front) @ _turn(Z, sign * leg.out) @ _turn(Y, sign * leg.turn),
+        "knee": _turn(X, leg.knee),
+        "ankle": _turn(X, -leg.ankle),
+        "foot": _turn(X, -leg.toes),
+    }
+
+
+def _turn(axis: int, degrees: float) -> NDArray[np.float64]:
+    return about_axis(axis, np.radians(degrees))
+
+
+_HANGING = Arm(down=76, elbow=14, forearm=-10)
+_STRAIGHT = Leg()
+
+BUILT_IN: dict[str, Pose] = {
+    "near T": Pose(Arm(down=8, elbow=4), Arm(down=8, elbow=4), Leg(out=4), Leg(out=4)),
+    "A": Pose(Arm(down=45, elbow=10), Arm(down=45, elbow=10), Leg(out=6), Leg(out=6)),
+    "standing": Pose(
+        Arm(down=74, elbow=20, swing=4), Arm(down=77, elbow=10, swing=-4),
+        Leg(out=7, turn=16, front=6, knee=12, ankle=4), Leg(out=1, turn=4), trunk=(0, 6, -4), head=(4, 10, 3),
+        whole=(0, -4, 2),
+    ),
+    "walking": Pose(
+        Arm(down=76, swing=-24, elbow=12), Arm(down=76, swing=22, elbow=28),
+        Leg(front=28, knee=6, ankle=10, out=1), Leg(front=-18, knee=24, ankle=-14, toes=22, out=1),
+        trunk=(5, -10, 0), head=(0, 6, 0), whole=(2, 4, 0),
+    ),
+    "striding": Pose(
+        Arm(down=74, swing=34, elbow=42), Arm(down=74, swing=-30, elbow=22),
+        Leg(front=-22, knee=38, ankle=-18, toes=26, out=1), Leg(front=34, knee=14, ankle=8, out=1),
+        trunk=(8, 14, 0), head=(-4, -8, 0), whole=(4, -6, 0),
+    ),
+    "running": Pose(
+        Arm(down=68, swing=-46, elbow=88), Arm(down=70, swing=44, elbow=96),
+        Leg(front=66, knee=84, ankle=6, out=1, turn=2), Leg(front=-22, knee=34, ankle=-26, toes=20, out=1, turn=2),
+        trunk=(12, -14, 0), head=(-12, 10, 0), whole=(12, 4, 0),
+    ),
+    "sitting": Pose(
+        Arm(down=70, swing=26, elbow=54, twist=34), Arm(down=70, swing=26, elbow=54, twist=34),
+        Leg(front=86, knee=88, out=8), Leg(front=86, knee=88, out=8), trunk=(8, 0, 0), head=(2, -12, 0),
+    ),
+    "arms up": Pose(
+        Arm(down=-62, elbow=16, front=14, shrug=16), Arm(down=-62, elbow=16, front=14, shrug=16),
+        Leg(out=7), Leg(out=7), trunk=(-6, 0, 0), head=(-14, 0, 0),
+    ),
+    "arms crossed": Pose(
+        Arm(down=68, swing=30, elbow=102, twist=60), Arm(down=68, swing=46, elbow=88, twist=54),
+        Leg(out=5, turn=12), Leg(out=5, turn=10), trunk=(2, 4, 0), head=(2, -10, -4),
+    ),
+    "waving": Pose(
+        _HANGING, Arm(down=-8, front=12, elbow=82, twist=-84, shrug=4), Leg(out=5, turn=12), Leg(out=2),
+        trunk=(0, -4, 4), head=(0, -10, 5),
+    ),
+    "pointing": Pose(
+        Arm(down=72, elbow=24), Arm(down=4, front=72, elbow=6, shrug=2), Leg(front=-8, knee=8, turn=18, out=5),
+        Leg(front=14, knee=12, ankle=2, out=3), trunk=(2, 12, 0), head=(2, -6, 0),
+    ),
+    "squatting": Pose(
+        Arm(down=18, front=74, elbow=20), Arm(down=18, front=74, elbow=20),
+        Leg(front=96, knee=104, ankle=22, out=18, turn=22), Leg(front=96, knee=104, ankle=22, out=18, turn=22),
+        trunk=(14, 0, 0), head=(-22, 0, 0), whole=(24, 0, 0),
+    ),
+    "lunging": Pose(
+        Arm(down=58, elbow=70, swing=10), Arm(down=62, elbow=60, swing=24),
+        Leg(front=74, knee=78, ankle=4, out=3), Leg(front=-28, knee=46, ankle=-10, toes=34, out=3),
+        trunk=(4, -6, 0), head=(-4, 0, 0), whole=(4, 0, 0),
+    ),
+    "looking back": Pose(
+        Arm(down=66, elbow=24, swing=14), Arm(down=66, elbow=30, swing=-18), Leg(out=6, turn=14), Leg(out=4, turn=4),
+        trunk=(2, 38, 0), head=(0, 46, -4), whole=(0, 14, 0),
+    ),
+    "dancing": Pose(
+        Arm(down=-38, front=10, elbow=52, twist=-50, shrug=12), Arm(down=26, front=-10, elbow=64, twist=40),
+        Leg(front=12, knee=38, ankle=-24, out=14, turn=26, toes=12), Leg(front=4, knee=14, out=2, turn=14, ankle=6),
+        trunk=(-4, -14, -12), head=(-6, 16, 10), whole=(0, 10, -6),
+    ),
+    "hands on hips": Pose(
+        Arm(down=46, front=-32, elbow=96, twist=54, wrist=10), Arm(down=46, front=-32, elbow=96, twist=54, wrist=10),
+        Leg(out=9, turn=10), Leg(out=9, turn=10), trunk=(-2, -6, 0), head=(4, 14, 0),
+    ),
+    "kicking": Pose(
+        Arm(down=28, front=24, elbow=30), Arm(down=42, front=-24, elbow=24),
+        Leg(front=-6, knee=16, ankle=8, out=2, turn=18), Leg(front=72, knee=18, ankle=-24, out=6),
+        trunk=(8, 10, 0), head=(6, -4, 0), whole=(-12, 0, 0),
+    ),
+    "stooping": Pose(
+        Arm(down=64, swing=46, elbow=10), Arm(down=64, swing=40, elbow=14),
+        Leg(front=48, knee=46, ankle=12, out=6), Leg(front=44, knee=44, ankle=12, out=6),
+        trunk=(42, 0, 0), head=(-20, 8, 0), whole=(34, 0, 0),
+    ),
+    "reaching": Pose(
+        Arm(down=70, elbow=26, swing=-10), Arm(down=-66, front=30, elbow=8, shrug=20),
+        Leg(front=-4, ankle=-18, toes=20, out=3), Leg(front=6, knee=26, ankle=-18, toes=12, out=4),
+        trunk=(-4, 10, 10), head=(-26, -14, 0),
+    ),
+    "on one leg": Pose(
+        Arm(down=-4, elbow=14), Arm(down=6, elbow=18), Leg(front=40, knee=96, out=34, turn=40, ankle=-16), Leg(out=-2),
+        trunk=(0, 0, -4), head=(0, -6, 2), whole=(0, 0, -2),
+    ),
+}  # fmt: skip
+"""Poses by name; the first is the one that captures begin with."""
+
+
+def built_in_poses(count: int = len(BUILT_IN)) -> Motion:
+    """The first `count` of our own poses, feet on the floor. Raises ValueError where there are not as many."""
+    if not 1 <= count <= len(BUILT_IN):
+        raise ValueError(f"{count} built-in poses were wanted, there are 1 to {len(BUILT_IN)}: give files for more")
+    rotations = np.array([pose.rotations() for pose in list(BUILT_IN.values())[:count]])
+    return Motion(rotations, grounding(rotations), 1.0, "built-in")
+
+
+def grounding(rotations: NDArray) -> NDArray[np.float64]:
+    """Translations [F, 3] that leave the pelvis above its place and put an average body's lowest part on the floor.
+
+    The floor is where it stands at rest.
+    """
+    joints = joint_positions(rotations)
+    clearance = np.array(
+        [
+            _CLEARANCE[joint] if name.split("_")[-1] in ("ankle", "foot") else _TOUCHING.get(name.split("_")[-1], 0.1)
+            for joint, name in enumerate(JOINT_NAMES)
+        ]
+    )
+    down = FLOOR - (joints[..., 1] - clearance).min(-1)
+    return np.stack([np.zeros_like(down), down, np.zeros_like(down)], -1)
+
+
+def pick_poses(motions: Sequence[Motion], count: int, seed: int = 0) -> Motion:
+    """`count` poses out of the frames of all motions, near-T first, the others as unlike each other as can be.
+
+    Each next pose is the one furthest from those chosen (farthest-point sampling over joint positions about the pelvis,
+    whatever way the person faces). Where no frame is near a T pose, our own is the first. People stay where they are:
+    poses are set on the floor and lose their place. The same seed picks the same poses.
+
+    Raises ValueError where the motions have too few frames.
+    """
+    rotations = np.concatenate([motion.rotations for motion in motions]) if motions else np.zeros((0, 24, 3, 3))
+    if len(rotations) < count - 1 or count < 1:
+        raise ValueError(f"{count} poses were wanted and the files hold {len(rotations)}: give more, or ask for fewer")
+    if len(rotations) > _POOL:
+        chosen = np.random.default_rng(seed).choice(len(rotations), _POOL, replace=False)
+        rotations = rotations[np.sort(chosen)]
+    own = built_in_poses(1).rotations
+    rotations = np.concatenate([own, rotations])
+    places = joint_positions(_unturned(rotations)) - REST_JOINTS[0]
+    from_t = np.linalg.norm(places - places[0], axis=-1).mean(-1)
+    nearest = 1 + int(from_t[1:].argmin()) if len(rotations) > 1 else 0
+    enough = len(rotations) - 1 >= count
+    picked = [nearest if nearest and from_t[nearest] < _NEAR_T_M and enough else 0]
+    distance = np.linalg.norm(places - places[picked[0]], axis=-1).mean(-1)
+    distance[0] = -1.0  # ours serves only as the first
+    while len(picked) < count:
+        picked.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(places - places[picked[-1]], axis=-1).mean(-1))
+        distance[picked] = -1.0
+    poses = rotations[picked]
+    names = ", ".join(dict.fromkeys(motion.name for motion in motions))
+    notes = ("no frame is near a T pose: the first is built in",) if picked[0] == 0 else ()
+    return Motion(poses, grounding(poses), 1.0, names, notes)
+
+
+def _unturned(rotations: NDArray) -> NDArray[np.float64]:
+    """The poses facing +z, as far as turning about the vertical does it."""
+    front = rotations[:, 0, :, 2]
+    unturned = np.array(rotations)
+    unturned[:, 0] = about_axis(Y, -np.arctan2(front[:, 0], front[:, 2])) @ rotations[:, 0]
+    return unturned
