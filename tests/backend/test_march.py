@@ -1,6 +1,10 @@
 """`march`: batches, backgrounds, the released code's settings, and what it refuses."""
 
 import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -193,3 +197,95 @@ def test_broken_scenes_are_refused_with_a_way_out(dtype):
         march(dataclasses.replace(boxes, rgb=boxes.rgb.to("meta")), camera)
     with pytest.raises(ValueError, match="compositing is 'nearest'; choose from"):
         MarchSettings(compositing="nearest")  # pyright: ignore[reportArgumentType]
+    for strides in ((), (1, 2), (4, 3), (4, 2, 0), (2.5,), (2**40, 1)):
+        with pytest.raises(ValueError, match="must fall and each divide the one before it"):
+            MarchSettings(strides=strides)  # pyright: ignore[reportArgumentType]
+    for step in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=r"the step is .* m; it must be positive and finite"):
+            MarchSettings(step=step)
+    with pytest.raises(ValueError, match="pixel_centre is nan"):
+        MarchSettings(pixel_centre=float("nan"))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_cameras_whose_rays_start_nowhere_are_refused(dtype):
+    boxes, camera = random_boxes(3).to(dtype=dtype), camera_at((0.0, 0.0, 0.5)).to(dtype=dtype)
+    flat = torch.tensor([1.0, 1.0, 0.0], dtype=dtype)[:, None]
+    for change in (2.0, 0.0, flat):
+        with pytest.raises(ValueError, match=r"world_to_camera .* scales or shears"):
+            march(boxes, dataclasses.replace(camera, world_to_camera=camera.world_to_camera * change))
+    for axis in (0, 1):
+        lens = camera.intrinsics.clone()
+        lens[axis, axis] = 0
+        with pytest.raises(ValueError, match=r"focal lengths are .* give ones other than 0"):
+            march(boxes, dataclasses.replace(camera, intrinsics=lens))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_boxes_that_would_take_hours_are_refused(dtype):
+    boxes, camera = random_boxes(3).to(dtype=dtype), camera_at((0.0, 0.0, 0.5)).to(dtype=dtype)
+    boxes.half_extent[1] = 1e9
+    with pytest.raises(ValueError, match=r"box 1 has half extents .* choose a larger step"):
+        march(boxes, camera)
+    assert march(boxes, camera, MarchSettings(step=1e8)).alpha.shape == (20, 24)
+
+
+def test_a_frame_grows_the_process_by_less_than_64_mb():
+    """All memory, torch's too, in a process that has drawn nothing but a thumbnail before."""
+    script = (
+        "import gc, torch\n"
+        "from march_scenes import camera_at, random_boxes\n"
+        "from primdiffusion.render.march import march\n"
+        "def kilobytes(name):\n"
+        "    return next(int(line.split()[1]) for line in open('/proc/self/status') if line.startswith(name))\n"
+        "boxes = random_boxes(1024, 28, spread=0.4).to(dtype=torch.float32)\n"
+        "def camera(side):\n"
+        "    return camera_at((0.2, 0.1, 1.5), fov=0.6, width=side, height=side).to(dtype=torch.float32)\n"
+        "march(random_boxes(4).to(dtype=torch.float32), camera(16)); gc.collect()\n"
+        "open('/proc/self/clear_refs', 'w').write('5')\n"
+        "before = kilobytes('VmRSS'); march(boxes, camera(512)); print(kilobytes('VmHWM') - before)\n"
+    )
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert 0 < int(done.stdout) < 64_000
+
+
+def test_tensors_may_be_views_and_gradients_recorded_off_for_good_or_for_one_input():
+    boxes, camera = one(people(0), 0), one(views(1), 0)
+    plain = march(boxes, camera)
+
+    def strided(tensor):
+        return torch.stack([tensor, tensor], dim=-1)[..., 0]
+
+    for same in (march(boxes.map(strided), camera.map(strided)), march(*in_inference_mode(boxes, camera))):
+        for name in FIELDS:
+            assert torch.equal(getattr(same, name), getattr(plain, name)), name
+    leaf = boxes.position.clone().requires_grad_()
+    total = march(dataclasses.replace(boxes, position=leaf), camera).rgb.sum()
+    once, again = (torch.autograd.grad(total, leaf, retain_graph=True)[0] for _ in range(2))
+    assert torch.equal(once, again)
+    assert once.abs().sum() > 0
+    with torch.no_grad():
+        assert not march(dataclasses.replace(boxes, position=leaf), camera).rgb.requires_grad
+
+
+def in_inference_mode(*records):
+    with torch.inference_mode():
+        return [record.map(torch.clone) for record in records]
+
+
+@pytest.mark.parametrize("offset", [1e3, 1e6])
+def test_a_scene_far_from_the_origin_is_drawn_as_it_is_there(offset):
+    """In float32 boxes lie where rounding puts them; the picture is that of these boxes, exactly."""
+    boxes, camera = random_boxes(12, 5), camera_at((0.1, 0.05, 0.6))
+    away = torch.tensor([offset, 0.0, -offset], dtype=torch.float64)
+    pose = camera.world_to_camera.clone()
+    pose[:, 3] -= pose[:, :3] @ away
+    there = dataclasses.replace(boxes, position=boxes.position + away).to(dtype=torch.float32)
+    view = dataclasses.replace(camera, world_to_camera=pose).to(dtype=torch.float32)
+    exact = march(there.to(dtype=torch.float64), view.to(dtype=torch.float64))
+    assert exact.alpha.max() > 0.9
+    torch.testing.assert_close(march(there, view).rgb.double(), exact.rgb, atol=2e-5, rtol=0)

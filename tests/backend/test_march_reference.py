@@ -11,6 +11,7 @@ from march_scenes import camera_at, one_box, random_boxes, single_ray
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render import reference
 from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings, Span, strides_of
 from primdiffusion.render.reference import march_reference, trilinear
 from scipy.integrate import quad
@@ -321,3 +322,16 @@ def test_mixed_and_narrow_dtypes_are_refused_with_a_way_out():
         march_reference(boxes.to(dtype=torch.float32), camera)
     with pytest.raises(ValueError, match="use float32 or float64"):
         march_reference(boxes.to(dtype=torch.bfloat16), camera.to(dtype=torch.bfloat16))
+
+
+def test_memory_is_bounded_by_cutting_the_picture_and_no_ray_may_ask_for_all_of_it(monkeypatch):
+    boxes, camera = random_boxes(30, 2), camera_at((0.2, 0.1, 0.6))
+    whole = march_reference(boxes, camera)
+    monkeypatch.setattr(reference, "PAIRS_AT_ONCE", 100)
+    monkeypatch.setattr(reference, "SAMPLES_AT_ONCE", 2000)
+    cut = march_reference(boxes, camera)
+    for name in ("rgb", "alpha", "depth", "first_hit"):
+        torch.testing.assert_close(getattr(cut, name), getattr(whole, name), atol=1e-12, rtol=0)
+    monkeypatch.setattr(reference, "SAMPLES_AT_ONCE", 10)
+    with pytest.raises(ValueError, match=r"a ray takes .* samples: choose a larger step"):
+        march_reference(boxes, camera)

@@ -19,6 +19,12 @@ Compositing = Literal["mixed", "index_order"]
 
 ORTHOGONAL = 1e-2
 """Largest entry of R^T R - 1 that passes as rounding of a rotation."""
+NEARLY_ORTHOGONAL = 5e-2
+"""The same of a camera, which an optimiser may have moved; the rays of one that scales start in the wrong place."""
+LARGEST_STRIDE = 2**20
+"""Lattice points; more would make a lattice finer than float32 tells boxes apart."""
+MOST_POINTS = 2**24
+"""Lattice points through one box: more are a slip of units and would take hours."""
 
 WINDOW_SHARPNESS = 8.0
 WINDOW_POWER = 8
@@ -53,9 +59,15 @@ class MarchSettings:
             raise ValueError(f"compositing is {self.compositing!r}; choose from {get_args(Compositing)}")
         if not self.samples_per_voxel > 0:
             raise ValueError(f"samples_per_voxel is {self.samples_per_voxel}; it must be positive")
+        if not math.isfinite(self.pixel_centre):
+            raise ValueError(f"pixel_centre is {self.pixel_centre}; 0.5 is the middle of a pixel, 0 its corner")
+        whole = all(isinstance(stride, int) and 1 <= stride <= LARGEST_STRIDE for stride in self.strides)
         pairs = zip(self.strides, self.strides[1:], strict=False)
-        if not self.strides or self.strides[-1] < 1 or any(a <= b or a % b for a, b in pairs):
-            raise ValueError(f"strides {self.strides} must fall and each divide the one before it, as (4, 2, 1) do")
+        if not self.strides or not whole or any(a <= b or a % b for a, b in pairs):
+            raise ValueError(
+                f"strides {self.strides} must fall and each divide the one before it, as (4, 2, 1) do: whole numbers "
+                f"from 1 to {LARGEST_STRIDE}"
+            )
 
     @property
     def spacing(self) -> float:
@@ -82,16 +94,25 @@ class Span(TensorRecord):
 
 
 def strides_of(primitives: Primitives, settings: MarchSettings) -> Int[Tensor, "k"]:
-    """Each box's stride in lattice points (see `MarchSettings`)."""
+    """Each box's stride in lattice points (see `MarchSettings`).
+
+    Raises ValueError where a ray would meet more than MOST_POINTS samples in one box.
+    """
     voxel = 2 * primitives.half_extent.detach().amin(-1) / max(primitives.density.shape[-1] - 1, 1)
     stride = torch.full(voxel.shape, settings.strides[-1], dtype=torch.int64, device=voxel.device)
     for candidate in reversed(settings.strides):
         stride[voxel >= candidate * settings.spacing * settings.samples_per_voxel] = candidate
+    points = 2 * primitives.half_extent.detach().amax(-1) / (stride * settings.spacing) * (voxel > 0)
+    if len(points) and float(points.max()) > MOST_POINTS:
+        raise ValueError(
+            f"box {int(points.argmax())} has half extents {primitives.half_extent[points.argmax()].tolist()} m: a ray "
+            f"would take {float(points.max()):.2g} samples in it; choose a larger step, or check the person's scale"
+        )
     return stride
 
 
 def check_scene(primitives: Primitives, camera: Camera, span: Span | None = None) -> None:
-    """ValueError, naming the field, unless all is finite, of one size and one device, and the picture has pixels.
+    """ValueError, naming the field, unless all is finite, of one size and one device, and the camera is one.
 
     Leading dimensions are free. Rotations may reflect (the box's contents are then mirrored), but not shear.
     """
@@ -107,17 +128,30 @@ def check_scene(primitives: Primitives, camera: Camera, span: Span | None = None
     if bool((primitives.density < 0).any()):
         raise ValueError(f"density falls to {float(primitives.density.min()):.4g} per metre; clamp it to 0 or more")
     _check_rotation(primitives.rotation)
+    check_camera(camera)
+    check_one_device(primitives, camera, span)
+    if span is not None:
+        _check_span(span, camera)
+
+
+def check_camera(camera: Camera) -> None:
+    """ValueError, naming the field, unless the picture has pixels and every pixel a ray from the camera's place."""
     for name, shape in (("intrinsics", (3, 3)), ("world_to_camera", (3, 4))):
         value = getattr(camera, name)
         if tuple(value.shape[-2:]) != shape:
             raise ValueError(f"camera.{name} has shape {tuple(value.shape)}; it must end in {shape}")
         if not torch.isfinite(value).all():
             raise ValueError(f"camera.{name} holds NaN or infinite values: {value.tolist()}; look_at makes one")
+    focal = camera.intrinsics.detach()[..., [0, 1], [0, 1]]
+    if not torch.isfinite(1 / focal).all():
+        raise ValueError(f"the camera's focal lengths are {focal.tolist()} pixels: give ones other than 0")
+    if _off_orthogonal(camera.world_to_camera[..., :3]).gt(NEARLY_ORTHOGONAL).any():
+        raise ValueError(
+            f"camera.world_to_camera {camera.world_to_camera.tolist()} scales or shears: a camera only turns and "
+            "moves; look_at makes one"
+        )
     if camera.width < 1 or camera.height < 1:
         raise ValueError(f"the picture is {camera.width} x {camera.height} pixels; both sides must be at least 1")
-    check_one_device(primitives, camera, span)
-    if span is not None:
-        _check_span(span, camera)
 
 
 def check_unbatched(primitives: Primitives, camera: Camera, span: Span | None = None) -> None:
@@ -136,9 +170,14 @@ def check_one_device(*records: TensorRecord | None) -> None:
         raise ValueError(f"primitives, camera and span lie on {sorted(devices)}: move them to one device with .to()")
 
 
+def _off_orthogonal(matrix: Tensor) -> Tensor:
+    """The largest entry of M^T M - 1 of each matrix."""
+    product = matrix.detach().mT @ matrix.detach()
+    return (product - torch.eye(3, dtype=product.dtype, device=product.device)).abs().amax((-2, -1))
+
+
 def _check_rotation(rotation: Tensor) -> None:
-    product = rotation.detach().mT @ rotation.detach()
-    excess = (product - torch.eye(3, dtype=product.dtype, device=product.device)).abs().amax((-2, -1))
+    excess = _off_orthogonal(rotation)
     if excess.numel() and float(excess.max()) > ORTHOGONAL:
         raise ValueError(
             f"primitives.rotation is no rotation in box {int(excess.flatten().argmax())}: R^T R is off the identity by "

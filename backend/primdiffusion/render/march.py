@@ -16,7 +16,7 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render import cuda
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu import march_cpu
-from primdiffusion.render.lattice import RELEASED, MarchSettings, Span, check_one_device
+from primdiffusion.render.lattice import RELEASED, MarchSettings, Span, check_camera, check_one_device
 from primdiffusion.render.reference import march_reference
 
 Record = TypeVar("Record", bound=TensorRecord)
@@ -45,6 +45,8 @@ def march(
     `check_scene` does, and where leading dimensions do not broadcast.
     """
     check_one_device(primitives, camera, span)
+    if camera.intrinsics.device.type == "cpu":  # the kernels of other devices look themselves: reading here would wait
+        check_camera(camera)
     if settings.pixel_centre != 0.5:
         shift = 0.5 - settings.pixel_centre
         camera = camera.moved_in_picture(shift, shift)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -22,8 +23,10 @@ from primdiffusion.render.lattice import (
     strides_of,
 )
 
-RAYS_AT_ONCE = 1024
-"""Bounds the memory of the ray-box table; no effect on the result."""
+PAIRS_AT_ONCE = 2**20
+"""Rays times boxes: bounds the memory of their table; no effect on the result."""
+SAMPLES_AT_ONCE = 2**21
+"""Bounds the memory of the samples, some 400 bytes each; no effect on the result."""
 
 
 def march_reference(
@@ -42,16 +45,24 @@ def march_reference(
 
     Differentiable in every tensor of `primitives` and `camera`; the number and places of the samples are treated as
     fixed, so the steps of 3.4e-4 (the window's value) at the boxes' faces give no gradient. Cost: memory in proportion
-    to all samples of the picture when gradients are recorded. Raises ValueError as `check_scene` does, and where the
-    tensors are batched, differ in dtype or are narrower than float32.
+    to all samples of the picture when gradients are recorded. Raises ValueError as `check_scene` does, where the
+    tensors are batched, differ in dtype or are narrower than float32, and where one ray takes more than
+    SAMPLES_AT_ONCE samples.
     """
     check_scene(primitives, camera, span)
     check_unbatched(primitives, camera, span)
     _check_dtype([*vars(primitives).values(), camera.intrinsics, camera.world_to_camera])
     origin, directions = camera.rays()
     reach = _reach(camera, span, settings.spacing)
-    portions = zip(directions.flatten(0, 1).split(RAYS_AT_ONCE), reach.split(RAYS_AT_ONCE), strict=True)
-    blocks = [_march_rays(primitives, origin, rays, allowed, settings) for rays, allowed in portions]
+    stride = strides_of(primitives, settings)
+    rays_at_once = max(PAIRS_AT_ONCE // max(len(stride), 1), 1)
+    blocks = []
+    for rays, allowed in zip(directions.flatten(0, 1).split(rays_at_once), reach.split(rays_at_once), strict=True):
+        crossings = _crossings(primitives, origin, rays, stride, settings.spacing)
+        blocks += [
+            _march_rays(primitives, origin, rays[begin:end], allowed[begin:end], settings, stride, part)
+            for begin, end, part in _portions(crossings, len(rays))
+        ]
 
     def picture(name: str) -> Tensor:
         return torch.cat([getattr(block, name) for block in blocks]).unflatten(0, (camera.height, camera.width))
@@ -110,9 +121,10 @@ def _march_rays(
     directions: Float[Tensor, "r 3"],
     reach: Float[Tensor, "r 2"],
     settings: MarchSettings,
+    stride: Int[Tensor, "k"],
+    crossings: Crossings,
 ) -> Rendering:
-    stride = strides_of(primitives, settings)
-    ray, box, n = _samples(primitives, origin, directions, reach, stride, settings.spacing)
+    ray, box, n = _samples(primitives, origin, directions, reach, stride, settings.spacing, crossings)
     order = torch.argsort(ray * (n.max() + 1 if len(n) else 1) + n, stable=True)  # within a point: index order
     ray, box, n = ray[order], box[order], n[order]
 
@@ -135,19 +147,30 @@ def _to_local(primitives: Primitives, box: Int[Tensor, "m"], point: Float[Tensor
     return (offset @ primitives.rotation[box])[:, 0, :] / primitives.half_extent[box]
 
 
+class Crossings(NamedTuple):
+    """Where rays may cross boxes, ordered by ray, then box."""
+
+    ray: Int[Tensor, "c"]
+    box: Int[Tensor, "c"]
+    first: Int[Tensor, "c"]
+    """The first and the last of the box's own lattice points, in its strides."""
+    last: Int[Tensor, "c"]
+
+    @property
+    def count(self) -> Int[Tensor, "c"]:
+        """Lattice points of each."""
+        return self.last - self.first + 1
+
+
 @torch.no_grad()
-def _samples(
+def _crossings(
     primitives: Primitives,
     origin: Float[Tensor, "3"],
     directions: Float[Tensor, "r 3"],
-    reach: Float[Tensor, "r 2"],
     stride: Int[Tensor, "k"],
     spacing: float,
-) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"], Int[Tensor, "m"]]:
-    """Ray, box and lattice index of all samples inside boxes, ordered by ray, then box, then lattice index.
-
-    Boxes with an extent of zero (or less) hold no point and are left out.
-    """
+) -> Crossings:
+    """Boxes with an extent of zero (or less) hold no point and are left out."""
     solid = (primitives.half_extent > 0).all(-1).nonzero()[:, 0]
     inverse = 1 / primitives.half_extent[solid]
     p = torch.einsum("ki,kij->kj", origin - primitives.position[solid], primitives.rotation[solid]) * inverse
@@ -157,16 +180,41 @@ def _samples(
     near, far = ((-1 - p) / q), ((1 - p) / q)
     enter, leave = torch.minimum(near, far).amax(-1), torch.maximum(near, far).amin(-1)
     step = stride[solid].to(origin.dtype) * spacing
-    # A little too wide, because of rounding; the test of |y| < 1 below decides.
+    # A little too wide, because of rounding; the test of |y| < 1 in _samples decides.
     first, last = (enter / step - 1e-3).ceil().clamp_min(1), (leave / step + 1e-3).floor()
     ray, candidate = (first <= last).nonzero(as_tuple=True)
-    first, last = first[ray, candidate].long(), last[ray, candidate].long()
-    count = last - first + 1
-    ray, candidate = ray.repeat_interleave(count), candidate.repeat_interleave(count)
+    return Crossings(ray, solid[candidate], first[ray, candidate].long(), last[ray, candidate].long())
+
+
+def _portions(crossings: Crossings, rays: int) -> Iterator[tuple[int, int, Crossings]]:
+    """Runs of rays, begin and end, with at most SAMPLES_AT_ONCE samples, and their crossings, rays numbered anew."""
+    samples = crossings.ray.new_zeros(rays).index_add(0, crossings.ray, crossings.count).tolist()
+    begin, held = 0, 0
+    for end in range(1, rays + 1):
+        held += samples[end - 1]
+        if samples[end - 1] > SAMPLES_AT_ONCE:
+            raise ValueError(f"a ray takes {samples[end - 1]:.2g} samples: choose a larger step, or fewer boxes")
+        if end == rays or held + samples[end] > SAMPLES_AT_ONCE:
+            run = slice(*torch.searchsorted(crossings.ray, crossings.ray.new_tensor([begin, end])).tolist())
+            yield begin, end, Crossings(crossings.ray[run] - begin, *(field[run] for field in crossings[1:]))
+            begin, held = end, 0
+
+
+@torch.no_grad()
+def _samples(
+    primitives: Primitives,
+    origin: Float[Tensor, "3"],
+    directions: Float[Tensor, "r 3"],
+    reach: Float[Tensor, "r 2"],
+    stride: Int[Tensor, "k"],
+    spacing: float,
+    crossings: Crossings,
+) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"], Int[Tensor, "m"]]:
+    """Ray, box and lattice index of all samples inside boxes, ordered by ray, then box, then lattice index."""
+    count = crossings.count
+    ray, box, first = (field.repeat_interleave(count) for field in (crossings.ray, crossings.box, crossings.first))
     begin = (count.cumsum(0) - count).repeat_interleave(count)
-    within = torch.arange(len(begin), device=begin.device) - begin
-    box = solid[candidate]
-    n = (first.repeat_interleave(count) + within) * stride[box]
+    n = (first + torch.arange(len(begin), device=begin.device) - begin) * stride[box]
     local = _to_local(primitives, box, origin + (n.to(origin.dtype) * spacing)[:, None] * directions[ray])
     inside = (local.abs() < 1).all(-1) & (n >= reach[ray, 0]) & (n <= reach[ray, 1])
     return ray[inside], box[inside], n[inside]
