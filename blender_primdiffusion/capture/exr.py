@@ -1,4 +1,4 @@
-"""Uncompressed OpenEXR files as Blender writes its render layers: numpy only, since not every Blender has OpenImageIO."""
+"""Uncompressed OpenEXR files as Blender writes them, read with numpy: not every Blender comes with OpenImageIO."""
 
 from __future__ import annotations
 

@@ -47,11 +47,15 @@ class CaptureSettings:
     denoise: bool = False
     """Of img under a dome or HDRI light; masks and the passes of pixel centres never are."""
     device: Device = "auto"
+    threads: int = 0
+    """Of Cycles on the CPU; 0: as many as there are cores."""
     shard: tuple[int, int] = (0, 1)
     """(i, n): the subjects i, i + n, i + 2 n, ... of the sorted list."""
     layouts: tuple[str, ...] = LAYOUTS
     released_reference: bool = False
     """Whether the first subject is also there under the name that the released code looks for."""
+    body: Path | None = None
+    """A user's own SMPL body, an .npz; none: the default body."""
 
     def __post_init__(self) -> None:
         index, count = self.shard
@@ -66,6 +70,7 @@ class CaptureSettings:
             f"{self.samples} samples: one or more": self.samples < 1,
             f"{self.pose_count} poses: 1 to 10000": not 1 <= self.pose_count <= 10000,
             f"shard {index}/{count}: 0/{count} to {count - 1}/{count}": not 0 <= index < count,
+            f"{self.threads} threads: 0 (all) to 1024": not 0 <= self.threads <= 1024,
             f"device {self.device}: choose of {', '.join(get_args(Device))}": self.device not in get_args(Device),
         }  # fmt: skip
         for sentence, is_so in wrong.items():

@@ -1,0 +1,183 @@
+"""Captures from a command line.
+
+`blender -c primdiffusion capture ...` with the extension enabled, `python -m blender_primdiffusion.capture ...` with
+Blender as a Python module, `blender -b --factory-startup --python launch.py -- ...` without either.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+import bpy
+
+from .job import CaptureError, Progress, run
+from .layout import CaptureFolderError
+from .options import UsageError, parse, settings_of
+from .report import Report, report_path
+from .scan import ScanError, ScanFile, find_scans
+from .settings import CaptureSettings
+from .verify import repair, verify
+
+DONE, FAILED, UNUSABLE, CANCELLED = 0, 1, 2, 130
+"""Exit codes: all is well; something failed or is damaged; nothing could be begun; told to stop."""
+MARK = "PRIMDIFFUSION "
+"""Begins each line of --progress json; an object follows."""
+_TOLD_S = 1.0
+
+Say = Callable[[str], None]
+
+
+class _Stopped(Exception):
+    """Told to stop."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; returns its exit code. Blender's own messages on stdout are dropped."""
+    try:
+        options = parse(argv)
+    except UsageError as error:
+        print(f"capture: {error}; --help names all options", file=sys.stderr, flush=True)
+        return UNUSABLE
+    with _stdout_of_our_own() as say:
+        try:
+            with _stopped_by_signals():
+                return _run(options, say)
+        except (CaptureFolderError, CaptureError, ScanError, OSError, ValueError) as error:
+            print(f"capture: {error}", file=sys.stderr, flush=True)
+            return UNUSABLE
+        except _Stopped:
+            say("Stopped; the same command goes on from here.")
+            return CANCELLED
+
+
+def scans_in(folders: Sequence, only: Sequence[str] = ()) -> list[ScanFile]:
+    """The scans of some folders, sorted by name; of `only`, where names are given.
+
+    Raises ScanError where there are none, or two of a name.
+    """
+    found: dict[str, ScanFile] = {}
+    for folder in folders:
+        for scan in find_scans(folder):
+            if scan.name in found:
+                raise ScanError(f"two scans are called {scan.name}: rename the file or folder of one")
+            found[scan.name] = scan
+    unknown = sorted(set(only) - set(found))
+    if unknown:
+        raise ScanError(f"nobody is called {unknown[0]} in {', '.join(map(str, folders))}")
+    if not found:
+        raise ScanError("nobody to render: name a folder of scans with --people")
+    return [found[name] for name in sorted(found) if not only or name in only]
+
+
+def _run(options: argparse.Namespace, say: Say) -> int:
+    if options.verify or (options.repair and not options.people):
+        return _check(options, say)
+    if options.repair and options.out.exists():
+        _check(options, say)
+    settings = settings_of(options)
+    scans = scans_in(options.people, options.only)
+    if options.list:
+        index, count = settings.shard
+        for scan in scans[index::count]:
+            say(scan.name)
+        return DONE
+    return _render(options, settings, scans, say)
+
+
+def _check(options: argparse.Namespace, say: Say) -> int:
+    wrong = repair(options.out) if options.repair else verify(options.out)
+    for sentence in wrong:
+        say(sentence)
+    say(f"{options.out}: {f'{len(wrong)} problems' if wrong else 'all is whole'}")
+    return FAILED if wrong else DONE
+
+
+def _render(options: argparse.Namespace, settings: CaptureSettings, scans: list[ScanFile], say: Say) -> int:
+    report, told, stop = Report(), 0.0, _end_of_stdin() if options.while_stdin else threading.Event()
+    with contextlib.closing(run(bpy.context, settings, scans, report)) as steps:
+        for progress in steps:
+            if options.progress == "json":
+                say(MARK + json.dumps(dataclasses.asdict(progress)))
+            elif options.progress == "text":
+                for line in progress.news:
+                    say(line)
+                if time.monotonic() - told > _TOLD_S or progress.done == progress.total:
+                    told = time.monotonic()
+                    say(describe(progress))
+            if stop.is_set():
+                raise _Stopped
+    say(f"{len(report.done)} done, {len(report.skipped)} were there, {len(report.failed)} failed")
+    if report.failed:
+        say(f"What failed and why: {report_path(settings.out, settings.shard)}")
+    return FAILED if report.failed else DONE
+
+
+def describe(progress: Progress) -> str:
+    """A line for people."""
+    left = "" if progress.eta_s is None else f", {_duration(progress.eta_s)} left"
+    return f"{progress.subject}: view {progress.done} of {progress.total}{left}"
+
+
+def _duration(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {seconds} s" if minutes else f"{seconds} s"
+
+
+@contextlib.contextmanager
+def _stdout_of_our_own() -> Iterator[Say]:
+    """A way to write lines to stdout while all else that is written there, by Blender, is dropped."""
+    sys.stdout.flush()
+    ours = os.dup(1)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)
+
+    def say(line: str) -> None:
+        os.write(ours, f"{line}\n".encode())
+
+    try:
+        yield say
+    finally:
+        sys.stdout.flush()
+        os.dup2(ours, 1)
+        os.close(ours)
+
+
+@contextlib.contextmanager
+def _stopped_by_signals() -> Iterator[None]:
+    """Ctrl-C and a polite kill take effect between views, and clean up."""
+
+    def stop(*_: object) -> None:
+        raise _Stopped
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+
+
+def _end_of_stdin() -> threading.Event:
+    ended = threading.Event()
+
+    def wait() -> None:
+        while sys.stdin.buffer.read(4096):
+            pass
+        ended.set()
+
+    threading.Thread(target=wait, name="capture stdin", daemon=True).start()
+    return ended

@@ -1,0 +1,25 @@
+"""A capture in a Blender of its own, installed or not: `blender -b --factory-startup --python launch.py -- ...`."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from pathlib import Path
+
+_NAME = "primdiffusion_extension"
+
+
+def run_command() -> int:
+    """The command `capture` with the arguments after `--`; the extension need not be enabled."""
+    root = Path(__file__).resolve().parents[1]
+    spec = importlib.util.spec_from_file_location(_NAME, root / "__init__.py", submodule_search_locations=[str(root)])
+    package = importlib.util.module_from_spec(spec)
+    sys.modules[_NAME] = package
+    spec.loader.exec_module(package)
+    words = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else []
+    return importlib.import_module(f"{_NAME}.capture.command").main(words)
+
+
+if __name__ == "__main__":
+    sys.exit(run_command())

@@ -1,0 +1,135 @@
+"""The words of the command `capture`, and what they ask for."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn, get_args
+
+import numpy as np
+
+from .blender_camera import CameraError
+from .rig import Arrangement, Rig, View
+from .settings import LAYOUTS, PASSES, Background, CaptureSettings, Device, Light
+
+
+class UsageError(ValueError):
+    """Words that the command does not understand."""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(message)
+
+
+def parser() -> argparse.ArgumentParser:
+    """All options of the command, with their defaults."""
+    rig = Rig()
+    made = _Parser(prog="capture", description="Render people from all sides in Cycles, into a dataset.")
+    add = made.add_argument
+    add("--people", type=Path, nargs="+", default=[], help="folders of scans, or of generated people")
+    add("--out", type=Path, required=True, help="the dataset's folder; one begun before is gone on with")
+    add("--seed", type=int, default=0)
+    add("--only", nargs="+", default=[], metavar="SUBJECT", help="just these people")
+    add("--shard", type=_shard, default=(0, 1), metavar="I/N", help="the people I, I + N, ... of the sorted list")
+    add("--body", type=Path, help="an SMPL body as .npz of plain arrays instead of the default one")
+    add("--pose-files", type=Path, nargs="+", default=[], help="AMASS or pose .npz, .npy, .json, .bvh; else built in")
+    add("--poses", type=int, default=20, help="how many; the first is near-T (default %(default)s)")
+    add("--cameras", type=int, default=rig.count, help="how many (default %(default)s)")
+    add("--arrangement", choices=get_args(Arrangement), default=rig.arrangement)
+    add("--elevations", type=float, nargs="+", default=rig.elevations, help="of rings, degrees above the horizon")
+    add("--fov", type=float, default=rig.vertical_fov, help="vertical, degrees (default %(default)s)")
+    add("--size", type=int, nargs=2, default=(rig.width, rig.height), metavar=("WIDTH", "HEIGHT"))
+    add("--margin", type=float, default=rig.margin, help="room around people (default %(default)s)")
+    add(
+        "--camera-file", type=Path, help='cameras that stand still: {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}'
+    )
+    add("--passes", nargs="+", default=PASSES, choices=PASSES)
+    add("--light", choices=get_args(Light), default="uniform")
+    add("--hdri", type=Path, help="the picture of --light hdri")
+    add("--background", choices=get_args(Background), default="black")
+    add("--samples", type=int, default=16, help="of a pixel (default %(default)s)")
+    add("--denoise", action="store_true", help="of img under a dome or HDRI light")
+    add("--device", choices=get_args(Device), default="auto")
+    add("--threads", type=int, default=0, help="of Cycles on the CPU; 0: all")
+    add("--layouts", nargs="*", default=LAYOUTS, choices=LAYOUTS, help="camera files of other projects")
+    add(
+        "--released-reference",
+        action="store_true",
+        help="the first subject also under the name the released code needs",
+    )
+    add("--list", action="store_true", help="name the people of the shard, render nothing")
+    add("--verify", action="store_true", help="check the dataset, render nothing")
+    add("--repair", action="store_true", help="with --verify: take away what is damaged; without: then render it anew")
+    add("--progress", choices=("text", "json", "none"), default="text", help="on stdout")
+    add("--while-stdin", action="store_true", help="stop when stdin ends: for programs that start this one")
+    return made
+
+
+def parse(argv: Sequence[str]) -> argparse.Namespace:
+    """The options in `argv`. Raises UsageError; SystemExit after --help."""
+    return parser().parse_args(list(argv))
+
+
+def settings_of(options: argparse.Namespace) -> CaptureSettings:
+    """The settings that options ask for. Raises ValueError, CameraError and OSError for impossible ones."""
+    width, height = options.size
+    rig = Rig(
+        arrangement=options.arrangement,
+        count=options.cameras,
+        elevations=tuple(options.elevations),
+        vertical_fov=options.fov,
+        width=width,
+        height=height,
+        margin=options.margin,
+    )
+    return CaptureSettings(
+        out=options.out,
+        seed=options.seed,
+        rig=rig,
+        cameras=read_cameras(options.camera_file, width, height) if options.camera_file else (),
+        pose_files=tuple(options.pose_files),
+        pose_count=options.poses,
+        passes=tuple(kind for kind in PASSES if kind in options.passes),
+        light=options.light,
+        hdri=options.hdri,
+        background=options.background,
+        samples=options.samples,
+        denoise=options.denoise,
+        device=options.device,
+        threads=options.threads,
+        shard=options.shard,
+        layouts=tuple(options.layouts),
+        released_reference=options.released_reference,
+        body=options.body,
+    )
+
+
+def read_cameras(path: Path, width: int, height: int) -> tuple[View, ...]:
+    """The cameras of a cameras.json, in the order of their names. Raises CameraError or OSError."""
+    try:
+        named = json.loads(path.read_text(encoding="utf-8"))
+        views = []
+        for name in sorted(named):
+            k, r, t = (np.array(named[name][key], np.float64) for key in "KRT")
+            if (k.shape, r.shape, t.size) != ((3, 3), (3, 3), 3) or not all(np.isfinite(x).all() for x in (k, r, t)):
+                raise CameraError(f"{path}: {name} has no finite K [3, 3], R [3, 3] and T [3]")
+            if not np.allclose(r @ r.T, np.eye(3), atol=1e-5) or np.linalg.det(r) < 0:
+                raise CameraError(f"{path}: R of {name} is no rotation")
+            views.append(View(k, r, t.ravel(), width, height))
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        if isinstance(error, CameraError):
+            raise
+        raise CameraError(f"{path} holds no cameras as cameras.json has them ({error!r})") from error
+    if not views:
+        raise CameraError(f"{path} holds no camera")
+    return tuple(views)
+
+
+def _shard(text: str) -> tuple[int, int]:
+    index, _, count = text.partition("/")
+    if not (index.isdigit() and count.isdigit() and int(index) < int(count)):
+        raise argparse.ArgumentTypeError(f"{text!r} is no shard: 0/4 is the first of four")
+    return int(index), int(count)

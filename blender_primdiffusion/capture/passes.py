@@ -1,0 +1,119 @@
+"""From what Cycles says of a view to the pictures of its passes."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+from pathlib import Path
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene.convention import points_to_backend
+from .exr import read_exr
+from .layout import picture_path, replacing
+from .picture_files import depth_steps, is_whole_picture, normal_bytes, write_png
+from .surfaces import PART
+
+JPEG_QUALITY = 95
+_NOTHING_M = 1e9
+"""Cycles gives rays that hit nothing a depth of 1e10."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Colours:
+    """What fills the pixels, averaged over each."""
+
+    rgb: NDArray[np.float32]
+    """Linear, premultiplied [H, W, 3]."""
+    alpha: NDArray[np.float32]
+    """Share of the pixel that is covered [H, W]."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Centres:
+    """What the rays through the pixels' centres hit."""
+
+    depth: NDArray[np.float32]
+    """Metres along the optical axis [H, W]; inf where nothing is."""
+    normal: NDArray[np.float64]
+    """World, backend's axes [H, W, 3]."""
+    part: NDArray[np.uint8]
+    """1 + joint [H, W]; 0 where nothing is."""
+
+
+def read_colours(path: Path) -> Colours:
+    """The combined pass of a multilayer EXR; with denoising only its colours are denoised, not its alpha."""
+    planes = read_exr(path)
+    rgb = np.stack([_plane(planes, f"Combined.{channel}") for channel in "RGB"], -1)
+    return Colours(rgb, _plane(planes, "Combined.A"))
+
+
+def read_centres(path: Path) -> Centres:
+    """The passes of a multilayer EXR that was rendered through the pixels' centres."""
+    planes = read_exr(path)
+    depth = _plane(planes, "Depth.Z")
+    depth = np.where(depth < _NOTHING_M, depth, np.float32(np.inf))
+    normal = points_to_backend(np.stack([_plane(planes, f"Normal.{axis}") for axis in "XYZ"], -1))
+    part = np.where(np.isfinite(depth), np.round(_plane(planes, f"{PART}.X")), 0)  # behind a hole it is the hole's
+    return Centres(depth, normal, part.clip(0, 24).astype(np.uint8))
+
+
+def write_passes(
+    subject: Path,
+    kinds: tuple[str, ...],
+    where: tuple[int, int],
+    colours: Colours | None,
+    centres: Centres | None,
+) -> None:
+    """The pictures of one view in the order of `kinds`; `where` is (frame, camera)."""
+    frame, camera = where
+    for kind in kinds:
+        path = picture_path(subject, kind, camera, frame)
+        if kind == "img":
+            _write_jpeg(path, srgb_bytes(colours.rgb))
+        elif kind == "rgba":
+            alpha = np.clip(colours.alpha, 0, 1)[..., None]
+            straight = srgb_bytes(colours.rgb / np.where(alpha > 0, alpha, 1))
+            write_png(path, np.concatenate([straight, _bytes(alpha)], -1))
+        elif kind == "mask":
+            write_png(path, _bytes(colours.alpha))
+        elif kind == "depth":
+            write_png(path, depth_steps(centres.depth))
+        elif kind == "normal":
+            write_png(path, normal_bytes(centres.normal, np.isfinite(centres.depth)))
+        else:
+            write_png(path, centres.part)
+
+
+def srgb_bytes(linear: NDArray) -> NDArray[np.uint8]:
+    """Linear colours as sRGB bytes, as Blender's view transform Standard has them (IEC 61966-2-1)."""
+    linear = np.clip(linear, 0, 1)
+    return _bytes(np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055))
+
+
+def _bytes(values: NDArray) -> NDArray[np.uint8]:
+    return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
+
+
+def _write_jpeg(path: Path, pixels: NDArray[np.uint8]) -> None:
+    height, width = pixels.shape[:2]
+    values = np.ones((height, width, 4), np.float32)
+    values[..., :3] = pixels[::-1] / np.float32(255)
+    sheet = bpy.data.images.new(path.stem, width, height, alpha=False)
+    try:
+        sheet.pixels.foreach_set(values.ravel())
+        sheet.file_format = "JPEG"
+        with replacing(path) as partial:
+            sheet.save(filepath=str(partial), quality=JPEG_QUALITY)
+            if not is_whole_picture(partial):  # on a full disk Blender saves what fits, and says nothing
+                raise OSError(errno.ENOSPC, "there is no room to write", str(path))
+    except RuntimeError as error:
+        raise OSError(f"{path} cannot be written ({error}): is the disk full?") from error
+    finally:
+        bpy.data.images.remove(sheet)
+
+
+def _plane(planes: dict[str, NDArray[np.float32]], ending: str) -> NDArray[np.float32]:
+    return next(plane for name, plane in planes.items() if name.endswith(f".{ending}"))

@@ -1,0 +1,289 @@
+"""What Cycles draws is where, and what, the cameras and the body say."""
+
+from __future__ import annotations
+
+import json
+
+import bpy
+import numpy as np
+import pytest
+import trimesh
+from bpy_extras.object_utils import world_to_camera_view
+from capture_person import NamedPerson, PaintedPerson, load_painted, plain, shader_of, two_poses
+from mathutils import Vector
+from PIL import Image
+from scipy.ndimage import center_of_mass, grey_dilation
+
+from blender_primdiffusion.capture.blender_camera import aim, view_of
+from blender_primdiffusion.capture.body import read_body
+from blender_primdiffusion.capture.inside import cameras_inside
+from blender_primdiffusion.capture.job import run
+from blender_primdiffusion.capture.layout import picture_path
+from blender_primdiffusion.capture.passes import srgb_bytes
+from blender_primdiffusion.capture.picture_files import DEPTH_UNIT
+from blender_primdiffusion.capture.rig import Rig, View, look_at
+from blender_primdiffusion.capture.settings import CaptureSettings
+from blender_primdiffusion.capture.shots import shoot_centres, shoot_colours
+from blender_primdiffusion.capture.stage import Stage
+from blender_primdiffusion.capture.surfaces import mark_parts, prepare_materials
+from blender_primdiffusion.scene.convention import points_to_blender
+from blender_primdiffusion.scene.human_file import JOINT_NAMES
+
+SIZE = 64
+POSES = two_poses()
+
+
+def odd_view() -> View:
+    """A camera of another make: pixels that are no squares, the axis off the middle."""
+    base = look_at(np.array([1.2, 0.7, 2.6]), np.array([0.1, -0.1, 0.0]), 0.6, 72, 48)
+    return View(np.array([[90.0, 0, 41.3], [0, 75.0, 17.8], [0, 0, 1]]), base.rotation, base.translation, 72, 48)
+
+
+@pytest.fixture
+def stage(empty_scene, tmp_path):
+    settings = CaptureSettings(tmp_path / "out", rig=Rig(count=3, width=SIZE, height=SIZE), samples=16, device="cpu")
+    made = Stage(empty_scene, settings)
+    yield made
+    made.close()
+
+
+def put(stage: Stage, frame: int = 1, **materials) -> PaintedPerson:
+    with stage.entered() as own:
+        person = PaintedPerson(own, read_body(), materials.get("paint") or plain((0.5, 0.25, 0.1)))
+        person.pose(POSES.rotations[frame], POSES.translations[frame])
+        for thing in person.objects:
+            mark_parts(thing, person.joint_of_group)
+        prepare_materials(person.objects, unlit=True)
+    return person
+
+
+def sphere(stage: Stage, centre, radius: float, paint: bpy.types.Material) -> bpy.types.Object:
+    with stage.entered() as own:
+        ball = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+        mesh = bpy.data.meshes.new("ball")
+        mesh.from_pydata(ball.vertices.tolist(), [], ball.faces.tolist())
+        mesh.materials.append(paint)
+        thing = bpy.data.objects.new("ball", mesh)
+        thing.location = points_to_blender(np.asarray(centre))
+        own.scene.collection.objects.link(thing)
+    return thing
+
+
+def cast(person: PaintedPerson, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Depth [H, W] (inf: nothing) and face [H, W] behind the pixels' centres, by another program."""
+    mesh = trimesh.Trimesh(person.vertices, person.faces, process=False)
+    v, u = np.mgrid[: view.height, : view.width] + 0.5
+    in_camera = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(view.intrinsics).T
+    rays = (in_camera @ view.rotation).reshape(-1, 3)  # z of a ray is 1, so its length is depth
+    at, ray, face = mesh.ray.intersects_location(np.tile(view.position, (len(rays), 1)), rays, multiple_hits=True)
+    depth = (at @ view.rotation.T + view.translation)[:, 2]
+    nearest, faces = np.full(len(rays), np.inf), np.full(len(rays), -1)
+    for order in np.argsort(-depth):
+        nearest[ray[order]], faces[ray[order]] = depth[order], face[order]
+    return nearest.reshape(view.height, view.width), faces.reshape(view.height, view.width)
+
+
+@pytest.mark.parametrize("which", ["rig", "odd"])
+def test_depth_is_what_rays_through_the_centres_of_pixels_meet(stage, which):
+    person = put(stage)
+    view = Rig(count=3, width=SIZE, height=SIZE).views(np.zeros(3), 1.1)[2] if which == "rig" else odd_view()
+    centres = shoot_centres(stage, view, seed=5)
+    depth, _ = cast(person, view)
+    assert (np.isfinite(depth) != np.isfinite(centres.depth)).mean() < 0.001
+    both = np.isfinite(depth) & np.isfinite(centres.depth)
+    assert both.sum() > 300
+    off = np.abs(depth[both] - centres.depth[both])
+    assert np.quantile(off, 0.99) < 1e-3  # the rest are rays that graze an edge
+    assert np.median(off) < 1e-4
+
+
+def test_half_a_pixel_aside_depth_would_differ(stage):
+    person, view = put(stage), odd_view()
+    aside = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    shifted = View(view.intrinsics + aside, view.rotation, view.translation, 72, 48)
+    depth, _ = cast(person, shifted)
+    centres = shoot_centres(stage, view, seed=5)
+    both = np.isfinite(depth) & np.isfinite(centres.depth)
+    assert np.median(np.abs(depth[both] - centres.depth[both])) > 2e-3
+
+
+def test_parts_and_normals_are_those_of_the_faces_that_are_met(stage):
+    person, view = put(stage), odd_view()
+    centres = shoot_centres(stage, view, seed=1)
+    depth, faces = cast(person, view)
+    weights = read_body().skin_weights[person._kept]
+    part = 1 + weights[person.faces].sum(1).argmax(1)
+    met = np.isfinite(depth) & np.isfinite(centres.depth)
+    assert (centres.part[met] == part[faces[met]]).mean() > 0.995
+    assert (centres.part[~np.isfinite(centres.depth)] == 0).all()
+    assert set(np.unique(centres.part)) >= {1 + JOINT_NAMES.index(name) for name in ("left_hip", "right_knee", "head")}
+    corners = person.vertices[person.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    agreement = (centres.normal[met] * normal[faces[met]]).sum(-1)
+    assert np.quantile(agreement, 0.01) > 0.99
+    assert np.allclose(np.linalg.norm(centres.normal[met], axis=-1), 1, atol=1e-3)
+
+
+@pytest.mark.parametrize("which", ["rig", "odd"])
+def test_a_marker_at_a_vertex_is_drawn_where_the_camera_puts_it(stage, which):
+    view = Rig(count=3, width=SIZE, height=SIZE).views(np.zeros(3), 1.1)[1] if which == "rig" else odd_view()
+    person = put(stage)
+    depth, faces = cast(person, view)
+    v, u = np.argwhere(np.isfinite(depth))[150]
+    vertex = person.vertices[person.faces[faces[v, u], 0]]
+    ball = sphere(stage, vertex, 0.03, plain((1, 1, 1)))
+    with stage.entered():
+        prepare_materials([ball], unlit=True)
+        person.objects[0].hide_render = True
+    colours = shoot_colours(stage, view, seed=0, samples=64)
+    row, column = center_of_mass(colours.rgb.sum(-1))
+    expected, _ = view.project(vertex)
+    assert np.abs((column + 0.5, row + 0.5) - expected).max() < 0.1
+
+
+def test_joints_are_where_spheres_at_them_are_drawn(stage):
+    view = Rig(count=1, width=256, height=256).views(np.zeros(3), 1.1)[0]
+    person = put(stage)
+    joints = person.pose(POSES.rotations[1], POSES.translations[1])
+    person.objects[0].hide_render = True
+    pixels, _ = view.project(joints)
+    for joint in (0, 4, 15, 20, 23):
+        ball = sphere(stage, joints[joint], 0.02, plain((1, 1, 1)))
+        with stage.entered():
+            prepare_materials([ball], unlit=True)
+        row, column = center_of_mass(shoot_colours(stage, view, seed=0, samples=16).alpha)
+        assert np.abs((column + 0.5, row + 0.5) - pixels[joint]).max() < 0.1
+        ball.hide_render = True
+
+
+def test_coverage_is_the_share_of_the_pixel(stage):
+    paint = plain((0.5, 0.25, 0.1))
+    view = look_at(np.array([0.0, 0.0, 4.0]), np.zeros(3), 0.6, SIZE, SIZE)
+    ball = sphere(stage, (0, 0, 0), 0.6, paint)
+    with stage.entered():
+        prepare_materials([ball], unlit=True)
+    colours = shoot_colours(stage, view, seed=3, samples=64)
+    finer = 32
+    v, u = (np.mgrid[: SIZE * finer, : SIZE * finer] + 0.5) / finer
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(view.intrinsics).T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    hit = 4.0**2 * (1 - rays[..., 2] ** 2) < 0.6**2  # distance of the ray from the sphere's centre
+    share = hit.reshape(SIZE, finer, SIZE, finer).mean((1, 3))
+    assert np.abs(colours.alpha - share).max() < 0.06
+    assert np.abs(colours.alpha - share).mean() < 0.002
+    assert np.allclose(colours.rgb, colours.alpha[..., None] * (0.5, 0.25, 0.1), atol=1e-4)
+
+
+def test_rays_go_through_holes_in_a_texture_and_every_pass_shows_what_is_behind(stage):
+    with stage.entered() as own:
+        image = bpy.data.images.new("half", 2, 1, alpha=True)
+        image.pixels.foreach_set(np.array([0, 1, 0, 0, 0, 1, 0, 1], np.float32))
+        image.pack()
+        paint = plain((1, 1, 1))
+        texture = paint.node_tree.nodes.new("ShaderNodeTexImage")
+        texture.image, texture.interpolation = image, "Closest"
+        for name, socket in (("Color", "Base Color"), ("Alpha", "Alpha")):
+            paint.node_tree.links.new(texture.outputs[name], shader_of(paint).inputs[socket])
+        mesh = bpy.data.meshes.new("card")
+        mesh.from_pydata([(-1, -0.5, -1), (1, -0.5, -1), (1, -0.5, 1), (-1, -0.5, 1)], [], [(0, 1, 2, 3)])
+        mesh.uv_layers.new().data.foreach_set("uv", np.array([0, 0, 1, 0, 1, 1, 0, 1], np.float32))
+        mesh.materials.append(paint)
+        card = bpy.data.objects.new("card", mesh)
+        card.vertex_groups.new(name="head").add([0, 1, 2, 3], 1.0, "REPLACE")
+        own.scene.collection.objects.link(card)
+        mark_parts(card, JOINT_NAMES.index)
+    ball = sphere(stage, (0, 0, 0), 0.4, plain((0, 0, 1)))
+    with stage.entered():
+        ball.vertex_groups.new(name="spine1").add(range(len(ball.data.vertices)), 1.0, "REPLACE")
+        mark_parts(ball, JOINT_NAMES.index)
+        prepare_materials([ball, card], unlit=True)
+    view = look_at(np.array([0.0, 0.0, 4.0]), np.zeros(3), 0.8, SIZE, SIZE)
+    colours, centres = shoot_colours(stage, view, 0, 4), shoot_centres(stage, view, 0)
+    middle, left, right = SIZE // 2, SIZE // 2 - 3, SIZE // 2 + 3
+    assert np.allclose(colours.rgb[middle, left], (0, 0, 1), atol=1e-3)
+    assert np.allclose(colours.rgb[middle, right], (0, 1, 0), atol=1e-3)
+    assert abs(centres.depth[middle, left] - 3.6) < 0.03
+    assert abs(centres.depth[middle, right] - 3.5) < 0.01
+    assert (centres.part[middle, left], centres.part[middle, right]) == tuple(
+        1 + JOINT_NAMES.index(name) for name in ("spine1", "head")
+    )
+    above = SIZE // 2 - 14  # over the ball: nothing is behind the hole
+    assert colours.alpha[above, left] == 0
+    assert np.isinf(centres.depth[above, left])
+    assert centres.part[above, left] == 0
+
+
+def test_a_users_camera_and_ours_see_the_same(empty_scene):
+    scene = empty_scene.scene
+    data = bpy.data.cameras.new("mine")
+    camera = bpy.data.objects.new("mine", data)
+    scene.collection.objects.link(camera)
+    data.lens, data.shift_x, data.shift_y, data.sensor_fit = 41.0, 0.1, -0.07, "VERTICAL"
+    camera.location, camera.rotation_euler, camera.scale = (1.0, -3.0, 0.5), (1.4, 0.1, 0.3), (2.0, 2.0, 2.0)
+    bpy.context.view_layer.update()
+    size = (80, 50)
+    view = view_of(camera, empty_scene.evaluated_depsgraph_get(), size)
+    other = bpy.data.objects.new("ours", bpy.data.cameras.new("ours"))
+    scene.collection.objects.link(other)
+    aspect = aim(other, view)
+    bpy.context.view_layer.update()
+    again = view_of(other, empty_scene.evaluated_depsgraph_get(), size, aspect)
+    assert np.allclose(again.intrinsics, view.intrinsics, atol=1e-4)
+    assert np.allclose(again.rotation, view.rotation, atol=1e-6)
+    assert np.allclose(again.translation, view.translation, atol=1e-6)
+    scene.render.resolution_x, scene.render.resolution_y = size
+    point = np.array([0.3, 0.2, -0.4])
+    x, y, _ = world_to_camera_view(scene, camera, Vector(points_to_blender(point)))
+    assert np.allclose(view.project(point)[0], (x * 80, (1 - y) * 50), atol=1e-3)
+
+
+def test_cameras_inside_are_found_and_those_between_the_legs_are_not(stage):
+    person = put(stage, frame=0)
+    places = [(0.0, 0.0, 0.0), (0.0, -0.9, 0.0), (0.0, 0.0, 3.0), (0.35, 0.26, 0.02), (0.4, -0.2, 0.0)]
+    views = [look_at(np.array(at), np.array([0.0, 0.05, 9.0]), 0.5, 8, 8) for at in places]
+    with stage.entered() as own:
+        assert cameras_inside(person.objects, own.evaluated_depsgraph_get(), views) == [0, 3]
+
+
+def test_files_hold_what_was_rendered(empty_scene, tmp_path):
+    rig = Rig(count=2, elevations=(10.0,), width=SIZE, height=SIZE)
+    settings = CaptureSettings(tmp_path, rig=rig, samples=4, background="transparent", device="cpu")
+    list(run(empty_scene, settings, [NamedPerson("anna")], poses=POSES, load=load_painted))
+    read = {
+        kind: np.asarray(Image.open(picture_path(tmp_path / "anna", kind, 1, 1))).astype(int)
+        for kind in ("img", "mask", "depth", "normal", "part", "rgba")
+    }
+    assert [read[kind].shape[2:] for kind in read] == [(3,), (), (), (3,), (), (4,)]
+    assert (read["rgba"][..., 3] == read["mask"]).all()
+    solid = read["mask"] == 255
+    assert solid.sum() > 100
+    difference = read["img"] @ (0.299, 0.587, 0.114) - read["rgba"][..., :3] @ (0.299, 0.587, 0.114)
+    assert np.abs(difference)[solid].mean() < 5  # JPEG keeps brightness better than colour
+    far = grey_dilation(read["mask"], 33) == 0  # from the person, farther than JPEG's blocks
+    assert far.sum() > 200
+    assert (read["img"][far] < 4).all()
+    assert ((read["depth"] > 0) == (read["part"] > 0)).all()
+    assert ((read["depth"] > 0) >= solid).mean() > 0.99
+    cameras = json.loads((tmp_path / "anna/cameras.json").read_text())["camera0001"]
+    distance = np.linalg.norm(cameras["T"])
+    assert np.abs(read["depth"][solid] * DEPTH_UNIT - distance).max() < 1.2
+    two = {(0.9, 0.3, 0.1), (0.1, 0.4, 0.8)}  # the chequers' colours are sRGB
+    nearest = np.min([np.abs(read["rgba"][..., :3] / 255 - colour).max(-1) for colour in two], 0)
+    assert (nearest[solid] < 0.02).mean() > 0.25  # the others mix two squares
+
+
+def test_colours_are_encoded_as_srgb():
+    assert srgb_bytes(np.array([0.0, 0.002, 0.2140411, 1.0, 3.0, -1.0])).tolist() == [0, 7, 127, 255, 255, 0]
+
+
+def test_denoising_leaves_the_mask_alone(empty_scene, tmp_path):
+    masks = {}
+    for name in ("plain", "denoised"):
+        settings = CaptureSettings(
+            tmp_path / name, rig=Rig(count=1, width=SIZE, height=SIZE), samples=2, light="dome", passes=("img", "mask"),
+            denoise=name == "denoised", device="cpu",
+        )  # fmt: skip
+        list(run(empty_scene, settings, [NamedPerson("anna")], poses=POSES.frames([0]), load=load_painted))
+        masks[name] = picture_path(tmp_path / name / "anna", "mask", 0, 0).read_bytes()
+    assert masks["plain"] == masks["denoised"]
