@@ -24,7 +24,7 @@ from .upright import axis_name, scale_note
 
 _FAR_M, _LOOSE_M = 0.10, 0.06
 """Mean distance from which on a scan is not the body's; distance at which a point's nearest place says little."""
-_GOOD_M = 0.015
+_EXACT_M = 0.003
 _SMOOTHING = 40
 _SAME_PLACE_M = 1e-5
 
@@ -133,22 +133,26 @@ def join_surface(vertices: NDArray, triangles: NDArray) -> Surface:
 
 
 def _shape(body: Body, parameters: Parameters, surface: Surface, scan_file: ScanFile):
-    """Betas, shift and notes: the parameters' own shape where it fits, else one fitted to the surface."""
+    """Betas, shift and notes: the parameters' own shape, unless they are of another body: then one that is fitted.
+
+    SMPL parameters found beside a scan are SMPL's; on the default body their pose holds and their shape does not.
+    """
     betas = _known(body, parameters.betas)
     nearest = _nearest_on(surface)
     own = fit_surface(body, betas, parameters.rotations, np.zeros(3), nearest, rounds=0)
-    if own.residual <= _GOOD_M:
+    trusted = _EXACT_M if body.name == "default" and parameters.body != body.name else _FAR_M
+    if own.residual <= trusted:
         return own.betas, np.zeros(3), [f"shape of its parameters, {own.residual * 1000:.0f} mm off on average"]
     fit = fit_surface(body, np.zeros(0), parameters.rotations, np.zeros(3), nearest)
-    if fit.residual > 0.75 * own.residual:
-        fit = own
     if fit.residual > _FAR_M:
         raise ScanError(
             f"{scan_file.path} does not match {scan_file.parameters}: its surface is {fit.residual * 100:.0f} cm from "
             "the body; check that they belong together"
         )
-    told = "shape of its parameters" if fit is own else f"shape fitted to its surface, as that of {body.name!r}"
-    return fit.betas, fit.shift, [f"{told}, {fit.residual * 1000:.0f} mm off on average"]
+    told = (
+        f"shape fitted to its surface, as that of the body {body.name!r}, {fit.residual * 1000:.0f} mm off on average"
+    )
+    return fit.betas, fit.shift, [told]
 
 
 def _nearest_on(surface: Surface) -> Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]:

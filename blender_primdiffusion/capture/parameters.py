@@ -26,6 +26,8 @@ class Parameters:
     translation: NDArray[np.float64]
     """[3], the scan's units."""
     scale: float
+    body: str
+    """Name of the body that the betas are of; empty where the file does not tell."""
     notes: list[str]
 
 
@@ -33,7 +35,7 @@ def read_parameters(scan_file: ScanFile) -> Parameters:
     """The parameters of a scan; of several frames the first.
 
     The .npz of plain arrays has `global_orient` and `body_pose` (or `pose`, `poses`), `betas`, and if wanted `transl`
-    or `trans` and `scale`. Raises ScanError where it is missing or holds something else.
+    or `trans`, `scale`, and `body`, the name of the body whose shape `betas` are. Raises ScanError where it is missing or holds something else.
     """
     path = scan_file.parameters
     if path is None:
@@ -44,7 +46,7 @@ def read_parameters(scan_file: ScanFile) -> Parameters:
             f"with global_orient, body_pose, betas and transl there{hint}"
         )
     try:
-        arrays = read_npz(path, (*POSE_KEYS, *_SHAPE_KEYS, "scale", "gender"))
+        arrays = read_npz(path, (*POSE_KEYS, *_SHAPE_KEYS, "scale", "body"))
         motion = motion_from_arrays({key: arrays[key] for key in POSE_KEYS if key in arrays}, path)
     except (ArrayFileError, MotionFileError) as e:
         raise ScanError(str(e)) from e
@@ -58,6 +60,7 @@ def read_parameters(scan_file: ScanFile) -> Parameters:
         rotations=motion.rotations[0],
         translation=motion.translations[0],
         scale=_positive(scale, path),
+        body=str(arrays["body"].ravel()[0]) if arrays.get("body", np.zeros(0)).size == 1 else "",
         notes=[f"first of {len(motion)} frames of parameters"] if len(motion) > 1 else [],
     )
 

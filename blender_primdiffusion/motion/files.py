@@ -55,8 +55,6 @@ def read_motion(path: str | Path) -> Motion:
         motion = reader(path)
     except (ArrayFileError, BvhError) as e:
         raise MotionFileError(str(e)) from e
-    if len(motion) == 0:
-        raise MotionFileError(f"{path} holds no frame: export it again")
     return motion
 
 
@@ -109,6 +107,8 @@ def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
     for key, array in arrays.items():
         if array.dtype.kind not in "iuf":
             raise MotionFileError(f"{path}: {key!r} holds {array.dtype} where numbers are wanted")
+        if array.size == 0:
+            raise MotionFileError(f"{path}: {key!r} holds no frame; export the motion again")
         if not np.isfinite(array).all():
             raise MotionFileError(f"{path}: {key!r} holds NaN or infinite numbers; export the motion again")
     rest = _first(arrays, _REST)
@@ -176,7 +176,7 @@ def _rotations(values: NDArray, path: Path, joints_before: int = 0) -> NDArray[n
 def _matrices(values: NDArray, path: Path) -> NDArray[np.float64]:
     """Rotation matrices [F, n, 3, 3] of axis-angle numbers [3 n], [F, 3 n], [F, n, 3], or of matrices [F, n, 3, 3]."""
     values = np.asarray(values, np.float64)
-    if values.ndim >= 3 and values.shape[-2:] == (3, 3) and not (values.ndim == 3 and _is_axis_angle(values)):
+    if values.ndim in (3, 4) and values.shape[-2:] == (3, 3) and not (values.ndim == 3 and _is_axis_angle(values)):
         given = values if values.ndim == 4 else values[None]
         if np.abs(given @ np.swapaxes(given, -1, -2) - np.eye(3)).max(initial=0) > 1e-2:
             raise MotionFileError(f"{path} holds matrices that are no rotations: export the poses again")

@@ -17,7 +17,7 @@ X, Y, Z = 0, 1, 2
 _CLEARANCE = REST_JOINTS[:, 1] - FLOOR
 _TOUCHING = {"knee": 0.06, "elbow": 0.04, "wrist": 0.03, "hand": 0.03, "pelvis": 0.12, "head": 0.12}
 """Metres from joints to the skin under them; ankles and feet stand as high as at rest."""
-_POOL = 4000
+_POOL = 1000
 """Frames among which poses are chosen."""
 _NEAR_T_M = 0.2
 
@@ -247,31 +247,35 @@ def pick_poses(motions: Sequence[Motion], count: int, seed: int = 0) -> Motion:
     rotations = np.concatenate([motion.rotations for motion in motions]) if motions else np.zeros((0, 24, 3, 3))
     if len(rotations) < count - 1 or count < 1:
         raise ValueError(f"{count} poses were wanted and the files hold {len(rotations)}: give more, or ask for fewer")
+    first = built_in_poses(1).rotations
+    from_t = _apart(_about_pelvis(rotations), _about_pelvis(first)[0])
+    has_t = len(rotations) >= count and from_t.min() < _NEAR_T_M
+    if has_t:
+        first = rotations[[int(from_t.argmin())]]
     if len(rotations) > _POOL:
         chosen = np.random.default_rng(seed).choice(len(rotations), _POOL, replace=False)
         rotations = rotations[np.sort(chosen)]
-    own = built_in_poses(1).rotations
-    rotations = np.concatenate([own, rotations])
-    places = joint_positions(_unturned(rotations)) - REST_JOINTS[0]
-    from_t = np.linalg.norm(places - places[0], axis=-1).mean(-1)
-    nearest = 1 + int(from_t[1:].argmin()) if len(rotations) > 1 else 0
-    enough = len(rotations) - 1 >= count
-    picked = [nearest if nearest and from_t[nearest] < _NEAR_T_M and enough else 0]
-    distance = np.linalg.norm(places - places[picked[0]], axis=-1).mean(-1)
-    distance[0] = -1.0  # ours serves only as the first
+    rotations = np.concatenate([first, rotations])
+    places, picked = _about_pelvis(rotations), [0]
+    distance = _apart(places, places[0])
     while len(picked) < count:
-        picked.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(places - places[picked[-1]], axis=-1).mean(-1))
         distance[picked] = -1.0
+        picked.append(int(distance.argmax()))
+        distance = np.minimum(distance, _apart(places, places[picked[-1]]))
     poses = rotations[picked]
     names = ", ".join(dict.fromkeys(motion.name for motion in motions))
-    notes = ("no frame is near a T pose: the first is built in",) if picked[0] == 0 else ()
+    notes = () if has_t else ("no frame is near a T pose: the first is built in",)
     return Motion(poses, grounding(poses), 1.0, names, notes)
 
 
-def _unturned(rotations: NDArray) -> NDArray[np.float64]:
-    """The poses facing +z, as far as turning about the vertical does it."""
+def _about_pelvis(rotations: NDArray) -> NDArray[np.float64]:
+    """Joints [F, 24, 3] seen from the pelvis, the person facing +z as far as turning about the vertical does it."""
     front = rotations[:, 0, :, 2]
     unturned = np.array(rotations)
     unturned[:, 0] = about_axis(Y, -np.arctan2(front[:, 0], front[:, 2])) @ rotations[:, 0]
-    return unturned
+    return joint_positions(unturned) - REST_JOINTS[0]
+
+
+def _apart(places: NDArray, place: NDArray) -> NDArray[np.float64]:
+    """Mean distance of the joints [F] between poses [F, 24, 3] and one pose [24, 3], metres."""
+    return np.linalg.norm(places - place, axis=-1).mean(-1)

@@ -1,0 +1,101 @@
+"""The body in numpy: the backend's, to rounding."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import synthetic
+
+from blender_primdiffusion.capture.body import BodyError, read_body
+
+
+@pytest.fixture(scope="module")
+def body():
+    return read_body()
+
+
+def arrays(count: int = 30) -> dict[str, np.ndarray]:
+    """A small body of SMPL's form with pose blend shapes."""
+    rng = np.random.default_rng(1)
+    weights = rng.uniform(0, 1, (count, 24)) ** 8
+    regressor = rng.uniform(0, 1, (24, count))
+    parents = synthetic.PARENTS.astype(np.int64)
+    return {
+        "v_template": rng.normal(0, 0.3, (count, 3)),
+        "shapedirs": rng.normal(0, 0.01, (count, 3, 12)),
+        "posedirs": rng.normal(0, 0.01, (count, 3, 207)),
+        "J_regressor": regressor / regressor.sum(1, keepdims=True),
+        "weights": weights / weights.sum(1, keepdims=True),
+        "f": rng.integers(0, count, (20, 3)),
+        "kintree_table": np.stack([np.where(parents < 0, 2**32 - 1, parents), np.arange(24)]),
+    }
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_posed_body_is_the_backends(body, seed):
+    torch = pytest.importorskip("torch")
+    model = pytest.importorskip("primdiffusion.body.model")
+    rng = np.random.default_rng(seed)
+    betas, move = rng.normal(size=10), rng.normal(size=3)
+    rotations = synthetic.axis_angle(rng.normal(0, 0.6, (24, 3)))
+    vertices, joints, skinning = body.pose(betas, rotations, move)
+    pose = model.BodyPose(torch.from_numpy(rotations), torch.from_numpy(move))
+    twin = model.default_body().to(dtype=torch.float64, device="cpu").shape(torch.from_numpy(betas)).pose(pose)
+    np.testing.assert_allclose(vertices, twin.vertices.numpy(), atol=1e-9)
+    np.testing.assert_allclose(joints, twin.joints[:, :3, 3].numpy(), atol=1e-9)
+    np.testing.assert_allclose(skinning, twin.skinning.numpy(), atol=1e-9)
+
+
+def test_pose_blend_shapes_are_those_of_smplx(tmp_path):
+    lbs = pytest.importorskip("smplx.lbs")
+    torch = pytest.importorskip("torch")
+    content = arrays()
+    np.savez(tmp_path / "mine.npz", **content)
+    body = read_body(tmp_path / "mine.npz")
+    assert body.name == "mine"
+    rng = np.random.default_rng(3)
+    betas, theta = rng.normal(size=10), rng.normal(0, 0.5, (24, 3))
+    vertices, joints, _ = body.pose(betas, synthetic.axis_angle(theta), np.zeros(3))
+
+    def tensor(array):
+        return torch.from_numpy(np.asarray(array, np.float64))
+
+    posedirs = tensor(content["posedirs"].reshape(-1, 207).T)
+    twin, twin_joints = lbs.lbs(
+        tensor(betas)[None], tensor(theta).reshape(1, -1), tensor(content["v_template"])[None],
+        tensor(content["shapedirs"][..., :10]), posedirs, tensor(content["J_regressor"]),
+        torch.from_numpy(synthetic.PARENTS), tensor(content["weights"]),
+    )  # fmt: skip
+    np.testing.assert_allclose(vertices, twin[0].numpy(), atol=1e-6)  # smplx adds 1e-8 to angles
+    np.testing.assert_allclose(joints, twin_joints[0].numpy(), atol=1e-6)
+
+
+def test_betas_that_lack_are_zero_and_betas_too_many_are_refused(body):
+    few, _ = body.rest([1.0, -1.0])
+    all_of_them, _ = body.rest([1.0, -1.0, *[0.0] * 30])
+    np.testing.assert_array_equal(few, all_of_them)
+    with pytest.raises(BodyError, match="11 betas were given"):
+        body.rest(np.ones(11))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"weights": None}, "holds no 'weights'"),
+        ({"v_template": np.full((30, 3), np.nan)}, "'v_template' has shape"),
+        ({"J_regressor": np.ones((55, 30))}, "'J_regressor' has shape"),
+        ({"f": np.full((20, 3), 30)}, "vertices that are not there"),
+        ({"kintree_table": np.zeros((2, 24), np.int64)}, "not SMPL's 24"),
+        ({"shapedirs": np.array({"a": 1}, object)}, "pickled Python objects"),
+    ],
+)
+def test_a_body_of_another_form_is_named(tmp_path, change, message):
+    content = {key: value for key, value in (arrays() | change).items() if value is not None}
+    np.savez(tmp_path / "body.npz", **content)
+    with pytest.raises(BodyError, match=message):
+        read_body(tmp_path / "body.npz")
+
+
+def test_a_missing_body_is_named(tmp_path):
+    with pytest.raises(BodyError, match="there is no body model"):
+        read_body(tmp_path / "none.npz")

@@ -1,0 +1,228 @@
+"""Files of poses as people have them, and files that hold something else."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+from blender_primdiffusion.motion.arrays import ArrayFileError, read_npz
+from blender_primdiffusion.motion.files import DEFAULT_FPS, MotionFileError, read_motion
+from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, to_axis_angle
+from blender_primdiffusion.motion.skeleton import REST_JOINTS
+
+FRAMES = 7
+RNG = np.random.default_rng(0)
+THETA = RNG.normal(0, 0.3, (FRAMES, 24, 3))
+MOVE = RNG.normal(0, 1, (FRAMES, 3))
+Z_FROM_Y = about_axis(0, np.pi / 2)
+"""Turns a world with y up into one with z up."""
+
+
+def amass(numbers: int) -> dict[str, np.ndarray]:
+    """What AMASS would hold of THETA and MOVE: z up, and `numbers` values a frame, the hands curled."""
+    theta = THETA.copy()
+    theta[:, 0] = to_axis_angle(Z_FROM_Y @ from_axis_angle(THETA[:, 0]))
+    poses = np.full((FRAMES, numbers), 0.4)
+    body = 72 if numbers == 72 else 66
+    poses[:, :body] = theta.reshape(FRAMES, 72)[:, :body]
+    trans = (MOVE + REST_JOINTS[0]) @ Z_FROM_Y.T - REST_JOINTS[0]
+    return {"poses": poses, "trans": trans, "betas": np.zeros(16), "gender": np.array("neutral")}
+
+
+@pytest.mark.parametrize("numbers", [72, 156, 165])
+@pytest.mark.parametrize("rate", ["mocap_framerate", "mocap_frame_rate", "fps"])
+def test_amass_is_read_with_y_up_and_without_hands(tmp_path, numbers, rate):
+    path = tmp_path / "walk_poses.npz"
+    np.savez(path, **amass(numbers), **{rate: np.array(120.0)})
+    motion = read_motion(path)
+    assert (motion.fps, motion.name) == (120.0, "walk_poses")
+    assert any("z is up" in note for note in motion.notes)
+    np.testing.assert_allclose(motion.translations, MOVE, atol=1e-9)
+    expected = THETA.copy()
+    if numbers != 72:
+        expected[:, 22:] = 0
+    np.testing.assert_allclose(motion.rotations, from_axis_angle(expected), atol=1e-9)
+
+
+def test_amass_that_has_y_up_already_is_left_alone(tmp_path):
+    np.savez(tmp_path / "m.npz", poses=THETA.reshape(FRAMES, 72), trans=MOVE, fps=np.array(60))
+    motion = read_motion(tmp_path / "m.npz")
+    np.testing.assert_allclose(motion.rotations, from_axis_angle(THETA), atol=1e-9)
+    np.testing.assert_allclose(motion.translations, MOVE, atol=1e-9)
+    assert any("y is up" in note for note in motion.notes)
+
+
+def test_amass_without_a_rate_gets_the_default_and_a_note(tmp_path):
+    np.savez(tmp_path / "m.npz", **amass(156))
+    motion = read_motion(tmp_path / "m.npz")
+    assert motion.fps == DEFAULT_FPS
+    assert "tells no frame rate: 30 frames a second are assumed" in motion.notes
+
+
+def test_smplx_by_parts_is_read(tmp_path):
+    whole = amass(165)
+    np.savez(
+        tmp_path / "m.npz", root_orient=whole["poses"][:, :3], pose_body=whole["poses"][:, 3:66], trans=whole["trans"],
+        mocap_frame_rate=np.array(30.0),
+    )  # fmt: skip
+    expected = THETA.copy()
+    expected[:, 22:] = 0
+    np.testing.assert_allclose(read_motion(tmp_path / "m.npz").rotations, from_axis_angle(expected), atol=1e-9)
+
+
+def test_a_pose_npz_is_read_as_it_stands(tmp_path):
+    np.savez(
+        tmp_path / "p.npz", global_orient=THETA[:, 0], body_pose=THETA[:, 1:].reshape(FRAMES, 69), transl=MOVE,
+        betas=np.zeros((1, 10)),
+    )  # fmt: skip
+    motion = read_motion(tmp_path / "p.npz")
+    np.testing.assert_allclose(motion.axis_angle(), THETA, atol=1e-9)
+    np.testing.assert_array_equal(motion.translations, MOVE)
+
+
+def test_rotation_matrices_are_read(tmp_path):
+    matrices = from_axis_angle(THETA)
+    np.savez(tmp_path / "p.npz", global_orient=matrices[:, :1], body_pose=matrices[:, 1:])
+    np.save(tmp_path / "p.npy", matrices)
+    np.testing.assert_allclose(read_motion(tmp_path / "p.npz").rotations, matrices, atol=1e-9)
+    np.testing.assert_allclose(read_motion(tmp_path / "p.npy").rotations, matrices, atol=1e-9)
+
+
+@pytest.mark.parametrize("shape", [(FRAMES, 72), (FRAMES, 24, 3)])
+def test_npy_of_many_frames_is_read(tmp_path, shape):
+    np.save(tmp_path / "p.npy", THETA.reshape(shape))
+    np.testing.assert_allclose(read_motion(tmp_path / "p.npy").axis_angle(), THETA, atol=1e-9)
+
+
+@pytest.mark.parametrize("shape", [(72,), (24, 3), (1, 72)])
+def test_npy_of_one_pose_is_read(tmp_path, shape):
+    np.save(tmp_path / "p.npy", THETA[0].reshape(shape).astype(np.float32))
+    motion = read_motion(tmp_path / "p.npy")
+    np.testing.assert_allclose(motion.axis_angle()[0], THETA[0], atol=1e-6)
+    assert motion.notes == ()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        THETA.reshape(FRAMES, 72).tolist(),
+        {"poses": THETA.tolist(), "fps": 30},
+        {"global_orient": THETA[:, 0].tolist(), "body_pose": THETA[:, 1:].reshape(FRAMES, 69).tolist()},
+    ],
+)
+def test_json_is_read(tmp_path, content):
+    (tmp_path / "p.json").write_text(json.dumps(content))
+    np.testing.assert_allclose(read_motion(tmp_path / "p.json").axis_angle(), THETA, atol=1e-9)
+
+
+def test_the_released_plain_twin_is_read_and_the_pickled_one_refused(tmp_path):
+    from blender_primdiffusion.capture.layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE, write_smpl
+
+    write_smpl(tmp_path, THETA[:, 0], THETA[:, 1:].reshape(FRAMES, 69), np.zeros(10), MOVE)
+    motion = read_motion(tmp_path / SMPL_FOLDER / SMPL_PLAIN_FILE)
+    np.testing.assert_allclose(motion.axis_angle(), THETA, atol=1e-6)
+    with pytest.raises(MotionFileError, match="pickled objects, which are never read"):
+        read_motion(tmp_path / SMPL_FOLDER / SMPL_FILE)
+
+
+def test_one_translation_serves_all_frames(tmp_path):
+    np.savez(tmp_path / "p.npz", pose=THETA.reshape(FRAMES, 72), transl=np.array([1.0, 2, 3]))
+    np.testing.assert_array_equal(read_motion(tmp_path / "p.npz").translations, np.tile([1.0, 2, 3], (FRAMES, 1)))
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"poses": np.full((3, 72), np.nan), "trans": np.zeros((3, 3))}, "'poses' holds NaN or infinite"),
+        ({"poses": np.zeros((3, 72)), "trans": np.full((3, 3), np.inf)}, "'trans' holds NaN or infinite"),
+        ({"poses": np.zeros((3, 60))}, "poses of 20 joints"),
+        ({"poses": np.zeros((3, 71))}, "72 axis-angle numbers"),
+        ({"poses": np.zeros((0, 72))}, "holds no frame"),
+        ({"poses": np.array(["a"] * 72)[None]}, "where numbers are wanted"),
+        ({"poses": np.zeros((3, 72)), "trans": np.zeros((4, 3))}, "translations of shape"),
+        ({"poses": np.array([{"a": 1}], object)}, "pickled Python objects"),
+        ({"body_pose": np.zeros((3, 69)), "global_orient": np.zeros((2, 3))}, "2 frames of global_orient but 3"),
+        ({"body_pose": np.ones((3, 23, 3, 3))}, "no rotations"),
+        ({"marker_data": np.zeros((3, 72))}, "in it is 'marker_data', wanted are 'poses'"),
+    ],
+)
+def test_arrays_that_are_no_poses_are_named(tmp_path, arrays, message):
+    np.savez(tmp_path / "bad.npz", **arrays)
+    with pytest.raises(MotionFileError, match=message):
+        read_motion(tmp_path / "bad.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.npz", b"PK\x03\x04 not a zip", "not a whole .npz"),
+        ("a.npy", b"\x93NUMPY\x01\x00 nothing", "not an array of numpy's format"),
+        ("a.json", b"{", "is not JSON"),
+        ("a.json", b'{"pose": [1, 2, [3]]}', "lists of numbers"),
+        ("a.json", b'{"angles": [1]}', "holds no poses"),
+        ("a.json", b"[NaN" + b", 0" * 71 + b"]", "NaN or infinite"),
+        ("a.bvh", b"HIERARCHY\nROOT hip\n{\n OFFSET 0 0 0\n", "not a BVH file"),
+        ("a.pkl", b"", "is no pose file"),
+    ],
+)
+def test_files_that_are_broken_are_named(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(MotionFileError, match=message) as caught:
+        read_motion(tmp_path / name)
+    assert str(tmp_path / name) in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(MotionFileError, match="there is no pose file"):
+        read_motion(tmp_path / "none.npz")
+
+
+def bomb(claimed: tuple[int, ...], size: int) -> bytes:
+    """An .npy whose header promises an array of shape `claimed` and that holds `size` zero bytes."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": claimed})
+    return stream.getvalue() + bytes(size)
+
+
+def test_an_array_larger_than_its_file_is_refused_before_memory_is_taken(tmp_path):
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w") as archive:
+        archive.writestr("poses.npy", bomb((10**9, 72), 100))
+    with pytest.raises(MotionFileError, match="its header promises 576000000000 bytes"):
+        read_motion(tmp_path / "bomb.npz")
+    (tmp_path / "bomb.npy").write_bytes(bomb((10**9, 72), 100))
+    with pytest.raises(MotionFileError, match="cut short"):
+        read_motion(tmp_path / "bomb.npy")
+
+
+def test_a_zip_bomb_is_refused(tmp_path):
+    with (
+        zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("poses.npy", "w", force_zip64=True) as member,
+    ):
+        for _ in range(700):
+            member.write(bytes(2**20))
+    assert (tmp_path / "bomb.npz").stat().st_size < 2**20
+    with pytest.raises(MotionFileError, match="unpacks to 700 MB"):
+        read_motion(tmp_path / "bomb.npz")
+
+
+def test_names_with_paths_in_them_write_nothing(tmp_path):
+    with zipfile.ZipFile(tmp_path / "evil.npz", "w") as archive:
+        archive.writestr("../../escaped.npy", bomb((1,), 8))
+    with pytest.raises(MotionFileError, match="holds no poses"):
+        read_motion(tmp_path / "evil.npz")
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["evil.npz"]
+    assert list(read_npz(tmp_path / "evil.npz", ["../../escaped"])) == ["../../escaped"]
+
+
+def test_a_damaged_member_is_named(tmp_path):
+    np.savez_compressed(tmp_path / "m.npz", poses=RNG.normal(size=(50, 72)))
+    content = bytearray((tmp_path / "m.npz").read_bytes())
+    content[400:440] = bytes(40)
+    (tmp_path / "m.npz").write_bytes(content)
+    with pytest.raises(ArrayFileError, match="damaged"):
+        read_npz(tmp_path / "m.npz", ["poses"])
