@@ -35,7 +35,8 @@ def read_parameters(scan_file: ScanFile) -> Parameters:
     """The parameters of a scan; of several frames the first.
 
     The .npz of plain arrays has `global_orient` and `body_pose` (or `pose`, `poses`), `betas`, and if wanted `transl`
-    or `trans`, `scale`, and `body`, the name of the body whose shape `betas` are. Raises ScanError where it is missing or holds something else.
+    or `trans`, `scale`, and `body`, the name of the body whose shape `betas` are. Raises ScanError where it is missing
+    or holds something else.
     """
     path = scan_file.parameters
     if path is None:
