@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int32
+from jaxtyping import Float, Float32, Float64, Int32, UInt8
 
+from primdiffusion.body.model import J
 from primdiffusion.capture.soup import flatten
 from primdiffusion.capture.texture_pyramid import TexturePyramid, texture_pyramid
-from primdiffusion.geometry.textured_mesh import TexturedMesh
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 
 SAME_PLACE = 1e-6
 """Vertices of a part nearer than this (metres, in the rest pose) are one to normals: seams of textures stay smooth."""
@@ -26,8 +27,8 @@ class Figure:
     part: Int32[np.ndarray, "F"]
     """Which part a face belongs to."""
     textures: TexturePyramid
-    skin_index: Int32[np.ndarray, "V M"]
-    skin_weight: Float32[np.ndarray, "V M"]
+    joint: UInt8[np.ndarray, "F"]
+    """The joint with the most weight on a face's corners."""
     corner: Int32[np.ndarray, "V"]
     """Vertices in one place of a part share a number; normals are means over these."""
 
@@ -71,7 +72,6 @@ def figure_of(mesh: TexturedMesh) -> Figure:
             texture has no texel.
     """
     soup = flatten(mesh)
-    most = max(part.skin_index.shape[1] for part in mesh.parts)
     first = 0
     corners = []
     for part in mesh.parts:
@@ -85,11 +85,14 @@ def figure_of(mesh: TexturedMesh) -> Figure:
         corner_uv=soup.corner_uv,
         part=soup.part,
         textures=texture_pyramid(mesh),
-        skin_index=np.concatenate([_wide(part.skin_index, most) for part in mesh.parts]).astype(np.int32),
-        skin_weight=np.concatenate([_wide(part.skin_weight, most) for part in mesh.parts]).astype(np.float32),
+        joint=np.concatenate([_joints_of_faces(part) for part in mesh.parts]),
         corner=np.concatenate(corners).astype(np.int32),
     )
 
 
-def _wide(rows: np.ndarray, columns: int) -> np.ndarray:
-    return np.pad(rows, ((0, 0), (0, columns - rows.shape[1])))
+def _joints_of_faces(part: TexturedPart) -> UInt8[np.ndarray, "F"]:
+    sums = np.zeros((len(part.faces), J))
+    rows = np.arange(len(part.faces))[:, None]
+    for corner in part.faces.T:
+        np.add.at(sums, (rows, part.skin_index[corner]), part.skin_weight[corner])
+    return sums.argmax(1).astype(np.uint8)
