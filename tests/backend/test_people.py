@@ -90,7 +90,8 @@ def test_outer_clothes_hide_the_body_and_what_lies_deeper(base):
     listed = " ".join(str(vertex) for vertex in triangle)
     outer = parse_mhclo(f"name outer\nz_depth 50\nverts 0\n{line * 3}delete_verts\n{listed}\n")
     inner = parse_mhclo(f"name inner\nz_depth 5\nverts 0\n{line * 3}")
-    shown = shown_faces(base, {"inner": (inner, np.array([[0, 1, 2]])), "outer": (outer, np.array([[0, 1, 2]]))})
+    proxies = {"inner": (inner, np.array([[0, 1, 2]])), "outer": (outer, np.array([[0, 1, 2]]))}
+    shown = shown_faces(base, proxies, np.zeros(len(base.template), bool))
     assert not shown["body"][0]
     assert shown["body"].sum() == len(base.faces) - 1
     assert not shown["inner"].any()

@@ -5,15 +5,19 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import BaseMesh
-from primdiffusion.people.mhclo import Proxy
+from primdiffusion.people.mhclo import ObjMesh, Proxy
+from primdiffusion.people.texel_map import connected_faces
+from primdiffusion.people.wardrobe import SKIRTS
 
 JOINTS = 24
 INFLUENCES = 4
 """Joints that move a vertex."""
+DRAPE, LOOSE = 6, 0.6
+"""How often a skirt's weights are averaged with their neighbours', each time by half; the lower share that is."""
 OVERLAP = 0.012
 """How far socks reach up into trousers, metres."""
 
@@ -23,14 +27,31 @@ def item_skinning(
     assets: Assets, base: BaseMesh, path: str
 ) -> tuple[Int[np.ndarray, "V 4"], Float[np.ndarray, "V 4"], Float[np.ndarray, "V 3 3"]]:
     """Joints, weights and turn of every vertex of a mesh: the base's, blended; the four strongest joints are kept."""
-    proxy, _ = assets.proxy(path)
+    proxy, mesh = assets.proxy(path)
     dense = np.zeros((len(base.template), JOINTS))
     np.add.at(dense, (np.arange(len(dense))[:, None], base.joint_index), base.joint_weight)
     blended = np.maximum(proxy.blend(dense), 0)
+    if path in SKIRTS:
+        blended = _draped(blended, mesh, SKIRTS[path])
     turn = np.einsum("vj,jab->vab", blended / blended.sum(1, keepdims=True), base.rest_from_native)
     index = np.argsort(-blended, axis=1, kind="stable")[:, :INFLUENCES]
     weight = np.take_along_axis(blended, index, axis=1)
     return index, weight / weight.sum(1, keepdims=True), turn
+
+
+def _draped(weight: Float[np.ndarray, "V J"], mesh: ObjMesh, pieces: tuple[int, ...]) -> Float[np.ndarray, "V J"]:
+    """Weights of skirts, averaged along the cloth: each half follows one thigh, and the middle would tear between."""
+    skirt = mesh.faces[np.isin(connected_faces(mesh.faces, len(weight)), pieces)]
+    height = mesh.vertices[skirt, 1]
+    edges = np.unique(np.sort(skirt[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    loose = mesh.vertices[:, 1:2] < height.min() + LOOSE * np.ptp(height)
+    both = np.concatenate([edges, edges[:, ::-1]])
+    count = np.bincount(both[:, 0], minlength=len(weight))[:, None]
+    for _ in range(DRAPE):
+        around = np.zeros_like(weight)
+        np.add.at(around, both[:, 0], weight[both[:, 1]])
+        weight = np.where(loose & (count > 0), 0.5 * weight + 0.5 * around / np.maximum(count, 1), weight)
+    return weight
 
 
 def fit_item(
@@ -63,16 +84,19 @@ def under_hem(
     return socks[faces].mean(axis=1)[:, 1] > outfit[:, 1].min() + OVERLAP
 
 
-def shown_faces(base: BaseMesh, proxies: dict[str, tuple[Proxy, Int[np.ndarray, "F 3"]]]) -> dict[str, np.ndarray]:
+def shown_faces(
+    base: BaseMesh, proxies: dict[str, tuple[Proxy, Int[np.ndarray, "F 3"]]], covered: Bool[np.ndarray, " B"]
+) -> dict[str, np.ndarray]:
     """Which faces of the body ("body") and of every proxy are seen: [F] bool by name.
 
     From the outermost proxy inwards, each hides the base vertices it lists: on the body, and on what lies deeper.
-    A face goes when all of its vertices are hidden, so that a rim of it stays under the hem.
+    A face goes when all of its vertices are hidden, so that a rim of it stays under the hem. The body also loses what
+    is `covered`.
     """
     hidden = np.zeros(len(base.template), bool)
     shown: dict[str, np.ndarray] = {}
     for name, (proxy, faces) in sorted(proxies.items(), key=lambda item: -item[1][0].z_depth):
         shown[name] = ~proxy.hidden_by(hidden)[faces].all(axis=1)
         hidden[proxy.delete_vertices] = True
-    shown["body"] = ~hidden[base.faces].all(axis=1)
+    shown["body"] = ~(hidden | covered)[base.faces].all(axis=1)
     return shown

@@ -7,7 +7,7 @@ import functools
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import binary_erosion, distance_transform_edt, gaussian_filter
 
 from primdiffusion.people import palette, patterns
 from primdiffusion.people.assets import Assets
@@ -15,7 +15,7 @@ from primdiffusion.people.base_mesh import BaseMesh
 from primdiffusion.people.colour import bytes_from_linear, lab_from_bytes, luminance
 from primdiffusion.people.fitting import fit_item
 from primdiffusion.people.texel_map import connected_faces, texel_map, uv_islands
-from primdiffusion.people.wardrobe import Garment, Kind, Piece
+from primdiffusion.people.wardrobe import Garment, Kind, Piece, stream
 
 SIZE = 512
 """Texels of a garment's side: about 3 mm of cloth each."""
@@ -25,6 +25,14 @@ PLAIN_TRIM_SHARE = 0.5
 """How often edgings and prints take the colour of their piece; a suit's shirt and tie never do."""
 TRIM_DISTANCE = 24.0
 """Lab distance from a piece's own colour beyond which a texel is trim."""
+
+
+RIM = 2
+"""Texels at an island's edge that are taken to be mixed with what is outside."""
+CREASE_SPREADS, CREASE_DEPTHS = (14, 1), (0.06, 0.03)
+"""Size (texels) and depth (share of the light) of creases and of weave drawn on cloth without a texture."""
+SKIN_DISTANCE, TRIES = 22.0, 8
+"""Lab distance that cloth keeps from its wearer's skin, and how often a colour is drawn for it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,7 +75,7 @@ def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
         original = assets.picture(name, SIZE)
         light = luminance(original[..., :3])
     else:
-        light = np.ones((SIZE, SIZE), np.float32)
+        light = _creases(garment.path)
     trim = np.zeros((SIZE, SIZE), bool)
     shade = np.ones((SIZE, SIZE), np.float32)
     for number, kind in enumerate(garment.pieces):
@@ -85,16 +93,20 @@ def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
             if (region & texels.inside).any():
                 middle = np.median(light[region & texels.inside])
                 shade[region] = np.clip((light[region] + 0.01) / (middle + 0.01), 0.15, 2.2) ** 0.75
-    shade *= _occlusion(assets, garment)
-    return Cloth(original, piece, trim, shade, position.astype(np.float32))
+    nearest = _inner_texels(texels.inside)
+    shade = (shade * _occlusion(assets, garment))[nearest]
+    return Cloth(original, piece, trim[nearest], shade, position.astype(np.float32))
 
 
-def paint_garment(garment: Garment, draws: np.random.Generator) -> tuple[Paint, ...]:
-    """Draw colours for every piece; pieces of one kind in a garment go together."""
+def paint_garment(
+    garment: Garment, draws: np.random.Generator, skin: UInt8[np.ndarray, "3"] | None = None
+) -> tuple[Paint, ...]:
+    """Draw colours for every piece; pieces of one kind in a garment go together, and none has the colour of `skin`."""
     by_kind: dict[Kind, Paint] = {}
     for piece in garment.pieces:
-        if piece.kind not in by_kind:
-            by_kind[piece.kind] = _paint(piece, draws)
+        for _ in range(TRIES):
+            if piece.kind not in by_kind or (skin is not None and _is_skin(by_kind[piece.kind].main, skin)):
+                by_kind[piece.kind] = _paint(piece, draws)
     return tuple(by_kind[piece.kind] for piece in garment.pieces)
 
 
@@ -119,6 +131,11 @@ def coloured(fabric: Cloth, paints: tuple[Paint, ...]) -> UInt8[np.ndarray, "H W
     return texture
 
 
+def _is_skin(colour: Float[np.ndarray, "3"], skin: UInt8[np.ndarray, "3"]) -> bool:
+    both = lab_from_bytes(np.stack([bytes_from_linear(colour), skin]))
+    return bool(np.linalg.norm(both[0] - both[1]) < SKIN_DISTANCE)
+
+
 def _paint(piece: Piece, draws: np.random.Generator) -> Paint:
     """Colours for a kind of piece: tops may be patterned, all else is of one colour."""
     kind = piece.kind
@@ -136,10 +153,32 @@ def _paint(piece: Piece, draws: np.random.Generator) -> Paint:
     return Paint(main, trim, second, pattern)
 
 
+def _inner_texels(inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of the texel each takes its shade from: at the rim of an island, one a little further in.
+
+    Rims are mixed with what the pack's picture has between islands, and would show as dark seams.
+    """
+    inner = np.asarray(binary_erosion(inside, iterations=RIM), bool)
+    nearest = np.asarray(distance_transform_edt(np.logical_not(inner), return_distances=False, return_indices=True))
+    own = np.indices(inside.shape)
+    far = inside & (np.abs(nearest - own).max(axis=0) > 3 * RIM)
+    rows, columns = np.where(far, own, nearest)
+    return rows, columns
+
+
 def _blurred(light: Float[np.ndarray, "H W"], seen: np.ndarray) -> Float[np.ndarray, "H W"]:
     """The broad shading of the seen texels, with none of their fine stripes."""
     weight = gaussian_filter(seen.astype(np.float32), 8) + 1e-6
     return gaussian_filter(np.where(seen, light, 0).astype(np.float32), 8) / weight
+
+
+def _creases(path: str) -> Float[np.ndarray, "H W"]:
+    """Light on cloth whose texture the pack lacks: shallow creases and a little weave, 1 in the middle."""
+    light = np.ones((SIZE, SIZE))
+    for spread, depth in zip(CREASE_SPREADS, CREASE_DEPTHS, strict=True):
+        field = gaussian_filter(stream(0, f"creases of {spread} on {path}").standard_normal((SIZE, SIZE)), spread)
+        light += depth * np.clip(field / field.std(), -2, 2)
+    return light
 
 
 def _occlusion(assets: Assets, garment: Garment) -> Float[np.ndarray, "H W"] | np.float32:

@@ -143,7 +143,7 @@ def _skin(skeleton: Skeleton, binary: _Binary) -> dict[str, Any]:
     inverse = np.tile(np.eye(4, dtype=np.float32), (len(skeleton.names), 1, 1))
     inverse[:, 3, :3] = -skeleton.positions
     matrices = binary.accessor(inverse.reshape(-1, 16), "MAT4", FLOAT, None)
-    return {"name": "body", "skeleton": 0, "joints": list(range(len(inverse))), "inverseBindMatrices": matrices}
+    return {"name": "skeleton", "skeleton": 0, "joints": list(range(len(inverse))), "inverseBindMatrices": matrices}
 
 
 def _primitive(part: TexturedPart, number: int, binary: _Binary) -> dict[str, Any]:

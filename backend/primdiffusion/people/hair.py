@@ -60,8 +60,11 @@ def tinted_cutout(picture: UInt8[np.ndarray, "H W 4"], colour: Float[np.ndarray,
 def _straight(texels: TexelMap, name: str) -> Strands:
     """Strands that run down the texture and end raggedly where an island ends below."""
     draws = stream(0, f"strands of {name}")
-    noise = draws.standard_normal((2, SIZE, SIZE)).astype(np.float32)
-    shade = _unit(gaussian_filter(noise[0], (60, 1.2))) + 0.7 * _unit(gaussian_filter(noise[1], (90, 5)))
+    noise = draws.standard_normal((3, SIZE, SIZE)).astype(np.float32)
+    shade = sum(
+        share * _unit(gaussian_filter(layer, spread))
+        for layer, share, spread in zip(noise, (0.8, 1.0, 0.8), ((60, 0.7), (80, 1.6), (100, 5)), strict=True)
+    )
     below = np.zeros((SIZE, SIZE), np.float32)
     above = np.zeros((SIZE, SIZE), np.float32)
     for row in range(SIZE - 2, -1, -1):
@@ -82,7 +85,8 @@ def _curls(texels: TexelMap, island: Int[np.ndarray, " F"]) -> Strands:
     curls, tufts = _unit(gaussian_filter(noise[0], 2.0)), _unit(gaussian_filter(noise[1], 7.0))
     edge = gaussian_filter(texels.inside.astype(np.float32), 5)
     there = (island < 2)[texels.face] | (curls + tufts + 6 * (edge - 0.6) > 0)
-    return Strands(np.exp(0.2 * (curls + 0.5 * tufts)).astype(np.float32), np.where(there, 255, 0).astype(np.uint8))
+    shade = _unit(gaussian_filter(noise[0], 1.2)) + 0.6 * curls + 0.8 * tufts
+    return Strands(np.exp(0.2 * shade).astype(np.float32), np.where(there, 255, 0).astype(np.uint8))
 
 
 def _unit(field: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 Pattern = Callable[[Float[np.ndarray, "*b 3"]], Float[np.ndarray, "*b"]]
 
-SHOULDER_X, SHOULDER_Y, EDGE = 0.2, 0.43, 0.003
+SHOULDER_X, SHOULDER_Y, EDGE = 0.2, 0.254, 0.003
 """Where sleeves begin, the height of the arms, and the half width of soft edges, metres."""
 
 
@@ -46,7 +46,9 @@ def dots(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
 
 def sleeves(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
     """Sleeves of the second colour."""
-    return _soft(np.abs(position[..., 0]) - SHOULDER_X + 0.02, EDGE)
+    # Hips, which can be as wide, are not sleeves.
+    raised = position[..., 1] > SHOULDER_Y - 0.25
+    return np.where(raised, _soft(np.abs(position[..., 0]) - SHOULDER_X + 0.02, EDGE), 0)
 
 
 def yoke(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:

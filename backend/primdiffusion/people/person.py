@@ -9,28 +9,18 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
-from primdiffusion.people import garments, hair, palette, skin
+from primdiffusion.people import eyes, faces, garments, hair, palette, skin
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import BaseMesh
 from primdiffusion.people.colour import bytes_from_linear
+from primdiffusion.people.covering import cover, sunk
 from primdiffusion.people.fitting import fit_item, item_skinning, shown_faces, under_hat, under_hem
 from primdiffusion.people.texel_map import connected_faces
 from primdiffusion.people.wardrobe import EYES, Choice, choose, hair_path, stream
 
-EYE_SIZE, BROW_SIZE = 256, 512
-EYE_SHARES = {
-    "brown": 0.4,
-    "brownlight": 0.22,
-    "blue": 0.1,
-    "lightblue": 0.07,
-    "green": 0.07,
-    "grey": 0.07,
-    "bluegreen": 0.04,
-    "ice": 0.03,
-}
+BROW_SIZE = 512
 CLOTHES = ("outfit", "shoes")
 """Parts that hide what is under them. Outfits also list the base's eyes and hair, which must stay."""
-DARK_EYES = ("brown", "brownlight")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -58,7 +48,7 @@ def make_person(assets: Assets, base: BaseMesh, seed: int) -> Person:
         AssetsMissingError, ProxyFileError: the asset folder lacks files or has damaged ones.
     """
     choice = choose(seed, femininity(base))
-    return _coloured(assets, base, choice, _geometry(assets, base, choice), seed)
+    return _coloured(assets, base, choice, _geometry(assets, base, choice, faces.draw_face(stream(seed, "face"))), seed)
 
 
 def recolour(person: Person, seed: int) -> Person:
@@ -74,9 +64,9 @@ def femininity(base: BaseMesh) -> Float[np.ndarray, "10"]:
     return np.linalg.lstsq(design, gender, rcond=None)[0][:-1]
 
 
-def _geometry(assets: Assets, base: BaseMesh, choice: Choice) -> TexturedMesh:
+def _geometry(assets: Assets, base: BaseMesh, choice: Choice, face: Float[np.ndarray, " M"]) -> TexturedMesh:
     """All parts in place, with a plain texture."""
-    vertices = base.vertices(choice.betas)
+    vertices = faces.with_face(base.vertices(choice.betas), base, face)
     paths = {
         "outfit": choice.outfit.path,
         "shoes": choice.shoes.path,
@@ -88,11 +78,13 @@ def _geometry(assets: Assets, base: BaseMesh, choice: Choice) -> TexturedMesh:
     }
     worn = {name: path for name, path in paths.items() if path}
     pairs = {name: assets.proxy(path) for name, path in worn.items()}
-    shown = shown_faces(base, {name: (pairs[name][0], pairs[name][1].faces) for name in CLOTHES})
+    covers = tuple(cover(assets, base, worn[name]) for name in CLOTHES)
+    covered = np.any([garment.hidden for garment in covers], axis=0)
+    shown = shown_faces(base, {name: (pairs[name][0], pairs[name][1].faces) for name in CLOTHES}, covered)
     plain = np.full((1, 1, 4), 255, np.uint8)
     body = TexturedPart(
         "body",
-        vertices,
+        sunk(vertices, base, covers),
         base.faces[shown["body"]].astype(np.int32),
         base.corner_uv[shown["body"]],
         plain,
@@ -132,12 +124,14 @@ def _coloured(assets: Assets, base: BaseMesh, choice: Choice, mesh: TexturedMesh
     """Draw all colours from a seed and put them on the geometry."""
     complexion = skin.draw_skin(assets, choice.sex, stream(seed, "skin"))
     hair_name, hair_linear = palette.hair_colour(complexion.tone, complexion.age == "old", stream(seed, "hair colour"))
-    eyes = _eye_picture(assets, complexion.tone, stream(seed, "eye colour"))
-    outfit = garments.paint_garment(choice.outfit, stream(seed, "outfit colour"))
+    iris = eyes.draw_eyes(assets, complexion.tone, stream(seed, "eye colour"))
+    skin_picture = skin.skin_texture(assets, complexion)
+    bare = np.median(skin_picture[::16, ::16, :3].reshape(-1, 3), axis=0).astype(np.uint8)
+    outfit = garments.paint_garment(choice.outfit, stream(seed, "outfit colour"), bare)
     shoes = garments.paint_garment(choice.shoes, stream(seed, "shoe colour"))
     textures: dict[str, UInt8[np.ndarray, "H W 4"]] = {
-        "body": skin.skin_texture(assets, complexion),
-        "eyes": assets.picture(eyes, EYE_SIZE),
+        "body": skin_picture,
+        "eyes": eyes.eye_texture(assets, iris),
         "eyebrows": hair.tinted_cutout(assets.picture(choice.eyebrows, BROW_SIZE), 0.35 * hair_linear),
         "eyelashes": hair.tinted_cutout(assets.picture(choice.eyelashes, BROW_SIZE), np.full(3, 0.006)),
         "outfit": garments.coloured(garments.cloth(assets, base, choice.outfit), outfit),
@@ -159,17 +153,10 @@ def _coloured(assets: Assets, base: BaseMesh, choice: Choice, mesh: TexturedMesh
         "hair": choice.hair or "none",
         "hair_colour": hair_name,
         "hat": choice.hat.rsplit("/", 1)[-1] if choice.hat else "none",
-        "eyes": eyes.rsplit("/", 1)[-1],
+        "eyes": iris,
         "height": round(float(mesh.parts[0].vertices[:, 1].max() - mesh.bounds[0, 1]), 4),
     }
     used = (choice.outfit.path, choice.shoes.path, choice.eyebrows, choice.eyelashes, EYES, complexion.base,
-            complexion.other, eyes, choice.hair and hair_path(choice.hair), choice.hat)  # fmt: skip
+            complexion.other, eyes.picture_of(iris), choice.hair and hair_path(choice.hair), choice.hat)  # fmt: skip
     sources = tuple(dict.fromkeys(file for name in used if name for file in assets.files(name)))
     return Person(TexturedMesh(parts), choice.betas, attributes, sources, choice, assets, base)
-
-
-def _eye_picture(assets: Assets, tone: float, draws: np.random.Generator) -> str:
-    """A picture of an iris; dark skin goes with brown eyes."""
-    there = {name: share for name, share in EYE_SHARES.items() if assets.has_picture(f"eyes/materials/{name}_eye")}
-    shares = np.array([share if name in DARK_EYES else share * (1 - tone) ** 2 for name, share in there.items()])
-    return f"eyes/materials/{list(there)[draws.choice(len(there), p=shares / shares.sum())]}_eye"

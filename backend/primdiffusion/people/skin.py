@@ -25,6 +25,8 @@ COARSE = 256
 """Texels of the local mean's side."""
 SPREAD = 6.0
 """Standard deviation of the local mean's window, texels of COARSE."""
+BROAD_SPREAD, EVENED = 16.0, (0.3, 0.6, 0.6)
+"""Limbs of another colour than the rest come this much (L, a, b) nearer to it; window in texels of COARSE."""
 FOLDER = "skins/textures"
 LEFT_OUT = ("suit", "toon")
 
@@ -73,11 +75,13 @@ def skin_texture(assets: Assets, skin: SkinColours) -> UInt8[np.ndarray, "H W 4"
     """The texture of a skin."""
     distance = skin.tone if "lightskinned" in skin.base else 1 - skin.tone
     means = _local_mean(assets, skin.other) - _local_mean(assets, skin.base)
-    move = np.float32(distance) * means + np.array(skin.shift, np.float32)
+    move = distance * means + np.array(skin.shift)
+    broad = gaussian_filter(_local_mean(assets, skin.base) + move, (BROAD_SPREAD, BROAD_SPREAD, 0))
+    move -= np.array(EVENED) * (broad - np.median(broad, axis=(0, 1)))
     lab = _lab(assets, skin.base).astype(np.float32)
     height, width = lab.shape[:2]
     for channel in range(3):
-        coarse = Image.fromarray(move[..., channel])
+        coarse = Image.fromarray(move[..., channel].astype(np.float32))
         lab[..., channel] += np.asarray(coarse.resize((width, height), Image.Resampling.BILINEAR))
     texture = np.full((height, width, 4), 255, np.uint8)
     texture[..., :3] = bytes_from_lab(lab)

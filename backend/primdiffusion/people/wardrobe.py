@@ -72,6 +72,13 @@ OUTFITS: dict[Sex, tuple[Garment, ...]] = {
         *UNISEX,
     ),
 }
+SKIRTS = {
+    garment.path: tuple(number for number, piece in enumerate(garment.pieces) if piece.kind == "skirt")
+    for garments in OUTFITS.values()
+    for garment in garments
+    if any(piece.kind == "skirt" for piece in garment.pieces)
+}
+"""Outfits with a skirt, and which of their pieces it is."""
 
 _SHOE = (Piece("shoe"), Piece("shoe"), Piece("sock"), Piece("sock"))
 SHOES: tuple[Garment, ...] = (
@@ -84,16 +91,27 @@ SHOES: tuple[Garment, ...] = (
 )
 
 HATS = ("clothes/fedora01/fedora", "clothes/fedora01/fedora_cocked")
-HAIR: dict[Sex, tuple[str, ...]] = {
-    "female": ("bob01", "bob02", "long01", "ponytail01", "braid01", "short03", "afro01"),
-    "male": ("short01", "short02", "short04", "short03", "afro01"),
+HAIR: dict[Sex, dict[str, float]] = {
+    "female": {
+        "bob01": 0.09,
+        "bob02": 0.11,
+        "long01": 0.2,
+        "ponytail01": 0.2,
+        "braid01": 0.16,
+        "short03": 0.12,
+        "afro01": 0.12,
+    },
+    "male": {"short01": 0.22, "short02": 0.22, "short04": 0.22, "short03": 0.17, "afro01": 0.17},
 }
-HAT_HAIR: dict[Sex, tuple[str, ...]] = {
-    "female": ("bob02", "long01"),
-    "male": ("short02", "short04"),
+"""Shares; the bobs hide an eye and stay few."""
+HAT_HAIR: dict[Sex, dict[str, float]] = {
+    "female": {"bob02": 0.3, "long01": 0.7},
+    "male": {"short02": 0.5, "short04": 0.5},
 }
 EYEBROWS = tuple(f"eyebrows/eyebrow{number:03d}/eyebrow{number:03d}" for number in range(1, 13))
 EYELASHES = tuple(f"eyelashes/eyelashes{number:02d}/eyelashes{number:02d}" for number in range(1, 5))
+FEMALE_EYELASHES = 3
+"""The first so many; the last are stage make-up."""
 FEMALE_EYEBROWS, MALE_EYEBROWS = (0, 1, 3, 5, 6, 9, 10), (0, 1, 2, 3, 4, 7, 9, 11)
 EYES = "eyes/low-poly/low-poly"
 
@@ -147,7 +165,7 @@ def choose(seed: int, femininity: Float[np.ndarray, "10"]) -> Choice:
     hat = HATS[head.integers(len(HATS))] if head.random() < HAT_SHARE else None
     bald = sex == "male" and head.random() < BALD_SHARE
     styles = HAT_HAIR[sex] if hat else HAIR[sex]
-    hair = None if bald else styles[head.integers(len(styles))]
+    hair = None if bald else list(styles)[head.choice(len(styles), p=list(styles.values()))]
     brows = FEMALE_EYEBROWS if sex == "female" else MALE_EYEBROWS
     return Choice(
         sex=sex,
@@ -157,7 +175,7 @@ def choose(seed: int, femininity: Float[np.ndarray, "10"]) -> Choice:
         hat=hat,
         hair=hair,
         eyebrows=EYEBROWS[brows[head.integers(len(brows))]],
-        eyelashes=EYELASHES[head.integers(len(EYELASHES)) if sex == "female" else 0],
+        eyelashes=EYELASHES[head.integers(FEMALE_EYELASHES) if sex == "female" else 0],
     )
 
 
