@@ -7,6 +7,7 @@ commands that need it, so `--help` is quick.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from primdiffusion import __version__
+from primdiffusion.drawing.steps import check_step
 from primdiffusion.failures import describe
 from primdiffusion.machine import share_processors
 
@@ -123,16 +125,33 @@ class Render:
         from primdiffusion.primitives.anchors import default_anchors
         from primdiffusion.render.image import depth_to_png, rgba_to_png
         from primdiffusion.render.march import MarchSettings, march
+        from primdiffusion.staging import written_whole
 
+        self._check()
         look = Look(self.view, settings=MarchSettings(step=self.step))
         primitives = place(load_human(self.human), None if self.pose is None else read_pose(self.pose, self.frame))
         width, height = (self.size if side is None else side for side in (self.width, self.height))
         camera = framing(primitives, math.radians(self.yaw), width, height)
         picture = draw(Scene(primitives, chart=default_anchors().chart), camera, look)
-        rgba_to_png(self.out, torch.from_numpy(picture.combined), BACKGROUNDS[self.background])
-        if self.depth is not None:
-            depth_to_png(self.depth, march(primitives, camera, look.settings))
+        with contextlib.ExitStack() as files:  # both pictures or none
+            rgba_to_png(
+                files.enter_context(written_whole(self.out)),
+                torch.from_numpy(picture.combined),
+                BACKGROUNDS[self.background],
+            )
+            if self.depth is not None:
+                rendering = march(primitives, camera, look.settings)
+                depth_to_png(files.enter_context(written_whole(self.depth)), rendering)
         print(self.out)
+
+    def _check(self) -> None:
+        if not math.isfinite(self.yaw):
+            raise ValueError(f"yaw is {self.yaw}: give an angle in degrees")
+        check_step(self.step)
+        if self.depth is not None and self.depth.resolve() == self.out.resolve():
+            raise ValueError(f"out and depth are both {self.out}: name two files")
+        if self.frame and self.pose is None:
+            raise ValueError(f"frame {self.frame} was asked for without a pose file: name one with --pose")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import shutil
 from collections.abc import Iterator
@@ -69,11 +70,21 @@ def _remove_leftovers(folder: Path) -> None:
 
 @contextlib.contextmanager
 def written_whole(path: str | Path) -> Iterator[Path]:
-    """A temporary name beside `path` to write to; renamed on a good end, removed on an error. Raises OSError."""
+    """A temporary name beside `path` to write to; renamed on a good end, removed on an error.
+
+    Raises OSError, which names `path` itself; PermissionError where it is a folder or a device, which renaming would
+    replace.
+    """
     path = Path(path)
+    if path.exists() and not path.is_file():
+        raise PermissionError(errno.EPERM, "this is no ordinary file and will not be replaced", str(path))
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield unfinished
         os.replace(unfinished, path)
+    except OSError as e:
+        if e.filename not in (None, str(unfinished), unfinished):
+            raise
+        raise type(e)(e.errno, e.strerror or str(e), str(path)) from e
     finally:
         unfinished.unlink(missing_ok=True)

@@ -325,6 +325,12 @@ def test_bad_scenes_are_refused_as_check_scene_does():
         draw(dataclasses.replace(boxes, density=boxes.density * 0 - 1), camera)
     with pytest.raises(ValueError, match=r"camera\.intrinsics"):
         draw(boxes, dataclasses.replace(camera, intrinsics=camera.intrinsics * torch.nan))
+    with pytest.raises(ValueError, match="scales or shears"):
+        draw(boxes, dataclasses.replace(camera, world_to_camera=camera.world_to_camera * 2))
+    lens = camera.intrinsics.clone()
+    lens[0, 0] = 0
+    with pytest.raises(ValueError, match="focal lengths"):
+        draw(boxes, dataclasses.replace(camera, intrinsics=lens))
     with pytest.raises(ValueError, match="no rotation in box"):
         draw(dataclasses.replace(boxes, rotation=boxes.rotation * 1.1), camera)
     with pytest.raises(ValueError, match="0 x 20 pixels"):

@@ -4,6 +4,7 @@ import itertools
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -134,6 +135,10 @@ def test_traceback_shows_where_an_error_came_from(tmp_path, capsys):
         ["render", "nobody.human.safetensors", "--out", "x.png"],
         ["render", "nobody.human.safetensors", "--out", "x.png", "--size", "0"],
         ["render", "nobody.human.safetensors", "--out", "x.png", "--step", "0"],
+        *(["render", "nobody.human.safetensors", "--out", "x.png", "--step", step] for step in ("1e-9", "2", "nan")),
+        *(["render", "nobody.human.safetensors", "--out", "x.png", "--yaw", yaw] for yaw in ("nan", "inf")),
+        ["render", "nobody.human.safetensors", "--out", "x.png", "--depth", "x.png"],
+        ["render", "nobody.human.safetensors", "--out", "x.png", "--frame", "3"],
         ["info", "nothing.safetensors"],
     ],
 )
@@ -141,6 +146,35 @@ def test_wrong_values_fail_with_code_1_and_leave_nothing(line, tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     code, stderr = fails(capsys, *line)
     assert (code, stderr.count("\n")) == (1, 1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_picture_that_cannot_be_written_is_named_and_nothing_is(person, tmp_path, capsys):
+    human = person / "person.human.safetensors"
+    small = ("--size", 16)
+    code, stderr = fails(capsys, "render", human, *small, "--out", tmp_path / "no" / "x.png")
+    assert (code, stderr.count("\n")) == (1, 1)
+    assert f"{tmp_path / 'no' / 'x.png'}: no such file" in stderr
+    code, stderr = fails(capsys, "render", human, *small, "--out", tmp_path / "x.png", "--depth", tmp_path / "no" / "d")
+    assert f"{tmp_path / 'no' / 'd'}: no such file" in stderr
+    code, stderr = fails(capsys, "render", human, *small, "--out", tmp_path)
+    assert f"{tmp_path}: this is no ordinary file" in stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
+def test_a_full_disk_is_one_sentence_that_names_the_picture(person, tmp_path, capsys, monkeypatch):
+    human, plain_save = person / "person.human.safetensors", Image.Image.save
+
+    def save(picture, place, **options):
+        plain_save(picture, place, **options)
+        with open("/dev/full", "wb", buffering=0) as full:
+            full.write(b"x")
+
+    monkeypatch.setattr(Image.Image, "save", save)
+    code, stderr = fails(capsys, "render", human, "--size", 16, "--out", tmp_path / "x.png")
+    assert (code, stderr.count("\n")) == (1, 1)
+    assert f"{tmp_path / 'x.png'}: no space left on device" in stderr
     assert list(tmp_path.iterdir()) == []
 
 

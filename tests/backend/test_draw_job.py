@@ -14,6 +14,7 @@ from primdiffusion.failures import describe
 from primdiffusion.human import framing, generate, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render.march import MarchSettings
 from primdiffusion.serve import drawing
 from primdiffusion.serve.draw_params import DrawParams, PersonParams
 from primdiffusion.serve.drawing import FrameDrawer, map_frame
@@ -192,3 +193,35 @@ def test_a_picture_can_be_stopped_at_every_report(params):
 
     with pytest.raises(Stop):
         FrameDrawer(torch.device("cpu")).draw(params, stop)
+
+
+@pytest.mark.parametrize("scale", [0.001, 0.03, 0.8, 300.0])
+def test_a_person_of_any_size_looks_the_same(params, tmp_path, scale):
+    """Dolls would fall between lattice points made for people, and giants would take a thousand times as long."""
+    plain = drawn(params).combined.copy()
+    pose = np.array(params.world_to_camera)
+    pose[:, 3] *= scale
+    person = dataclasses.replace(params.people[0], object=(scale * np.eye(3, 4)).tolist())
+    scaled = dataclasses.replace(params, people=[person], world_to_camera=pose.tolist())
+    difference = np.abs(drawn(scaled).combined - plain)
+    assert difference.max() < 0.02
+    assert difference.mean() < 1e-4
+
+
+def test_samples_are_those_of_the_default_for_people_of_about_natural_size():
+    def objects(*scales: float) -> list:
+        return [(scale * np.eye(3, 4)).tolist() for scale in scales]
+
+    for scales in ((), (1.0,), (0.8, 1.3), (-1.0,)):
+        assert drawing.settings_for(0.004, objects(*scales)) == MarchSettings()
+    both = drawing.settings_for(0.004, objects(1.0, 0.25))
+    assert (both.strides, both.spacing) == ((16, 8, 4, 2, 1), 0.00025)
+    assert drawing.settings_for(0.004, objects(1e-6, 1e6)).strides[0] == 4 * 2**drawing.MOST_DOUBLINGS
+
+
+def test_a_camera_that_scales_is_refused_before_anything_is_drawn(params):
+    for view in ("colour", "boxes"):
+        wrong = (3 * np.array(params.world_to_camera)).tolist()
+        with pytest.raises(ValueError, match=r"world_to_camera .* scales or shears"):
+            drawn(dataclasses.replace(params, world_to_camera=wrong, view=view))
+    assert np.isnan(np.fromfile(params.frame, np.float32)).all()

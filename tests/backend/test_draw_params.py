@@ -63,6 +63,8 @@ BROKEN = [[1.0, 0.0, 0.0, 0.0], [0.0, math.nan, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
         ({"intrinsics": [[0.0, 0, 32], [0, 50.0, 24], [0, 0, 1]]}, "focal"),
         ({"intrinsics": 3 * [[1.0, 2.0]]}, "intrinsics"),
         ({"intrinsics": [[True, 0, 32], [0, 50.0, 24], [0, 0, 1]]}, "intrinsics holds True"),
+        ({"intrinsics": [[50.0, 0, 32], [0, 50.0, 24], [0, 0, 0]]}, "[0, 0, 1]"),
+        ({"intrinsics": [[50.0, 0, 32], [3.0, 50.0, 24], [0, 0, 1]]}, "[0, fy, cy]"),
         ({"world_to_camera": BROKEN}, "world_to_camera holds nan"),
         ({"people": ["h"]}, "JSON object"),
         ({"people": person(object=BROKEN)}, "object holds nan"),

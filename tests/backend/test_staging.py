@@ -1,5 +1,6 @@
 """All files or none."""
 
+import errno
 import os
 
 import pytest
@@ -67,3 +68,25 @@ def test_a_single_file_is_written_whole_or_not_at_all(tmp_path):
         half_done(written_whole(path))
     assert path.read_text() == "one"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_errors_name_the_file_that_was_asked_for(tmp_path):
+    with pytest.raises(FileNotFoundError) as missing, written_whole(tmp_path / "no" / "a") as unfinished:
+        unfinished.write_text("x")
+    assert missing.value.filename == str(tmp_path / "no" / "a")
+    with pytest.raises(OSError, match="No space left") as full, written_whole(tmp_path / "a"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert full.value.filename == str(tmp_path / "a")
+    with pytest.raises(PermissionError, match="elsewhere"), written_whole(tmp_path / "a"):
+        raise PermissionError(errno.EPERM, "not permitted", "elsewhere")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes in folders")
+def test_folders_and_devices_are_not_replaced(tmp_path):
+    """Who may do anything, as the administrator may, would otherwise lose a device to a picture."""
+    os.mkfifo(tmp_path / "pipe")
+    for place in (tmp_path, tmp_path / "pipe"):
+        with pytest.raises(PermissionError, match="no ordinary file"), written_whole(place):
+            pass
+    assert [entry.name for entry in tmp_path.iterdir()] == ["pipe"]

@@ -23,6 +23,7 @@ from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.boxes import draw_boxes
 from primdiffusion.render.image import depth_colours
+from primdiffusion.render.lattice import check_camera
 from primdiffusion.render.march import Span, march
 from primdiffusion.render.solids import Layer
 
@@ -42,6 +43,7 @@ def draw(scene: Scene, camera: Camera, look: Look = Look()) -> Picture:  # noqa:
 
 def draw_into(picture: Picture, scene: Scene, camera: Camera, look: Look) -> float:
     """As `draw`, into a picture of the camera's size; returns the seconds of the marcher alone."""
+    check_camera(camera)
     behind = None if scene.solids is None else backdrop(scene.solids, camera, look.clip)
     end = None if behind is None else behind.end
     if scene.primitives is None or scene.primitives.position.shape[0] == 0:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from torch import Tensor
 
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.render.compositing import Rendering
+from primdiffusion.staging import written_whole
 
 Background = tuple[float, float, float]
 NEAR_TO_FAR = ((1.0, 0.95, 0.75), (0.98, 0.62, 0.25), (0.80, 0.25, 0.33), (0.42, 0.12, 0.47), (0.10, 0.07, 0.28))
@@ -28,7 +28,7 @@ def over(rendering: Rendering, background: Background) -> Float[Tensor, "*r 3"]:
 def to_png(path: str | Path, rendering: Rendering, background: Background | None = (0.0, 0.0, 0.0)) -> None:
     """Writes an 8 bit sRGB picture: over `background` (linear RGB), or with straight alpha where that is None.
 
-    A reader never sees half a file: it is written beside `path` and renamed.
+    A reader never sees half a file: it is written beside `path` and renamed. Raises OSError as `written_whole` does.
     """
     rgba_to_png(path, torch.cat([rendering.rgb, rendering.alpha[..., None]], dim=-1), background)
 
@@ -75,10 +75,5 @@ def _to_bytes(values: Float[Tensor, "h w c"]) -> UInt8[ndarray, "h w c"]:
 
 
 def _save(path: str | Path, pixels: UInt8[ndarray, "h w c"]) -> None:
-    target = Path(path)
-    unfinished = target.with_name(f".{target.name}.{os.getpid()}")
-    try:
+    with written_whole(path) as unfinished:
         Image.fromarray(pixels).save(unfinished, format="PNG")
-        os.replace(unfinished, target)
-    finally:
-        unfinished.unlink(missing_ok=True)

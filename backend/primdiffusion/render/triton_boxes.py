@@ -29,6 +29,7 @@ BAD_CONTENT = tl.constexpr(1)
 BAD_PLACE = tl.constexpr(2)
 BAD_CAMERA = tl.constexpr(4)
 ORTHOGONAL = tl.constexpr(1e-2)
+NEARLY_ORTHOGONAL = tl.constexpr(0.045)  # of a camera, the rows of whose matrix are compared here, not its columns
 # Totals: 0 what is wrong, 1 pairs of boxes and bins, 2 pairs of boxes and tiles, 3 units of the adjoint, 4-5 written so
 # far, 6 spans that are no numbers, 7 whether a stride is odd (1), or even and no multiple of 4 (2).
 TOTALS = 8
@@ -216,7 +217,12 @@ def place_boxes(
     sound = (shear_off <= ORTHOGONAL) & (size_sum < float("inf"))
     if tl.min((sound | (here == 0)).to(tl.int32), 0) == 0:
         tl.atomic_or(totals, 2)
-    if (sum_camera < float("inf")) == 0:
+    bent = tl.maximum(tl.abs(_dot(r0x, r0y, r0z, r0x, r0y, r0z) - 1), tl.abs(_dot(r1x, r1y, r1z, r1x, r1y, r1z) - 1))
+    bent = tl.maximum(bent, tl.abs(_dot(r2x, r2y, r2z, r2x, r2y, r2z) - 1))
+    bent = tl.maximum(bent, tl.abs(_dot(r0x, r0y, r0z, r1x, r1y, r1z)))
+    bent = tl.maximum(bent, tl.abs(_dot(r0x, r0y, r0z, r2x, r2y, r2z)))
+    bent = tl.maximum(bent, tl.abs(_dot(r1x, r1y, r1z, r2x, r2y, r2z)))
+    if ((sum_camera < float("inf")) & (bent <= NEARLY_ORTHOGONAL)) == 0:
         tl.atomic_or(totals, 4)
 
     # The reference: direction D through pixel (u0, v0), lattice point n0.

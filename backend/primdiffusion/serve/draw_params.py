@@ -6,11 +6,10 @@ import dataclasses
 import math
 from typing import Any
 
+from primdiffusion.drawing.steps import check_step
+
 VIEWS = ("colour", "depth", "alpha", "boxes")
 JOINTS = 24
-FINEST_STEP = 1e-4
-"""Metres; finer, a picture takes hours and gains nothing."""
-COARSEST_STEP = 1.0
 Matrix = tuple[tuple[float, ...], ...]
 
 
@@ -59,7 +58,7 @@ class DrawParams:
     """[r, g, b], linear; None leaves the picture transparent."""
     view: str = "colour"
     step: float = 0.004
-    """Metres between samples of a ray."""
+    """Metres between samples of a ray through people of natural size; others are sampled in proportion to theirs."""
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 1:
@@ -67,6 +66,8 @@ class DrawParams:
         check_numbers("intrinsics", self.intrinsics, (3, 3))
         if not (self.intrinsics[0][0] > 0 and self.intrinsics[1][1] > 0):
             raise ValueError(f"the focal lengths of intrinsics {self.intrinsics} are not positive")
+        if self.intrinsics[1][0] != 0 or self.intrinsics[2] != [0, 0, 1]:
+            raise ValueError(f"intrinsics are {self.intrinsics}: give [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]")
         check_numbers("world_to_camera", self.world_to_camera, (3, 4))
         check_numbers("clip", self.clip, (2,))
         if not 0 <= self.clip[0] < self.clip[1]:
@@ -75,8 +76,7 @@ class DrawParams:
             check_numbers("background", self.background, (3,))
         if self.view not in VIEWS:
             raise ValueError(f"there is no view {self.view!r}: choose from {', '.join(VIEWS)}")
-        if not FINEST_STEP <= self.step <= COARSEST_STEP:
-            raise ValueError(f"the step is {self.step} m: choose {FINEST_STEP} to {COARSEST_STEP}")
+        check_step(self.step)
         if self.region is not None:
             self._check_region(self.region)
 
