@@ -10,6 +10,7 @@ import dataclasses
 import threading
 from typing import NamedTuple
 
+import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -19,9 +20,9 @@ from torch import Tensor
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.compositing import Rendering
-from primdiffusion.render.cpu_adjoint import Gradients, Upstream, adjoin_boxes
-from primdiffusion.render.cpu_forward import NEVER, Ends, Picture, march_tiles
-from primdiffusion.render.cpu_packing import Scene, dealt, pack
+from primdiffusion.render.cpu_adjoint import Gradients, Upstream, adjoin_boxes, weigh_rays
+from primdiffusion.render.cpu_forward import Ends, Picture, march_tiles
+from primdiffusion.render.cpu_packing import Scene, heaviest_first, pack
 from primdiffusion.render.lattice import MarchSettings, Span, check_scene, check_unbatched, strides_of
 
 _ONE_AT_A_TIME = threading.Lock()
@@ -73,7 +74,7 @@ def count_samples(
     counts = []
     for empty_cells in (True, False):
         scene = _scene(view, inputs, empty_cells=empty_cells)
-        counts.append(np.zeros((len(scene.order), 2), np.int64))
+        counts.append(np.zeros((len(scene.tile_boxes), 2), np.int64))
         _draw(view, scene, _ends(camera.width * camera.height), counts[-1])
     return SampleCount(inside_boxes=int(counts[0][:, 1].sum()), evaluated=int(counts[1][:, 0].sum()))
 
@@ -194,7 +195,8 @@ def _draw(
     with _ONE_AT_A_TIME:
         march_tiles(
             picture, ends, counts, scene.boxes, scene.size, scene.rectangle, scene.row_start, scene.row_box,
-            scene.order, view.limits, scene.pixel_to_world, view.width, view.height, view.spacing, view.index_order,
+            scene.tile_boxes, heaviest_first(scene.tile_boxes), numba.get_num_threads(), np.zeros(1, np.int64),
+            view.limits, scene.pixel_to_world, view.width, view.height, view.spacing, view.index_order,
         )  # fmt: skip
     rgb, alpha, depth, first_hit = map(torch.from_numpy, picture)
     return rgb, alpha, depth, first_hit
@@ -233,21 +235,13 @@ class _March(torch.autograd.Function):
 def _upstream(
     ends: Ends, spacing: float, alpha: Tensor, depth: Tensor, g_rgb: Tensor, g_alpha: Tensor, g_depth: Tensor
 ) -> Upstream:
-    """What each ray's samples are worth (SPEC 4), with distance as a fourth colour: depth = sum w t / alpha."""
-    opaque = torch.from_numpy(ends.index != NEVER)
-    visible = alpha > 0
-    end = torch.from_numpy(ends.index).double() * spacing
-    nothing = torch.zeros((), dtype=torch.float32)
-    behind = (g_rgb * torch.from_numpy(ends.rgb)).sum(-1)
-    return Upstream(
-        rgb=g_rgb.contiguous().numpy(),
-        distance=torch.where(visible, g_depth / alpha, nothing).numpy(),
-        origin=torch.where(visible, torch.where(opaque, end.float(), depth), nothing).numpy(),
-        constant=torch.where(opaque, -behind, g_alpha).numpy(),
-        end=ends.index,
-        box=ends.box,
-        share=ends.share,
-    )
+    """What each ray's samples are worth (SPEC 4)."""
+    distance, origin, constant = np.empty((3, len(alpha)), np.float32)
+    upstream = Upstream(g_rgb.contiguous().numpy(), distance, origin, constant, ends.index, ends.box, ends.share)
+    fields = (value.contiguous().numpy() for value in (alpha, depth, g_alpha, g_depth))
+    with _ONE_AT_A_TIME:
+        weigh_rays(upstream, *fields, ends.rgb, spacing)
+    return upstream
 
 
 def _adjoin(
@@ -267,8 +261,9 @@ def _adjoin(
     tiles = (columns_rows[:, 1] - columns_rows[:, 0] + 1) * (columns_rows[:, 3] - columns_rows[:, 2] + 1)
     with _ONE_AT_A_TIME:
         adjoin_boxes(
-            gradients, upstream, scene.boxes, size, scene.rectangle, dealt(tiles), view.limits, scene.pixel_to_world,
-            view.width, view.height, view.spacing, view.index_order,
+            gradients, upstream, scene.boxes, size, scene.rectangle, heaviest_first(tiles), numba.get_num_threads(),
+            np.zeros(1, np.int64), view.limits, scene.pixel_to_world, view.width, view.height, view.spacing,
+            view.index_order,
         )  # fmt: skip
     rgb, density, to_local, offset, parts = map(torch.from_numpy, gradients)
     rgb, density = (value.unflatten(-1, (size, size, size)) for value in (rgb, density))

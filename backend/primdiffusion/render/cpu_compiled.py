@@ -7,11 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 FASTMATH = frozenset({"contract", "arcp", "nsz", "reassoc"})
 """Rounding may differ from the source's; NaN and infinity keep their meaning."""
 
 _njit: Any = numba.njit  # its overloads do not know all options
+_compiled_call: Any = intrinsic  # its callers do not give the typing context, nor see the real types
 _SOURCES = ("cpu_*.py", "tiles.py", "lattice.py", "compositing.py")
 
 Function = Callable[..., Any]
@@ -42,6 +46,21 @@ def part(*, inline: bool = False) -> Callable[[Function], Any]:
         fastmath=set(FASTMATH),
         error_model="numpy",
     )
+
+
+@_compiled_call
+def take(typingctx, taken):
+    """The first of the numbers 0, 1, 2, ... that no thread has taken yet; `taken` int64 [1], at first 0, counts them.
+
+    Threads that take their work piece by piece finish together, which shares fixed beforehand do not, least of all on
+    a busy machine; and what a thread needs to work with is allocated once a thread and not once a piece.
+    """
+
+    def generate(context, builder, signature, arguments):
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        return builder.atomic_rmw("add", data, ir.Constant(ir.IntType(64), 1), "monotonic")
+
+    return types.int64(taken), generate
 
 
 def _stamp() -> tuple[tuple[str, int, int], ...]:

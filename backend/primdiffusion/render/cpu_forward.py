@@ -10,15 +10,12 @@ from jaxtyping import Float32, Int32, Int64
 from numpy import ndarray
 
 from primdiffusion.render.compositing import SURFACE_OPACITY
-from primdiffusion.render.cpu_compiled import kernel, part
+from primdiffusion.render.cpu_compiled import kernel, part, take
+from primdiffusion.render.cpu_hits import ENTER, HIT_ROWS, LANES, LEAVE, TABLE_ROWS, hit_boxes, lowest
 from primdiffusion.render.cpu_sampling import (
-    HIT_ROWS,
-    LANES,
     PIXELS,
     SAMPLES,
-    TABLE_ROWS,
     add_segment,
-    hit_boxes,
     leave_empty,
     reference_point,
     tabulate,
@@ -32,8 +29,9 @@ NEVER = np.iinfo(np.int64).max
 """The lattice index at which a ray saturates that does not."""
 NO_BOX = np.iinfo(np.int32).max
 
-# Entries of a hit: its box, the reference point, the first, the next and the last lattice point.
-_BOX, _REFERENCE, _FIRST, _NEXT, _LAST = range(5)
+COLUMNS = 6
+# A hit: its box, the reference point, its place among the tests, the first, the next and the last lattice point.
+_BOX, _REFERENCE, _LINE, _FIRST, _NEXT, _LAST = range(COLUMNS)
 
 
 class Picture(NamedTuple):
@@ -58,45 +56,69 @@ class Ends(NamedTuple):
     """That sample's colour."""
 
 
+class _Room(NamedTuple):
+    """What one thread needs to draw a tile, for as many boxes as the fullest tile sees."""
+
+    listed: Int64[ndarray, "n"]
+    """The tile's boxes, nearest first."""
+    reference: Int64[ndarray, "n"]
+    """Their reference points (see `reference_point`)."""
+    earliest: Int64[ndarray, "n"]
+    """A lattice index before which no ray enters any of the boxes from here on."""
+    table: Float32[ndarray, "floats"]
+    rays: Float32[ndarray, "floats"]
+    tests: Float32[ndarray, "floats"]
+    """[blocks, HIT_ROWS, LANES], flat."""
+    hits: Int64[ndarray, "n columns"]
+    sequence: Int64[ndarray, "n"]
+    """The hits, sorted by their first lattice points."""
+    points: Float32[ndarray, "floats"]
+    """[CHUNK + 1, 4], flat: colour times opacity and opacity at each lattice point of a chunk; one more to work in."""
+    block: Float32[ndarray, "floats"]
+
+
 @kernel
 def march_tiles(
-    picture, ends, counts, boxes, size, rectangle, row_start, row_box, order, limits, pixel_to_world, width, height,
-    spacing, index_order,
+    picture, ends, counts, boxes, size, rectangle, row_start, row_box, seen, order, threads, taken, limits,
+    pixel_to_world, width, height, spacing, index_order,
 ):  # fmt: skip
-    """Draws all tiles. limits [r, 2]: first and last lattice index of each ray, may be empty.
+    """Draws all tiles in their `order`, each of which has `seen` so many boxes; `taken` as in `take`.
 
+    limits [r, 2]: first and last lattice index of each ray, may be empty.
     counts [tiles, 2], may be empty: samples evaluated, and samples up to where rays become opaque.
     """
-    across = (width + TILE - 1) // TILE
-    for i in numba.prange(len(order)):
-        tile = order[i]
-        row0, column0 = (tile // across) * TILE, (tile % across) * TILE
-        found = _count(row_box, row_start, rectangle, tile, across)
-        if found == 0:
-            _leave_blank(picture, ends, row0, column0, width, height)
-            continue
-        blocks = (found + LANES - 1) // LANES
-        _march_tile(
-            picture, ends, counts, boxes, size, rectangle, row_start, row_box, tile, limits, pixel_to_world, width,
-            height, spacing, index_order,
-            np.empty(found, np.int64), np.empty(found, np.int64), np.empty(blocks * LANES * TABLE_ROWS, np.float32),
-            np.empty(3 * PIXELS, np.float32), np.empty((found, 5), np.int64), np.empty((found, 6), np.float32),
-            np.empty(found, np.int64), np.empty(HIT_ROWS * LANES, np.float32),
+    most = seen.max()
+    blocks = (most + LANES - 1) // LANES
+    for _ in numba.prange(threads):
+        room = _Room(
+            np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64),
+            np.empty(blocks * LANES * TABLE_ROWS, np.float32), np.empty(3 * PIXELS, np.float32),
+            np.empty(blocks * LANES * HIT_ROWS, np.float32),
+            np.empty((most, COLUMNS), np.int64), np.empty(most, np.int64),
             np.empty(4 * (CHUNK + 1), np.float32), np.empty(8 * SAMPLES, np.float32),
         )  # fmt: skip
+        i = take(taken)
+        while i < len(order):
+            _march_tile(
+                picture, ends, counts, boxes, size, rectangle, row_start, row_box, order[i], seen[order[i]], limits,
+                pixel_to_world, width, height, spacing, index_order, room,
+            )  # fmt: skip
+            i = take(taken)
 
 
 @part()
 def _march_tile(
-    picture, ends, counts, boxes, size, rectangle, row_start, row_box, tile, limits, pixel_to_world, width, height,
-    spacing, index_order, listed, reference, table, rays, hits, lines, sequence, tests, points, block,
+    picture, ends, counts, boxes, size, rectangle, row_start, row_box, tile, listed, limits, pixel_to_world, width,
+    height, spacing, index_order, room,
 ):  # fmt: skip
-    """Draws one tile; the arrays after `index_order` are room to work in."""
+    """Draws one tile, which sees `listed` boxes."""
     across = (width + TILE - 1) // TILE
     row0, column0 = (tile // across) * TILE, (tile % across) * TILE
-    strides, voxels = boxes.stride, boxes.voxels
-    middle = tile_rays(rays, pixel_to_world, row0, column0)
-    _tabulate_tile(listed, reference, table, row_box, row_start, rectangle, tile, across, boxes, middle, spacing)
+    if listed == 0:
+        _leave_blank(picture, ends, row0, column0, width, height)
+        return
+    middle = tile_rays(room.rays, pixel_to_world, row0, column0)
+    _tabulate_tile(room, row_box, row_start, rectangle, tile, across, boxes, middle, spacing)
     for row in range(row0, min(row0 + TILE, height)):
         for column in range(column0, min(column0 + TILE, width)):
             ray = row * width + column
@@ -104,26 +126,13 @@ def _march_tile(
             first, last = 1, NEVER
             if len(limits) > 0:
                 first, last = limits[ray, 0], limits[ray, 1]
-            number = _find_hits(
-                hits, lines, sequence, tests, table, rays, pixel, listed, reference, strides, first, last
-            )
-            evaluated = _march_ray(
-                picture, ends, ray, hits, lines, sequence, number, points, block, voxels, strides, size, spacing,
+            evaluated, number = _march_ray(
+                picture, ends, ray, pixel, room, listed, first, last, boxes.voxels, boxes.stride, size, spacing,
                 index_order,
             )  # fmt: skip
             if len(counts) > 0:
                 counts[tile, 0] += evaluated
-                counts[tile, 1] += _needed(hits, number, strides, ends.index[ray])
-
-
-@part()
-def _count(row_box, row_start, rectangle, tile, across):
-    row, column = tile // across, tile % across
-    found = 0
-    for entry in range(row_start[row], row_start[row + 1]):
-        k = row_box[entry]
-        found += rectangle[k, 0] <= column <= rectangle[k, 1]
-    return found
+                counts[tile, 1] += _needed(room.hits, number, boxes.stride, ends.index[ray])
 
 
 @part()
@@ -138,65 +147,75 @@ def _leave_blank(picture, ends, row0, column0, width, height):
 
 
 @part()
-def _tabulate_tile(listed, reference, table, row_box, row_start, rectangle, tile, across, boxes, middle, spacing):
+def _tabulate_tile(room, row_box, row_start, rectangle, tile, across, boxes, middle, spacing):
     row, column = tile // across, tile % across
     i = 0
     for entry in range(row_start[row], row_start[row + 1]):
         k = np.int64(row_box[entry])
         if rectangle[k, 0] <= column <= rectangle[k, 1]:
-            listed[i] = k
-            reference[i] = reference_point(boxes, k, middle, spacing)
-            tabulate(table, i // LANES * LANES * TABLE_ROWS + i % LANES, boxes, k, middle, reference[i], spacing)
+            reference = reference_point(boxes, k, middle, spacing)
+            room.listed[i], room.reference[i] = k, reference
+            room.earliest[i] = np.int64(max(boxes.nearest[k], 0.0) / spacing) - 1
+            tabulate(room.table, i // LANES * LANES * TABLE_ROWS + i % LANES, boxes, k, middle, reference, spacing)
             i += 1
     while i % LANES > 0:
-        leave_empty(table, i // LANES * LANES * TABLE_ROWS + i % LANES)
+        leave_empty(room.table, i // LANES * LANES * TABLE_ROWS + i % LANES)
         i += 1
 
 
-@part()
-def _find_hits(hits, lines, sequence, tests, table, rays, pixel, listed, reference, strides, first, last):
-    """The boxes that a ray meets between two lattice indices; `sequence` sorts them by their first lattice points."""
-    dx, dy, dz = rays[pixel], rays[PIXELS + pixel], rays[2 * PIXELS + pixel]
-    number = 0
-    for begin in range(0, len(listed), LANES):
-        hit_boxes(tests, table, begin * TABLE_ROWS, dx, dy, dz)
-        for j in range(LANES):
-            if tests[6 * LANES + j] > tests[7 * LANES + j]:
-                continue
-            at, stride = reference[begin + j], strides[listed[begin + j]]
-            enter, leave = at + np.int64(tests[6 * LANES + j]) * stride, at + np.int64(tests[7 * LANES + j]) * stride
-            if enter < first:
-                enter += (first - enter + stride - 1) // stride * stride
-            if leave > last:
-                leave -= (leave - last + stride - 1) // stride * stride
-            if enter > leave:
-                continue
-            hits[number, _BOX], hits[number, _REFERENCE] = listed[begin + j], at
-            hits[number, _FIRST], hits[number, _NEXT], hits[number, _LAST] = enter, enter, leave
-            for row in range(6):
-                lines[number, row] = tests[row * LANES + j]
-            place = number
-            while place > 0 and hits[sequence[place - 1], _FIRST] > enter:
-                sequence[place] = sequence[place - 1]
-                place -= 1
-            sequence[place] = number
-            number += 1
+@part(inline=True)
+def _test_boxes(room, number, begin, pixel, strides, first, last):
+    """Adds to the ray's `number` hits those among LANES boxes from `begin` on; returns how many there are then."""
+    dx, dy, dz = room.rays[pixel], room.rays[PIXELS + pixel], room.rays[2 * PIXELS + pixel]
+    place = begin * HIT_ROWS
+    tests, hits, sequence = room.tests, room.hits, room.sequence
+    hit = hit_boxes(tests, place, room.table, begin * TABLE_ROWS, dx, dy, dz)
+    while hit != 0:
+        lane = lowest(hit)
+        hit &= hit - 1
+        k, at = room.listed[begin + lane], room.reference[begin + lane]
+        stride = strides[k]
+        enter = at + np.int64(tests[place + ENTER * LANES + lane]) * stride
+        leave = at + np.int64(tests[place + LEAVE * LANES + lane]) * stride
+        if enter < first:
+            enter += (first - enter + stride - 1) // stride * stride
+        if leave > last:
+            leave -= (leave - last + stride - 1) // stride * stride
+        if enter > leave:
+            continue
+        hits[number, _BOX], hits[number, _REFERENCE], hits[number, _LINE] = k, at, place + lane
+        hits[number, _FIRST], hits[number, _NEXT], hits[number, _LAST] = enter, enter, leave
+        turn = number
+        while turn > 0 and hits[sequence[turn - 1], _FIRST] > enter:
+            sequence[turn] = sequence[turn - 1]
+            turn -= 1
+        sequence[turn] = number
+        number += 1
     return number
 
 
-@part()
-def _march_ray(
-    picture, ends, ray, hits, lines, sequence, number, points, block, voxels, strides, size, spacing, index_order
-):
-    """Composites one ray; returns how many samples it took."""
+@part(inline=True)
+def _march_ray(picture, ends, ray, pixel, room, listed, first, last, voxels, strides, size, spacing, index_order):
+    """Composites one ray; returns how many samples it took and how many hits it looked at."""
+    hits, sequence, points = room.hits, room.sequence, room.points
     red, green, blue, alpha, moment, first_hit = 0.0, 0.0, 0.0, 0.0, 0.0, np.inf
-    evaluated, done, begin = 0, 0, 0  # hits before `done` end before the chunk
+    evaluated, number, done = 0, 0, 0  # hits before `done` end before the chunk
+    begin, tested = 0, 0  # boxes before `tested` have been
     if len(ends.index) > 0:
         ends.index[ray], ends.box[ray] = NEVER, NO_BOX
-    while done < number and alpha < 1.0:
-        begin = max(begin, hits[sequence[done], _FIRST])
+    while alpha < 1.0:
+        following = begin
+        if done < number:
+            following = max(begin, hits[sequence[done], _FIRST])
+        if tested < listed and (done == number or room.earliest[tested] < following + CHUNK):
+            number = _test_boxes(room, number, tested, pixel, strides, first, last)
+            tested += LANES
+            continue
+        if done == number:
+            break
+        begin = following
         points[:] = 0
-        evaluated += _gather(points, begin, hits, lines, sequence, done, number, block, voxels, strides, size, spacing)
+        evaluated += _gather(room, begin, done, number, voxels, strides, size, spacing)
         slot, before = CHUNK, alpha
         r, g, b, a, m = _sum(points)
         if alpha + a >= 1.0:
@@ -206,9 +225,7 @@ def _march_ray(
             moment += (begin + slot) * (1.0 - alpha)
             k = NO_BOX
             if index_order:
-                k, r, g, b, a = _in_index_order(
-                    points, slot, begin + slot, alpha, hits, lines, number, block, voxels, strides, size, spacing
-                )
+                k, r, g, b, a = _in_index_order(room, slot, begin + slot, alpha, number, voxels, strides, size, spacing)
                 red, green, blue, alpha = red + r, green + g, blue + b, alpha + a
             share = (1.0 - alpha) / points[4 * slot + 3]
             red, green = red + share * points[4 * slot], green + share * points[4 * slot + 1]
@@ -224,12 +241,13 @@ def _march_ray(
     picture.rgb[ray, 0], picture.rgb[ray, 1], picture.rgb[ray, 2], picture.alpha[ray] = red, green, blue, alpha
     picture.depth[ray] = moment * spacing / alpha if alpha > 0 else np.inf
     picture.first_hit[ray] = first_hit * spacing
-    return evaluated
+    return evaluated, number
 
 
-@part()
-def _gather(points, begin, hits, lines, sequence, done, number, block, voxels, strides, size, spacing):
+@part(inline=True)
+def _gather(room, begin, done, number, voxels, strides, size, spacing):
     """Adds what all boxes have at the lattice points from `begin` to `begin + CHUNK`; returns how many samples."""
+    hits, sequence = room.hits, room.sequence
     evaluated, end = 0, begin + CHUNK
     for place in range(done, number):
         hit = sequence[place]
@@ -246,7 +264,10 @@ def _gather(points, begin, hits, lines, sequence, done, number, block, voxels, s
         first = np.float32(upcoming - hits[hit, _REFERENCE]) * inverse
         length = np.float32(stride * spacing)
         base = 4 * k * size * size * size
-        add_segment(points, upcoming - begin, stride, voxels, base, size, block, lines, hit, first, count, length)
+        add_segment(
+            room.points, upcoming - begin, stride, voxels, base, size, room.block, room.tests, hits[hit, _LINE], first,
+            count, length,
+        )  # fmt: skip
         hits[hit, _NEXT] = upcoming + count * stride
         evaluated += count
     return evaluated
@@ -289,11 +310,12 @@ def _slot_of_surface(points, alpha, last):
 
 
 @part()
-def _in_index_order(points, slot, index, alpha, hits, lines, number, block, voxels, strides, size, spacing):
+def _in_index_order(room, slot, index, alpha, number, voxels, strides, size, spacing):
     """The boxes of one lattice point one after the other, the lowest index first, until the ray is opaque.
 
     points[slot] becomes the sample that does it. Returns its box and the colour and opacity of the samples before it.
     """
+    hits, points = room.hits, room.points
     r, g, b, a = 0.0, 0.0, 0.0, 0.0
     r_end, g_end, b_end, a_end = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
     box, box_end = np.int64(-1), np.int64(NO_BOX)
@@ -313,7 +335,8 @@ def _in_index_order(points, slot, index, alpha, hits, lines, number, block, voxe
             points[scratch + channel] = 0
         first, length = np.float32((index - hits[following, _REFERENCE]) // stride), np.float32(stride * spacing)
         base = 4 * box * size * size * size
-        add_segment(points, CHUNK, 0, voxels, base, size, block, lines, following, first, 1, length)
+        line = hits[following, _LINE]
+        add_segment(points, CHUNK, 0, voxels, base, size, room.block, room.tests, line, first, 1, length)
         if points[scratch + 3] > 0:
             r, g, b, a = r + r_end, g + g_end, b + b_end, a + a_end
             r_end, g_end, b_end, a_end = points[scratch], points[scratch + 1], points[scratch + 2], points[scratch + 3]

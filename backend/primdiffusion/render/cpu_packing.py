@@ -26,8 +26,8 @@ class Scene(NamedTuple):
     row_start: Int64[ndarray, "down+1"]
     row_box: Int32[ndarray, "entries"]
     """The boxes of each row of tiles, nearest first (see `row_lists`)."""
-    order: Int64[ndarray, "tiles"]
-    """The tiles, dealt to threads so that each has its share of the work."""
+    tile_boxes: Int64[ndarray, "tiles"]
+    """How many boxes each tile sees."""
     pixel_to_world: Float64[ndarray, "3 3"]
     size: int
     """Voxels along a side of a box."""
@@ -66,20 +66,18 @@ def pack(
         away, rotation.contiguous().numpy(), solid.numpy(),
         np.linalg.inv(to_world), across, down, empty_cells,
     )  # fmt: skip
-    boxes = PackedBoxes(local, away, stride.numpy(), low, high, voxels)
+    boxes = PackedBoxes(local, away, stride.numpy(), nearest, low, high, voxels)
     seen = np.flatnonzero(rectangle[:, 0] <= rectangle[:, 1])
     seen = seen[np.argsort(nearest[seen], kind="stable")]
     row_start, row_place = row_lists(rectangle[seen], down)
-    order = dealt(boxes_per_tile(rectangle, across, down))
+    tile_boxes = boxes_per_tile(rectangle, across, down)
     row_box = seen.astype(np.int32)[row_place]
-    return Scene(boxes, rectangle, row_start, row_box, order, to_world, size, bool(suspect.any()))
+    return Scene(boxes, rectangle, row_start, row_box, tile_boxes, to_world, size, bool(suspect.any()))
 
 
-def dealt(work: Int64[ndarray, "n"]) -> Int64[ndarray, "n"]:
-    """An order in which each thread's contiguous share has about the same amount of work."""
-    threads = numba.get_num_threads()
-    heavy_first = np.argsort(-work, kind="stable")
-    return np.concatenate([heavy_first[thread::threads] for thread in range(threads)])
+def heaviest_first(work: Int64[ndarray, "n"]) -> Int64[ndarray, "n"]:
+    """The order in which threads take pieces of so much work: light ones fill the end."""
+    return np.argsort(-work, kind="stable")
 
 
 @kernel
@@ -162,15 +160,18 @@ def _narrow(low, high, axis, first, last, size):
 
 @part()
 def _place_corners(corners, to_world, low, high, offset, world_to_pixel):
-    """The box's corners as homogeneous pixels; returns how near the camera its bounding sphere comes, metres."""
-    distance, radius = 0.0, 0.0
+    """The box's corners as homogeneous pixels; returns how near the camera it comes at least, metres.
+
+    That is along the direction to its middle: what is farther in any one direction is farther altogether.
+    """
+    middle, distance = (0.0, 0.0, 0.0), 0.0
     for axis in range(3):
-        place, reach = -offset[axis], 0.0
+        place = -offset[axis]
         for other in range(3):
             place += to_world[axis, other] * 0.5 * (low[other] + high[other])
-            reach += abs(to_world[axis, other])
+        middle = (middle[1], middle[2], place)
         distance += place * place
-        radius += reach * reach
+    nearest, scale = np.inf, 1.0 / max(math.sqrt(distance), 1e-12)
     for i in range(8):
         x = high[0] if i & 1 else low[0]
         y = high[1] if i & 2 else low[1]
@@ -178,9 +179,10 @@ def _place_corners(corners, to_world, low, high, offset, world_to_pixel):
         a = to_world[0, 0] * x + to_world[0, 1] * y + to_world[0, 2] * z - offset[0]
         b = to_world[1, 0] * x + to_world[1, 1] * y + to_world[1, 2] * z - offset[1]
         c = to_world[2, 0] * x + to_world[2, 1] * y + to_world[2, 2] * z - offset[2]
+        nearest = min(nearest, (middle[0] * a + middle[1] * b + middle[2] * c) * scale)
         for axis in range(3):
             corners[i, axis] = world_to_pixel[axis, 0] * a + world_to_pixel[axis, 1] * b + world_to_pixel[axis, 2] * c
-    return math.sqrt(distance) - math.sqrt(radius)
+    return nearest
 
 
 @part()

@@ -15,12 +15,21 @@ from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
 from primdiffusion.render.cpu_compiled import part
+from primdiffusion.render.cpu_hits import (
+    AT_CENTRE,
+    FIRST,
+    HIGH,
+    LANES,
+    LOW,
+    PER_STEP,
+    STEPS,
+    TABLE_ROWS,
+    TO_LOCAL,
+)
 from primdiffusion.render.cpu_vectors import add_sample, power_of_two
 from primdiffusion.render.lattice import WINDOW_SHARPNESS
 from primdiffusion.render.tiles import TILE
 
-LANES = 16
-"""Rays or boxes that are tested together."""
 SAMPLES = 8
 """Samples whose places and weights are computed together."""
 PIXELS = TILE * TILE
@@ -36,18 +45,13 @@ class PackedBoxes(NamedTuple):
     offset: Float64[ndarray, "k 3"]
     """From each box's centre to the camera, metres."""
     stride: Int64[ndarray, "k"]
+    nearest: Float64[ndarray, "k"]
+    """No point of the box is nearer to the camera, metres; may be negative."""
     low: Float32[ndarray, "k 3"]
     """Where in y the box holds density: from low to high, per axis."""
     high: Float32[ndarray, "k 3"]
     voxels: Float32[ndarray, "floats"]
     """[k, d, h, w, (red, green, blue, density)], flat."""
-
-
-# Rows of a tile's table of boxes; box i is lane i % LANES of block i // LANES, so a row of a block is one vector.
-_AT_CENTRE, _PER_STEP, _TO_LOCAL, _STEPS, _LOW, _HIGH, _FIRST = 0, 3, 6, 15, 16, 19, 22
-TABLE_ROWS = 23
-# Rows of a block of ray-box tests: y at the reference point, dy per step, first and last step from that point.
-HIT_ROWS = 8
 
 
 @part()
@@ -88,16 +92,16 @@ def tabulate(table, place, boxes, k, middle, reference, spacing):
     z = boxes.offset[k, 2] + distance * middle[2]
     for axis in range(3):
         a, b, c = boxes.to_local[k, axis, 0], boxes.to_local[k, axis, 1], boxes.to_local[k, axis, 2]
-        table[place + (_AT_CENTRE + axis) * LANES] = a * x + b * y + c * z
-        table[place + (_PER_STEP + axis) * LANES] = step * (a * middle[0] + b * middle[1] + c * middle[2])
-        table[place + (_TO_LOCAL + 3 * axis) * LANES] = step * a
-        table[place + (_TO_LOCAL + 3 * axis + 1) * LANES] = step * b
-        table[place + (_TO_LOCAL + 3 * axis + 2) * LANES] = step * c
-        table[place + (_LOW + axis) * LANES] = boxes.low[k, axis]
-        table[place + (_HIGH + axis) * LANES] = boxes.high[k, axis]
+        table[place + (AT_CENTRE + axis) * LANES] = a * x + b * y + c * z
+        table[place + (PER_STEP + axis) * LANES] = step * (a * middle[0] + b * middle[1] + c * middle[2])
+        table[place + (TO_LOCAL + 3 * axis) * LANES] = step * a
+        table[place + (TO_LOCAL + 3 * axis + 1) * LANES] = step * b
+        table[place + (TO_LOCAL + 3 * axis + 2) * LANES] = step * c
+        table[place + (LOW + axis) * LANES] = boxes.low[k, axis]
+        table[place + (HIGH + axis) * LANES] = boxes.high[k, axis]
     steps = reference // stride
-    table[place + _STEPS * LANES] = steps
-    table[place + _FIRST * LANES] = 1 - steps
+    table[place + STEPS * LANES] = steps
+    table[place + FIRST * LANES] = 1 - steps
 
 
 @part()
@@ -105,64 +109,21 @@ def leave_empty(table, place):
     """A lane that no ray hits."""
     for row in range(TABLE_ROWS):
         table[place + row * LANES] = 0
-    table[place + _FIRST * LANES] = np.inf
-
-
-@part()
-def hit_boxes(hits, table, block, dx, dy, dz):
-    """One ray (by its difference from the middle) against LANES boxes: fills hits [HIT_ROWS, LANES], flat."""
-    place = np.int64(np.uint32(block))  # not negative: what the vectoriser must know
-    for j in range(LANES):
-        _hit(hits, j, table, place + j, dx, dy, dz)
-
-
-@part()
-def hit_rays(hits, table, rays, first):
-    """LANES rays from `first` on against the table's first box: fills hits [HIT_ROWS, LANES], flat."""
-    place = np.int64(np.uint32(first))
-    for j in range(LANES):
-        _hit(hits, j, table, 0, rays[place + j], rays[PIXELS + place + j], rays[2 * PIXELS + place + j])
+    table[place + FIRST * LANES] = np.inf
 
 
 @part(inline=True)
-def _hit(hits, lane, table, place, dx, dy, dz):
-    ex, qx, enter_x, leave_x = _axis_hit(table, place, 0, dx, dy, dz)
-    ey, qy, enter_y, leave_y = _axis_hit(table, place, 1, dx, dy, dz)
-    ez, qz, enter_z, leave_z = _axis_hit(table, place, 2, dx, dy, dz)
-    hits[lane], hits[LANES + lane], hits[2 * LANES + lane] = ex, ey, ez
-    hits[3 * LANES + lane], hits[4 * LANES + lane], hits[5 * LANES + lane] = qx, qy, qz
-    hits[6 * LANES + lane] = np.ceil(max(max(enter_x, enter_y), max(enter_z, table[place + _FIRST * LANES])))
-    hits[7 * LANES + lane] = np.floor(min(min(leave_x, leave_y), leave_z))
-
-
-@part(inline=True)
-def _axis_hit(table, place, axis, dx, dy, dz):
-    along = (
-        table[place + (_TO_LOCAL + 3 * axis) * LANES] * dx
-        + table[place + (_TO_LOCAL + 3 * axis + 1) * LANES] * dy
-        + table[place + (_TO_LOCAL + 3 * axis + 2) * LANES] * dz
-    )
-    q = table[place + (_PER_STEP + axis) * LANES] + along
-    e = table[place + (_AT_CENTRE + axis) * LANES] + table[place + _STEPS * LANES] * along
-    # A ray parallel to a face gets a tiny slope instead of a division by zero; beside the box it then still misses.
-    inverse = np.float32(1) / (q if abs(q) > np.float32(1e-12) else np.float32(1e-12))
-    a = (table[place + (_LOW + axis) * LANES] - e) * inverse
-    b = (table[place + (_HIGH + axis) * LANES] - e) * inverse
-    return e, q, min(a, b), max(a, b)
-
-
-@part(inline=True)
-def place_samples(block, lines, hit, first, size, length):
+def place_samples(block, hits, hit, first, size, length):
     """Cells, weights and windows of SAMPLES samples from step `first` on: fills block [8, SAMPLES], flat.
 
-    lines[hit] holds y at step 0 and dy per step. Rows: 0-3 the weights of a cell's edges, 4 and 5 those of an edge's
-    ends, 6 window * length, 7 the cell's first voxel.
+    Lane `hit` of `hits` holds y at step 0 and dy per step (see `hit_boxes`). Rows of block: 0-3 the weights of a cell's
+    edges, 4 and 5 those of an edge's ends, 6 window * length, 7 the cell's first voxel.
     """
     one = np.float32(1)
     width = np.float32(size)
     half, last = np.float32(0.5) * (width - one), width - np.float32(2)
-    ex, ey, ez = lines[hit, 0], lines[hit, 1], lines[hit, 2]
-    qx, qy, qz = lines[hit, 3], lines[hit, 4], lines[hit, 5]
+    ex, ey, ez = hits[hit], hits[LANES + hit], hits[2 * LANES + hit]
+    qx, qy, qz = hits[3 * LANES + hit], hits[4 * LANES + hit], hits[5 * LANES + hit]
     for j in range(SAMPLES):
         step = first + np.float32(j)
         x, y, z = ex + step * qx, ey + step * qy, ez + step * qz
@@ -202,13 +163,13 @@ def _window(x, y, z):
     return (low + square * (middle + square * high)) * power_of_two(whole)
 
 
-@part()
-def add_segment(points, slot, slots, voxels, base, size, block, lines, hit, first, count, length):
+@part(inline=True)
+def add_segment(points, slot, slots, voxels, base, size, block, hits, hit, first, count, length):
     """Adds `count` samples of one box, from step `first` on, to points[slot], points[slot + slots], ..."""
     row = size * 4
     slab = size * row
     for begin in range(0, count, SAMPLES):
-        place_samples(block, lines, hit, first + np.float32(begin), size, length)
+        place_samples(block, hits, hit, first + np.float32(begin), size, length)
         for j in range(min(SAMPLES, count - begin)):
             corner = base + 4 * np.int64(block[7 * SAMPLES + j])
             add_sample(

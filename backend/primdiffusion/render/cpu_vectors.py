@@ -13,10 +13,14 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from primdiffusion.render.lattice import WINDOW_POWER, WINDOW_SHARPNESS
+
 _compiled_call: Any = intrinsic  # its callers do not give the typing context, nor see the real types
 
 _FLOAT, _INT32, _INT64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 _FOUR, _EIGHT = ir.VectorType(_FLOAT, 4), ir.VectorType(_FLOAT, 8)
+_WINDOW_SLOPE = _FLOAT(-WINDOW_SHARPNESS * WINDOW_POWER)
+"""d log(window) / dy = _WINDOW_SLOPE * y ** (WINDOW_POWER - 1)."""
 
 
 @_compiled_call
@@ -44,9 +48,7 @@ def add_sample(typingctx, points, slot, voxels, corner, row, slab, w00, w01, w10
         points, slot, voxels, *place, w00, w01, w10, w11, gu, fu, length = arguments
         code = _Vectors(builder)
         edges = code.edges(code.data(context, signature.args[2], voxels), *place)
-        edge = code.multiply(edges[0], code.splat(w00, _EIGHT))
-        for other, weight in zip(edges[1:], (w01, w10, w11), strict=True):
-            edge = code.add(edge, code.multiply(other, code.splat(weight, _EIGHT)))
+        edge = code.weighted(edges, [code.splat(weight, _EIGHT) for weight in (w00, w01, w10, w11)])
         value = code.between(edge, gu, fu)
         opacity = code.multiply(code.lane(value, 3), code.splat(length, _FOUR))
         value = builder.insert_element(value, _FLOAT(1), _INT32(3))
@@ -62,53 +64,53 @@ def add_sample(typingctx, points, slot, voxels, corner, row, slab, w00, w01, w10
 
 @_compiled_call
 def adjoin_sample(
-    typingctx, gradient, slopes, voxels, base, corner, row, slab, v, w, gu, fu, length, red, green, blue, constant, step
-):
-    """The adjoint of one sample: returns a * dL/da.
+    typingctx, gradient, slopes, path, voxels, base, corner, row, slab, w00, w01, w10, w11, gu, fu, length, half,
+    red, green, blue, constant, step,
+):  # fmt: skip
+    """The adjoint of one sample, whose opacity's worth is dL/da = <colour, (red, green, blue)> + constant.
 
-    dL/da = <colour, (red, green, blue)> + constant. The box's voxels begin at `base`; its gradient, laid out like them,
-    receives dL/d(voxels); slopes [2, 4] receives dL/d(u, v, w) and the same times `step`. v and w are the sample's
-    fractions along h and d. An empty gradient or empty slopes are not written.
+    The box's voxels begin at `base`; its gradient, laid out like them, receives dL/d(voxels). path [2, 4] holds the
+    ray: y = path[0] + step * path[1]. slopes [2, 4] receives dL/dy and the same times `step`; `half` are the voxels per
+    y. Weights as in `add_sample`. An empty gradient or empty slopes are not written.
     """
-    numbers = (types.float32,) * 10
-    signature = types.float32(gradient, slopes, voxels, *(types.int64,) * 4, *numbers)
+    numbers = (types.float32,) * 13
+    signature = types.void(gradient, slopes, path, voxels, *(types.int64,) * 4, *numbers)
 
     def generate(context, builder, signature, arguments):
-        gradient, slopes, voxels, base, corner, row, slab, v, w, gu, fu, length, *cotangent, constant, step = arguments
+        gradient, slopes, path, voxels, base, corner, row, slab, *numbers = arguments
+        w00, w01, w10, w11, gu, fu, length, half, *cotangent, constant, step = numbers
         code = _Vectors(builder)
-        first = builder.add(base, corner)
-        near, up, far, far_up = code.edges(code.data(context, signature.args[2], voxels), first, row, slab)
-        one = _FLOAT(1)
-        gv, gw = builder.fsub(one, v), builder.fsub(one, w)
-        front = code.mix(near, up, gv, v)
-        back = code.mix(far, far_up, gv, v)
-        edge = code.mix(front, back, gw, w)
+        weights = [code.splat(weight, _EIGHT) for weight in (w00, w01, w10, w11)]
+        edges = code.edges(code.data(context, signature.args[3], voxels), builder.add(base, corner), row, slab)
+        edge = code.weighted(edges, weights)
         value = code.between(edge, gu, fu)
 
         g = code.vector([*cotangent, _FLOAT(0)])
-        opacity = builder.fmul(builder.extract_element(value, _INT32(3)), length)
-        per_opacity = builder.fadd(code.total(code.multiply(value, g)), constant)
+        density = builder.extract_element(value, _INT32(3))
+        opacity = builder.fmul(density, length)
+        worth = builder.fadd(code.total(code.multiply(value, g)), constant)
         bar = code.multiply(g, code.splat(opacity, _FOUR))
-        bar = builder.insert_element(bar, builder.fmul(per_opacity, length), _INT32(3))
+        bar = builder.insert_element(bar, builder.fmul(worth, length), _INT32(3))
         bars = code.multiply(code.twice(bar), code.ends(gu, fu))
 
         array = context.make_array(signature.args[0])(context, builder, gradient)
         with builder.if_then(builder.icmp_signed(">", array.nitems, _INT64(0))):
             places = [corner, builder.add(corner, row), builder.add(corner, slab)]
             places.append(builder.add(places[2], row))
-            for place, pair in zip(places, ((gv, gw), (v, gw), (gv, w), (v, w)), strict=True):
-                weight = builder.fmul(*pair)
-                code.accumulate(array.data, place, code.multiply(bars, code.splat(weight, _EIGHT)))
+            for place, weight in zip(places, weights, strict=True):
+                code.accumulate(array.data, place, code.multiply(bars, weight))
         array = context.make_array(signature.args[1])(context, builder, slopes)
-        with builder.if_then(builder.icmp_signed(">", array.nitems, _INT64(0))):
-            along_u = code.multiply(bar, builder.fsub(code.half(edge, 1), code.half(edge, 0)))
-            rise = code.mix(builder.fsub(up, near), builder.fsub(far_up, far), gw, w)
-            along_v = code.folded(code.multiply(bars, rise))
-            along_w = code.folded(code.multiply(bars, builder.fsub(back, front)))
-            slope = code.totals(along_u, along_v, along_w)
+        # Where there is no density, moving changes nothing.
+        dense = builder.fcmp_ordered(">", density, _FLOAT(0))
+        with builder.if_then(builder.and_(dense, builder.icmp_signed(">", array.nitems, _INT64(0)))):
+            v, w = builder.fadd(w01, w11), builder.fadd(w10, w11)
+            slope = code.multiply(code.slope(bar, bars, edge, edges, v, w), code.splat(half, _FOUR))
+            y = code.point(code.data(context, signature.args[2], path), step)
+            fade = code.multiply(code.seventh_power(y), code.splat(builder.fmul(worth, opacity), _FOUR))
+            slope = code.add(slope, code.multiply(fade, code.splat(_WINDOW_SLOPE, _FOUR)))
             code.accumulate(array.data, _INT64(0), slope)
             code.accumulate(array.data, _INT64(4), code.multiply(slope, code.splat(step, _FOUR)))
-        return builder.fmul(per_opacity, opacity)
+        return context.get_dummy_value()
 
     return signature, generate
 
@@ -144,6 +146,9 @@ class _Vectors:
 
     def add(self, a, b):
         return self.builder.fadd(a, b, flags=("contract",))
+
+    def subtract(self, a, b):
+        return self.builder.fsub(a, b, flags=("contract",))
 
     def splat(self, value, kind):
         first = self.builder.insert_element(ir.Constant(kind, ir.Undefined), value, _INT32(0))
@@ -181,8 +186,33 @@ class _Vectors:
             self.multiply(self.half(edge, 1), self.splat(fu, _FOUR)),
         )
 
-    def mix(self, a, b, at_a, at_b):
-        return self.add(self.multiply(a, self.splat(at_a, _EIGHT)), self.multiply(b, self.splat(at_b, _EIGHT)))
+    def weighted(self, edges, weights):
+        result = self.multiply(edges[0], weights[0])
+        for edge, weight in zip(edges[1:], weights[1:], strict=True):
+            result = self.add(result, self.multiply(edge, weight))
+        return result
+
+    def mix(self, a, b, share):
+        """a + share * (b - a)."""
+        return self.add(a, self.multiply(self.subtract(b, a), self.splat(share, a.type)))
+
+    def slope(self, bar, bars, edge, edges, v, w):
+        """The derivative in the cell's coordinates (u, v, w) of what `bar`, dL/d(value), stands for."""
+        near, up, far, far_up = edges
+        along_u = self.multiply(bar, self.subtract(self.half(edge, 1), self.half(edge, 0)))
+        rise = self.mix(self.subtract(up, near), self.subtract(far_up, far), w)
+        depth = self.mix(self.subtract(far, near), self.subtract(far_up, up), v)
+        along_v, along_w = self.folded(self.multiply(bars, rise)), self.folded(self.multiply(bars, depth))
+        return self.totals(along_u, along_v, along_w)
+
+    def point(self, path, step):
+        """path[0] + step * path[1]."""
+        first, per_step = (self.builder.load(self._vector_at(path, _INT64(place), _FOUR), align=4) for place in (0, 4))
+        return self.add(first, self.multiply(per_step, self.splat(step, _FOUR)))
+
+    def seventh_power(self, y):
+        cube = self.multiply(self.multiply(y, y), y)
+        return self.multiply(self.multiply(cube, cube), y)
 
     def totals(self, a, b, c):
         """The sums over the lanes of a, of b and of c, and 0."""
