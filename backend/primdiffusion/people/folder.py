@@ -137,7 +137,7 @@ def skeleton_of(person: Person) -> Skeleton:
         "vcn,n->vc", body.shape_basis[..., : len(person.betas)].double(), torch.from_numpy(person.betas)
     )
     joints = (body.joint_regressor.double() @ vertices).numpy()
-    return Skeleton(JOINT_NAMES, body.parents.tolist(), np.rint(joints * JOINT_GRID) / JOINT_GRID)
+    return Skeleton(JOINT_NAMES, body.parents.tolist(), np.rint(joints * JOINT_GRID) / JOINT_GRID + 0.0)
 
 
 def is_whole(folder: Path, seed: int) -> bool:

@@ -77,7 +77,7 @@ def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
     else:
         light = _creases(garment.path)
     trim = np.zeros((SIZE, SIZE), bool)
-    shade = np.ones((SIZE, SIZE), np.float32)
+    shade = np.ones((SIZE, SIZE), np.float64)
     for number, kind in enumerate(garment.pieces):
         here = piece == number
         seen = here & texels.inside
@@ -87,7 +87,7 @@ def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
             light = np.where(here, _blurred(light, seen), light)
         if kind.trim and original is not None:
             lab = lab_from_bytes(original[..., :3])
-            distance = np.linalg.norm((lab - np.median(lab[seen], axis=0)) * np.array([0.8, 1, 1], np.float32), axis=-1)
+            distance = np.linalg.norm((lab - np.median(lab[seen], axis=0)) * np.array([0.8, 1, 1], np.float64), axis=-1)
             trim |= here & (distance > TRIM_DISTANCE)
         for region in (here & ~trim, here & trim):
             if (region & texels.inside).any():
@@ -95,7 +95,7 @@ def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
                 shade[region] = np.clip((light[region] + 0.01) / (middle + 0.01), 0.15, 2.2) ** 0.75
     nearest = _inner_texels(texels.inside)
     shade = (shade * _occlusion(assets, garment))[nearest]
-    return Cloth(original, piece, trim[nearest], shade, position.astype(np.float32))
+    return Cloth(original, piece, trim[nearest], shade, position.astype(np.float64))
 
 
 def paint_garment(
@@ -112,15 +112,15 @@ def paint_garment(
 
 def coloured(fabric: Cloth, paints: tuple[Paint, ...]) -> UInt8[np.ndarray, "H W 4"]:
     """The garment's texture in new colours."""
-    main = np.stack([paint.main for paint in paints]).astype(np.float32)
-    trim = np.stack([paint.trim for paint in paints]).astype(np.float32)
+    main = np.stack([paint.main for paint in paints]).astype(np.float64)
+    trim = np.stack([paint.trim for paint in paints]).astype(np.float64)
     target = np.where(fabric.trim[..., None], trim[fabric.piece], main[fabric.piece])
     for number, paint in enumerate(paints):
         pattern = dict(patterns.PATTERNS).get(paint.pattern)
         if pattern is not None:
             here = (fabric.piece == number) & ~fabric.trim
-            share = pattern(fabric.position[here])[:, None].astype(np.float32)
-            target[here] += share * (paint.second - paint.main).astype(np.float32)
+            share = pattern(fabric.position[here])[:, None].astype(np.float64)
+            target[here] += share * (paint.second - paint.main).astype(np.float64)
     texture = np.full((*fabric.piece.shape, 4), 255, np.uint8)
     texture[..., :3] = bytes_from_linear(np.clip(target * fabric.shade[..., None], 0, 1))
     if fabric.original is not None:
@@ -168,8 +168,8 @@ def _inner_texels(inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _blurred(light: Float[np.ndarray, "H W"], seen: np.ndarray) -> Float[np.ndarray, "H W"]:
     """The broad shading of the seen texels, with none of their fine stripes."""
-    weight = gaussian_filter(seen.astype(np.float32), 8) + 1e-6
-    return gaussian_filter(np.where(seen, light, 0).astype(np.float32), 8) / weight
+    weight = gaussian_filter(seen.astype(np.float64), 8) + 1e-6
+    return gaussian_filter(np.where(seen, light, 0).astype(np.float64), 8) / weight
 
 
 def _creases(path: str) -> Float[np.ndarray, "H W"]:
@@ -181,9 +181,9 @@ def _creases(path: str) -> Float[np.ndarray, "H W"]:
     return light
 
 
-def _occlusion(assets: Assets, garment: Garment) -> Float[np.ndarray, "H W"] | np.float32:
+def _occlusion(assets: Assets, garment: Garment) -> Float[np.ndarray, "H W"] | np.float64:
     """Folds from the pack's ambient occlusion picture, softened; one where it has none."""
     name = f"{garment.path}_ao"
     if not assets.has_picture(name):
-        return np.float32(1)
-    return 0.45 + 0.55 * assets.picture(name, SIZE)[..., :3].astype(np.float32).mean(-1) / 255
+        return np.float64(1)
+    return 0.45 + 0.55 * assets.picture(name, SIZE)[..., :3].astype(np.float64).mean(-1) / 255

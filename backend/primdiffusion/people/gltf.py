@@ -187,7 +187,7 @@ def _normals(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) 
         np.add.at(total, faces[:, corner], across)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     unit = np.where(length > 1e-12, total / np.maximum(length, 1e-12), np.array([0.0, 1.0, 0.0]))
-    return (np.rint(unit * NORMAL_STEPS) / NORMAL_STEPS).astype(np.float32)
+    return (np.rint(unit * NORMAL_STEPS) / NORMAL_STEPS + 0.0).astype(np.float32)
 
 
 def _material(part: TexturedPart, number: int) -> dict[str, Any]:

@@ -45,14 +45,14 @@ def strands(assets: Assets, name: str) -> Strands:
 
 def coloured_strands(hair: Strands, colour: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, "H W 4"]:
     """Strands of one linear colour."""
-    rgb = bytes_from_linear(np.clip(hair.shade[..., None] * colour.astype(np.float32), 0, 1))
+    rgb = bytes_from_linear(np.clip(hair.shade[..., None] * colour.astype(np.float64), 0, 1))
     return np.concatenate([rgb, hair.alpha[..., None]], axis=-1)
 
 
 def tinted_cutout(picture: UInt8[np.ndarray, "H W 4"], colour: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, "H W 4"]:
     """Brows or lashes: the picture's alpha, thickened to pass an alpha test, in one linear colour."""
     texture = np.empty_like(picture)
-    texture[..., :3] = bytes_from_linear(colour.astype(np.float32))
+    texture[..., :3] = bytes_from_linear(colour.astype(np.float64))
     texture[..., 3] = np.minimum(picture[..., 3].astype(np.int32) * 3 // 2, 255).astype(np.uint8)
     return texture
 
@@ -60,33 +60,33 @@ def tinted_cutout(picture: UInt8[np.ndarray, "H W 4"], colour: Float[np.ndarray,
 def _straight(texels: TexelMap, name: str) -> Strands:
     """Strands that run down the texture and end raggedly where an island ends below."""
     draws = stream(0, f"strands of {name}")
-    noise = draws.standard_normal((3, SIZE, SIZE)).astype(np.float32)
+    noise = draws.standard_normal((3, SIZE, SIZE)).astype(np.float64)
     shade = sum(
         share * _unit(gaussian_filter(layer, spread))
         for layer, share, spread in zip(noise, (0.8, 1.0, 0.8), ((60, 0.7), (80, 1.6), (100, 5)), strict=True)
     )
-    below = np.zeros((SIZE, SIZE), np.float32)
-    above = np.zeros((SIZE, SIZE), np.float32)
+    below = np.zeros((SIZE, SIZE), np.float64)
+    above = np.zeros((SIZE, SIZE), np.float64)
     for row in range(SIZE - 2, -1, -1):
         below[row] = np.where(texels.inside[row], below[row + 1] + 1, 0)
     for row in range(1, SIZE):
         above[row] = np.where(texels.inside[row], above[row - 1] + 1, 0)
-    reach = np.abs(_unit(gaussian_filter(draws.standard_normal((SIZE, SIZE)).astype(np.float32), (40, 0.8))))
+    reach = np.abs(_unit(gaussian_filter(draws.standard_normal((SIZE, SIZE)).astype(np.float64), (40, 0.8))))
     ragged = below > 0.06 * (below + above) * reach
     # Sideways across island borders, or sheets that meet there would let light through.
     there = binary_dilation(ragged, np.ones((1, 5), bool))
-    return Strands(np.exp(0.22 * shade).astype(np.float32), np.where(there, 255, 0).astype(np.uint8))
+    return Strands(np.exp(0.22 * shade).astype(np.float64), np.where(there, 255, 0).astype(np.uint8))
 
 
 def _curls(texels: TexelMap, island: Int[np.ndarray, " F"]) -> Strands:
     """Small curls without a direction; the two large islands, a cap, are solid, the tufts around it have gaps."""
     draws = stream(0, "curls")
-    noise = draws.standard_normal((2, SIZE, SIZE)).astype(np.float32)
+    noise = draws.standard_normal((2, SIZE, SIZE)).astype(np.float64)
     curls, tufts = _unit(gaussian_filter(noise[0], 2.0)), _unit(gaussian_filter(noise[1], 7.0))
-    edge = gaussian_filter(texels.inside.astype(np.float32), 5)
+    edge = gaussian_filter(texels.inside.astype(np.float64), 5)
     there = (island < 2)[texels.face] | (curls + tufts + 6 * (edge - 0.6) > 0)
     shade = _unit(gaussian_filter(noise[0], 1.2)) + 0.6 * curls + 0.8 * tufts
-    return Strands(np.exp(0.2 * shade).astype(np.float32), np.where(there, 255, 0).astype(np.uint8))
+    return Strands(np.exp(0.2 * shade).astype(np.float64), np.where(there, 255, 0).astype(np.uint8))
 
 
 def _unit(field: np.ndarray) -> np.ndarray:

@@ -70,6 +70,6 @@ def hair_colour(tone: float, old: bool, draws: np.random.Generator) -> tuple[str
 def _near(code: str, draws: np.random.Generator, spread: tuple[float, float, float]) -> Float[np.ndarray, "3"]:
     """A linear colour about a hexadecimal one."""
     lab = lab_from_bytes(np.frombuffer(bytes.fromhex(code), np.uint8))
-    moved = lab + draws.normal(0, spread).astype(np.float32)
+    moved = lab + draws.normal(0, spread).astype(np.float64)
     moved[0] = np.clip(moved[0], 3, 97)
     return linear_from_bytes(bytes_from_lab(moved)).astype(np.float64)

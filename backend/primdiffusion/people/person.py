@@ -19,6 +19,8 @@ from primdiffusion.people.texel_map import connected_faces
 from primdiffusion.people.wardrobe import EYES, Choice, choose, hair_path, stream
 
 BROW_SIZE = 512
+GRID = 2.0**17
+"""Vertices are rounded to 1 / GRID m, 8 micrometres."""
 CLOTHES = ("outfit", "shoes")
 """Parts that hide what is under them. Outfits also list the base's eyes and hair, which must stay."""
 
@@ -65,7 +67,7 @@ def femininity(base: BaseMesh) -> Float[np.ndarray, "10"]:
 
 
 def _geometry(assets: Assets, base: BaseMesh, choice: Choice, face: Float[np.ndarray, " M"]) -> TexturedMesh:
-    """All parts in place, with a plain texture."""
+    """All parts in place, with a plain texture; coordinates rounded so that every machine has the same."""
     vertices = faces.with_face(base.vertices(choice.betas), base, face)
     paths = {
         "outfit": choice.outfit.path,
@@ -109,11 +111,11 @@ def _geometry(assets: Assets, base: BaseMesh, choice: Choice, face: Float[np.nda
 
 
 def _compact(part: TexturedPart) -> TexturedPart:
-    """The part without vertices that no face uses."""
+    """The part without vertices that no face uses, the others on a grid."""
     used, faces = np.unique(part.faces, return_inverse=True)
     return dataclasses.replace(
         part,
-        vertices=part.vertices[used],
+        vertices=np.rint(part.vertices[used] * GRID) / GRID + 0.0,  # no negative zeros
         faces=faces.reshape(-1, 3).astype(np.int32),
         skin_index=part.skin_index[used],
         skin_weight=part.skin_weight[used],
@@ -141,7 +143,7 @@ def _coloured(assets: Assets, base: BaseMesh, choice: Choice, mesh: TexturedMesh
         textures["hair"] = hair.coloured_strands(hair.strands(assets, choice.hair), hair_linear)
     if choice.hat:
         colour = palette.garment_colour("hat", stream(seed, "hat colour"))
-        textures["hat"] = np.append(bytes_from_linear(colour.astype(np.float32)), np.uint8(255)).reshape(1, 1, 4)
+        textures["hat"] = np.append(bytes_from_linear(colour), np.uint8(255)).reshape(1, 1, 4)
     parts = tuple(dataclasses.replace(part, texture=textures[part.name]) for part in mesh.parts)
     attributes: dict[str, str | float] = {
         "sex": choice.sex,

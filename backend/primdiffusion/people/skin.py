@@ -78,7 +78,7 @@ def skin_texture(assets: Assets, skin: SkinColours) -> UInt8[np.ndarray, "H W 4"
     move = distance * means + np.array(skin.shift)
     broad = gaussian_filter(_local_mean(assets, skin.base) + move, (BROAD_SPREAD, BROAD_SPREAD, 0))
     move -= np.array(EVENED) * (broad - np.median(broad, axis=(0, 1)))
-    lab = _lab(assets, skin.base).astype(np.float32)
+    lab = _lab(assets, skin.base).astype(np.float64)
     height, width = lab.shape[:2]
     for channel in range(3):
         coarse = Image.fromarray(move[..., channel].astype(np.float32))

@@ -26,8 +26,8 @@ class TexelMap:
     """[H, W] bool: the texel's centre lies in a triangle."""
 
     def sample(self, per_vertex: Float[np.ndarray, "V C"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "H W C"]:
-        """A quantity of the vertices interpolated under each texel, float32."""
-        corners = per_vertex.astype(np.float32)[faces[self.face]]
+        """A quantity of the vertices interpolated under each texel, float64."""
+        corners = per_vertex[faces[self.face]]
         return np.einsum("hwk,hwkc->hwc", self.barycentric, corners)
 
 

@@ -116,7 +116,7 @@ FEMALE_EYEBROWS, MALE_EYEBROWS = (0, 1, 3, 5, 6, 9, 10), (0, 1, 2, 3, 4, 7, 9, 1
 EYES = "eyes/low-poly/low-poly"
 
 HAT_SHARE, BALD_SHARE = 0.08, 0.08
-LARGEST_BETA = 2.0
+LARGEST_BETA, BETA_DIGITS = 2.0, 6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -191,4 +191,4 @@ def draw_body(seed: int, femininity: Float[np.ndarray, "10"]) -> tuple[Float[np.
     side = float(betas @ axis)
     sign = 1.0 if side >= 0 else -1.0
     betas += axis * sign * max(0.0, 0.5 - abs(side))
-    return np.clip(betas, -LARGEST_BETA, LARGEST_BETA), "female" if sign > 0 else "male"
+    return np.clip(betas, -LARGEST_BETA, LARGEST_BETA).round(BETA_DIGITS), "female" if sign > 0 else "male"
