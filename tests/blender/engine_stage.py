@@ -36,9 +36,11 @@ class Oracle:
         self._process.stdin.flush()
         assert self._process.stdout.readline().strip() == "{}"
 
-    def picture(self, people: list[dict], camera: dict, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    def picture(
+        self, people: list[dict], camera: dict, size: tuple[int, int], step: float = STEP
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Combined [h, w, 4] and depth [h, w], top row first."""
-        draw = {"people": people, **camera, "width": size[0], "height": size[1], "step": STEP}
+        draw = {"people": people, **camera, "width": size[0], "height": size[1], "step": step}
         self.ask({"draw": draw, "out": str(self._out)})
         with np.load(self._out) as answer:
             return answer["combined"], answer["depth"]
