@@ -96,6 +96,17 @@ def test_reports_tell_the_rows_that_are_done_and_the_frame_is_filled_that_far(pa
     assert 0 < result["seconds_place"] < result["seconds"]
 
 
+def test_the_first_band_is_small_where_samples_or_people_are_many(params):
+    def first_band(**changes) -> int:
+        reports: list = []
+        drawn(dataclasses.replace(params, **changes), reports=reports)
+        return next(step for _, step, *_ in reports if step > 0)
+
+    assert first_band() == HEIGHT
+    assert first_band(step=1e-4) < HEIGHT / 2
+    assert first_band(people=20 * params.people) < HEIGHT
+
+
 def test_people_are_loaded_once_and_placed_once_a_pose(params, monkeypatch, tmp_path):
     calls = []
     for name in ("load_human", "place_skinned"):

@@ -57,6 +57,8 @@ BROKEN = [[1.0, 0.0, 0.0, 0.0], [0.0, math.nan, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
         ({"clip": [0.1]}, "clip holds 1 entries"),
         ({"background": [0.1, 0.2]}, "background"),
         ({"background": [0.1, 0.2, "x"]}, "background holds 'x'"),
+        ({"background": [0.1, 0.2, 1e300]}, "background holds 1e+300"),
+        ({"background": [0.1, 0.2, -(10**400)]}, "background holds"),
         ({"step": 0}, "step"),
         ({"step": 1e-7}, "step"),
         ({"step": math.nan}, "step"),

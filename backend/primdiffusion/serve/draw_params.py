@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any
 
 from primdiffusion.drawing.steps import check_step
 
 VIEWS = ("colour", "depth", "alpha", "boxes")
 JOINTS = 24
+LARGEST_NUMBER = 1e30
+"""Products of larger ones do not fit into float32."""
 Matrix = tuple[tuple[float, ...], ...]
 
 
@@ -101,13 +102,13 @@ class DrawParams:
 
 
 def check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> None:
-    """ValueError that names `name` unless `value` is nested lists of finite numbers of this shape."""
+    """ValueError that names `name` unless `value` is nested lists of this shape, of numbers that float32 can hold."""
     wanted = " x ".join(map(str, shape))
     if not shape:
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ValueError(f"{name} holds {value!r:.40} where a number should be")
-        if not math.isfinite(value):
-            raise ValueError(f"{name} holds {value}: give finite numbers")
+        if not -LARGEST_NUMBER <= value <= LARGEST_NUMBER:
+            raise ValueError(f"{name} holds {value!r:.40}: give finite numbers, of at most {LARGEST_NUMBER:g}")
         return
     if not isinstance(value, list) or len(value) != shape[0]:
         given = f"{len(value)} entries" if isinstance(value, list) else f"{value!r:.40}"

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from primdiffusion.body.model import BodyModel, default_body
-from primdiffusion.drawing.bands import draw_in_bands
+from primdiffusion.drawing.bands import BAND_SECONDS, FIRST_PIXELS, draw_in_bands
 from primdiffusion.drawing.scene import Look, Picture, Scene
 from primdiffusion.failures import PictureOutOfMemory, out_of_memory
 from primdiffusion.geometry.camera import Camera
@@ -55,8 +55,8 @@ class FrameDrawer:
         self._placed = functools.lru_cache(PEOPLE_KEPT)(self._place)
         self._everybody = functools.lru_cache(2)(self._together)
         self._solids = functools.lru_cache(SOLIDS_KEPT)(_load_solids)
-        self._speed: dict[tuple[str, float], float] = {}
-        """Pixels a second of the last picture, by view and step."""
+        self._speed: dict[tuple[str, float, int], float] = {}
+        """Pixels a second of the last picture, by view, step and number of people."""
 
     def draw(self, params: DrawParams, report: Report) -> dict[str, Any]:
         """Fills the frame band by band from the top, with a report after each; returns what it took.
@@ -117,8 +117,9 @@ class FrameDrawer:
             settings_for(params.step, [person.object for person in params.people]),
         )
         began, seconds, height = time.perf_counter(), 0.0, len(picture.depth)
-        kind = (params.view, params.step)
-        for done in draw_in_bands(picture, scene, self._camera(params), look, self._speed.get(kind)):
+        kind = (params.view, params.step, len(params.people))
+        speed = self._speed.get(kind) or _first_guess(params)
+        for done in draw_in_bands(picture, scene, self._camera(params), look, speed):
             self._speed[kind], seconds = done.pixels_a_second, done.seconds_march
             left = (time.perf_counter() - began) / done.rows * (height - done.rows)
             report("draw", done.rows, height, round(left, 3))
@@ -145,6 +146,12 @@ def map_frame(path: str, width: int, height: int) -> Picture:
     values = np.asarray(np.memmap(path, np.float32, "r+", shape=(width * height * CHANNELS,)))
     combined, depth = values[: width * height * 4], values[width * height * 4 :]
     return Picture(combined.reshape(height, width, 4)[::-1], depth.reshape(height, width)[::-1])
+
+
+def _first_guess(params: DrawParams) -> float:
+    """Pixels a second of a machine that nobody knows, on the safe side: work grows with samples and with people."""
+    plain = FIRST_PIXELS / BAND_SECONDS
+    return plain * min(1.0, params.step / MarchSettings().step) / max(1, len(params.people))
 
 
 def settings_for(step: float, objects: list[Any]) -> MarchSettings:
