@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -47,14 +48,27 @@ def sit(person: SkinnedPerson, poses: BodyPose, rig: Rig | Sequence[View]) -> Si
         ValueError: the poses are not finite.
     """
     figure = figure_of(person.mesh)
-    body = default_body().shape(torch.from_numpy(person.betas).float()).pose(poses)
-    skinning, joints = body.skinning.double().numpy(), body.joints[..., :3, 3].double().numpy()
+    with _one_thread():
+        shaped = default_body().to(dtype=torch.float64).shape(torch.from_numpy(person.betas).double())
+        body = shaped.pose(poses.to(dtype=torch.float64))
+    skinning, joints = body.skinning.numpy(), body.joints[..., :3, 3].numpy()
     if isinstance(rig, Rig):
         moved = [part.posed(matrices).vertices for matrices in skinning for part in person.mesh.parts]
         views = rig.views(*bounding_sphere(np.concatenate(moved)))
     else:
         views = list(rig)
     return Sitting(figure, person.betas, poses, skinning, joints, views)
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Sums in one order, so that any number of workers writes the same files to the last digit."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def begin(subject: Path, sitting: Sitting) -> None:

@@ -1,0 +1,162 @@
+"""The rasteriser of captures against scenes whose pictures are known, and against the plain rasteriser."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from capture_scenes import BLUE, GREEN, RED, WHITE, box, square
+from primdiffusion.capture.figure import figure_of
+from primdiffusion.capture.multisample import shoot
+from primdiffusion.capture.rasterise import rasterise
+from primdiffusion.capture.reader import as_camera
+from primdiffusion.capture.rig import View, look_at
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+
+REST = np.tile(np.eye(4), (24, 1, 1))
+HOLE = (9, 9, 9, 0)
+
+
+def shot_of(*parts: TexturedPart, view: View, samples: int = 3):
+    return shoot(figure_of(TexturedMesh(parts)).posed(REST), view, samples)
+
+
+def front(distance: float, focal: float, size: int) -> View:
+    """A camera on +z that looks at the origin."""
+    intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    return View(intrinsics, np.diag([1.0, -1, -1]), np.array([0.0, 0, distance]), size, size)
+
+
+def test_a_cubes_front_covers_what_the_pinhole_says():
+    # A front face of 1 m, 2 m away, focal length 40 px: 20 pixels, from 10 to 30.
+    shot = shot_of(box(), view=front(2.5, 40, 40))
+    expected = np.zeros((40, 40))
+    expected[10:30, 10:30] = 1
+    np.testing.assert_array_equal(shot.coverage, expected)
+    inside = shot.coverage > 0
+    np.testing.assert_allclose(shot.depth[inside], 2, atol=1e-6)
+    np.testing.assert_allclose(shot.rgb[inside], [[1, 0, 0]] * 400, atol=1e-6)
+    assert (shot.part[inside] == 1).all()
+    assert not shot.depth[~inside].any()
+    assert not shot.part[~inside].any()
+    assert (shot.normal[inside][:, 2] > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(shot.normal[inside], axis=-1), 1, atol=1e-6)
+
+
+def test_coverage_is_the_share_of_samples_and_colour_is_linear_and_premultiplied():
+    # The square ends at pixel 10 + 1/3 on each side: one of three columns of samples.
+    shot = shot_of(square([[(188, 188, 188, 255)]], side=1 + 1 / 30), view=front(2, 40, 40))
+    assert shot.coverage[20, 9] == pytest.approx(1 / 3)
+    assert shot.coverage[9, 9] == pytest.approx(1 / 9)
+    linear = ((188 / 255 + 0.055) / 1.055) ** 2.4
+    np.testing.assert_allclose(shot.rgb[20, [9, 20], 0], [linear / 3, linear], rtol=1e-5)
+
+
+def test_textures_are_upright_and_holes_show_what_is_behind():
+    texture = np.array([[RED, GREEN], [BLUE, HOLE]]).repeat(8, 0).repeat(8, 1)
+    shot = shot_of(square(texture, 0), square([[WHITE]], -1, 9), view=front(2, 40, 40))
+    corners = shot.rgb[[14, 14, 25, 25], [14, 25, 14, 25]]
+    np.testing.assert_allclose(corners, [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], atol=1e-6)
+    assert shot.depth[25, 25] == pytest.approx(3)
+    assert shot.depth[25, 14] == pytest.approx(2)
+    assert shot.coverage.min() == 1
+
+
+def test_the_edge_of_a_hole_lies_where_interpolated_alpha_is_one_half():
+    texture = np.full((1, 2, 4), 255, np.uint8)
+    texture[0, 0, 3], texture[0, 1, 3] = 51, 255  # from 0.2 to 1 between u = 1/4 and 3/4: one half at 0.4375
+    shot = shot_of(square(texture), view=front(1, 400, 400), samples=1)
+    assert np.flatnonzero(shot.coverage[200, 100:300])[0] + 100 == pytest.approx(400 * 0.4375, abs=1)
+
+
+def test_holes_tint_nothing():
+    texture = np.array([[RED, HOLE]]).repeat(4, 0).repeat(4, 1)
+    shot = shot_of(square(texture), view=front(1, 30, 30))
+    seen = shot.coverage > 0
+    np.testing.assert_allclose(shot.rgb[seen] / shot.coverage[seen][:, None], [[1, 0, 0]] * int(seen.sum()), atol=1e-6)
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+def test_silhouette_depth_and_colour_agree_with_the_plain_rasteriser(samples):
+    sphere = trimesh.creation.icosphere(subdivisions=4)
+    vertices = sphere.vertices * (1 + 0.35 * np.sin(5 * sphere.vertices[:, :1]) * np.cos(4 * sphere.vertices[:, 1:2]))
+    colours = np.random.default_rng(0).integers(0, 256, (8, 8, 4), np.uint8)
+    colours[..., 3] = 255
+    part = dataclasses.replace(
+        box(), vertices=vertices, faces=np.asarray(sphere.faces, np.int32), texture=colours.repeat(16, 0).repeat(16, 1),
+        corner_uv=(vertices[sphere.faces][..., :2] / 4 + 0.5).astype(np.float32),
+        skin_index=np.zeros((len(vertices), 1), np.int32), skin_weight=np.ones((len(vertices), 1)),
+    )  # fmt: skip
+    view = look_at(np.array([1.0, 0.7, 4.0]), np.zeros(3), 0.7, 160, 160)
+    shot, picture = (
+        shot_of(part, view=view, samples=samples),
+        rasterise(TexturedMesh((part,)), as_camera(view), samples),
+    )
+    assert np.mean(np.abs(shot.coverage - picture.alpha) > 1e-6) < 1e-3
+    both = (shot.coverage == 1) & (picture.alpha == 1)
+    assert both.mean() > 0.2
+    assert np.abs(shot.rgb - picture.rgb)[both].mean() < 0.01
+    if samples == 1:
+        _, rays = as_camera(view).rays()
+        along = (rays.numpy() @ view.rotation[2])[both]
+        np.testing.assert_allclose(shot.depth[both], picture.depth[both] * along, atol=1e-4)
+
+
+def test_a_triangle_across_the_cameras_plane_is_seen_as_far_as_it_is_in_front():
+    part = dataclasses.replace(
+        square([[RED]]), vertices=np.array([[-9, -1, -9], [9, -1, -9], [9, -1, 9], [-9, -1, 9.0]])
+    )
+    shot = shot_of(part, view=front(0, 20, 40), samples=1)  # stands inside of a floor one metre below
+    assert not shot.coverage[:20].any()
+    rows = np.arange(23, 40)  # beyond row 22 the floor has ended
+    np.testing.assert_allclose(shot.depth[rows, 20], 20 / (rows + 0.5 - 20), rtol=1e-5)
+
+
+def test_nothing_behind_the_camera_or_beside_the_picture_is_seen():
+    for centre in ((0, 0, 9), (50, 0, 0)):
+        shot = shot_of(box(centre=centre), view=front(3, 40, 40))
+        assert not shot.coverage.any()
+
+
+def test_no_ray_slips_between_triangles():
+    shot = shot_of(box(half=3), view=look_at(np.array([0.1, 0.2, 0.3]), np.array([1.0, 2, 3]), 1.5, 64, 64))
+    assert shot.coverage.min() == 1
+
+
+def test_fine_textures_are_averaged_not_sampled():
+    checks = np.indices((512, 512)).sum(0) % 2
+    texture = np.where(checks[..., None], np.array(WHITE), np.array((0, 0, 0, 255))).astype(np.uint8)
+    rgb = shot_of(square(texture), view=front(2, 50, 40)).rgb[10:30, 10:30]
+    np.testing.assert_allclose(rgb, 0.5, atol=0.02)
+
+
+def test_normals_are_smooth_across_seams_and_face_the_camera():
+    sphere = trimesh.creation.icosphere(subdivisions=3)
+    torn = sphere.vertices[sphere.faces].reshape(-1, 3)  # every face with vertices of its own
+    part = dataclasses.replace(
+        box(), vertices=torn, faces=np.arange(len(torn), dtype=np.int32).reshape(-1, 3)[:, ::-1].copy(),
+        corner_uv=np.zeros((len(torn) // 3, 3, 2), np.float32),
+        skin_index=np.zeros((len(torn), 1), np.int32), skin_weight=np.ones((len(torn), 1)),
+    )  # fmt: skip
+    view = front(3, 60, 60)
+    shot = shot_of(part, view=view, samples=1)
+    seen = shot.depth > 0
+    place = np.stack([(np.indices((60, 60))[1] + 0.5 - 30) / 60, -(np.indices((60, 60))[0] + 0.5 - 30) / 60], -1)
+    at = np.concatenate([place * shot.depth[..., None], 3 - shot.depth[..., None]], -1)
+    cosine = (at * shot.normal).sum(-1)[seen] / np.linalg.norm(at, axis=-1)[seen]
+    assert np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))) < 0.5  # flat faces are 3 degrees off
+    assert cosine.min() > 0.99
+
+
+def test_even_samples_are_refused():
+    with pytest.raises(ValueError, match="odd"):
+        shot_of(box(), view=front(3, 40, 40), samples=2)
+
+
+def test_skinning_moves_vertices_with_their_joints():
+    moved = torch.eye(4).repeat(24, 1, 1).numpy().astype(np.float64)
+    moved[3, :3, 3] = 1, 2, 3
+    posed = figure_of(TexturedMesh((box(joint=3), box("still")))).posed(moved)
+    np.testing.assert_allclose(posed.vertices[:8].mean(0), [1, 2, 3])
+    np.testing.assert_allclose(posed.vertices[8:].mean(0), 0, atol=1e-12)
