@@ -149,9 +149,7 @@ def _shape(body: Body, parameters: Parameters, surface: Surface, scan_file: Scan
             f"{scan_file.path} does not match {scan_file.parameters}: its surface is {fit.residual * 100:.0f} cm from "
             "the body; check that they belong together"
         )
-    told = (
-        f"shape fitted to its surface, as that of the body {body.name!r}, {fit.residual * 1000:.0f} mm off on average"
-    )
+    told = f"shape of the {body.name} body fitted to its surface, {fit.residual * 1000:.0f} mm off on average"
     return fit.betas, fit.shift, [told]
 
 

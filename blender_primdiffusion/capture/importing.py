@@ -23,7 +23,7 @@ def import_file(path: Path) -> list[bpy.types.Object]:
 
 
 def _import_gltf(path: str) -> None:
-    bpy.ops.import_scene.gltf(filepath=path, disable_bone_shape=True, bone_heuristic="BLENDER", loglevel=50)
+    bpy.ops.import_scene.gltf(filepath=path, disable_bone_shape=True, bone_heuristic="BLENDER")
 
 
 def _import_fbx(path: str) -> None:
