@@ -1,0 +1,165 @@
+"""Samples of captures: what is in them, their order, going on, packs."""
+
+import dataclasses
+import itertools
+import os
+
+import numpy as np
+import pytest
+import torch
+from capture_scenes import captured
+from primdiffusion.capture.dataset import CaptureDataset, Position, SampleSettings, batches
+from primdiffusion.capture.pack import open_pack, pack, pack_path
+from primdiffusion.capture.reader import open_captures
+from primdiffusion.capture.rig import View
+from primdiffusion.capture.windows import Window, resample, through, whole
+from primdiffusion.geometry.records import TensorRecord
+
+SETTINGS = SampleSettings(conditioning=2, targets=1, size=16)
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    return open_captures(captured(tmp_path_factory.mktemp("captures"), people=3, passes=("img", "mask")))
+
+
+def same(first: TensorRecord, second: TensorRecord) -> bool:
+    """Whether all tensors of two records are equal."""
+    pairs = ((getattr(first, f.name), getattr(second, f.name)) for f in dataclasses.fields(first))
+    return all(
+        same(a, b) if isinstance(a, TensorRecord) else torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+        for a, b in pairs
+    )
+
+
+def first(count: int, dataset: CaptureDataset, size: int = 2, **more) -> list:
+    return list(itertools.islice(batches(dataset, size, **more), count))
+
+
+def test_a_batch_holds_views_cameras_poses_and_shapes(captures):
+    ((batch, after),) = first(1, CaptureDataset(captures, SETTINGS))
+    assert batch.conditioning.image.shape == (2, 2, 16, 16, 3)
+    assert batch.target.mask.shape == (2, 1, 16, 16)
+    assert batch.target.camera.intrinsics.shape == (2, 1, 3, 3)
+    assert (batch.target.camera.width, batch.target.camera.height) == (16, 16)
+    assert batch.target.pose.joint_rotation.shape == (2, 24, 3, 3)
+    assert batch.betas.shape == (2, 10)
+    assert after == Position(0, 2)
+
+
+def test_a_sample_is_what_the_reader_reads(captures):
+    sample = CaptureDataset(captures, SampleSettings(1, 3, size=32, conditioning_frame="same"))[0, 4]
+    name, frame = captures.subjects[int(sample.subject)], int(sample.frame)
+    views = [captures.view(name, frame, camera) for camera in range(4)]
+    shown = torch.cat([sample.conditioning.image, sample.target.image])
+    numbers = [next(i for i, view in enumerate(views) if torch.equal(view.image, image)) for image in shown]
+    assert sorted(numbers) == [0, 1, 2, 3]
+    for view, camera in zip([views[i] for i in numbers[1:]], sample.target.camera.world_to_camera, strict=True):
+        assert torch.equal(view.camera.world_to_camera, camera)
+    assert torch.equal(sample.target.pose.joint_rotation, views[0].pose.joint_rotation)
+
+
+def test_conditioning_views_show_the_near_t_pose_by_default(captures):
+    near_t = captures.subject(captures.subjects[0]).smpl.pose(0)
+    samples = [CaptureDataset(captures, SETTINGS)[0, index] for index in range(9)]
+    assert all(torch.equal(sample.conditioning.pose.joint_rotation, near_t.joint_rotation) for sample in samples)
+
+
+def test_an_epoch_shows_every_pose_of_everybody_once_in_an_order_of_its_own(captures):
+    dataset = CaptureDataset(captures, SETTINGS)
+    epochs = [[(int(s.subject), int(s.frame)) for s in (dataset[e, i] for i in range(len(dataset)))] for e in (0, 1)]
+    assert sorted(epochs[0]) == sorted(epochs[1]) == list(itertools.product(range(3), range(3)))
+    assert epochs[0] != epochs[1]
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_any_number_of_workers_gives_the_same_batches(captures, workers):
+    dataset = CaptureDataset(captures, dataclasses.replace(SETTINGS, framing="crop"), seed=5)
+    for (one, at), (other, there) in zip(first(7, dataset), first(7, dataset, workers=workers), strict=True):
+        assert at == there
+        assert same(one, other)
+
+
+def test_another_seed_gives_another_order(captures):
+    (one, _), (other, _) = (first(1, CaptureDataset(captures, SETTINGS, seed), 9)[0] for seed in (0, 1))
+    assert not torch.equal(one.frame * 3 + one.subject, other.frame * 3 + other.subject)
+
+
+def test_training_goes_on_where_it_stopped_across_epochs(captures):
+    dataset = CaptureDataset(captures, SETTINGS)
+    through = first(8, dataset)
+    _, stopped = through[3]
+    assert stopped == Position(0, 8)
+    again = first(4, CaptureDataset(captures, SETTINGS), start=stopped, workers=1)
+    assert all(same(one, other) and at == there for (one, at), (other, there) in zip(through[4:], again, strict=True))
+    assert through[4][1] == Position(1, 1)
+
+
+def test_packs_hold_the_same_samples_and_are_used(captures, monkeypatch):
+    settings = dataclasses.replace(SETTINGS, framing="crop")
+    before = [CaptureDataset(captures, settings)[0, i] for i in range(9)]
+    assert [packing.kept for packing in pack(captures)] == [False] * 3
+    assert [packing.kept for packing in pack(captures)] == [True] * 3
+    monkeypatch.setattr("primdiffusion.capture.reader.read_picture", None)  # nothing is decoded any more
+    after = [CaptureDataset(captures, settings)[0, i] for i in range(9)]
+    assert all(same(one, other) for one, other in zip(before, after, strict=True))
+
+
+@pytest.mark.parametrize("marked", [True, False])
+def test_a_pack_of_other_pictures_is_not_used(tmp_path, marked):
+    root = captured(tmp_path, people=1, passes=("img", "mask"))
+    subject = open_captures(root).subject("person_000000")
+    if not marked:
+        (subject.folder / "complete.json").unlink()
+    list(pack(open_captures(root)))
+    assert isinstance(open_pack(subject), np.memmap)
+    changed = subject.folder / ("complete.json" if marked else "img/camera0000/0000.jpg")
+    if marked:
+        changed.write_text(changed.read_text() + " ")
+    else:
+        os.utime(changed, ns=(1, 1))
+    assert open_pack(subject) is None
+    list(pack(open_captures(root)))
+    pack_path(subject).write_bytes(pack_path(subject).read_bytes()[:-1000])
+    assert open_pack(subject) is None
+
+
+def test_a_smaller_picture_is_the_mean_of_linear_light_and_its_camera_sees_the_same():
+    rgba = np.zeros((4, 4, 4), np.uint8)
+    rgba[:, 2:] = 255
+    small = resample(rgba, Window(0, 0, 4, 4), 2)
+    assert small[0].tolist() == [[0, 0, 0, 0], [255, 255, 255, 255]]
+    middle = resample(rgba, Window(1, 0, 2, 4), 1)
+    assert middle[0, 0].tolist() == [188, 188, 188, 128]  # half of the light
+    assert resample(rgba, Window(-2, 0, 4, 4), 1)[0, 0].tolist() == [0, 0, 0, 0]
+    view = View(np.array([[5.0, 0.1, 2], [0, 5, 2], [0, 0, 1]]), np.eye(3), np.array([0, 0, 3.0]), 4, 4)
+    point = np.array([0.3, -0.2, 0.4])
+    window = Window(0.5, 1.25, 2, 2.5)
+    pixel, seen = view.project(point)[0], through(view, window, 16).project(point)[0]
+    np.testing.assert_allclose(seen, (pixel - (0.5, 1.25)) * (16 / 2, 16 / 2.5))
+    assert np.array_equal(through(view, whole(view), 4).intrinsics, view.intrinsics)
+
+
+def test_crops_lie_in_the_picture_and_see_the_person(captures):
+    dataset = CaptureDataset(captures, dataclasses.replace(SETTINGS, framing="crop"))
+    samples = [dataset[epoch, index] for epoch in range(3) for index in range(9)]
+    focal = captures.subject(captures.subjects[0]).views[0].intrinsics[0, 0]
+    scales = [float(s.target.camera.intrinsics[0, 0, 0]) / focal for s in samples]
+    assert 0.5 <= min(scales) < 0.6
+    assert 0.9 < max(scales) <= 1
+    assert np.mean([bool(s.target.mask.any()) for s in samples]) > 0.9
+
+
+@pytest.mark.parametrize("wrong", [{"conditioning": 0}, {"targets": -1}, {"size": 0}])
+def test_samples_without_views_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        SampleSettings(**wrong)
+
+
+def test_a_missing_picture_is_named_by_a_worker(tmp_path):
+    root = captured(tmp_path, people=1, frames=1, passes=("img", "mask"))
+    for path in root.rglob("img/*/0000.jpg"):
+        path.unlink()
+        path.with_name("0001.jpg").write_bytes(b"")
+    with pytest.raises((ValueError, FileNotFoundError), match=r"000[01]\.jpg"):
+        first(1, CaptureDataset(open_captures(root), SETTINGS), 1, workers=1)

@@ -1,0 +1,114 @@
+"""Poses to capture people in."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.capture import layout
+from primdiffusion.capture.plain_npz import NpzError
+from primdiffusion.capture.poses import BUILT_IN, MotionFileError, built_in_poses, choose_poses, read_motion
+from primdiffusion.geometry.rotation import axis_angle_to_matrix
+
+THETA = np.random.default_rng(0).uniform(-0.5, 0.5, (5, 72))
+
+
+def assert_turns(pose: BodyPose, theta=THETA) -> None:
+    expected = axis_angle_to_matrix(torch.from_numpy(theta.reshape(len(theta), 24, 3))).float()
+    assert torch.allclose(pose.joint_rotation, expected, atol=1e-6)
+
+
+def joints(pose: BodyPose) -> np.ndarray:
+    return default_body().shape(torch.zeros(1)).pose(pose).joints[..., :3, 3].numpy()
+
+
+def test_frame_0_of_the_built_in_poses_is_near_t_and_all_differ():
+    poses = built_in_poses()
+    places = joints(poses)
+    assert len(BUILT_IN) == 20
+    wrist, shoulder = places[0, 20], places[0, 16]
+    assert wrist[0] - shoulder[0] > 0.4  # arms out,
+    assert 0.1 < shoulder[1] - wrist[1] < 0.3  # a little below level
+    apart = np.linalg.norm(places[:, None] - places[None], axis=-1).mean(-1)
+    assert apart[~np.eye(20, dtype=bool)].min() > 0.03
+
+
+def test_built_in_poses_bend_the_right_way():
+    names = [name for name, _ in BUILT_IN]
+    places = dict(zip(names, joints(built_in_poses()), strict=True))
+    assert places["sitting"][4, 2] - places["sitting"][1, 2] > 0.2  # knees in front of the hips
+    assert places["sitting"][7, 1] < places["sitting"][4, 1] - 0.2  # feet below the knees
+    assert places["arms forward"][20, 2] > 0.3
+    assert places["arms up"][20, 1] > places["arms up"][15, 1]
+    assert places["bowing"][15, 2] > 0.3
+    np.testing.assert_allclose(places["A"][20], places["A"][21] * (-1, 1, 1), atol=0.01)
+
+
+def test_every_form_of_file_is_the_same_motion(tmp_path):
+    np.savez(tmp_path / "a.npz", poses=np.pad(THETA, ((0, 0), (0, 84))), trans=np.ones((5, 3)), gender="neutral")
+    np.savez(tmp_path / "b.npz", global_orient=THETA[:, :3], body_pose=THETA[:, 3:], transl=np.ones((5, 3)))
+    np.save(tmp_path / "c.npy", THETA)
+    np.save(tmp_path / "d.npy", THETA.reshape(5, 24, 3))
+    (tmp_path / "e.json").write_text(json.dumps({"poses": THETA.tolist(), "trans": [1, 1, 1]}))
+    (tmp_path / "f.json").write_text(json.dumps(THETA.tolist()))
+    for path in sorted(tmp_path.iterdir()):
+        assert_turns(read_motion(path))
+    assert torch.equal(read_motion(tmp_path / "b.npz").translation, torch.ones(5, 3))
+
+
+def test_one_pose_is_a_motion_of_one_frame(tmp_path):
+    (tmp_path / "a.json").write_text(json.dumps({"pose": THETA[0].tolist()}))
+    np.save(tmp_path / "b.npy", THETA[0].reshape(24, 3))
+    for path in tmp_path.iterdir():
+        assert_turns(read_motion(path), THETA[:1])
+
+
+def test_a_captures_parameters_are_a_motion(tmp_path):
+    layout.write_smpl(tmp_path, THETA[:, :3], THETA[:, 3:], np.zeros(10), np.zeros((5, 3)))
+    assert_turns(read_motion(tmp_path / layout.SMPL_FOLDER / layout.SMPL_PLAIN_FILE))
+
+
+def test_amass_files_are_turned_upright(tmp_path):
+    poses = np.zeros((1, 156))
+    poses[0, 0] = np.pi / 2  # upright where z is up
+    np.savez(tmp_path / "a.npz", poses=poses, trans=[[1.0, 2, 3]], mocap_framerate=120.0)
+    motion = read_motion(tmp_path / "a.npz")
+    assert torch.allclose(motion.joint_rotation[0, 0], torch.eye(3), atol=1e-6)
+    assert torch.allclose(motion.translation, torch.tensor([[1.0, 3, -2]]))
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("a.json", b"{}"), ("a.json", b"[[1, 2]]"), ("a.json", b"{"), ("a.npy", b"no"), ("a.npz", b"no"),
+     ("a.json", b"[]"), ("a.json", json.dumps([float("nan")] * 72).encode()), ("a.json", b'{"poses": "up"}')],
+)  # fmt: skip
+def test_files_that_are_no_poses_are_refused_by_name(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises((MotionFileError, NpzError), match=name):
+        read_motion(tmp_path / name)
+
+
+def test_a_missing_file_is_named():
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.npz"):
+        read_motion("nowhere.npz")
+
+
+def test_few_poses_are_chosen_to_differ_and_the_choice_is_the_seeds(tmp_path):
+    still = np.zeros((50, 72))
+    still[:, 3 * 16 + 2] = -1.2 + np.linspace(0, 0.01, 50)  # fifty frames of the same
+    still[17, 3 * 18 + 1] = -2.0  # and one with a bent arm
+    np.savez(tmp_path / "a.npz", poses=still)
+    chosen = choose_poses([tmp_path / "a.npz"], 3, seed=0)
+    assert torch.equal(chosen.joint_rotation[0], built_in_poses().joint_rotation[0])
+    assert any(
+        torch.allclose(pose, read_motion(tmp_path / "a.npz").joint_rotation[17]) for pose in chosen.joint_rotation
+    )
+    assert torch.equal(chosen.joint_rotation, choose_poses([tmp_path / "a.npz"], 3, seed=0).joint_rotation)
+
+
+def test_more_poses_than_there_are_are_refused():
+    with pytest.raises(ValueError, match="there are 20"):
+        choose_poses([], 21, 0)
+    with pytest.raises(ValueError, match="0 poses"):
+        choose_poses([], 0, 0)

@@ -1,0 +1,256 @@
+"""Captures read back, ours and in the released layout, whole and damaged."""
+
+import json
+import pickle
+import shutil
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from capture_scenes import captured, small_job
+from PIL import Image
+from primdiffusion import cli
+from primdiffusion.body.model import BodyPose
+from primdiffusion.body.smpl_pickle import UnsafePickleError
+from primdiffusion.capture import layout
+from primdiffusion.capture.multisample import shoot
+from primdiffusion.capture.people_files import read_person
+from primdiffusion.capture.plain_npz import NpzError, read_npz
+from primdiffusion.capture.rasterised import render
+from primdiffusion.capture.reader import CaptureFileError, open_captures
+from primdiffusion.capture.sheet import default_joints, draw_sheet, reprojection_error
+from primdiffusion.capture.subject import sit
+from primdiffusion.capture.verify import verify
+
+NAME = "person_000000"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    return captured(tmp_path_factory.mktemp("whole"), people=2)
+
+
+@pytest.fixture
+def root(whole, tmp_path):
+    shutil.copytree(whole.parent, tmp_path / "copy")
+    return tmp_path / "copy" / whole.name
+
+
+def test_a_view_comes_back_as_it_was_drawn(root):
+    captures = open_captures(root)
+    assert captures.subjects == (NAME, "person_000001")
+    subject = captures.subject(NAME)
+    poses = BodyPose.from_axis_angle(torch.from_numpy(subject.smpl.theta), torch.from_numpy(subject.smpl.translation))
+    sitting = sit(read_person(root.parent / "people" / NAME / "person.glb"), poses, subject.views)
+    for frame, camera in ((0, 0), (2, 3)):
+        view = captures.view(NAME, frame, camera)
+        shot = shoot(sitting.figure.posed(sitting.skinning[frame]), subject.views[camera])
+        assert (view.camera.width, view.camera.height) == (32, 32)
+        np.testing.assert_allclose(view.mask.numpy() / 255, shot.coverage, atol=0.003)
+        np.testing.assert_allclose(view.depth.numpy(), shot.depth, atol=0.00013)
+        np.testing.assert_allclose(view.normal.numpy(), shot.normal, atol=0.005)
+        assert np.array_equal(view.part.numpy(), shot.part)
+        assert torch.allclose(view.pose.joint_rotation, poses.joint_rotation[frame], atol=1e-5)
+        assert view.image.shape == (32, 32, 3)
+        assert view.betas.shape == (10,)
+
+
+def test_depth_and_camera_put_points_on_the_persons_surface(root):
+    """Independent of joints: pixels lifted by depth lie on the box about the wrist that the part mask shows."""
+    captures = open_captures(root)
+    joints = default_joints(captures.subject(NAME))
+    for camera in range(4):
+        view = captures.view(NAME, 1, camera)
+        seen = view.part == 1 + 20  # left wrist
+        if not seen.any():
+            continue
+        origin, rays = view.camera.rays()
+        along = rays @ view.camera.world_to_camera[2, :3]
+        points = origin + rays * (view.depth / along)[..., None]
+        apart = (points[seen] - torch.from_numpy(joints[1, 20]).float()).norm(dim=-1)
+        assert apart.max() < 0.1 * 3**0.5 + 0.001
+        assert apart.min() > 0.1 - 0.001
+
+
+def test_joints_project_to_where_the_file_says(root):
+    for name in open_captures(root).subjects:
+        subject = open_captures(root).subject(name)
+        assert reprojection_error(subject) < 1e-3
+        with np.load(subject.folder / "joints.npz") as noted:
+            np.testing.assert_allclose(default_joints(subject), noted["world"], atol=1e-5)
+
+
+def as_released(root):
+    """What the authors' files are: no dataset.json, no plain twin, no other passes."""
+    (root / layout.DATASET_FILE).unlink()
+    for name in (root / layout.LIST_FILE).read_text().split():
+        for thing in (root / name).iterdir():
+            if thing.name not in ("img", "mask", "cameras.json", layout.SMPL_FOLDER):
+                shutil.rmtree(thing) if thing.is_dir() else thing.unlink()
+        (root / name / layout.SMPL_FOLDER / layout.SMPL_PLAIN_FILE).unlink()
+
+
+def test_the_released_layout_is_read_through_its_pickle(root):
+    ours = open_captures(root).view(NAME, 1, 2)
+    as_released(root)
+    captures = open_captures(root)
+    assert captures.passes == ("img", "mask")
+    theirs = captures.view(NAME, 1, 2)
+    assert torch.equal(ours.image, theirs.image)
+    assert torch.equal(ours.mask, theirs.mask)
+    assert torch.equal(ours.pose.joint_rotation, theirs.pose.joint_rotation)
+    assert torch.equal(ours.camera.world_to_camera, theirs.camera.world_to_camera)
+    assert theirs.depth is None
+
+
+@pytest.mark.parametrize("protocol", [2, 3, 4, 5])
+def test_any_protocol_of_the_pickle_is_read(root, protocol):
+    as_released(root)
+    path = root / NAME / layout.SMPL_FOLDER / layout.SMPL_FILE
+    content = np.load(path, allow_pickle=True)["smpl"]
+    with zipfile.ZipFile(path, "w") as archive, archive.open("smpl.npy", "w") as member:
+        np.lib.format.write_array_header_1_0(member, {"descr": "|O", "fortran_order": False, "shape": ()})
+        member.write(pickle.dumps(content, protocol=protocol))
+    expected = content.item()["body_pose"]
+    assert np.array_equal(open_captures(root).subject(NAME).smpl.theta[:, 3:], expected)
+
+
+def test_a_pickle_that_would_run_code_is_refused(root, tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (open, (str(tmp_path / "trapped"), "w"))
+
+    as_released(root)
+    path = root / NAME / layout.SMPL_FOLDER / layout.SMPL_FILE
+    np.savez(path, smpl=np.array({"global_orient": Trap()}, dtype=object))
+    with pytest.raises(UnsafePickleError, match="open"):
+        open_captures(root).subject(NAME)
+    assert not (tmp_path / "trapped").exists()
+
+
+@pytest.mark.parametrize("content", [{}, {"global_orient": "up"}, [1, 2], {"global_orient": np.zeros((3, 3))}])
+def test_a_pickle_without_parameters_is_refused_by_name(root, content):
+    as_released(root)
+    path = root / NAME / layout.SMPL_FOLDER / layout.SMPL_FILE
+    np.savez(path, smpl=np.array(content, dtype=object))
+    with pytest.raises(NpzError, match=layout.SMPL_FILE):
+        open_captures(root).subject(NAME)
+
+
+@pytest.mark.parametrize("name", ["../../etc", "/etc", ".ssh", "a/b", "..", "a b"])
+def test_a_list_that_names_folders_outside_is_refused(root, name):
+    (root / layout.LIST_FILE).write_text(f"{NAME}\n{name}\n")
+    with pytest.raises(CaptureFileError, match=layout.LIST_FILE):
+        open_captures(root)
+
+
+def test_zip_paths_that_lead_out_are_not_followed(tmp_path):
+    path = tmp_path / "in" / "a.npz"
+    path.parent.mkdir()
+    np.savez(path, x=np.arange(3))
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("../../evil.npy", b"evil")
+        archive.writestr("/evil.npy", b"evil")
+    assert read_npz(path, ("x",))["x"].tolist() == [0, 1, 2]
+    assert [p.name for p in tmp_path.rglob("*")] == ["in", "a.npz"]
+
+
+@pytest.mark.parametrize(
+    ("arrays", "why"),
+    [
+        ({"x": np.array([object()], dtype=object)}, "plain array"),
+        ({"x": np.array(["a"])}, "not numbers"),
+        ({"x": np.array([np.nan])}, "NaN"),
+        ({"y": np.zeros(2)}, "no array 'x'"),
+    ],
+)
+def test_npz_files_of_other_things_are_refused(tmp_path, arrays, why):
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(NpzError, match=why):
+        read_npz(tmp_path / "a.npz", ("x",))
+
+
+def test_an_npz_that_claims_petabytes_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive, archive.open("x.npy", "w") as member:
+        about = {"descr": "<f8", "fortran_order": False, "shape": (1 << 50,)}
+        np.lib.format.write_array_header_1_0(member, about)
+    with pytest.raises(NpzError, match=r"a\.npz"):
+        read_npz(tmp_path / "a.npz", ("x",))
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "why"),
+    [
+        ("img/camera0002/0001.jpg", None, "missing"),
+        ("img/camera0002/0001.jpg", 200, "no whole picture"),
+        ("mask/camera0002/0001.png", b"", "no whole picture"),
+        ("mask/camera0002/0001.png", "small", "5 x 5 pixels, its camera 32 x 32"),
+        ("depth/camera0002/0001.png", 60, "no whole picture"),
+        ("cameras.json", None, "missing"),
+        ("cameras.json", b"[1, 2]", "not a list of cameras"),
+        ("cameras.json", b'{"camera0000": {"K": [[1]]}}', "not a list of cameras"),
+        ("cameras.json", b"{}", "names no camera"),
+        ("cameras.json", b"{", "cannot be read"),
+        (f"{layout.SMPL_FOLDER}/{layout.SMPL_PLAIN_FILE}", 100, "no whole .npz"),
+    ],
+)
+def test_wrong_and_missing_files_are_named(root, file, content, why):
+    path = root / NAME / file
+    if content is None:
+        path.unlink()
+    elif content == "small":
+        Image.new("L", (5, 5)).save(path)
+    else:
+        path.write_bytes(path.read_bytes()[:content] if isinstance(content, int) else content)
+    with pytest.raises((ValueError, FileNotFoundError), match=why) as error:
+        open_captures(root).view(NAME, 1, 2)
+    assert str(path) in str(error.value)
+
+
+def test_no_captures_are_no_captures(tmp_path):
+    with pytest.raises(FileNotFoundError, match="check the path"):
+        open_captures(tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match="no finished captures"):
+        open_captures(tmp_path)
+
+
+def test_frames_and_cameras_that_are_not_there_are_refused(root):
+    for frame, camera in ((3, 0), (0, 4), (-1, 0)):
+        with pytest.raises(IndexError, match="3 frames and 4 cameras"):
+            open_captures(root).view(NAME, frame, camera)
+
+
+def test_damage_is_found_and_repaired_so_that_only_it_is_made_again(root, capsys):
+    cli.main(["captures", "verify", str(root)])
+    cut, altered, stray = (
+        root / NAME / file for file in ("depth/camera0001/0002.png", "part/camera0003/0000.png", ".x.9.partial.png")
+    )
+    cut.write_bytes(cut.read_bytes()[:-4])
+    data = bytearray(altered.read_bytes())
+    data[50] ^= 1
+    altered.write_bytes(data)
+    stray.touch()
+    assert [finding.path for finding in verify(root)] == [cut, altered, stray]
+    assert [finding.path for finding in verify(root, checksums=False)] == [cut, stray]
+    with pytest.raises(SystemExit) as end:
+        cli.main(["captures", "verify", str(root), "--repair"])
+    assert end.value.code == 1
+    assert str(cut) in capsys.readouterr().out
+    assert not stray.exists()
+    gone = [layout.picture_path(root / NAME, "img", camera, frame) for camera, frame in ((1, 2), (3, 0))]
+    assert not any(path.exists() for path in gone)
+    assert layout.picture_path(root / NAME, "img", 0, 0).exists()
+    assert open_captures(root).subjects == ("person_000001",)
+    assert sorted(outcome.what for outcome in render(small_job(root.parent))) == ["done", "skipped"]
+    assert verify(root) == []
+
+
+def test_info_and_sheet_say_and_show_what_is_there(root, tmp_path, capsys):
+    cli.main(["captures", "info", str(root)])
+    about = json.loads(capsys.readouterr().out)
+    assert [about[key] for key in ("subjects", "frames", "cameras", "size", "packed")] == [2, 3, 4, [32, 32], 0]
+    assert draw_sheet(open_captures(root), tmp_path / "sheet.png", rows=6, columns=3, size=64) < 1e-3
+    with Image.open(tmp_path / "sheet.png") as sheet:
+        assert sheet.size == (3 * 64, 6 * 64)
+        assert np.asarray(sheet).any(-1).mean() > 0.02
