@@ -186,7 +186,7 @@ def test_everybody_wears_an_outfit_and_shoes_and_has_a_face(people):
 
 def test_people_stand_upright_at_adult_size(people):
     for person in people:
-        assert 1.4 < person.attributes["height"] < 2.15
+        assert 1.5 < person.attributes["height"] < 2.0
         low, high = person.mesh.bounds
         assert high[0] - low[0] == pytest.approx(high[1] - low[1], rel=0.25)  # arms level
 

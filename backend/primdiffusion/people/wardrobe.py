@@ -117,6 +117,9 @@ EYES = "eyes/low-poly/low-poly"
 
 HAT_SHARE, BALD_SHARE = 0.08, 0.08
 LARGEST_BETA, BETA_DIGITS = 2.0, 6
+STATURE: dict[Sex, float] = {"female": -0.6, "male": 0.05}
+STATURE_SPREAD = 0.55
+"""The first beta is height, 14 cm a unit about 1.76 m: men are 1.77 +- 0.08 m tall, women 1.68 +- 0.08 m."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -191,4 +194,7 @@ def draw_body(seed: int, femininity: Float[np.ndarray, "10"]) -> tuple[Float[np.
     side = float(betas @ axis)
     sign = 1.0 if side >= 0 else -1.0
     betas += axis * sign * max(0.0, 0.5 - abs(side))
-    return np.clip(betas, -LARGEST_BETA, LARGEST_BETA).round(BETA_DIGITS), "female" if sign > 0 else "male"
+    sex: Sex = "female" if sign > 0 else "male"
+    betas = np.clip(betas, -LARGEST_BETA, LARGEST_BETA)
+    betas[0] = STATURE[sex] + STATURE_SPREAD * betas[0]
+    return betas.round(BETA_DIGITS), sex
