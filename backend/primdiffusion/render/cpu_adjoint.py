@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 from numpy import ndarray
 
-from primdiffusion.render.cpu_compiled import kernel, part, take
+from primdiffusion.render.cpu_compiled import index, kernel, part, take
 from primdiffusion.render.cpu_forward import NEVER
 from primdiffusion.render.cpu_hits import ENTER, HIT_ROWS, LANES, LEAVE, TABLE_ROWS, hit_rays, lowest
 from primdiffusion.render.cpu_sampling import (
@@ -142,12 +142,12 @@ def _adjoin_box(
             for begin in range(0, PIXELS, LANES):
                 hit = hit_rays(hits, room.table, rays, begin, PIXELS)
                 while hit != 0:
-                    j = lowest(hit)
+                    j = index(lowest(hit))
                     hit &= hit - 1
                     row, column = row0 + (begin + j) // TILE, column0 + (begin + j) % TILE
                     if row >= height or column >= width:
                         continue
-                    ray = row * width + column
+                    ray = index(row * width + column)
                     enter, leave = _steps(hits, j, reference, stride, limits, ray, ends[ray], k, last_box[ray])
                     if enter > leave:
                         continue

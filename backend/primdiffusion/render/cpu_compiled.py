@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
@@ -46,6 +47,12 @@ def part(*, inline: bool = False) -> Callable[[Function], Any]:
         fastmath=set(FASTMATH),
         error_model="numpy",
     )
+
+
+@part(inline=True)
+def index(i):
+    """i, which is not negative and below 2^32: numba looks before each use of an index whether it is negative."""
+    return np.int64(np.uint32(i))
 
 
 @_compiled_call

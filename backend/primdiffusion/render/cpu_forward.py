@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from jaxtyping import Float32, Int32, Int64
+from jaxtyping import Float32, Int32, Int64, UInt64
 from numpy import ndarray
 
 from primdiffusion.render.compositing import SURFACE_OPACITY
-from primdiffusion.render.cpu_compiled import kernel, part, take
+from primdiffusion.render.cpu_compiled import index, kernel, part, take
 from primdiffusion.render.cpu_hits import ENTER, HIT_ROWS, LANES, LEAVE, TABLE_ROWS, hit_boxes, lowest
 from primdiffusion.render.cpu_sampling import (
     PIXELS,
@@ -29,9 +29,10 @@ NEVER = np.iinfo(np.int64).max
 """The lattice index at which a ray saturates that does not."""
 NO_BOX = np.iinfo(np.int32).max
 
-COLUMNS = 6
-# A hit: its box, the reference point, its place among the tests, the first, the next and the last lattice point.
-_BOX, _REFERENCE, _LINE, _FIRST, _NEXT, _LAST = range(COLUMNS)
+COLUMNS = 7
+# A hit: its box and its stride, the reference point, its place among the tests, the first, the next and the last
+# lattice point.
+_BOX, _STRIDE, _REFERENCE, _LINE, _FIRST, _NEXT, _LAST = range(COLUMNS)
 
 
 class Picture(NamedTuple):
@@ -70,8 +71,10 @@ class _Room(NamedTuple):
     tests: Float32[ndarray, "floats"]
     """[blocks, HIT_ROWS, LANES], flat."""
     hits: Int64[ndarray, "n columns"]
-    sequence: Int64[ndarray, "n"]
-    """The hits, sorted by their first lattice points."""
+    per_stride: Float32[ndarray, "n"]
+    """1 / stride of each hit."""
+    sequence: UInt64[ndarray, "n"]
+    """The hits, sorted by their first lattice points; unsigned, as numba looks whether signed indices are negative."""
     points: Float32[ndarray, "floats"]
     """[CHUNK + 1, 4], flat: colour times opacity and opacity at each lattice point of a chunk; one more to work in."""
     block: Float32[ndarray, "floats"]
@@ -94,7 +97,7 @@ def march_tiles(
             np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64),
             np.empty(blocks * LANES * TABLE_ROWS, np.float32), np.empty(3 * PIXELS, np.float32),
             np.empty(blocks * LANES * HIT_ROWS, np.float32),
-            np.empty((most, COLUMNS), np.int64), np.empty(most, np.int64),
+            np.empty((most, COLUMNS), np.int64), np.empty(most, np.float32), np.empty(most, np.uint64),
             np.empty(4 * (CHUNK + 1), np.float32), np.empty(8 * SAMPLES, np.float32),
         )  # fmt: skip
         i = take(taken)
@@ -167,23 +170,25 @@ def _tabulate_tile(room, row_box, row_start, rectangle, tile, across, boxes, mid
 def _test_boxes(room, number, begin, pixel, strides, first, last):
     """Adds to the ray's `number` hits those among LANES boxes from `begin` on; returns how many there are then."""
     dx, dy, dz = room.rays[pixel], room.rays[PIXELS + pixel], room.rays[2 * PIXELS + pixel]
+    begin, number = index(begin), index(number)
     place = begin * HIT_ROWS
     tests, hits, sequence = room.tests, room.hits, room.sequence
     hit = hit_boxes(tests, place, room.table, begin * TABLE_ROWS, dx, dy, dz)
     while hit != 0:
-        lane = lowest(hit)
+        lane = index(lowest(hit))
         hit &= hit - 1
-        k, at = room.listed[begin + lane], room.reference[begin + lane]
+        k, at, line = index(room.listed[begin + lane]), room.reference[begin + lane], place + lane
         stride = strides[k]
-        enter = at + np.int64(tests[place + ENTER * LANES + lane]) * stride
-        leave = at + np.int64(tests[place + LEAVE * LANES + lane]) * stride
+        enter = at + np.int64(tests[line + ENTER * LANES]) * stride
+        leave = at + np.int64(tests[line + LEAVE * LANES]) * stride
         if enter < first:
             enter += (first - enter + stride - 1) // stride * stride
         if leave > last:
             leave -= (leave - last + stride - 1) // stride * stride
         if enter > leave:
             continue
-        hits[number, _BOX], hits[number, _REFERENCE], hits[number, _LINE] = k, at, place + lane
+        hits[number, _BOX], hits[number, _REFERENCE], hits[number, _LINE] = k, at, line
+        hits[number, _STRIDE], room.per_stride[number] = stride, np.float32(1) / np.float32(stride)
         hits[number, _FIRST], hits[number, _NEXT], hits[number, _LAST] = enter, enter, leave
         turn = number
         while turn > 0 and hits[sequence[turn - 1], _FIRST] > enter:
@@ -256,10 +261,9 @@ def _gather(room, begin, done, number, voxels, strides, size, spacing):
         upcoming, last = hits[hit, _NEXT], min(hits[hit, _LAST], end - 1)
         if upcoming > last:
             continue
-        k = hits[hit, _BOX]
-        stride = strides[k]
+        k, stride = hits[hit, _BOX], hits[hit, _STRIDE]
         # Division of small whole numbers by way of float32, exact and far faster than the processor's own.
-        inverse = np.float32(1) / np.float32(stride)
+        inverse = room.per_stride[hit]
         count = np.int64((np.float32(last - upcoming) + np.float32(0.5)) * inverse) + 1
         first = np.float32(upcoming - hits[hit, _REFERENCE]) * inverse
         length = np.float32(stride * spacing)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
-from primdiffusion.render.cpu_compiled import part
+from primdiffusion.render.cpu_compiled import index, part
 from primdiffusion.render.cpu_hits import (
     AT_CENTRE,
     FIRST,
@@ -119,6 +119,7 @@ def place_samples(block, hits, hit, first, size, length):
     Lane `hit` of `hits` holds y at step 0 and dy per step (see `hit_boxes`). Rows of block: 0-3 the weights of a cell's
     edges, 4 and 5 those of an edge's ends, 6 window * length, 7 the cell's first voxel.
     """
+    hit = index(hit)
     one = np.float32(1)
     width = np.float32(size)
     half, last = np.float32(0.5) * (width - one), width - np.float32(2)
