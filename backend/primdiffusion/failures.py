@@ -38,9 +38,7 @@ def describe(error: BaseException) -> Failure | None:
     """The failure `error` stands for, or None where it is no domain error but a defect."""
     sentence = " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, PictureOutOfMemory):
-        return Failure(
-            "out_of_memory", sentence, "choose a smaller resolution, or close other programs, then try again"
-        )
+        return Failure("out_of_memory", sentence, PICTURE_REMEDY)
     if out_of_memory(error):
         amount = re.search(r"[Tt]ried to allocate ([\d.]+ \w+)", sentence, re.ASCII)
         wanted = f" when it asked for {amount[1]} more" if amount else ""
