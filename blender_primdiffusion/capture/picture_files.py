@@ -49,7 +49,9 @@ def depth_steps(depth: NDArray) -> NDArray[np.uint16]:
 
 def normal_bytes(normal: NDArray, covered: NDArray) -> NDArray[np.uint8]:
     """World normals [H, W, 3] as a normal file's values, zero where not `covered` [H, W]."""
-    return np.where(covered[..., None], np.round((np.clip(normal, -1, 1) + 1) * 127.5), 0).astype(np.uint8)
+    values = np.zeros(normal.shape, np.uint8)
+    values[covered] = np.round((np.clip(normal[covered], -1, 1) + 1) * 127.5)
+    return values
 
 
 def is_whole_picture(path: Path) -> bool:

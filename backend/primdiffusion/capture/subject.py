@@ -19,7 +19,7 @@ from primdiffusion.capture.multisample import Shot, shoot
 from primdiffusion.capture.people_files import SkinnedPerson
 from primdiffusion.capture.plain_npz import NpzError, read_npz
 from primdiffusion.capture.rig import Rig, View, bounding_sphere
-from primdiffusion.capture.texture_pyramid import BYTE_OF_LINEAR, BYTE_STEPS
+from primdiffusion.capture.texture_pyramid import BYTE_OF_LINEAR, encode_bytes
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
 
 JPEG_QUALITY = 95
@@ -136,7 +136,9 @@ def write_shot(subject: Path, passes: Sequence[str], camera: int, frame: int, sh
 
 def srgb_bytes(linear: np.ndarray) -> np.ndarray:
     """Linear colours as sRGB-encoded bytes."""
-    return BYTE_OF_LINEAR[(linear.clip(0, 1) * (BYTE_STEPS - 1) + 0.5).astype(np.uint16)]
+    encoded = np.empty(linear.shape, np.uint8)
+    encode_bytes(np.ascontiguousarray(linear, np.float32).ravel(), BYTE_OF_LINEAR, encoded.ravel())
+    return encoded
 
 
 def _refuse_others(subject: Path, theta: np.ndarray, betas: np.ndarray, translation: np.ndarray) -> None:

@@ -71,6 +71,14 @@ BYTE_OF_LINEAR = _byte_table()
 
 
 @numba.njit(cache=True, nogil=True)
+def encode_bytes(linear, byte_of_linear, encoded):
+    """Writes the sRGB-encoded bytes of linear intensities [n], clamped to 0 ... 1."""
+    for i in range(linear.shape[0]):
+        value = min(max(linear[i], np.float32(0)), np.float32(1))
+        encoded[i] = byte_of_linear[int(value * np.float32(BYTE_STEPS - 1) + np.float32(0.5))]
+
+
+@numba.njit(cache=True, nogil=True)
 def _halved(texture, linear_of_byte, byte_of_linear):
     rows, columns = texture.shape[0] // 2, texture.shape[1] // 2
     half = np.empty((rows, columns, 4), np.uint8)
