@@ -23,6 +23,10 @@ ROOMS = ("clothes", "hair", "eyebrows", "eyelashes", "eyes", "skins")
 SOURCE = "https://github.com/makehumancommunity/makehuman-assets"
 
 
+class DamagedPictureError(ValueError):
+    """A picture that cannot be decoded."""
+
+
 class AssetsMissingError(FileNotFoundError):
     """No asset folder, or one that lacks files."""
 
@@ -46,6 +50,7 @@ class Assets:
 
         Raises:
             AssetsMissingError: the folder has no such picture.
+            DamagedPictureError: it cannot be decoded.
         """
         path = _picture_path(self.root, name)
         if path is None:
@@ -126,8 +131,11 @@ def _picture_path(root: Path, name: str) -> Path | None:
 @functools.lru_cache(maxsize=48)
 def _decoded(path: Path, size: int) -> UInt8[np.ndarray, "H W 4"]:
     """Decode, shrink and freeze one picture; colour is weighted by alpha when it shrinks, so that edges keep theirs."""
-    with Image.open(path) as file:
-        picture = file.convert("RGBA")
+    try:
+        with Image.open(path) as file:
+            picture = file.convert("RGBA")
+    except (OSError, SyntaxError) as error:
+        raise DamagedPictureError(f"{path} cannot be decoded ({error}); fetch it again.") from error
     if picture.width > size:
         box = (size, round(picture.height * size / picture.width))
         picture = picture.convert("RGBa").resize(box, Image.Resampling.BOX).convert("RGBA")

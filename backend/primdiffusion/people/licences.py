@@ -38,8 +38,10 @@ def licence_of(root: Path, path: str) -> str:
     file = root / path
     if file.suffix in (".mhclo", ".obj", ".mhmat"):
         return _stated(file)
+    # The material may name the picture as it was before it was stored in another format.
+    named = re.compile(rf"(?<![\w-]){re.escape(file.stem)}\.\w+")
     for material in sorted(file.parent.glob("*.mhmat")):
-        if file.name.rsplit(".", 1)[0] in _head(material):
+        if named.search(_head(material)):
             return _stated(material)
     return UNKNOWN
 
