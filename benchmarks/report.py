@@ -12,6 +12,7 @@ SOURCES = {
     "people": ("Payloads against their meshes", "benchmarks/people.py --assets DIR --json docs/results/people.json"),
     "march": ("The marcher", "benchmarks/march.py --json docs/results/march.json"),
     "denoisers": ("Denoisers on held-out people", "benchmarks/denoisers.py --json docs/results/denoisers.json"),
+    "captures": ("Captures", "benchmarks/captures.py --assets DIR --json docs/results/captures.json"),
     "layout": ("The grid on the default body", "scripts/bake_layout"),
 }  # fmt: skip
 ABOUT = ("device", "cores", "memory_gb", "python", "commit", "date")

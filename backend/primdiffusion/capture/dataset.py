@@ -7,6 +7,7 @@ goes on from a `Position` as if it had never stopped.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple, TypeVar
 
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Int64, UInt8
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, Sampler, get_worker_info
 
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.pack import open_pack
@@ -62,14 +63,22 @@ class SampleSettings:
 class Views(TensorRecord):
     """Pictures of one person in one pose, or a batch of such."""
 
-    image: UInt8[Tensor, "*b v H W 3"]
-    """sRGB-encoded, over black."""
-    mask: UInt8[Tensor, "*b v H W"]
-    """Share of the pixel that the person covers, of 255."""
+    rgba: UInt8[Tensor, "*b v H W 4"]
+    """sRGB-encoded over black, and the mask; as one, because it is copied on its way from the workers."""
     camera: Camera
     """A batch of views [*b, v]."""
     pose: BodyPose
     """[*b]."""
+
+    @property
+    def image(self) -> UInt8[Tensor, "*b v H W 3"]:
+        """sRGB-encoded, over black."""
+        return self.rgba[..., :3]
+
+    @property
+    def mask(self) -> UInt8[Tensor, "*b v H W"]:
+        """Share of the pixel that the person covers, of 255."""
+        return self.rgba[..., 3]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,9 +146,8 @@ class CaptureDataset(Dataset[TrainingSample]):
             window = whole(view) if crops is None else _about_the_person(rgba, size, crops)
             pictures.append(resample(rgba, window, size))
             seen.append(through(view, window, size))
-        rgba = torch.from_numpy(np.stack(pictures))
         camera = stack([as_camera(view) for view in seen])
-        return Views(rgba[..., :3].contiguous(), rgba[..., 3].contiguous(), camera, subject.smpl.pose(frame))
+        return Views(torch.from_numpy(np.stack(pictures)), camera, subject.smpl.pose(frame))
 
     def _rgba(self, subject: Subject, frame: int, camera: int) -> np.ndarray:
         if subject.name not in self._packs:
@@ -200,10 +208,20 @@ def stack(records: Sequence[Record]) -> Record:
     for field in dataclasses.fields(first):
         values = [getattr(record, field.name) for record in records]
         if isinstance(values[0], Tensor):
-            stacked[field.name] = torch.stack(values)
+            stacked[field.name] = _stacked(values)
         elif isinstance(values[0], TensorRecord):
             stacked[field.name] = stack(values)
     return dataclasses.replace(first, **stacked)
+
+
+def _stacked(values: Sequence[Tensor]) -> Tensor:
+    """In a worker straight into the memory that the training process sees, which saves a copy."""
+    if get_worker_info() is None:
+        return torch.stack(list(values))
+    shape = (len(values), *values[0].shape)
+    shared = values[0].untyped_storage()._new_shared(math.prod(shape) * values[0].element_size())
+    out = values[0].new_empty(0).set_(shared, 0, torch.Size(shape))  # type: ignore[call-overload]
+    return torch.stack(list(values), out=out)
 
 
 def _after(position: Position, samples: int, length: int) -> Position:

@@ -46,7 +46,7 @@ def resample(rgba: UInt8[np.ndarray, "H W 4"], window: Window, size: int) -> UIn
     Colours are over black, so they average as they are; outside of the picture there is nothing.
     """
     if window == Window(0, 0, size, size) and rgba.shape[:2] == (size, size):
-        return np.ascontiguousarray(rgba)
+        return rgba
     out = np.empty((size, size, 4), np.uint8)
     _resample(rgba, window.left, window.top, window.width / size, window.height / size, LINEAR_OF_BYTE,
               BYTE_OF_LINEAR, out)  # fmt: skip

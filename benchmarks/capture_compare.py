@@ -1,0 +1,78 @@
+"""The same views from Cycles and from the rasteriser: how they differ, and whether joints fall where they should."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+from primdiffusion.body.model import BodyPose
+from primdiffusion.capture.multisample import shoot
+from primdiffusion.capture.people_files import read_person
+from primdiffusion.capture.picture_files import DEPTH_UNIT
+from primdiffusion.capture.reader import Captures, Subject
+from primdiffusion.capture.sheet import default_joints, joints_of
+from primdiffusion.capture.subject import sit, srgb_bytes
+
+SAME_DEPTH_M = 0.002
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """Of one view."""
+
+    mask_iou: float
+    """Of the masks over one half."""
+    squared: float
+    """Mean squared difference of colour bytes over the pixels that either covers."""
+    depth_share: float
+    """Share of the pixels with a depth in either that agree within SAME_DEPTH_M."""
+    part_share: float
+    """Share of those pixels of one part in both."""
+    shift_px: float
+    """How far one picture lies beside the other."""
+
+
+def compare(captures: Captures, people: dict, samples: int) -> list[Difference]:
+    """Every view of `captures`, drawn again by the rasteriser from the SMPL parameters and cameras on disk."""
+    differences = []
+    for name in captures.subjects:
+        subject = captures.subject(name)
+        smpl = subject.smpl
+        poses = BodyPose.from_axis_angle(torch.from_numpy(smpl.theta), torch.from_numpy(smpl.translation))
+        sitting = sit(read_person(people[name]), poses, subject.views)
+        for frame in range(subject.frames):
+            posed = sitting.figure.posed(sitting.skinning[frame])
+            for camera, view in enumerate(subject.views):
+                differences.append(_difference(subject, frame, camera, shoot(posed, view, samples)))
+    return differences
+
+
+def joint_error_px(subject: Subject) -> float:
+    """Largest distance of the joints noted with the pictures from where the backend's body puts them."""
+    apart = [view.project(default_joints(subject))[0] - view.project(joints_of(subject))[0] for view in subject.views]
+    return float(np.linalg.norm(apart, axis=-1).max())
+
+
+def _difference(subject: Subject, frame: int, camera: int, shot) -> Difference:
+    stored = {kind: subject.picture(kind, frame, camera) for kind in ("img", "mask", "depth", "part")}
+    colours, coverage = srgb_bytes(shot.rgb), np.round(shot.coverage * 255)
+    ours, theirs = coverage > 127, stored["mask"] > 127
+    covered = (coverage > 0) | (stored["mask"] > 0)
+    apart = colours[covered].astype(float) - stored["img"][covered]
+    depth = stored["depth"] * DEPTH_UNIT
+    either = (depth > 0) | (shot.depth > 0)
+    return Difference(
+        mask_iou=float((ours & theirs).sum() / (ours | theirs).sum()),
+        squared=float((apart**2).mean()),
+        depth_share=float((np.abs(depth - shot.depth) < SAME_DEPTH_M)[either].mean()),
+        part_share=float((stored["part"] == shot.part)[either].mean()),
+        shift_px=_shift(stored["img"].astype(float), colours.astype(float)),
+    )
+
+
+def _shift(first: np.ndarray, second: np.ndarray) -> float:
+    """The displacement between two pictures that explains most of their difference (Lucas and Kanade 1981), pixels."""
+    down, across = np.gradient(second, axis=(0, 1))
+    gradients = np.stack([across.ravel(), down.ravel()], -1)
+    return float(np.linalg.norm(np.linalg.lstsq(gradients, (first - second).ravel(), rcond=None)[0]))

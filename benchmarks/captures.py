@@ -1,0 +1,173 @@
+"""Captures: Cycles and the rasteriser on the same views, and how fast training can read them.
+
+`python benchmarks/captures.py --assets DIR --json F` makes a few people, renders them with the extension's command in
+a child process (uniform light, 16 samples a pixel) and draws the same views with the rasteriser (9 samples a pixel).
+Seconds a view include writing all passes and leave out start-up and the first view. Cycles uses all cores, a process of
+the rasteriser one; `fast_speedup` is of processor seconds, what a full machine gains; the wall's is beside it.
+PSNR is of sRGB bytes over the pixels that either picture covers; `joint_reprojection_px_max` is between the joints
+noted by the extension, from Blender's armature, and those of the backend's body from SMPL parameters and cameras on
+disk; `picture_shift_px_max` is how far Cycles' pictures lie beside those drawn from the same files.
+Null: not measured (`--quick` makes no 200 views and no people; without bpy nothing of Cycles is).
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib.util
+import itertools
+import math
+import os
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from capture_compare import compare, joint_error_px
+from capture_cycles import Moment, cycles
+from primdiffusion.capture.dataset import CaptureDataset, SampleSettings, batches
+from primdiffusion.capture.pack import pack
+from primdiffusion.capture.people_files import find_people, read_person
+from primdiffusion.capture.poses import built_in_poses
+from primdiffusion.capture.rasterised import Job, render
+from primdiffusion.capture.reader import Captures, open_captures
+from primdiffusion.capture.rig import Rig
+from primdiffusion.capture.subject import begin, draw_frames, sit
+from primdiffusion.people.assets import open_assets
+from primdiffusion.people.folder import PeopleSet, make_people
+from primdiffusion.people.wardrobe import required_meshes
+from record import tell
+
+SIZE, SAMPLES = 512, 3
+FIRST_SEED = 20_000_000
+"""Of the people; training sets count from 0."""
+GROWTH_VIEWS, GROWTH_FROM = 200, 20
+"""Views of the memory test, and how many of them warm up."""
+
+
+def main() -> None:
+    """Measures, prints and, if asked, writes the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
+    parser.add_argument("--people", type=int, default=3, help="how many are compared")
+    parser.add_argument("--out", type=Path, help="keep people and captures here")
+    parser.add_argument("--quick", action="store_true", help="one person, few views")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = arguments.out or Path(scratch)
+        assets = open_assets(arguments.assets, required_meshes())
+        count, poses, cameras = (1, 2, 3) if arguments.quick else (arguments.people, 4, 6)
+        for _ in make_people(assets, PeopleSet(folder / "people", FIRST_SEED, count), 1):
+            pass
+        figures = {"people_per_second": None if arguments.quick else _people(assets)}
+        figures |= _fast(folder, poses, cameras)
+        figures |= _cycles(folder, poses, cameras) if importlib.util.find_spec("bpy") else _no_cycles()
+        both = (figures["processor_seconds_a_view_cycles_512"], figures["processor_seconds_a_view_fast_512"])
+        figures["fast_speedup"] = both[0] / both[1] if both[0] else None
+        walls = (figures["seconds_a_view_cycles_512"], figures["seconds_a_view_fast_512"])
+        figures["fast_speedup_wall_one_process"] = walls[0] / walls[1] if walls[0] else None
+        measurable = not arguments.quick and importlib.util.find_spec("bpy")
+        figures["memory_growth_mb_over_200_views"] = _growth(folder) if measurable else None
+        figures |= _loader(folder, 1.5 if arguments.quick else 5.0)
+    tell(figures, arguments.json)
+
+
+def _people(assets) -> float:
+    from people_speed import people_per_second
+
+    return people_per_second(16, os.cpu_count() or 1, assets)
+
+
+def _fast(folder: Path, poses: int, cameras: int) -> dict[str, float]:
+    """Draws everybody in one process, the views counted after the first of each person."""
+    taken = built_in_poses().map(lambda values: values[:poses])
+    job = Job(find_people(folder / "people"), taken, folder / "fast", Rig(count=cameras), samples=SAMPLES)
+    list(render(Job(dict(itertools.islice(job.people.items(), 1)), taken, folder / "warm", Rig(count=1, width=64))))
+    shutil.rmtree(folder / "warm")
+    per_view = []
+    for name, path in job.people.items():
+        sitting = sit(read_person(path), taken, job.rig)
+        begin(folder / "timed" / name, sitting)
+        moments = [
+            (time.perf_counter(), time.process_time())
+            for _ in draw_frames(folder / "timed" / name, sitting, range(poses), job.passes, SAMPLES)
+        ]
+        per_view.append((np.array(moments[-1]) - moments[0]) / (len(moments) - 1))
+    shutil.rmtree(folder / "timed")
+    assert all(outcome.what != "failed" for outcome in render(job))
+    wall, processor = np.mean(per_view, axis=0)
+    return {"seconds_a_view_fast_512": float(wall), "processor_seconds_a_view_fast_512": float(processor)}
+
+
+def _cycles(folder: Path, poses: int, cameras: int) -> dict[str, float | None]:
+    moments = cycles(folder / "people", folder / "cycles", poses, cameras, SIZE)
+    captures = open_captures(folder / "cycles")
+    wall, processor = _pace(moments, len(captures.subjects))
+    differences = compare(captures, find_people(folder / "people"), SAMPLES)
+    return {
+        "seconds_a_view_cycles_512": wall,
+        "processor_seconds_a_view_cycles_512": processor,
+        "views_compared": len(differences),
+        "mask_iou_fast_vs_cycles": float(np.mean([d.mask_iou for d in differences])),
+        "mask_iou_fast_vs_cycles_min": min(d.mask_iou for d in differences),
+        "psnr_fast_vs_cycles": 10 * math.log10(255**2 / np.mean([d.squared for d in differences])),
+        "psnr_fast_vs_cycles_min": 10 * math.log10(255**2 / max(d.squared for d in differences)),
+        "depth_share_within_2_mm": float(np.mean([d.depth_share for d in differences])),
+        "part_share_same": float(np.mean([d.part_share for d in differences])),
+        "picture_shift_px_max": max(d.shift_px for d in differences),
+        "joint_reprojection_px_max": max(joint_error_px(captures.subject(name)) for name in captures.subjects),
+    }
+
+
+def _no_cycles() -> dict[str, float | None]:
+    names = ("seconds_a_view_cycles_512", "processor_seconds_a_view_cycles_512", "mask_iou_fast_vs_cycles",
+             "psnr_fast_vs_cycles", "joint_reprojection_px_max")  # fmt: skip
+    return dict.fromkeys(names)
+
+
+def _pace(moments: list[Moment], people: int) -> tuple[float, float]:
+    """Wall and processor seconds a view, people's first views, which load them, left out."""
+    each = len(moments) // people
+    kept = [pair for i, pair in enumerate(itertools.pairwise(moments), start=1) if i % each]
+    wall = sum(after.wall_s - before.wall_s for before, after in kept) / len(kept)
+    return wall, sum(after.processor_s - before.processor_s for before, after in kept) / len(kept)
+
+
+def _growth(folder: Path) -> float:
+    """How much more memory Cycles' process holds after 200 views than after 20, MB."""
+    poses, cameras = 5, GROWTH_VIEWS // 5
+    first = next(iter(find_people(folder / "people")))
+    moments = cycles(folder / "people", folder / "growth", poses, cameras, 64, "--samples", "1", "--only", first)
+    return moments[-1].resident_mb - moments[min(GROWTH_FROM, len(moments) - 1)].resident_mb
+
+
+def _loader(folder: Path, seconds: float) -> dict[str, float]:
+    """Views a second that one worker hands to training; batches of 2 samples of 4 + 4 views."""
+    captures = open_captures(folder / "fast")
+    figures = {}
+    for kind in ("files", "packed"):
+        if kind == "packed":
+            list(pack(captures))
+        for size in (512, 256):
+            figures[f"loader_views_per_second_{kind}_{size}"] = _views_per_second(captures, size, seconds)
+    figures["loader_views_per_second"] = figures["loader_views_per_second_packed_512"]
+    return figures
+
+
+def _views_per_second(captures: Captures, size: int, seconds: float) -> float:
+    dataset = CaptureDataset(captures, SampleSettings(4, 4, size))
+    stream = batches(dataset, 2, workers=1)
+    with contextlib.closing(stream):
+        for _ in range(2):
+            next(stream)
+        begun, views = time.perf_counter(), 0
+        while time.perf_counter() - begun < seconds:
+            batch, _ = next(stream)
+            views += batch.conditioning.mask.shape[:2].numel() + batch.target.mask.shape[:2].numel()
+        return views / (time.perf_counter() - begun)
+
+
+if __name__ == "__main__":
+    main()
