@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..scene.human_file import JOINT_NAMES
 from .body import Body
 
-_RIDGE_M = 0.004
+_RIDGE_M = 0.008
 """A beta of 1 costs as much as a joint that is this far off, metres: rigs are no more exact than that."""
 _WEIGHTS = {"hip": 0.5, "collar": 0.1, "hand": 0.2, "foot": 0.3, "pelvis": 0.2, "spine1": 0.05, "spine2": 0.05,
             "spine3": 0.05, "neck": 0.3, "head": 0.3}  # fmt: skip
