@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion import __version__
-from primdiffusion.body.model import BodyModel, BodyPose, PosedBody, default_body
+from primdiffusion.body.model import JOINT_NAMES, BodyModel, BodyPose, PosedBody, default_body
 from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.samplers import Step
 from primdiffusion.geometry.camera import Camera, look_at
@@ -126,12 +126,16 @@ def place_skinned(
     on which the frames sit, and with s = cbrt(det P) boxes are s times as large and 1/s as dense, so a person is as
     opaque at any size; Q and the translation move the frames. Where the object mirrors, so do the frames (det -1).
 
-    Raises ValueError for matrices with NaN or infinite values, and for an object that is flat (scaled to zero).
+    Raises ValueError for matrices with NaN or infinite values, and for a flat object or joint (scaled to zero).
     """
     body, anchors = _together(body, anchors)
     for name, matrix in (("skinning", skinning), ("object_to_world", object_to_world)):
         if not torch.isfinite(matrix).all():
             raise ValueError(f"{name} holds NaN or infinite values: check the pose and scale of the armature")
+    flat = torch.linalg.det(skinning[:, :3, :3].double()).abs() < SMALLEST_SCALE**3
+    if flat.any():
+        name = JOINT_NAMES[int(flat.int().argmax())]
+        raise ValueError(f"skinning flattens the joint {name!r}: give its bone a scale other than zero")
     orthogonal, stretch = polar(object_to_world[:3, :3].double())
     scale = float(torch.linalg.det(stretch)) ** (1 / 3)
     if not scale > SMALLEST_SCALE:

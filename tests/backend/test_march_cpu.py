@@ -133,6 +133,10 @@ def test_negative_density_broken_shapes_and_cameras_are_refused():
         march(boxes, dataclasses.replace(camera, intrinsics=camera.intrinsics * torch.nan))
     with pytest.raises(ValueError, match="0 x 20 pixels"):
         march(boxes, dataclasses.replace(camera, width=0))
+    with pytest.raises(ValueError, match="scales or shears"):
+        march_cpu(boxes, dataclasses.replace(camera, world_to_camera=2 * camera.world_to_camera))
+    with pytest.raises(ValueError, match="half_extent"):
+        march_cpu(dataclasses.replace(boxes, half_extent=boxes.half_extent * -torch.inf), camera)
     with pytest.raises(ValueError, match="strides"):
         MarchSettings(strides=(4, 3))
 

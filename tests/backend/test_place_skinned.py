@@ -159,3 +159,10 @@ def test_polar_factors_are_orthogonal_and_symmetric_and_multiply_to_the_matrix(s
     assert torch.allclose(stretch, stretch.mT, atol=1e-12)
     assert (torch.linalg.eigvalsh(stretch) > 0).all()
     assert torch.equal(torch.linalg.det(orthogonal).sign(), torch.linalg.det(matrix).sign())
+
+
+def test_a_flat_joint_is_refused_by_name(human, joints):
+    flat = joints.clone()
+    flat[4, :, :3] = 0
+    with pytest.raises(ValueError, match="'left_knee'"):
+        place_skinned(human, flat, STILL)

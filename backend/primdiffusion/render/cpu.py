@@ -23,7 +23,7 @@ from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu_adjoint import Gradients, Upstream, adjoin_boxes, weigh_rays
 from primdiffusion.render.cpu_forward import Ends, Picture, march_tiles
 from primdiffusion.render.cpu_packing import Scene, heaviest_first, pack
-from primdiffusion.render.lattice import MarchSettings, Span, check_scene, check_unbatched, strides_of
+from primdiffusion.render.lattice import MarchSettings, Span, check_camera, check_scene, check_unbatched, strides_of
 
 _ONE_AT_A_TIME = threading.Lock()
 """numba's built-in thread pool, all there is on some systems, ends the process when two threads use it at once."""
@@ -141,9 +141,10 @@ def _is_one_scene(primitives: Primitives, camera: Camera, span: Span | None) -> 
     shapes += [] if span is None else [(span.near, picture), (span.far, picture)]
     if not all(tuple(tensor.shape) == shape and tensor.device.type == "cpu" for tensor, shape in shapes):
         return False
-    finite = bool(torch.isfinite(camera.intrinsics).all() and torch.isfinite(camera.world_to_camera).all())
+    check_camera(camera)
     whole = span is None or not bool(torch.isnan(span.near).any() or torch.isnan(span.far).any())
-    return finite and whole and min(picture) > 0 and 1 <= size <= LARGEST_PAYLOAD
+    sized = bool(torch.isfinite(primitives.half_extent).all())
+    return sized and whole and 1 <= size <= LARGEST_PAYLOAD
 
 
 def _pixel_to_world(camera: Camera) -> Float[Tensor, "3 3"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +20,7 @@ from primdiffusion.render.march import march
 from primdiffusion.serve.draw_params import DrawParams
 from primdiffusion.serve.drawing import FrameDrawer, Report
 from primdiffusion.serve.params import GenerateParams, RenderParams
-from primdiffusion.staging import staged
+from primdiffusion.staging import staged, written_whole
 from primdiffusion.training.checkpoint import load_checkpoint
 
 
@@ -77,9 +78,10 @@ class Jobs:
         report("render", 0, 1, None)
         rendering = march(primitives, framing(primitives, params.yaw, params.width, params.height))
         report("write", 1, 1, 0.0)
-        to_png(params.out, rendering)
-        if params.depth is not None:
-            depth_to_png(params.depth, rendering)
+        with contextlib.ExitStack() as files:  # both pictures or none
+            to_png(files.enter_context(written_whole(params.out)), rendering)
+            if params.depth is not None:
+                depth_to_png(files.enter_context(written_whole(params.depth)), rendering)
         return {"out": params.out, "depth": params.depth, "seconds": round(time.perf_counter() - began, 3)}
 
     def draw(self, params: DrawParams, report: Report) -> dict[str, Any]:
