@@ -147,7 +147,7 @@ def test_the_fast_marcher_repeats_itself_bit_for_bit():
     assert torch.equal(first.rgb, second.rgb)
 
 
-def test_march_takes_the_reference_where_gradients_or_float64_are_asked_for():
+def test_march_takes_the_reference_for_float64_and_the_fast_one_for_float32_with_gradients_or_without():
     boxes, camera = random_boxes(4, 18), camera_at((0.0, 0.0, 0.5))
     assert march(boxes, camera).rgb.dtype == torch.float64
     single, view = boxes.to(dtype=torch.float32), camera.to(dtype=torch.float32)
