@@ -19,7 +19,8 @@ _TOUCHING = {"knee": 0.06, "elbow": 0.04, "wrist": 0.03, "hand": 0.03, "pelvis":
 """Metres from joints to the skin under them; ankles and feet stand as high as at rest."""
 _POOL = 1000
 """Frames among which poses are chosen."""
-_NEAR_T_M = 0.2
+_NEAR_T_M = 0.08
+"""Mean distance of the joints from our own first pose up to which a frame counts as near T."""
 
 
 @dataclasses.dataclass(frozen=True)
