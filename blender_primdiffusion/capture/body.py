@@ -81,7 +81,8 @@ def skinning_transforms(
 
 def blend(weights: NDArray, transforms: NDArray) -> NDArray[np.float64]:
     """Weighted means [V, 3, 4] of transforms [J, 4, 4] by weights [V, J]."""
-    return (weights @ transforms[:, :3].reshape(len(transforms), 12)).reshape(-1, 3, 4)
+    blended: NDArray[np.float64] = weights @ transforms[:, :3].reshape(len(transforms), 12)
+    return blended.reshape(-1, 3, 4)
 
 
 def skin(points: NDArray, weights: NDArray, transforms: NDArray) -> NDArray[np.float64]:
