@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 
 import numpy as np
 import torch
+from PIL import Image
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.multisample import shoot
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.picture_files import DEPTH_UNIT
 from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.capture.sheet import default_joints, joints_of
-from primdiffusion.capture.subject import sit, srgb_bytes
+from primdiffusion.capture.subject import JPEG_QUALITY, sit, srgb_bytes
 
 SAME_DEPTH_M = 0.002
 
@@ -24,7 +26,7 @@ class Difference:
     mask_iou: float
     """Of the masks over one half."""
     squared: float
-    """Mean squared difference of colour bytes over the pixels that either covers."""
+    """Mean squared difference of colour bytes over the pixels that either covers, both out of the same kind of JPEG."""
     depth_share: float
     """Share of the pixels with a depth in either that agree within SAME_DEPTH_M."""
     part_share: float
@@ -59,7 +61,7 @@ def _difference(subject: Subject, frame: int, camera: int, shot) -> Difference:
     colours, coverage = srgb_bytes(shot.rgb), np.round(shot.coverage * 255)
     ours, theirs = coverage > 127, stored["mask"] > 127
     covered = (coverage > 0) | (stored["mask"] > 0)
-    apart = colours[covered].astype(float) - stored["img"][covered]
+    apart = _as_blender_stores(colours)[covered].astype(float) - stored["img"][covered]
     depth = stored["depth"] * DEPTH_UNIT
     either = (depth > 0) | (shot.depth > 0)
     return Difference(
@@ -69,6 +71,14 @@ def _difference(subject: Subject, frame: int, camera: int, shot) -> Difference:
         part_share=float((stored["part"] == shot.part)[either].mean()),
         shift_px=_shift(stored["img"].astype(float), colours.astype(float)),
     )
+
+
+def _as_blender_stores(colours: np.ndarray) -> np.ndarray:
+    """Out of a JPEG with colour at half the resolution, as Blender writes it; the rasteriser's own have it whole."""
+    file = io.BytesIO()
+    Image.fromarray(colours).save(file, "JPEG", quality=JPEG_QUALITY, subsampling="4:2:0")
+    with Image.open(file) as picture:
+        return np.asarray(picture)
 
 
 def _shift(first: np.ndarray, second: np.ndarray) -> float:

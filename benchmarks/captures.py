@@ -4,9 +4,10 @@
 a child process (uniform light, 16 samples a pixel) and draws the same views with the rasteriser (9 samples a pixel).
 Seconds a view include writing all passes and leave out start-up and the first view. Cycles uses all cores, a process of
 the rasteriser one; `fast_speedup` is of processor seconds, what a full machine gains; the wall's is beside it.
-PSNR is of sRGB bytes over the pixels that either picture covers; `joint_reprojection_px_max` is between the joints
-noted by the extension, from Blender's armature, and those of the backend's body from SMPL parameters and cameras on
-disk; `picture_shift_px_max` is how far Cycles' pictures lie beside those drawn from the same files.
+PSNR is of sRGB bytes over the pixels that either picture covers, both as JPEGs of the kind that Blender writes, with
+colour at half the resolution (the rasteriser's own files have it whole). `joint_reprojection_px_max` is between the
+joints noted by the extension, from Blender's armature, and those of the backend's body from SMPL parameters and cameras
+on disk; `picture_shift_px_max` is how far Cycles' pictures lie beside those drawn from the same files.
 Null: not measured (`--quick` makes no 200 views and no people; without bpy nothing of Cycles is).
 """
 
