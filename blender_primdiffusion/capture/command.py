@@ -175,7 +175,7 @@ def _end_of_stdin() -> threading.Event:
     ended = threading.Event()
 
     def wait() -> None:
-        while sys.stdin.buffer.read(4096):
+        while os.read(0, 4096):  # not sys.stdin, whose lock the interpreter wants when it ends
             pass
         ended.set()
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
+import shutil
 import sys
 from pathlib import Path
+from typing import NoReturn
 
 _NAME = "primdiffusion_extension"
 
@@ -21,5 +24,15 @@ def run_command() -> int:
     return importlib.import_module(f"{_NAME}.capture.command").main(words)
 
 
+def leave(code: int) -> NoReturn:
+    """End the process without Blender's own end: 4.5 as a module hangs there while a thread waits for stdin."""
+    import bpy
+
+    sys.stdout.flush()
+    sys.stderr.flush()
+    shutil.rmtree(bpy.app.tempdir, ignore_errors=True)
+    os._exit(code)
+
+
 if __name__ == "__main__":
-    sys.exit(run_command())
+    leave(run_command())

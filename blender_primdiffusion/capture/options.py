@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn, get_args
 
@@ -13,6 +13,8 @@ import numpy as np
 from .blender_camera import CameraError
 from .rig import Arrangement, Rig, View
 from .settings import LAYOUTS, PASSES, Background, CaptureSettings, Device, Light
+
+_POSE_ENDINGS = (".npz", ".npy", ".json", ".bvh")
 
 
 class UsageError(ValueError):
@@ -35,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
     add("--only", nargs="+", default=[], metavar="SUBJECT", help="just these people")
     add("--shard", type=_shard, default=(0, 1), metavar="I/N", help="the people I, I + N, ... of the sorted list")
     add("--body", type=Path, help="an SMPL body as .npz of plain arrays instead of the default one")
-    add("--pose-files", type=Path, nargs="+", default=[], help="AMASS or pose .npz, .npy, .json, .bvh; else built in")
+    add("--pose-files", type=Path, nargs="+", default=[], help="AMASS or pose .npz, .npy, .json, .bvh, or folders")
     add("--poses", type=int, default=20, help="how many; the first is near-T (default %(default)s)")
     add("--cameras", type=int, default=rig.count, help="how many (default %(default)s)")
     add("--arrangement", choices=get_args(Arrangement), default=rig.arrangement)
@@ -90,7 +92,7 @@ def settings_of(options: argparse.Namespace) -> CaptureSettings:
         seed=options.seed,
         rig=rig,
         cameras=read_cameras(options.camera_file, width, height) if options.camera_file else (),
-        pose_files=tuple(options.pose_files),
+        pose_files=tuple(_files_of_poses(options.pose_files)),
         pose_count=options.poses,
         passes=tuple(kind for kind in PASSES if kind in options.passes),
         light=options.light,
@@ -126,6 +128,17 @@ def read_cameras(path: Path, width: int, height: int) -> tuple[View, ...]:
     if not views:
         raise CameraError(f"{path} holds no camera")
     return tuple(views)
+
+
+def _files_of_poses(paths: Sequence[Path]) -> Iterator[Path]:
+    for path in paths:
+        if not path.is_dir():
+            yield path
+            continue
+        found = sorted(file for file in path.rglob("*") if file.suffix.lower() in _POSE_ENDINGS and file.is_file())
+        if not found:
+            raise ValueError(f"{path} holds no pose files: {', '.join(_POSE_ENDINGS)}")
+        yield from found
 
 
 def _shard(text: str) -> tuple[int, int]:

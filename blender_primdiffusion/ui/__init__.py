@@ -6,7 +6,18 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..scene.collect import collect_before_saving
-from . import operators, panel, preferences, properties, render_panels
+from . import (
+    capture_command,
+    capture_operators,
+    capture_panel,
+    capture_settings,
+    operators,
+    panel,
+    preferences,
+    properties,
+    render_panels,
+)
+from .capture_session import captures
 from .generation import session
 
 CLASSES = (
@@ -15,10 +26,19 @@ CLASSES = (
     operators.PRIMDIFFUSION_OT_generate,
     operators.PRIMDIFFUSION_OT_cancel,
     panel.PRIMDIFFUSION_PT_generate,
+    capture_settings.PRIMDIFFUSION_PG_captures,
+    capture_operators.PRIMDIFFUSION_OT_render_captures,
+    capture_operators.PRIMDIFFUSION_OT_cancel_captures,
+    capture_operators.PRIMDIFFUSION_OT_verify_captures,
+    capture_operators.PRIMDIFFUSION_OT_preview_rig,
+    capture_panel.PRIMDIFFUSION_PT_captures,
+    *capture_panel.SUB_PANELS,
     render_panels.PRIMDIFFUSION_PT_marching,
     render_panels.PRIMDIFFUSION_PT_film,
     render_panels.PRIMDIFFUSION_PT_passes,
 )
+_commands: list[object] = []
+"""Of Blender's command line, while they are known to it."""
 
 
 @persistent
@@ -32,19 +52,26 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion = bpy.props.PointerProperty(type=properties.PRIMDIFFUSION_PG_settings)
+    bpy.types.Scene.primdiffusion_captures = bpy.props.PointerProperty(type=capture_settings.PRIMDIFFUSION_PG_captures)
+    _commands.append(capture_command.register())
     render_panels.join_panels()
     bpy.app.handlers.load_pre.append(drop_job_before_loading)
     bpy.app.handlers.save_pre.append(collect_before_saving)
 
 
 def unregister() -> None:
-    """All of `register` undone, the child ended."""
+    """All of `register` undone, the children ended."""
     session.close()
-    if bpy.app.timers.is_registered(operators.follow):
-        bpy.app.timers.unregister(operators.follow)
+    captures.close()
+    for timer in (operators.follow, capture_operators.follow):
+        if bpy.app.timers.is_registered(timer):
+            bpy.app.timers.unregister(timer)
+    while _commands:
+        capture_command.unregister(_commands.pop())
     bpy.app.handlers.save_pre.remove(collect_before_saving)
     bpy.app.handlers.load_pre.remove(drop_job_before_loading)
     render_panels.leave_panels()
+    del bpy.types.Scene.primdiffusion_captures
     del bpy.types.Scene.primdiffusion
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

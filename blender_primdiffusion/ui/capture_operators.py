@@ -1,0 +1,194 @@
+"""Render Captures, Verify, Cancel and the preview of the cameras."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import time
+
+import bpy
+import numpy as np
+from mathutils import Vector
+from numpy.typing import NDArray
+
+from ..capture.blender_camera import aim
+from ..capture.command import describe, scans_in
+from ..capture.job import run
+from ..capture.options import parse, settings_of
+from ..capture.report import Report, report_path
+from ..capture.rig import bounding_sphere
+from ..capture.verify import repair, verify
+from ..scene.convention import points_to_backend
+from .capture_session import Busy, captures
+from .capture_settings import words_of
+from .operators import redraw
+
+RIG = "Capture Rig"
+_TICK_S = 0.1
+_TOLD_S = 1.0
+_PERSON_M = 1.1
+"""Radius of the sphere around a person in the T-pose about the world's origin, where there is nothing to look at."""
+
+
+class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
+    """Render everybody in the folder of people from all sides, into the folder of captures"""
+
+    bl_idname = "primdiffusion.render_captures"
+    bl_label = "Render Captures"
+    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO: the scene stays as it is
+
+    people: bpy.props.StringProperty(name="People", description="Empty: the panel's")
+    out: bpy.props.StringProperty(name="Captures", description="Empty: the panel's")
+    options: bpy.props.StringProperty(name="Options", description="More words, as on the command line")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """With a window a Blender of its own renders and a timer follows it; in background mode this one renders."""
+        try:
+            if captures.busy:
+                raise Busy("captures are being rendered; wait for them or press Cancel")
+            words = words_of(
+                context.scene.primdiffusion_captures, context, captures.new_folder(), self.people, self.out
+            )
+            words += shlex.split(self.options)
+            if bpy.app.background:
+                return self._render_here(context, words)
+            settings_of(parse(words))  # what is impossible is said at once
+            captures.start(words)
+        except (Busy, OSError, ValueError, RuntimeError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        bpy.app.timers.register(follow, first_interval=_TICK_S, persistent=True)
+        return {"FINISHED"}
+
+    def _render_here(self, context: bpy.types.Context, words: list[str]) -> set[str]:
+        options = parse(words)
+        settings, report, told = settings_of(options), Report(), 0.0
+        captures.close()  # the file of cameras is read
+        scans = scans_in(options.people, options.only)
+        with contextlib.closing(run(context, settings, scans, report)) as steps:
+            for progress in steps:
+                for line in progress.news:
+                    print(f"PrimDiffusion: {line}", flush=True)
+                if time.monotonic() - told > _TOLD_S:
+                    told = time.monotonic()
+                    print(f"PrimDiffusion: {describe(progress)}", flush=True)
+        if report.failed:
+            first, path = report.failed[0], report_path(settings.out, settings.shard)
+            who = first["subject"] or first["what"]
+            self.report({"ERROR"}, f"{len(report.failed)} failed; {who}: {first['why']} (all: {path})")
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_cancel_captures(bpy.types.Operator):
+    """Stop rendering; what is there stays, and the next run goes on from it"""
+
+    bl_idname = "primdiffusion.cancel_captures"
+    bl_label = "Cancel"
+    bl_options: set[str] = set()  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        """Only while something runs."""
+        return captures.busy
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        """Ask; the timer sees it through."""
+        captures.cancel()
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_verify_captures(bpy.types.Operator):
+    """Read every file of the captures and name what is missing, cut short or altered"""
+
+    bl_idname = "primdiffusion.verify_captures"
+    bl_label = "Verify"
+    bl_options: set[str] = set()  # noqa: RUF012
+
+    out: bpy.props.StringProperty(name="Captures", description="Empty: the panel's")
+    repair: bpy.props.BoolProperty(
+        name="Repair", description="Take away what is damaged, so that the next run renders just that anew"
+    )
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """With a window in a Blender of its own; in background mode here, and it fails where something is wrong."""
+        out = bpy.path.abspath(self.out or context.scene.primdiffusion_captures.out)
+        try:
+            if not out:
+                raise ValueError("choose the folder of captures first")
+            words = ["--out", out, "--verify", *(["--repair"] if self.repair else [])]
+            if not bpy.app.background:
+                captures.start(words)
+                bpy.app.timers.register(follow, first_interval=_TICK_S, persistent=True)
+                return {"FINISHED"}
+            root = parse(words).out
+            wrong = repair(root) if self.repair else verify(root)
+        except (Busy, OSError, ValueError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        for sentence in wrong:
+            print(f"PrimDiffusion: {sentence}")
+        if wrong and not self.repair:
+            self.report({"ERROR"}, f"{len(wrong)} problems; the first: {wrong[0]}")
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_preview_rig(bpy.types.Operator):
+    """Show the cameras around the active object, or take them away again"""
+
+    bl_idname = "primdiffusion.preview_rig"
+    bl_label = "Preview Cameras"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """A collection of camera objects; they are only for looking at."""
+        collection = context.scene.collection.children.get(RIG)
+        if collection is not None:
+            remove_rig(collection)
+            return {"FINISHED"}
+        try:
+            rig = context.scene.primdiffusion_captures.rig()
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        collection = bpy.data.collections.new(RIG)
+        context.scene.collection.children.link(collection)
+        for number, view in enumerate(rig.views(*_sphere_around(context))):
+            camera = bpy.data.objects.new(f"Capture {number:04d}", bpy.data.cameras.new(f"Capture {number:04d}"))
+            collection.objects.link(camera)
+            aim(camera, view)
+            camera.data.display_size = 0.1
+            camera.hide_select = True
+        return {"FINISHED"}
+
+
+def remove_rig(collection: bpy.types.Collection) -> None:
+    """Take the preview out of the file, and nothing that the user has put into its collection."""
+    ours = [thing for thing in collection.objects if thing.type == "CAMERA" and thing.name.startswith("Capture ")]
+    cameras = [thing.data for thing in ours]
+    bpy.data.batch_remove([*ours, *cameras, collection])
+
+
+def follow() -> float | None:
+    """The timer: take in what the child has said, draw it."""
+    if captures.tick():
+        redraw()
+    return _TICK_S if captures.busy else None
+
+
+def _sphere_around(context: bpy.types.Context) -> tuple[NDArray[np.float64], float]:
+    """Of the active object and what hangs on it; of a person at the origin where there is none."""
+    active = context.active_object
+    things = [active, *active.children_recursive] if active is not None and active.type != "CAMERA" else []
+    depsgraph = context.evaluated_depsgraph_get()
+    corners = [
+        thing.matrix_world @ corner
+        for thing in (thing.evaluated_get(depsgraph) for thing in things)
+        for corner in map(Vector, thing.bound_box)
+        if thing.type in ("MESH", "ARMATURE")
+    ]
+    if not corners:
+        return np.zeros(3), _PERSON_M
+    centre, radius = bounding_sphere(points_to_backend(np.array(corners)))
+    return (centre, radius) if radius > 0 else (centre, _PERSON_M)

@@ -1,0 +1,177 @@
+"""The one capture that may run at a time: a Blender of its own, so that this one stays free."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import json
+import os
+import queue
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO
+
+import bpy
+
+from ..capture import launch
+from ..capture.command import CANCELLED, DONE, MARK
+
+PATIENCE_S = 0.7
+"""After this a child that was asked to stop is ended: its views are written whole or not at all."""
+_KEPT_LINES = 200
+
+
+class Busy(RuntimeError):
+    """A capture runs already."""
+
+
+class CaptureSession:
+    """Starts the child, follows it, ends it. All methods are for Blender's main thread."""
+
+    def __init__(self) -> None:
+        self.error = ""
+        """Why the last run failed; empty when it went well."""
+        self.notice = ""
+        """How the last run ended otherwise."""
+        self.message = ""
+        self.fraction = 0.0
+        self.eta_s: float | None = None
+        self.lines: collections.deque[str] = collections.deque(maxlen=_KEPT_LINES)
+        """What the child told, newest last."""
+        self.exit_code: int | None = None
+        """Of the last run."""
+        self._process: subprocess.Popen[str] | None = None
+        self._heard: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._complaints: collections.deque[str] = collections.deque(maxlen=_KEPT_LINES)
+        self._readers: list[threading.Thread] = []
+        self._folder: Path | None = None
+        self._asked_to_stop_at: float | None = None
+
+    @property
+    def busy(self) -> bool:
+        """A child is at work."""
+        return self._process is not None
+
+    def new_folder(self) -> Path:
+        """For files of the next run; gone when it ends."""
+        if self._folder is None:
+            self._folder = Path(tempfile.mkdtemp(prefix="primdiffusion_captures_"))
+        return self._folder
+
+    def start(self, words: Sequence[str]) -> None:
+        """Begin a run of the command `capture`. Raises Busy, or OSError where no Blender can be started."""
+        if self.busy:
+            raise Busy("captures are being rendered; wait for them or press Cancel")
+        folder = str(self.new_folder())
+        self.error = self.notice = ""
+        self.message, self.fraction, self.eta_s, self.exit_code = "Starting Blender", 0.0, None, None
+        self.lines.clear()
+        self._complaints.clear()
+        self._heard, self._asked_to_stop_at = queue.SimpleQueue(), None
+        self._process = subprocess.Popen(
+            [*child_command(), *words, "--progress", "json", "--while-stdin"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            encoding="utf-8",
+            errors="replace",
+            env={**os.environ, "TMPDIR": folder, "TEMP": folder, "TMP": folder},
+            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+        )
+        self._readers = [
+            threading.Thread(target=_read, args=(self._process.stdout, self._heard.put), daemon=True),
+            threading.Thread(target=_read, args=(self._process.stderr, self._complaints.append), daemon=True),
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    def tick(self) -> bool:
+        """Take in what the child has said; True when something visible changed. Never waits."""
+        if self._process is None:
+            return False
+        before = (self.message, self.fraction, len(self.lines), self.busy)
+        self._listen()
+        asked = self._asked_to_stop_at
+        if asked is not None and time.monotonic() - asked > PATIENCE_S:
+            self._process.kill()
+        if self._process.poll() is not None and not any(reader.is_alive() for reader in self._readers):
+            self._listen()
+            self._finish(self._process.returncode)
+        return before != (self.message, self.fraction, len(self.lines), self.busy)
+
+    def cancel(self) -> None:
+        """Ask the child to stop; it ends within a second. What is rendered stays, and the next run goes on there."""
+        if self._process is None or self._asked_to_stop_at is not None:
+            return
+        self._asked_to_stop_at = time.monotonic()
+        self.message, self.eta_s = "Cancelling", None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
+
+    def close(self) -> None:
+        """End the child at once: the extension is going, or another file is loaded."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+        self._clear_folder()
+
+    def _listen(self) -> None:
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._take(self._heard.get_nowait())
+
+    def _take(self, line: str) -> None:
+        if not line.startswith(MARK):
+            self.lines.append(line)
+            return
+        progress = json.loads(line[len(MARK) :])
+        self.lines.extend(progress["news"])
+        if self._asked_to_stop_at is None:
+            self.fraction, self.eta_s = progress["done"] / max(progress["total"], 1), progress["eta_s"]
+            self.message = f"{progress['subject']}: view {progress['done']} of {progress['total']}"
+
+    def _finish(self, code: int) -> None:
+        self.exit_code, stopped = code, self._asked_to_stop_at is not None
+        for stream in (self._process.stdout, self._process.stderr, self._process.stdin):
+            with contextlib.suppress(OSError):
+                stream.close()
+        self._process = None
+        self._clear_folder()
+        last = self.lines[-1] if self.lines else ""
+        if stopped or code == CANCELLED:
+            self.notice = "Cancelled; the same settings go on from here."
+        elif code == DONE:
+            self.notice, self.fraction = last, 1.0
+        else:
+            said = [line for line in self._complaints if line.startswith("capture: ")]
+            self.error = said[-1].removeprefix("capture: ") if said else last or f"Blender ended with code {code}"
+
+    def _clear_folder(self) -> None:
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._folder = None
+
+
+def child_command() -> list[str]:
+    """What starts a Blender for captures; the extension's words follow."""
+    script = str(Path(launch.__file__).resolve())
+    if bpy.app.binary_path:
+        return [bpy.app.binary_path, "-b", "--factory-startup", "--python", script, "--"]
+    return [sys.executable, script, "--"]
+
+
+def _read(stream: IO[str], take) -> None:
+    for line in stream:
+        take(line.rstrip("\n"))
+
+
+captures = CaptureSession()
+"""Blender has one main thread and one user: one session."""
