@@ -10,8 +10,11 @@ import pytest
 import torch
 from PIL import Image
 from primdiffusion.capture import camera_files, layout, picture_files, rig
+from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.geometry.camera import look_at
 from scipy.spatial.transform import Rotation
+
+from blender_primdiffusion.motion import poses as motion_poses
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = rig.Rig(count=7, width=40, height=60)
@@ -21,6 +24,11 @@ SMALL = rig.Rig(count=7, width=40, height=60)
 def test_both_programs_hold_the_same_file(name):
     here = (ROOT / "backend/primdiffusion/capture" / name).read_bytes()
     assert (ROOT / "blender_primdiffusion/capture" / name).read_bytes() == here
+
+
+def test_both_programs_have_the_same_poses():
+    ours, theirs = built_in_poses(), motion_poses.built_in_poses()
+    assert np.allclose(ours.joint_rotation.numpy(), theirs.rotations, atol=1e-5)
 
 
 @pytest.mark.parametrize("arrangement", ["rings", "sphere", "hemisphere"])

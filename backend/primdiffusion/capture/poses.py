@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from primdiffusion.body.model import JOINT_NAMES, BodyPose, J, default_body
+from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.capture.plain_npz import read_npz
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 
@@ -22,36 +22,8 @@ AMASS_KEYS = ("mocap_framerate", "mocap_frame_rate")
 """Their presence tells a file of AMASS, whose z is up."""
 MOST_CANDIDATES = 2000
 """Frames among which few are chosen; of more, these many evenly spaced."""
-NEAR_T = {"shoulder": (0, 0, -25)}
-BUILT_IN: tuple[tuple[str, Mapping[str, tuple[float, float, float]]], ...] = (
-    ("near T", NEAR_T),
-    ("standing", {"shoulder": (0, 0, -75), "elbow": (0, -12, 0)}),
-    ("A", {"shoulder": (0, 0, -48)}),
-    ("arms forward", {"shoulder": (0, -75, -10), "elbow": (0, -15, 0)}),
-    ("arms up", {"collar": (0, 0, 20), "shoulder": (0, 0, 50)}),
-    ("hands on hips", {"shoulder": (25, 15, -50), "elbow": (0, -85, 30)}),
-    ("walking", {"l_hip": (-25, 0, 0), "r_hip": (20, 0, 0), "l_knee": (12, 0, 0), "r_knee": (30, 0, 0),
-                 "l_shoulder": (0, 25, -72), "r_shoulder": (0, 35, 72), "elbow": (0, -25, 0)}),
-    ("running", {"spine1": (10, 0, 0), "l_hip": (-60, 0, 0), "r_hip": (25, 0, 0), "l_knee": (70, 0, 0),
-                 "r_knee": (60, 0, 0), "l_shoulder": (0, 35, -65), "r_shoulder": (0, 50, 60), "elbow": (0, -80, 0)}),
-    ("squatting", {"hip": (-80, 0, 15), "knee": (95, 0, 0), "ankle": (-20, 0, 0), "spine1": (25, 0, 0),
-                   "shoulder": (0, -70, -15)}),
-    ("sitting", {"hip": (-85, 0, 5), "knee": (85, 0, 0), "shoulder": (0, -25, -65), "elbow": (0, -45, 0)}),
-    ("lunging", {"l_hip": (-65, 0, 5), "l_knee": (75, 0, 0), "r_hip": (25, 0, -5), "r_knee": (20, 0, 0),
-                 "shoulder": (0, 0, -60), "elbow": (0, -40, 0)}),
-    ("waving", {"l_shoulder": (0, 0, -72), "r_shoulder": (0, 10, -30), "r_elbow": (0, 20, -70)}),
-    ("pointing", {"l_shoulder": (0, -80, 0), "r_shoulder": (0, 0, 72), "neck": (0, 15, 0)}),
-    ("crossed arms", {"l_shoulder": (0, -45, -55), "r_shoulder": (0, 45, 50), "l_elbow": (0, -95, 25),
-                      "r_elbow": (0, 100, -20)}),
-    ("bowing", {"spine1": (25, 0, 0), "spine2": (20, 0, 0), "spine3": (15, 0, 0), "shoulder": (0, -40, -60)}),
-    ("leaning back", {"spine1": (-10, 0, 0), "spine2": (-10, 0, 0), "spine3": (-8, 0, 0), "shoulder": (0, 20, -45)}),
-    ("twisting", {"spine1": (0, 15, 0), "spine2": (0, 15, 0), "spine3": (0, 12, 0), "shoulder": (0, 0, -20)}),
-    ("on one leg", {"l_hip": (-70, 0, 0), "l_knee": (95, 0, 0), "shoulder": (0, 0, -15)}),
-    ("side bend", {"spine1": (0, 0, -12), "spine2": (0, 0, -12), "spine3": (0, 0, -10), "l_shoulder": (0, 0, 60),
-                   "r_shoulder": (0, 0, 60)}),
-    ("wide stance", {"hip": (0, 0, 22), "shoulder": (0, 0, 25), "elbow": (0, -10, 0)}),
-)  # fmt: skip
-"""Turns of joints about the axes of the rest pose, degrees; a name without a side is the left one's, and mirrored."""
+BUILT_IN = Path(__file__).parent / "data" / "poses.json"
+"""Made by scripts/bake_poses: the poses that the extension has, 72 axis-angle numbers by name."""
 
 
 class MotionFileError(ValueError):
@@ -60,12 +32,8 @@ class MotionFileError(ValueError):
 
 def built_in_poses() -> BodyPose:
     """All built-in poses, the near-T pose first: rotations [20, 24, 3, 3]."""
-    turns = np.zeros((len(BUILT_IN), J, 3))
-    for number, (_, joints) in enumerate(BUILT_IN):
-        for name, degrees in joints.items():
-            for joint, sign in _sides(name):
-                turns[number, joint] = np.radians(degrees) * sign
-    return _as_pose(turns, np.zeros((len(BUILT_IN), 3)))
+    turns = np.array(list(json.loads(BUILT_IN.read_text(encoding="utf-8")).values()))
+    return _as_pose(turns, np.zeros((len(turns), 3)))
 
 
 def read_motion(path: str | Path) -> BodyPose:
@@ -125,16 +93,6 @@ def _spread(rotation: Float[torch.Tensor, "F J 3 3"], count: int, seed: int) -> 
         score[taken] = -1
         taken.append(int(score.argmax()))
     return taken
-
-
-def _sides(name: str) -> list[tuple[int, NDArray]]:
-    """Joints that a name of BUILT_IN stands for, and the signs of its turns."""
-    if name in JOINT_NAMES:
-        return [(JOINT_NAMES.index(name), np.ones(3))]
-    same, mirror = np.ones(3), np.array([1.0, -1.0, -1.0])
-    if name[:2] in ("l_", "r_"):
-        return [(JOINT_NAMES.index({"l": "left", "r": "right"}[name[0]] + name[1:]), same)]
-    return [(JOINT_NAMES.index(f"left_{name}"), same), (JOINT_NAMES.index(f"right_{name}"), mirror)]
 
 
 def _as_pose(turns: NDArray, translation: NDArray) -> BodyPose:
