@@ -21,16 +21,12 @@ import bpy
 
 from .job import CaptureError, Progress, run
 from .layout import CaptureFolderError
-from .options import UsageError, parse, settings_of
+from .options import CANCELLED, DONE, FAILED, MARK, UNUSABLE, UsageError, parse, settings_of
 from .report import Report, report_path
 from .scan import ScanError, ScanFile, find_scans
 from .settings import CaptureSettings
 from .verify import repair, verify
 
-DONE, FAILED, UNUSABLE, CANCELLED = 0, 1, 2, 130
-"""Exit codes: all is well; something failed or is damaged; nothing could be begun; told to stop."""
-MARK = "PRIMDIFFUSION "
-"""Begins each line of --progress json; an object follows."""
 _TOLD_S = 1.0
 
 Say = Callable[[str], None]

@@ -1,4 +1,4 @@
-"""The words of the command `capture`, and what they ask for."""
+"""The words of the command `capture`, what they ask for, and how it answers programs."""
 
 from __future__ import annotations
 
@@ -14,6 +14,10 @@ from .blender_camera import CameraError
 from .rig import Arrangement, Rig, View
 from .settings import LAYOUTS, PASSES, Background, CaptureSettings, Device, Light
 
+DONE, FAILED, UNUSABLE, CANCELLED = 0, 1, 2, 130
+"""Exit codes: all is well; something failed or is damaged; nothing could be begun; told to stop."""
+MARK = "PRIMDIFFUSION "
+"""Begins each line of --progress json; an object follows."""
 _POSE_ENDINGS = (".npz", ".npy", ".json", ".bvh")
 
 

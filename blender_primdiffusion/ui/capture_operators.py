@@ -12,12 +12,9 @@ from mathutils import Vector
 from numpy.typing import NDArray
 
 from ..capture.blender_camera import aim
-from ..capture.command import describe, scans_in
-from ..capture.job import run
 from ..capture.options import parse, settings_of
 from ..capture.report import Report, report_path
 from ..capture.rig import bounding_sphere
-from ..capture.verify import repair, verify
 from ..scene.convention import points_to_backend
 from .capture_session import Busy, captures
 from .capture_settings import words_of
@@ -61,6 +58,9 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
         return {"FINISHED"}
 
     def _render_here(self, context: bpy.types.Context, words: list[str]) -> set[str]:
+        from ..capture.command import describe, scans_in  # the reading of scans and poses would slow Blender's start
+        from ..capture.job import run
+
         options = parse(words)
         settings, report, told = settings_of(options), Report(), 0.0
         captures.close()  # the file of cameras is read
@@ -112,6 +112,8 @@ class PRIMDIFFUSION_OT_verify_captures(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """With a window in a Blender of its own; in background mode here, and it fails where something is wrong."""
+        from ..capture.verify import repair, verify
+
         out = bpy.path.abspath(self.out or context.scene.primdiffusion_captures.out)
         try:
             if not out:
