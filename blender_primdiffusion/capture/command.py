@@ -29,7 +29,8 @@ from .verify import repair, verify
 
 _TOLD_S = 1.0
 
-Say = Callable[[str], None]
+Say = Callable[..., None]
+"""Takes a line; for --progress json a Progress too."""
 
 
 class _Stopped(Exception):
@@ -43,7 +44,8 @@ def main(argv: Sequence[str]) -> int:
     except UsageError as error:
         print(f"capture: {error}; --help names all options", file=sys.stderr, flush=True)
         return UNUSABLE
-    with _stdout_of_our_own() as say:
+    with _stdout_of_our_own() as write:
+        say = _saying_json(write) if options.progress == "json" else write
         try:
             with _stopped_by_signals():
                 return _run(options, say)
@@ -102,7 +104,7 @@ def _render(options: argparse.Namespace, settings: CaptureSettings, scans: list[
     with contextlib.closing(run(bpy.context, settings, scans, report)) as steps:
         for progress in steps:
             if options.progress == "json":
-                say(MARK + json.dumps(dataclasses.asdict(progress)))
+                say(progress)
             elif options.progress == "text":
                 for line in progress.news:
                     say(line)
@@ -115,6 +117,15 @@ def _render(options: argparse.Namespace, settings: CaptureSettings, scans: list[
     if report.failed:
         say(f"What failed and why: {report_path(settings.out, settings.shard)}")
     return FAILED if report.failed else DONE
+
+
+def _saying_json(write: Callable[[str], None]) -> Say:
+    """Blender may have said things of its own before: what is ours begins with MARK."""
+
+    def say(what: str | Progress) -> None:
+        write(MARK + json.dumps({"line": what} if isinstance(what, str) else dataclasses.asdict(what)))
+
+    return say
 
 
 def describe(progress: Progress) -> str:
@@ -130,7 +141,7 @@ def _duration(seconds: float) -> str:
 
 
 @contextlib.contextmanager
-def _stdout_of_our_own() -> Iterator[Say]:
+def _stdout_of_our_own() -> Iterator[Callable[[str], None]]:
     """A way to write lines to stdout while all else that is written there, by Blender, is dropped."""
     sys.stdout.flush()
     ours = os.dup(1)

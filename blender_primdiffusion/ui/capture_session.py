@@ -130,9 +130,11 @@ class CaptureSession:
 
     def _take(self, line: str) -> None:
         if not line.startswith(MARK):
-            self.lines.append(line)
-            return
+            return  # Blender's own
         progress = json.loads(line[len(MARK) :])
+        if "line" in progress:
+            self.lines.append(progress["line"])
+            return
         self.lines.extend(progress["news"])
         if self._asked_to_stop_at is None:
             self.fraction, self.eta_s = progress["done"] / max(progress["total"], 1), progress["eta_s"]
