@@ -9,16 +9,17 @@ from pathlib import Path
 out, arguments = Path(sys.argv[1]), sys.argv[2:]
 subjects = ["anna", "bert", "carl", "dora"]
 if "--list" in arguments:
-    print("\n".join(f"subject {name}" for name in subjects))
+    print("A renderer's own words")
+    print("\n".join(f'PRIMDIFFUSION {{"subject": "{name}"}}' for name in subjects))
     sys.exit()
-index, count = map(int, arguments[arguments.index("--shard") + 1].split("/"))
-folder = out / subjects[index]
+subject = arguments[arguments.index("--only") + 1]
+folder = out / subject
 folder.mkdir(parents=True, exist_ok=True)
 for view in range(6):
     path = folder / f"view{view}"
     if path.exists():
         continue
-    trouble = out / f"{subjects[index]}.{view}.trouble"
+    trouble = out / f"{subject}.{view}.trouble"
     if trouble.exists():
         what = trouble.read_text()
         trouble.unlink()
@@ -28,5 +29,5 @@ for view in range(6):
         time.sleep(5)
     time.sleep(0.05)
     with (out / "log").open("a") as log:
-        log.write(f"{subjects[index]} {view}\n")
+        log.write(f"{subject} {view}\n")
     path.touch()

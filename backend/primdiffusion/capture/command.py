@@ -1,4 +1,4 @@
-"""The command `primdiffusion captures`: render, verify, info, pack, sheet."""
+"""The command `primdiffusion captures`: render, verify, info, pack, sheet, farm."""
 
 from __future__ import annotations
 
@@ -207,12 +207,51 @@ class SheetOfCaptures:
         print(f"{self.out}  joints drawn, largest error {error:.4f} px")
 
 
+@dataclasses.dataclass(frozen=True)
+class FarmCaptures:
+    """Render a dataset by a command of Blender's on a Ray cluster, a person a task (needs the extra `farm`).
+
+    `primdiffusion captures farm --workers 4 -- blender -c primdiffusion capture --people scans --out captures`
+    """
+
+    command: tyro.conf.Positional[tuple[str, ...]]
+    """The renderer and its options; its paths must mean the same files on every machine."""
+    address: str | None = None
+    """Of a Ray cluster; "auto": the one of this machine; without it one is started here."""
+    workers: int = 1
+    """Renderers at once, where the cluster is started here."""
+    processors_each: float = 1
+    """Cores of each renderer."""
+    gpus_each: float = 0
+    """GPUs of each renderer; 0.5: two share one."""
+    attempts: int = 3
+    """Times a person is tried whose worker or renderer is killed."""
+
+    def run(self) -> None:
+        """Renders, and prints how each person ended.
+
+        Raises:
+            FarmError: the farm cannot begin, or somebody is not finished.
+        """
+        from primdiffusion.capture.farm import Farm, FarmError, Outcome, render_on
+
+        def tell(outcome: Outcome, done: int, total: int) -> None:
+            print(f"{done}/{total}  {outcome.subject}  {outcome.error or f'{outcome.seconds:.0f} s'}", flush=True)
+
+        farm = Farm(self.address, self.workers, self.processors_each, self.gpus_each, self.attempts)
+        outcomes = render_on(farm, self.command, tell)
+        failed = [outcome.subject for outcome in outcomes if outcome.exit_code]
+        if failed:
+            raise FarmError(f"{len(failed)} of {len(outcomes)} people are not finished: {', '.join(failed[:5])}")
+
+
 Command = (
     Annotated[RenderCaptures, tyro.conf.subcommand("render")]
     | Annotated[VerifyCaptures, tyro.conf.subcommand("verify")]
     | Annotated[InfoOfCaptures, tyro.conf.subcommand("info")]
     | Annotated[PackCaptures, tyro.conf.subcommand("pack")]
     | Annotated[SheetOfCaptures, tyro.conf.subcommand("sheet")]
+    | Annotated[FarmCaptures, tyro.conf.subcommand("farm")]
 )
 
 

@@ -8,21 +8,22 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
+import json
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
-LIST_OPTION, SHARD_OPTION = "--list", "--shard"
-"""What a renderer's command must understand: tell the subjects, a line each; render the i-th of n."""
+LIST, ONLY = ("--list", "--progress", "json"), ("--progress", "none", "--only")
+"""What a renderer's command must understand: to tell its subjects, a line of MARK and JSON each; to render one."""
+MARK = "PRIMDIFFUSION "
 _LINES_OF_ERROR = 5
 _SET_PARENT_DEATH_SIGNAL = 1
 
 
-class FarmError(RuntimeError):
+class FarmError(ValueError):
     """The farm cannot begin: no Ray, no cluster, or a command that lists no subjects."""
 
 
@@ -55,13 +56,13 @@ class Farm:
 def subjects_of(command: Sequence[str]) -> list[str]:
     """The subjects that a renderer's command would render. Raises FarmError where it names none."""
     try:
-        ran = subprocess.run([*command, LIST_OPTION], capture_output=True, text=True, check=False)
+        ran = subprocess.run([*command, *LIST], capture_output=True, text=True, check=False)
     except OSError as e:
         raise FarmError(f"the renderer {command[0]!r} cannot be started ({e}): give its path") from e
-    names = [line.removeprefix("subject ") for line in ran.stdout.splitlines() if line.startswith("subject ")]
-    if ran.returncode or not names:
-        raise FarmError(f"{' '.join(command)} {LIST_OPTION} names no subjects: {_tail(ran.stderr) or 'it is silent'}")
-    return names
+    told = [json.loads(line.removeprefix(MARK)) for line in ran.stdout.splitlines() if line.startswith(MARK)]
+    if ran.returncode or not told:
+        raise FarmError(f"{' '.join([*command, *LIST])} names no subjects: {_tail(ran.stderr) or 'it is silent'}")
+    return [line["subject"] for line in told]
 
 
 def render_on(
@@ -77,10 +78,7 @@ def render_on(
         task = ray.remote(
             num_cpus=farm.processors_each, num_gpus=farm.gpus_each, max_retries=farm.attempts - 1, max_calls=1
         )(render_one)
-        waiting = {
-            task.remote(list(command), subject, i, len(subjects), farm.attempts): subject
-            for i, subject in enumerate(subjects)
-        }
+        waiting = {task.remote(list(command), subject, farm.attempts): subject for subject in subjects}
         outcomes = []
         while waiting:
             finished, _ = ray.wait(list(waiting), num_returns=1)
@@ -96,12 +94,12 @@ def render_on(
         ray.shutdown()
 
 
-def render_one(command: list[str], subject: str, index: int, count: int, attempts: int) -> Outcome:
+def render_one(command: list[str], subject: str, attempts: int) -> Outcome:
     """The task: one renderer process, started again where it is killed, but not where it says what is wrong."""
     began, exit_code, error = time.monotonic(), -1, ""
     for _ in range(attempts):
         process = subprocess.Popen(
-            [*command, SHARD_OPTION, f"{index}/{count}"],
+            [*command, *ONLY, subject],
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, preexec_fn=_die_with_parent,
         )  # fmt: skip
         error = _tail(process.communicate()[1])
@@ -109,15 +107,6 @@ def render_one(command: list[str], subject: str, index: int, count: int, attempt
         if exit_code >= 0:
             break
     return Outcome(subject, exit_code, time.monotonic() - began, error if exit_code else "")
-
-
-def unfinished(root: Path, outcomes: Sequence[Outcome]) -> list[str]:
-    """A sentence for each person whose captures are not all there."""
-    from primdiffusion.capture.layout import damaged
-
-    told = [f"{outcome.subject}: {outcome.error or outcome.exit_code}" for outcome in outcomes if outcome.exit_code]
-    silent = [outcome.subject for outcome in outcomes if not outcome.exit_code]
-    return told + [sentence for name in silent for sentence in damaged(root / name, checksums=False)]
 
 
 def _started(farm: Farm) -> Any:
