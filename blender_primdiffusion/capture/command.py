@@ -86,7 +86,7 @@ def _run(options: argparse.Namespace, say: Say) -> int:
     if options.list:
         index, count = settings.shard
         for scan in scans[index::count]:
-            say(f"{MARK}{json.dumps({'subject': scan.name})}" if options.progress == "json" else scan.name)
+            say(scan.name)
         return DONE
     return _render(options, settings, scans, say)
 

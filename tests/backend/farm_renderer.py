@@ -10,7 +10,7 @@ out, arguments = Path(sys.argv[1]), sys.argv[2:]
 subjects = ["anna", "bert", "carl", "dora"]
 if "--list" in arguments:
     print("A renderer's own words")
-    print("\n".join(f'PRIMDIFFUSION {{"subject": "{name}"}}' for name in subjects))
+    print("\n".join(f'PRIMDIFFUSION {{"line": "{name}"}}' for name in subjects))
     sys.exit()
 subject = arguments[arguments.index("--only") + 1]
 folder = out / subject

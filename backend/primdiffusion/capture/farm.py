@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 LIST, ONLY = ("--list", "--progress", "json"), ("--progress", "none", "--only")
-"""What a renderer's command must understand: to tell its subjects, a line of MARK and JSON each; to render one."""
+"""What a renderer's command must understand: to tell its subjects, {"line": NAME} on a marked line each; to render one."""
 MARK = "PRIMDIFFUSION "
 _LINES_OF_ERROR = 5
 _SET_PARENT_DEATH_SIGNAL = 1
@@ -62,7 +62,7 @@ def subjects_of(command: Sequence[str]) -> list[str]:
     told = [json.loads(line.removeprefix(MARK)) for line in ran.stdout.splitlines() if line.startswith(MARK)]
     if ran.returncode or not told:
         raise FarmError(f"{' '.join([*command, *LIST])} names no subjects: {_tail(ran.stderr) or 'it is silent'}")
-    return [line["subject"] for line in told]
+    return [line["line"] for line in told]
 
 
 def render_on(
