@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 LIST, ONLY = ("--list", "--progress", "json"), ("--progress", "none", "--only")
-"""What a renderer's command must understand: to tell its subjects, {"line": NAME} on a marked line each; to render one."""
+"""What a renderer's command must understand: to tell its subjects, {"line": NAME} on marked lines; to render one."""
 MARK = "PRIMDIFFUSION "
 _LINES_OF_ERROR = 5
 _SET_PARENT_DEATH_SIGNAL = 1
