@@ -52,6 +52,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
     parser.add_argument("--people", type=int, default=3, help="how many are compared")
+    parser.add_argument("--cameras", type=int, default=6, help="of each of the four poses")
     parser.add_argument("--out", type=Path, help="keep people and captures here")
     parser.add_argument("--quick", action="store_true", help="one person, few views")
     parser.add_argument("--json", type=Path, help="file for the figures")
@@ -59,7 +60,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         folder = arguments.out or Path(scratch)
         assets = open_assets(arguments.assets, required_meshes())
-        count, poses, cameras = (1, 2, 3) if arguments.quick else (arguments.people, 4, 6)
+        count, poses, cameras = (1, 2, 3) if arguments.quick else (arguments.people, 4, arguments.cameras)
         for _ in make_people(assets, PeopleSet(folder / "people", FIRST_SEED, count), 1):
             pass
         figures = {"people_per_second": None if arguments.quick else _people(assets)}
