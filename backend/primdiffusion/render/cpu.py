@@ -7,10 +7,8 @@ boxes, gathers opacity and colour over a chunk of lattice points, composites the
 from __future__ import annotations
 
 import dataclasses
-import threading
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -21,12 +19,11 @@ from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu_adjoint import Gradients, Upstream, adjoin_boxes, weigh_rays
+from primdiffusion.render.cpu_compiled import on_all_threads
 from primdiffusion.render.cpu_forward import Ends, Picture, march_tiles
 from primdiffusion.render.cpu_packing import Scene, heaviest_first, pack
 from primdiffusion.render.lattice import MarchSettings, Span, check_camera, check_scene, check_unbatched, strides_of
 
-_ONE_AT_A_TIME = threading.Lock()
-"""numba's built-in thread pool, all there is on some systems, ends the process when two threads use it at once."""
 LARGEST_PAYLOAD = 256
 """Voxels along a side: cells are numbered in float32, exact below 2^24."""
 
@@ -47,7 +44,7 @@ def march_cpu(
     settings: MarchSettings = MarchSettings(),  # noqa: B008
     span: Span | None = None,
 ) -> Rendering:
-    """As `march_reference`, in float32 on the CPU with all of numba's threads.
+    """As `march_reference`, in float32 on the CPU on all processors.
 
     Differentiable, once, in every tensor of `primitives` and `camera`, from rgb, alpha and depth. The first call on a
     machine compiles (some 10 s, the first backward pass as much again); the result is cached on disk. Memory beyond the
@@ -169,11 +166,10 @@ def _scene(view: _View, inputs: Inputs, *, empty_cells: bool) -> Scene:
     rgb, density, to_local, offset, pixel_to_world = (tensor.detach() for tensor in inputs)
     if density.shape[-1] == 1:  # one voxel is the same everywhere, as two equal ones are
         rgb, density = rgb.expand(-1, -1, 2, 2, 2), density.expand(-1, 2, 2, 2)
-    with _ONE_AT_A_TIME:
-        scene = pack(
-            rgb, density, to_local, offset, view.given[0].rotation.detach(), view.stride, view.solid, pixel_to_world,
-            view.width, view.height, empty_cells=empty_cells,
-        )  # fmt: skip
+    scene = pack(
+        rgb, density, to_local, offset, view.given[0].rotation.detach(), view.stride, view.solid, pixel_to_world,
+        view.width, view.height, empty_cells=empty_cells,
+    )  # fmt: skip
     if scene.suspect:
         check_scene(*view.given)
     return scene
@@ -193,12 +189,11 @@ def _draw(
     rays = view.width * view.height
     picture = Picture(np.empty((rays, 3), np.float32), *(np.empty(rays, np.float32) for _ in range(3)))
     counts = np.empty((0, 2), np.int64) if counts is None else counts
-    with _ONE_AT_A_TIME:
-        march_tiles(
-            picture, ends, counts, scene.boxes, scene.size, scene.rectangle, scene.row_start, scene.row_box,
-            scene.tile_boxes, heaviest_first(scene.tile_boxes), numba.get_num_threads(), np.zeros(1, np.int64),
-            view.limits, scene.pixel_to_world, view.width, view.height, view.spacing, view.index_order,
-        )  # fmt: skip
+    on_all_threads(
+        march_tiles, picture, ends, counts, scene.boxes, scene.size, scene.rectangle, scene.row_start, scene.row_box,
+        scene.tile_boxes, heaviest_first(scene.tile_boxes), view.limits, scene.pixel_to_world, view.width, view.height,
+        view.spacing, view.index_order,
+    )  # fmt: skip
     rgb, alpha, depth, first_hit = map(torch.from_numpy, picture)
     return rgb, alpha, depth, first_hit
 
@@ -240,8 +235,7 @@ def _upstream(
     distance, origin, constant = np.empty((3, len(alpha)), np.float32)
     upstream = Upstream(g_rgb.contiguous().numpy(), distance, origin, constant, ends.index, ends.box, ends.share)
     fields = (value.contiguous().numpy() for value in (alpha, depth, g_alpha, g_depth))
-    with _ONE_AT_A_TIME:
-        weigh_rays(upstream, *fields, ends.rgb, spacing)
+    on_all_threads(weigh_rays, upstream, *fields, ends.rgb, spacing)
     return upstream
 
 
@@ -260,12 +254,10 @@ def _adjoin(
     )
     columns_rows = scene.rectangle.astype(np.int64)
     tiles = (columns_rows[:, 1] - columns_rows[:, 0] + 1) * (columns_rows[:, 3] - columns_rows[:, 2] + 1)
-    with _ONE_AT_A_TIME:
-        adjoin_boxes(
-            gradients, upstream, scene.boxes, size, scene.rectangle, heaviest_first(tiles), numba.get_num_threads(),
-            np.zeros(1, np.int64), view.limits, scene.pixel_to_world, view.width, view.height, view.spacing,
-            view.index_order,
-        )  # fmt: skip
+    on_all_threads(
+        adjoin_boxes, gradients, upstream, scene.boxes, size, scene.rectangle, heaviest_first(tiles), view.limits,
+        scene.pixel_to_world, view.width, view.height, view.spacing, view.index_order,
+    )  # fmt: skip
     rgb, density, to_local, offset, parts = map(torch.from_numpy, gradients)
     rgb, density = (value.unflatten(-1, (size, size, size)) for value in (rgb, density))
     if view.given[0].density.shape[-1] == 1:

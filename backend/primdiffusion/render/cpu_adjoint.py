@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 from numpy import ndarray
@@ -27,6 +26,9 @@ from primdiffusion.render.cpu_sampling import (
 )
 from primdiffusion.render.cpu_vectors import adjoin_sample
 from primdiffusion.render.tiles import TILE
+
+RAYS = 4096
+"""Rays that are weighed at a time."""
 
 
 class Upstream(NamedTuple):
@@ -56,13 +58,16 @@ class Gradients(NamedTuple):
 
 
 @kernel
-def weigh_rays(upstream, alpha, depth, g_alpha, g_depth, end_rgb, spacing):
+def weigh_rays(taken, upstream, alpha, depth, g_alpha, g_depth, end_rgb, spacing):
     """Fills distance, origin and constant from the picture's and its gradient's fields.
 
     With distance as a fourth colour: depth = sum w t / alpha.
     """
-    for ray in numba.prange(len(alpha)):
-        _weigh_ray(upstream, ray, alpha[ray], depth[ray], g_alpha[ray], g_depth[ray], end_rgb, spacing)
+    begin = take(taken) * RAYS
+    while begin < len(alpha):
+        for ray in range(begin, min(begin + RAYS, len(alpha))):
+            _weigh_ray(upstream, ray, alpha[ray], depth[ray], g_alpha[ray], g_depth[ray], end_rgb, spacing)
+        begin = take(taken) * RAYS
 
 
 @part()
@@ -94,27 +99,26 @@ class _Room(NamedTuple):
 
 @kernel
 def adjoin_boxes(
-    gradients, upstream, boxes, size, rectangle, order, threads, taken, limits, pixel_to_world, width, height, spacing,
+    taken, gradients, upstream, boxes, size, rectangle, order, limits, pixel_to_world, width, height, spacing,
     index_order,
 ):  # fmt: skip
     """Fills `gradients`, which must hold zeros. The rest as in `march_tiles`."""
     payload, geometry = len(gradients.density) > 0, len(gradients.to_local) > 0
-    for _ in numba.prange(threads):
-        room = _Room(
-            np.zeros(4 * size * size * size if payload else 0, np.float32),
-            np.zeros(8 if geometry else 0, np.float32), np.zeros(8, np.float32),
-            np.empty(LANES * TABLE_ROWS, np.float32), np.empty(3 * PIXELS, np.float32),
-            np.empty(HIT_ROWS * LANES, np.float32), np.empty(8 * SAMPLES, np.float32), np.zeros(3), np.zeros((3, 3)),
-        )  # fmt: skip
+    room = _Room(
+        np.zeros(4 * size * size * size if payload else 0, np.float32),
+        np.zeros(8 if geometry else 0, np.float32), np.zeros(8, np.float32),
+        np.empty(LANES * TABLE_ROWS, np.float32), np.empty(3 * PIXELS, np.float32),
+        np.empty(HIT_ROWS * LANES, np.float32), np.empty(8 * SAMPLES, np.float32), np.zeros(3), np.zeros((3, 3)),
+    )  # fmt: skip
+    i = take(taken)
+    while i < len(order):
+        k = order[i]
+        if rectangle[k, 0] <= rectangle[k, 1]:
+            _adjoin_box(
+                gradients, upstream, boxes, size, rectangle, k, limits, pixel_to_world, width, height, spacing,
+                index_order, room,
+            )  # fmt: skip
         i = take(taken)
-        while i < len(order):
-            k = order[i]
-            if rectangle[k, 0] <= rectangle[k, 1]:
-                _adjoin_box(
-                    gradients, upstream, boxes, size, rectangle, k, limits, pixel_to_world, width, height, spacing,
-                    index_order, room,
-                )  # fmt: skip
-            i = take(taken)
 
 
 @part()

@@ -1,8 +1,11 @@
-"""numba's compiler as the CPU marcher uses it: kernels, which Python calls, and the parts they are made of."""
+"""numba's compiler as the CPU marcher uses it: kernels, which threads run, and the parts they are made of."""
 
 from __future__ import annotations
 
+import functools
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +13,14 @@ import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core import config
 from numba.extending import intrinsic
 
 FASTMATH = frozenset({"contract", "arcp", "nsz", "reassoc"})
 """Rounding may differ from the source's; NaN and infinity keep their meaning."""
+
+THREADS: int = vars(config)["NUMBA_NUM_THREADS"]
+"""All that this process may run on, or as many as the environment variable of that name says."""
 
 _njit: Any = numba.njit  # its overloads do not know all options
 _compiled_call: Any = intrinsic  # its callers do not give the typing context, nor see the real types
@@ -23,12 +30,12 @@ Function = Callable[..., Any]
 
 
 def kernel(function: Function) -> Any:
-    """Compiled for all threads, and cached on disk.
+    """Compiled for `on_all_threads` to call, and cached on disk.
 
     numba 0.68 compiles a cached kernel again when the kernel's own file has changed, but not when a function or a
     constant it takes from another file has. Here the files that hold them are part of the cache's stamp.
     """
-    dispatcher = _njit(parallel=True, cache=True, fastmath=set(FASTMATH), error_model="numpy")(function)
+    dispatcher = _njit(nogil=True, cache=True, fastmath=set(FASTMATH), error_model="numpy")(function)
     dispatcher._cache._cache_file._source_stamp = _stamp()
     return dispatcher
 
@@ -47,6 +54,27 @@ def part(*, inline: bool = False) -> Callable[[Function], Any]:
         fastmath=set(FASTMATH),
         error_model="numpy",
     )
+
+
+def on_all_threads(function: Any, *arguments: Any) -> None:
+    """Calls the kernel `function(taken, *arguments)` on all threads at once, which share the work by `take`.
+
+    These are Python's threads and not numba's: its OpenMP threads wait by spinning, which on a busy machine costs more
+    than a picture and takes the processors from torch's; and its own built-in pool ends the process when two threads
+    use it at once.
+    """
+    taken = np.zeros(1, np.int64)
+    others = [_pool(os.getpid()).submit(function, taken, *arguments) for _ in range(THREADS - 1)]
+    function(taken, *arguments)
+    for other in others:
+        if not other.cancel():  # one that has not begun has nothing left to do
+            other.result()
+
+
+@functools.cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Threads of this process: those of the one it was forked from are not there."""
+    return ThreadPoolExecutor(THREADS, thread_name_prefix=f"march-{process}")
 
 
 @part(inline=True)

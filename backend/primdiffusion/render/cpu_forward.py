@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float32, Int32, Int64, UInt64
 from numpy import ndarray
@@ -82,31 +81,30 @@ class _Room(NamedTuple):
 
 @kernel
 def march_tiles(
-    picture, ends, counts, boxes, size, rectangle, row_start, row_box, seen, order, threads, taken, limits,
+    taken, picture, ends, counts, boxes, size, rectangle, row_start, row_box, seen, order, limits,
     pixel_to_world, width, height, spacing, index_order,
 ):  # fmt: skip
-    """Draws all tiles in their `order`, each of which has `seen` so many boxes; `taken` as in `take`.
+    """Draws all tiles in their `order`, each of which has `seen` so many boxes.
 
     limits [r, 2]: first and last lattice index of each ray, may be empty.
     counts [tiles, 2], may be empty: samples evaluated, and samples up to where rays become opaque.
     """
     most = seen.max()
     blocks = (most + LANES - 1) // LANES
-    for _ in numba.prange(threads):
-        room = _Room(
-            np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64),
-            np.empty(blocks * LANES * TABLE_ROWS, np.float32), np.empty(3 * PIXELS, np.float32),
-            np.empty(blocks * LANES * HIT_ROWS, np.float32),
-            np.empty((most, COLUMNS), np.int64), np.empty(most, np.float32), np.empty(most, np.uint64),
-            np.empty(4 * (CHUNK + 1), np.float32), np.empty(8 * SAMPLES, np.float32),
+    room = _Room(
+        np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64),
+        np.empty(blocks * LANES * TABLE_ROWS, np.float32), np.empty(3 * PIXELS, np.float32),
+        np.empty(blocks * LANES * HIT_ROWS, np.float32),
+        np.empty((most, COLUMNS), np.int64), np.empty(most, np.float32), np.empty(most, np.uint64),
+        np.empty(4 * (CHUNK + 1), np.float32), np.empty(8 * SAMPLES, np.float32),
+    )  # fmt: skip
+    i = take(taken)
+    while i < len(order):
+        _march_tile(
+            picture, ends, counts, boxes, size, rectangle, row_start, row_box, order[i], seen[order[i]], limits,
+            pixel_to_world, width, height, spacing, index_order, room,
         )  # fmt: skip
         i = take(taken)
-        while i < len(order):
-            _march_tile(
-                picture, ends, counts, boxes, size, rectangle, row_start, row_box, order[i], seen[order[i]], limits,
-                pixel_to_world, width, height, spacing, index_order, room,
-            )  # fmt: skip
-            i = take(taken)
 
 
 @part()

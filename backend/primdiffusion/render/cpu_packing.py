@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int32, Int64
 from numpy import ndarray
 from torch import Tensor
 
-from primdiffusion.render.cpu_compiled import kernel, part
+from primdiffusion.render.cpu_compiled import kernel, on_all_threads, part, take
 from primdiffusion.render.cpu_sampling import PackedBoxes
 from primdiffusion.render.lattice import ORTHOGONAL
 from primdiffusion.render.tiles import NOTHING, boxes_per_tile, row_lists, tile_rectangle, tiles_across
@@ -60,8 +59,8 @@ def pack(
     rectangle, nearest = np.empty((k, 4), np.int32), np.empty(k)
     suspect = np.empty(k, np.bool_)
     local, away, to_world = (value.contiguous().numpy() for value in (to_local, offset, pixel_to_world))
-    _pack_boxes(
-        voxels, low, high, rectangle, nearest, suspect,
+    on_all_threads(
+        _pack_boxes, voxels, low, high, rectangle, nearest, suspect,
         rgb.contiguous().numpy().reshape(-1), density.contiguous().numpy().reshape(-1), size, local,
         away, rotation.contiguous().numpy(), solid.numpy(),
         np.linalg.inv(to_world), across, down, empty_cells,
@@ -82,26 +81,39 @@ def heaviest_first(work: Int64[ndarray, "n"]) -> Int64[ndarray, "n"]:
 
 @kernel
 def _pack_boxes(
-    voxels, low, high, rectangle, nearest, suspect,
+    taken, voxels, low, high, rectangle, nearest, suspect,
     rgb, density, size, to_local, offset, rotation, solid, world_to_pixel, across, down, empty_cells,
 ):  # fmt: skip
+    corners, to_world = np.empty((8, 3)), np.empty((3, 3))
+    k = take(taken)
+    while k < len(solid):
+        _pack_box(
+            voxels, low[k], high[k], rectangle[k], nearest, suspect, rgb, density, size, k, to_local[k], offset[k],
+            rotation[k], solid[k], world_to_pixel, across, down, empty_cells, corners, to_world,
+        )  # fmt: skip
+        k = take(taken)
+
+
+@part()
+def _pack_box(
+    voxels, low, high, rectangle, nearest, suspect, rgb, density, size, k, to_local, offset, rotation, solid,
+    world_to_pixel, across, down, empty_cells, corners, to_world,
+):  # fmt: skip
+    """Packs box k, of which some arguments are the rows; the last two are room to work in."""
     count = size**3
-    for k in numba.prange(len(solid)):
-        own = density[k * count : (k + 1) * count]
-        colour = rgb[3 * k * count : 3 * (k + 1) * count]
-        suspect[k] = _is_suspect(own, colour, to_local[k], offset[k], rotation[k])
-        rectangle[k, 0], rectangle[k, 1], rectangle[k, 2], rectangle[k, 3] = NOTHING
-        for axis in range(3):
-            low[k, axis], high[k, axis] = -1, 1
-        if not solid[k] or not (empty_cells or _shrink(low[k], high[k], own, size)):
-            continue
-        corners, to_world = np.empty((8, 3)), np.empty((3, 3))
-        _invert(to_world, to_local[k])
-        nearest[k] = _place_corners(corners, to_world, low[k], high[k], offset[k], world_to_pixel)
-        columns_rows = tile_rectangle(corners, across, down)
-        rectangle[k, 0], rectangle[k, 1], rectangle[k, 2], rectangle[k, 3] = columns_rows
-        if columns_rows[0] <= columns_rows[1]:
-            _interleave(voxels[4 * k * count : 4 * (k + 1) * count], own, colour, count)
+    own = density[k * count : (k + 1) * count]
+    colour = rgb[3 * k * count : 3 * (k + 1) * count]
+    suspect[k] = _is_suspect(own, colour, to_local, offset, rotation)
+    rectangle[0], rectangle[1], rectangle[2], rectangle[3] = NOTHING
+    for axis in range(3):
+        low[axis], high[axis] = -1, 1
+    if not solid or not (empty_cells or _shrink(low, high, own, size)):
+        return
+    _invert(to_world, to_local)
+    nearest[k] = _place_corners(corners, to_world, low, high, offset, world_to_pixel)
+    rectangle[0], rectangle[1], rectangle[2], rectangle[3] = tile_rectangle(corners, across, down)
+    if rectangle[0] <= rectangle[1]:
+        _interleave(voxels[4 * k * count : 4 * (k + 1) * count], own, colour, count)
 
 
 @part()
