@@ -9,11 +9,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from primdiffusion.body.model import BodyPose, J
 
 POSE_KEYS = ("pose", "poses", "theta")
 TRANSLATION_KEYS = ("translation", "trans", "transl")
+BODY_NUMBERS = 66
+"""Axis-angle numbers of the 22 joints before the hands, the same in SMPL, SMPL-H and SMPL-X."""
 
 
 class PoseFileError(ValueError):
@@ -24,7 +27,9 @@ def read_pose(path: str | Path, frame: int = 0) -> BodyPose:
     """The pose in a .json or .npz file, from one `frame` where it holds several (AMASS: `poses` [F, 156], `trans`).
 
     JSON: a list of 72 numbers or 24 rows of 3, or an object with one under "pose" and, if wanted, "translation" in
-    metres. Joints beyond the 24th (hands of SMPL-H and SMPL-X) are left out. Raises FileNotFoundError or PoseFileError.
+    metres. Of SMPL-H and SMPL-X the body's 22 joints are taken (`body_theta`).
+
+    Raises FileNotFoundError or PoseFileError.
     """
     path = Path(path)
     if not path.is_file():
@@ -45,8 +50,11 @@ def pose_from_numbers(content: Any, name: str, frame: int = 0) -> BodyPose:
         pose = _first(content, POSE_KEYS, None)
         translation = _first(content, TRANSLATION_KEYS, translation)
     try:
-        theta = _frame(np.asarray(pose, dtype=np.float32), 3 * J, frame)
-        move = _frame(np.asarray(translation, dtype=np.float32), 3, frame)
+        theta = np.asarray(pose, dtype=np.float32)
+        theta = body_theta(_frame(_a_row_a_pose(theta), frame))
+        move = _frame(np.asarray(translation, dtype=np.float32), frame)[:3].copy()
+        if len(move) < 3:
+            raise ValueError(f"{len(move)} numbers instead of 3")
     except (TypeError, ValueError, IndexError) as e:
         raise PoseFileError(
             f"{name} holds no pose: it needs {3 * J} axis-angle numbers ({J} joints x 3, radians)"
@@ -65,12 +73,26 @@ def _first(content: dict[str, Any], keys: tuple[str, ...], default: Any) -> Any:
     return next((content[key] for key in keys if key in content), default)
 
 
-def _frame(values: np.ndarray, wanted: int, frame: int) -> np.ndarray:
-    """One row of `wanted` values: `values` itself, its rows of joints, or one frame of several."""
-    if values.ndim == 2 and values.shape[1] == 3 and wanted > 3:
-        values = values.reshape(-1)
-    if values.ndim >= 2:
-        values = values[frame].reshape(-1)
-    if len(values) < wanted:
-        raise ValueError(f"{len(values)} numbers instead of {wanted}")
-    return values[:wanted].copy()
+def body_theta(values: NDArray) -> NDArray:
+    """SMPL's 72 numbers [..., 72] out of a pose's [..., n]: SMPL itself, 22 joints without hands, SMPL-H or SMPL-X.
+
+    SMPL-H and SMPL-X have jaw, eyes or fingers where SMPL has its two hand joints, which therefore stay at rest.
+    Raises ValueError for another n.
+    """
+    count = values.shape[-1]
+    if count == 3 * J:
+        return values.copy()
+    if count != BODY_NUMBERS and (count < 3 * J or count % 3):
+        raise ValueError(f"{count} numbers instead of {3 * J}")
+    hands = np.zeros((*values.shape[:-1], 3 * J - BODY_NUMBERS), values.dtype)
+    return np.concatenate([values[..., :BODY_NUMBERS], hands], axis=-1)
+
+
+def _a_row_a_pose(values: NDArray) -> NDArray:
+    """A pose given as rows of joints in one row."""
+    return values.reshape(-1) if values.ndim == 2 and values.shape[1] == 3 else values
+
+
+def _frame(values: NDArray, frame: int) -> NDArray:
+    """The numbers of one frame of several, or of the only one."""
+    return values[frame].reshape(-1) if values.ndim >= 2 else values

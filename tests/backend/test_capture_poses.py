@@ -35,7 +35,7 @@ def test_frame_0_of_the_built_in_poses_is_near_t_and_all_differ():
 
 
 def test_every_form_of_file_is_the_same_motion(tmp_path):
-    np.savez(tmp_path / "a.npz", poses=np.pad(THETA, ((0, 0), (0, 84))), trans=np.ones((5, 3)), gender="neutral")
+    np.savez(tmp_path / "a.npz", poses=THETA, trans=np.ones((5, 3)), gender="neutral")
     np.savez(tmp_path / "b.npz", global_orient=THETA[:, :3], body_pose=THETA[:, 3:], transl=np.ones((5, 3)))
     np.save(tmp_path / "c.npy", THETA)
     np.save(tmp_path / "d.npy", THETA.reshape(5, 24, 3))
@@ -58,13 +58,31 @@ def test_a_captures_parameters_are_a_motion(tmp_path):
     assert_turns(read_motion(tmp_path / layout.SMPL_FOLDER / layout.SMPL_PLAIN_FILE))
 
 
-def test_amass_files_are_turned_upright(tmp_path):
+@pytest.mark.parametrize("rate", [{}, {"mocap_framerate": 120.0}])
+def test_amass_files_are_turned_upright_with_and_without_a_frame_rate(tmp_path, rate):
     poses = np.zeros((1, 156))
     poses[0, 0] = np.pi / 2  # upright where z is up
-    np.savez(tmp_path / "a.npz", poses=poses, trans=[[1.0, 2, 3]], mocap_framerate=120.0)
+    np.savez(tmp_path / "a.npz", poses=poses, trans=[[1.0, 2, 3]], **rate)
     motion = read_motion(tmp_path / "a.npz")
     assert torch.allclose(motion.joint_rotation[0, 0], torch.eye(3), atol=1e-6)
-    assert torch.allclose(motion.translation, torch.tensor([[1.0, 3, -2]]))
+    pelvis = default_body().shape(torch.zeros(1)).joints[0]
+    placed = torch.tensor([1.0, 2, 3]) + pelvis
+    assert torch.allclose(motion.translation + pelvis, torch.stack([placed[0], placed[2], -placed[1]]), atol=1e-6)
+
+
+@pytest.mark.parametrize("numbers", [66, 156, 165])
+def test_fingers_are_not_taken_for_smpls_hand_joints(tmp_path, numbers):
+    poses = np.full((5, numbers), 0.7)
+    poses[:, :66] = THETA[:, :66]
+    np.save(tmp_path / "a.npy", poses)
+    assert_turns(read_motion(tmp_path / "a.npy"), np.pad(THETA[:, :66], ((0, 0), (0, 6))))
+
+
+@pytest.mark.parametrize("moves", [[[0, 0, 0]] * 4, [[0, 0, float("nan")]] * 5])
+def test_translations_that_do_not_fit_are_refused_by_name(tmp_path, moves):
+    (tmp_path / "a.json").write_text(json.dumps({"poses": THETA.tolist(), "trans": moves}))
+    with pytest.raises(MotionFileError, match=r"a\.json has 5 frames"):
+        read_motion(tmp_path / "a.json")
 
 
 @pytest.mark.parametrize(

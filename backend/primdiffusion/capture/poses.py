@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.capture.plain_npz import read_npz
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
+from primdiffusion.pose_file import body_theta
 
-MOTION_KEYS = ("poses", "pose", "theta", "global_orient", "body_pose")
-TRANSLATION_KEYS = ("trans", "transl", "translation")
-AMASS_KEYS = ("mocap_framerate", "mocap_frame_rate")
-"""Their presence tells a file of AMASS, whose z is up."""
+POSES, ROOT, REST = ("poses", "pose", "theta", "fullpose"), ("global_orient", "root_orient"), ("body_pose", "pose_body")
+TRANSLATIONS = ("trans", "transl", "translation")
+KEYS = (*POSES, *ROOT, *REST, *TRANSLATIONS)
+CLEARLY_UP = 0.6
+"""Mean cosine between the pelvis' own up and an axis from which on that axis counts as up."""
 MOST_CANDIDATES = 2000
 """Frames among which few are chosen; of more, these many evenly spaced."""
 BUILT_IN = Path(__file__).parent / "data" / "poses.json"
@@ -39,21 +41,25 @@ def built_in_poses() -> BodyPose:
 def read_motion(path: str | Path) -> BodyPose:
     """Every frame of a file: rotations [F, 24, 3, 3], translations [F, 3] in metres, y up.
 
-    .npz of AMASS (its z becomes y; hands are left out), of "poses" or "pose" [F, >= 72], or of "global_orient" and
-    "body_pose"; .npy or .json of 72 numbers a frame. Raises FileNotFoundError, NpzError or MotionFileError.
+    .npz of AMASS, of "poses" or "pose" [F, 72 or more], or of "global_orient" and "body_pose"; .npy or .json of the
+    same. Hands of SMPL-H and SMPL-X are left out (`pose_file.body_theta`). AMASS (its names are "trans" with "poses"
+    or "pose_body") is turned so that y is up. The extension has a reader of its own, for it imports nothing of the
+    backend; a test holds both to the same poses. Raises FileNotFoundError, NpzError or MotionFileError.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no pose file {path}: check the path")
-    if path.suffix == ".npz":
-        content = read_npz(path, (), (*MOTION_KEYS, *TRANSLATION_KEYS, *AMASS_KEYS))
-    else:
-        content = _read_plain(path)
+    content = read_npz(path, (), KEYS) if path.suffix == ".npz" else _read_plain(path)
     turns = _turns(path, content)
-    move = next((content[key] for key in TRANSLATION_KEYS if key in content), np.zeros((len(turns), 3)))
-    move = np.broadcast_to(np.asarray(move, np.float64).reshape(-1, 3), (len(turns), 3))
-    pose = _as_pose(turns, move)
-    return _upright(pose) if any(key in content for key in AMASS_KEYS) else pose
+    move = np.asarray(_first(content, TRANSLATIONS, np.zeros(3)), np.float64)
+    if move.size not in (3, 3 * len(turns)) or not np.isfinite(move).all():
+        raise MotionFileError(
+            f"{path} has {len(turns)} frames of poses but translations of shape {move.shape}, or not finite: export it "
+            "again"
+        )
+    pose = _as_pose(turns, np.broadcast_to(move.reshape(-1, 3), (len(turns), 3)))
+    is_amass = path.suffix == ".npz" and "trans" in content and ("poses" in content or "pose_body" in content)
+    return _upright(pose) if is_amass else pose
 
 
 def choose_poses(files: Sequence[Path], count: int, seed: int) -> BodyPose:
@@ -107,39 +113,66 @@ def _read_plain(path: Path) -> dict[str, NDArray]:
         content = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(content, dict):
             content = {"poses": content}
-        keys = (*MOTION_KEYS, *TRANSLATION_KEYS)
-        return {key: np.asarray(content[key], np.float64) for key in keys if key in content}
+        return {key: np.asarray(content[key], np.float64) for key in KEYS if key in content}
     except (ValueError, TypeError, OSError, EOFError, RecursionError) as e:
         raise MotionFileError(f"{path} is no pose file ({e}): give .npz, .npy or .json of axis-angle numbers") from e
 
 
 def _turns(path: Path, content: Mapping[str, NDArray]) -> NDArray[np.float64]:
     """Axis-angle vectors [F, 24, 3]."""
-    wanted = f"{3 * J} axis-angle numbers a frame ({J} joints x 3, radians)"
     try:
-        if "body_pose" in content:
-            body = np.asarray(content["body_pose"], np.float64)
-            body = body.reshape(-1, 3 * (J - 1)) if body.size % (3 * (J - 1)) == 0 else body.reshape(-1, 63)
-            body = np.pad(body, ((0, 0), (0, 3 * (J - 1) - body.shape[1])))
-            root = np.asarray(content.get("global_orient", np.zeros((len(body), 3))), np.float64).reshape(-1, 3)
-            values = np.concatenate([root, body], axis=1)
-        else:
-            values = np.asarray(next(content[key] for key in MOTION_KEYS if key in content), np.float64)
-            values = values[None] if values.ndim == 1 or values.shape == (J, 3) else values
-            values = values.reshape(len(values), -1)
-            if values.shape[1] < 3 * J:
-                raise ValueError(f"{values.shape[1]} numbers")
-        turns = values[:, : 3 * J].reshape(-1, J, 3)
-    except (StopIteration, ValueError, TypeError) as e:
-        raise MotionFileError(f"{path} holds no poses ({e or 'none of the usual keys'}): it needs {wanted}") from e
+        values = _rows(_first(content, REST, None), _first(content, ROOT, None), _first(content, POSES, None))
+        turns = body_theta(values).reshape(-1, J, 3)
+    except (ValueError, TypeError) as e:
+        raise MotionFileError(
+            f"{path} holds no poses ({e}): it needs {3 * J} axis-angle numbers a frame ({J} joints x 3, radians)"
+        ) from e
     if not len(turns) or not np.isfinite(turns).all():
         raise MotionFileError(f"{path} holds no frame, or NaN or infinite numbers: export it again")
     return turns
 
 
+def _rows(rest: NDArray | None, root: NDArray | None, poses: NDArray | None) -> NDArray[np.float64]:
+    """A row a frame [F, n], the pelvis first, of poses in two parts or whole."""
+    if rest is None:
+        if poses is None:
+            raise ValueError("none of the usual names")
+        return _frames(poses)
+    body = _frames(rest)
+    turn = np.zeros(3) if root is None else np.asarray(root, np.float64)
+    if turn.size not in (3, 3 * len(body)):
+        raise ValueError(f"global_orient of shape {turn.shape} for {len(body)} frames")
+    return np.concatenate([np.broadcast_to(turn.reshape(-1, 3), (len(body), 3)), body], axis=1)
+
+
+def _frames(values: NDArray) -> NDArray[np.float64]:
+    values = np.asarray(values, np.float64)
+    values = values[None] if values.ndim == 1 or (values.ndim == 2 and values.shape[1] == 3) else values
+    return values.reshape(len(values), -1)
+
+
+def _first(content: Mapping[str, NDArray], keys: Sequence[str], default: NDArray | None) -> NDArray | None:
+    return next((content[key] for key in keys if key in content), default)
+
+
 def _upright(pose: BodyPose) -> BodyPose:
-    """From z up to y up: a quarter turn about x."""
-    turn = pose.joint_rotation.new_tensor([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    """With y up: people stand, sit and walk more than they lie, so the mean of the pelvis' up is the world's."""
+    mean = pose.joint_rotation[:, 0, :, 1].mean(0)
+    axis = int(mean.abs().argmax())
+    if (axis == 1 and mean[1] > 0) or mean[axis].abs() < CLEARLY_UP:
+        return pose
+    turn = _shortest_turn_to_y(axis, float(mean[axis].sign())).to(pose.joint_rotation)
     rotation = pose.joint_rotation.clone()
     rotation[:, 0] = turn @ rotation[:, 0]
-    return BodyPose(rotation, pose.translation @ turn.T)
+    pelvis = default_body().shape(torch.zeros(1)).joints[0]  # a translation moves a body whose pelvis rests there
+    return BodyPose(rotation, (pose.translation + pelvis) @ turn.T - pelvis)
+
+
+def _shortest_turn_to_y(axis: int, sign: float) -> Float[torch.Tensor, "3 3"]:
+    """The rotation that takes a world axis to y; half a turn, from -y, is about z."""
+    if axis == 1:
+        return torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+    turn = torch.zeros(3, 3)
+    other = 2 - axis
+    turn[1, axis], turn[axis, 1], turn[other, other] = sign, -sign, 1.0
+    return turn
