@@ -10,12 +10,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from primdiffusion.body.model import JOINT_NAMES, J
+from primdiffusion.body.model import JOINT_NAMES, J, default_body
 from primdiffusion.capture.glb import Glb, GlbError, read_glb
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 
 SUBJECT_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
+FARTHEST = 10.0
+"""Metres from the origin within which all of a person lies; one lost vertex would send the cameras far away."""
+LARGEST_BETA = 20.0
+"""Standard deviations; beyond, joints lie outside of any body."""
 OURS = "primdiffusion"
 """Key of the extras that hold betas and body."""
 
@@ -74,8 +78,12 @@ def _betas(glb: Glb) -> Float[np.ndarray, "n"]:
     if extras.get("body", "default") != "default":
         raise GlbError(f"{glb.path} is rigged on the body {extras['body']!r}: only the default body is known here")
     betas = np.asarray(extras["betas"], np.float64)
-    if betas.ndim != 1 or not np.isfinite(betas).all():
-        raise GlbError(f"{glb.path} has betas of shape {betas.shape}, or not finite: make the person again")
+    components = default_body().shape_basis.shape[-1]
+    if betas.ndim != 1 or len(betas) > components or not (np.abs(betas) <= LARGEST_BETA).all():
+        raise GlbError(
+            f"{glb.path} has betas of shape {betas.shape}, not up to {components} within {LARGEST_BETA:g} of 0: "
+            "make the person again"
+        )
     return betas
 
 
@@ -114,8 +122,11 @@ def _part(glb: Glb, name: str, primitive: dict[str, Any], joints: Int[np.ndarray
     index = joints[glb.array(attributes["JOINTS_0"]).astype(np.int64)]
     weight = glb.array(attributes["WEIGHTS_0"]).astype(np.float64)
     total = weight.sum(1, keepdims=True)
-    if not np.isfinite(vertices).all() or not (total > 0).all():
-        raise GlbError(f"{glb.path}: {name!r} has vertices that are not finite or follow no joint: make it again")
+    if not (np.abs(vertices) < FARTHEST).all() or not (total > 0).all():
+        raise GlbError(
+            f"{glb.path}: {name!r} has vertices {FARTHEST:g} m and more from the origin, not finite, or that follow no "
+            "joint: make it again"
+        )
     return TexturedPart(
         name=name,
         vertices=vertices,
