@@ -19,7 +19,7 @@ from .fit import fit_surface, vertex_normals
 from .parameters import Parameters, read_parameters
 from .registration import Registration, register
 from .scan_files import ScanError, ScanFile
-from .surface_sample import mesh_points
+from .skinned_surface import mesh_points
 from .upright import axis_name, scale_note
 
 _FAR_M, _LOOSE_M = 0.10, 0.06

@@ -47,8 +47,8 @@ def main(argv: Sequence[str]) -> int:
     with _stdout_of_our_own() as write:
         say = _saying_json(write) if options.progress == "json" else write
         try:
-            with _stopped_by_signals():
-                return _run(options, say)
+            with _stopped_by_signals() as stop:
+                return _run(options, say, stop)
         except (CaptureFolderError, CaptureError, ScanError, OSError, ValueError) as error:
             print(f"capture: {error}", file=sys.stderr, flush=True)
             return UNUSABLE
@@ -76,7 +76,7 @@ def scans_in(folders: Sequence, only: Sequence[str] = ()) -> list[ScanFile]:
     return [found[name] for name in sorted(found) if not only or name in only]
 
 
-def _run(options: argparse.Namespace, say: Say) -> int:
+def _run(options: argparse.Namespace, say: Say, stop: threading.Event) -> int:
     if options.verify or (options.repair and not options.people):
         return _check(options, say)
     if options.repair and options.out.exists():
@@ -88,7 +88,9 @@ def _run(options: argparse.Namespace, say: Say) -> int:
         for scan in scans[index::count]:
             say(scan.name)
         return DONE
-    return _render(options, settings, scans, say)
+    if options.while_stdin:
+        _set_at_end_of_stdin(stop)
+    return _render(options, settings, scans, say, stop)
 
 
 def _check(options: argparse.Namespace, say: Say) -> int:
@@ -99,8 +101,10 @@ def _check(options: argparse.Namespace, say: Say) -> int:
     return FAILED if wrong else DONE
 
 
-def _render(options: argparse.Namespace, settings: CaptureSettings, scans: list[ScanFile], say: Say) -> int:
-    report, told, stop = Report(), 0.0, _end_of_stdin() if options.while_stdin else threading.Event()
+def _render(
+    options: argparse.Namespace, settings: CaptureSettings, scans: list[ScanFile], say: Say, stop: threading.Event
+) -> int:
+    report, told = Report(), 0.0
     with contextlib.closing(run(bpy.context, settings, scans, report)) as steps:
         for progress in steps:
             if options.progress == "json":
@@ -161,30 +165,33 @@ def _stdout_of_our_own() -> Iterator[Callable[[str], None]]:
 
 
 @contextlib.contextmanager
-def _stopped_by_signals() -> Iterator[None]:
-    """Ctrl-C and a polite kill take effect between views, and clean up."""
+def _stopped_by_signals() -> Iterator[threading.Event]:
+    """Set by Ctrl-C or a polite kill, for the time between views; the second one ends the process at once.
 
-    def stop(*_: object) -> None:
-        raise _Stopped
+    An exception would not do: raised while Cycles calls Python, it is printed and forgotten.
+    """
+    stop = threading.Event()
+
+    def note(*_: object) -> None:
+        if stop.is_set():
+            os._exit(CANCELLED)
+        stop.set()
 
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield stop
         return
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield
+        yield stop
     finally:
         for number, handler in before.items():
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
 
-def _end_of_stdin() -> threading.Event:
-    ended = threading.Event()
-
+def _set_at_end_of_stdin(stop: threading.Event) -> None:
     def wait() -> None:
-        while os.read(0, 4096):  # not sys.stdin, whose lock the interpreter wants when it ends
+        while sys.stdin.buffer.read(4096):
             pass
-        ended.set()
+        stop.set()
 
     threading.Thread(target=wait, name="capture stdin", daemon=True).start()
-    return ended

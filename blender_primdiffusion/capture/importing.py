@@ -38,5 +38,7 @@ def _import_obj(path: str) -> None:
 
 
 def _last_line(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    """Of an importer's traceback the exception; Blender's operators add the place in their own code."""
+    lines = [line.strip() for line in str(error).splitlines()]
+    lines = [line for line in lines if line and not line.startswith("Location: ")]
     return (lines[-1] if lines else type(error).__name__).removeprefix("Error: ")

@@ -88,6 +88,7 @@ def run(
     index, count = settings.shard
     mine = everybody[index::count]
     clock = _Clock(len(mine) * len(poses) * settings.camera_count, report)
+    clock.tell(*(f"{failure['what']}: {failure['why']}" for failure in report.failed))
     try:
         for scan_file in mine:
             yield from _try_subject(context, settings, scan_file, poses, body, load, clock)

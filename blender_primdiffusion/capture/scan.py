@@ -34,7 +34,7 @@ from .rigged import (
 )
 from .scan_files import ScanError, ScanFile, find_scans, own_betas
 from .skeleton import Skeleton
-from .surface_sample import SurfaceSample, mesh_points, sample_surface
+from .skinned_surface import SkinnedSurface, mesh_points, skinned_surface
 from .textures import complete_colours
 from .upright import stand_up
 
@@ -74,7 +74,7 @@ class Scan:
         self.notes = list(notes)
         """What was found out and done on loading, a sentence each."""
         self._belongings = belongings
-        self._sample: SurfaceSample = sample_surface(self.objects, skeleton.names)
+        self._surface: SkinnedSurface = skinned_surface(self.objects, skeleton.names)
 
     def pose(self, rotations: NDArray, translation: NDArray) -> NDArray[np.float64]:
         """Take a pose: joint rotations [24, 3, 3] about the rest axes, y up, and a translation [3] in metres.
@@ -94,11 +94,8 @@ class Scan:
 
     def bounds(self, rotations: NDArray, translations: NDArray) -> NDArray[np.float64]:
         """The outermost points [n, 3] of the surface over poses [F, 24, 3, 3] and [F, 3], y up, metres."""
-        found = [
-            self._sample.outermost(self.skeleton.transforms(*pose))
-            for pose in zip(rotations, translations, strict=True)
-        ]
-        return np.concatenate(found)
+        poses = zip(rotations, translations, strict=True)
+        return self._surface.outermost(self.skeleton.transforms(*pose) for pose in poses)
 
     def joint_of_group(self, name: str) -> int | None:
         """The SMPL joint that moves the vertex group of this name: the bone's, or its nearest parent's."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
 import struct
 from collections.abc import Iterator
@@ -85,10 +86,18 @@ def own_betas(path: Path) -> tuple[list[float], str] | None:
 
 
 def _models(folder: Path) -> Iterator[Path]:
-    for path in sorted(folder.rglob("*")):
-        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
-        if path.suffix.lower() in ENDINGS and path.is_file() and not hidden:
-            yield path
+    """Files of scans, sorted; linked folders are gone into, each folder once."""
+    entered = set()
+    for inner, folders, names in os.walk(folder, followlinks=True):
+        if os.path.realpath(inner) in entered:
+            folders.clear()
+            continue
+        entered.add(os.path.realpath(inner))
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted(names):
+            path = Path(inner, name)
+            if path.suffix.lower() in ENDINGS and path.is_file() and not name.startswith("."):
+                yield path
 
 
 def _rank(path: Path) -> int:

@@ -12,6 +12,8 @@ from .scan_files import ScanError
 
 SHORTEST, TALLEST = 0.5, 2.6
 """People's heights in metres, toddlers to giants with hats: less than a power of ten apart."""
+_WIDEST = 10.0
+"""Metres that a person with whatever it holds may reach: one stray vertex would send the cameras far away."""
 _UNITS = {1.0: "", 0.01: "centimetres", 0.001: "millimetres", 100.0: "hundreds of metres", 1000.0: "kilometres"}
 
 
@@ -35,6 +37,9 @@ def stand_up(axes: NDArray, points: NDArray, name: str) -> Standing:
     along = np.asarray(points) @ up
     height = float(along.max() - along.min())
     scale = unit_of(height, name)
+    reach = float(np.ptp(points, axis=0).max()) * scale
+    if not reach <= _WIDEST:
+        raise ScanError(f"{name} has points {reach:.4g} m apart: remove what is not the person, or lost vertices")
     notes = [f"{height * scale:.2f} m tall", scale_note(scale)]
     tilt = np.degrees(np.arccos(np.clip(up[2], -1, 1)))
     if tilt > 1:

@@ -34,6 +34,14 @@ def test_a_folder_of_folders_and_files_is_searched(tmp_path):
     assert found[3].parameters is None
 
 
+def test_linked_folders_are_searched_once(tmp_path):
+    touch(tmp_path / "far" / "person_000000" / "person.glb")
+    (tmp_path / "near").mkdir()
+    (tmp_path / "near" / "person_000000").symlink_to(tmp_path / "far" / "person_000000", target_is_directory=True)
+    (tmp_path / "near" / "round").symlink_to(tmp_path / "near", target_is_directory=True)
+    assert [scan.name for scan in find_scans(tmp_path / "near")] == ["person_000000"]
+
+
 def test_names_are_made_fit_for_folders_and_unlike_each_other(tmp_path):
     touch(
         tmp_path / "a" / "Ann Müller.glb",

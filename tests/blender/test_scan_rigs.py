@@ -13,6 +13,7 @@ import scan_fixtures
 import synthetic
 
 from blender_primdiffusion.capture.body import read_body
+from blender_primdiffusion.capture.rig import bounding_sphere
 from blender_primdiffusion.capture.scan import Scan, ScanError, find_scans, load_scan
 from blender_primdiffusion.motion.bones import RIGS, UnknownBonesError, map_bones
 from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle
@@ -101,8 +102,9 @@ def test_bounds_are_those_of_what_blender_draws(tmp_path, empty_scene):
     outermost = scan.bounds(ROTATIONS[None], MOVE[None])
     scan.pose(ROTATIONS, MOVE)
     seen = scan_fixtures.evaluated(scan.objects)
-    np.testing.assert_allclose(outermost.min(0), seen.min(0), atol=0.01)
-    np.testing.assert_allclose(outermost.max(0), seen.max(0), atol=0.01)
+    np.testing.assert_allclose(outermost.min(0), seen.min(0), atol=2e-5)
+    np.testing.assert_allclose(outermost.max(0), seen.max(0), atol=2e-5)
+    np.testing.assert_allclose(bounding_sphere(outermost)[1], bounding_sphere(seen)[1], atol=2e-5)
 
 
 def own_person(path: Path) -> Path:
@@ -239,3 +241,22 @@ def test_names_that_are_no_rigs_are_refused():
         map_bones(["a", "b"])
     with pytest.raises(UnknownBonesError, match="'left_knee'"):
         map_bones([name for name in JOINT_NAMES if name != "left_knee"])
+
+
+def test_a_lost_vertex_is_named(tmp_path, empty_scene):
+    mesh, _ = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
+    mesh.data.vertices[0].co.x = 1e6
+    with pytest.raises(ScanError, match="remove what is not the person"):
+        load(scan_fixtures.save(tmp_path / "anna.glb"))
+
+
+def test_an_importers_failure_is_told_by_its_exception_not_its_place(tmp_path, empty_scene):
+    (tmp_path / "anna.glb").write_bytes(glb_of({"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [7]}]}))
+    with pytest.raises(ScanError, match=r"cannot be imported: KeyError"):
+        load(tmp_path / "anna.glb")
+
+
+def glb_of(content: dict) -> bytes:
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text
