@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -245,6 +246,22 @@ def test_a_child_whose_parent_is_gone_stops(only_good, tmp_path):
     child.stdin.close()
     assert child.wait(30) == CANCELLED
     child.stdout.close()
+
+
+@pytest.mark.parametrize("moment", [0.1, 0.3])
+def test_a_polite_kill_in_the_midst_of_a_view_ends_the_command_after_it(only_good, tmp_path, moment):
+    words = ["--people", str(only_good), "--out", str(tmp_path / "a"), "--progress", "json"]
+    child = subprocess.Popen(
+        [sys.executable, launch.__file__, "--", *words, "--size", "256", "256"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert child.stdout is not None
+    child.stdout.readline()
+    time.sleep(moment)
+    child.send_signal(signal.SIGTERM)
+    _, complaints = child.communicate(timeout=30)
+    assert child.returncode == CANCELLED
+    assert complaints == ""
 
 
 def test_the_panels_defaults_are_the_commands(extension, tmp_path):
