@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .layout import picture_path, replacing
+from .layout import picture_path, replacing, write_npz
 from .rig import View
 
 _FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -32,15 +32,14 @@ def write_cameras(subject: Path, views: Sequence[View]) -> None:
 
 def write_opencv(subject: Path, views: Sequence[View]) -> None:
     """K, R, T of all cameras as arrays."""
-    with replacing(subject / "opencv" / "cameras.npz") as path:
-        np.savez(
-            path,
-            K=np.stack([view.intrinsics for view in views]),
-            R=np.stack([view.rotation for view in views]),
-            T=np.stack([view.translation for view in views]),
-            width=np.array([view.width for view in views]),
-            height=np.array([view.height for view in views]),
-        )
+    write_npz(
+        subject / "opencv" / "cameras.npz",
+        K=np.stack([view.intrinsics for view in views]),
+        R=np.stack([view.rotation for view in views]),
+        T=np.stack([view.translation for view in views]),
+        width=np.array([view.width for view in views]),
+        height=np.array([view.height for view in views]),
+    )
 
 
 def write_nerf(subject: Path, views: Sequence[View], frame: int) -> None:

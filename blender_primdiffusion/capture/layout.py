@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import json
 import os
 import zlib
@@ -64,14 +65,29 @@ def view_seed(seed: int, subject: str, frame: int, camera: int) -> int:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends, and vanishes when it fails."""
+    """A temporary path beside `path` that takes its place when the block ends, and vanishes when it fails.
+
+    Errors of the file system name `path`: Python names no file where a disk is full.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         yield partial
         os.replace(partial, path)
+    except OSError as e:
+        if e.errno is None or e.filename not in (None, str(partial)):
+            raise
+        raise OSError(e.errno, e.strerror, str(path)) from e
     finally:
         partial.unlink(missing_ok=True)
+
+
+def write_npz(path: Path, **arrays: NDArray) -> None:
+    """Arrays as an .npz, made in memory: numpy's own writer leaves an archive half open where a disk is full."""
+    made = io.BytesIO()
+    np.savez(made, **arrays)  # type: ignore[arg-type]
+    with replacing(path) as partial:
+        partial.write_bytes(made.getvalue())
 
 
 def claim(root: Path, about: Mapping[str, Any]) -> None:
@@ -133,22 +149,19 @@ def write_smpl(subject: Path, global_orient: NDArray, body_pose: NDArray, betas:
         "betas": np.asarray(betas, np.float32).reshape(1, -1),
         "transl": np.asarray(translation, np.float32),
     }
-    with replacing(subject / SMPL_FOLDER / SMPL_PLAIN_FILE) as path:
-        np.savez(path, **arrays)  # type: ignore[arg-type]
-    with replacing(subject / SMPL_FOLDER / SMPL_FILE) as path:
-        np.savez(path, smpl=np.array(arrays, dtype=object))
+    write_npz(subject / SMPL_FOLDER / SMPL_PLAIN_FILE, **arrays)
+    write_npz(subject / SMPL_FOLDER / SMPL_FILE, smpl=np.array(arrays, dtype=object))
 
 
 def write_joints(subject: Path, views: Sequence[View], world: NDArray) -> None:
     """The joints [F,24,3] in the world and in every picture."""
     projected = [view.project(world) for view in views]
-    with replacing(subject / "joints.npz") as path:
-        np.savez(
-            path,
-            world=np.asarray(world, np.float32),
-            pixel=np.stack([pixel for pixel, _ in projected]).astype(np.float32),
-            depth=np.stack([depth for _, depth in projected]).astype(np.float32),
-        )
+    write_npz(
+        subject / "joints.npz",
+        world=np.asarray(world, np.float32),
+        pixel=np.stack([pixel for pixel, _ in projected]).astype(np.float32),
+        depth=np.stack([depth for _, depth in projected]).astype(np.float32),
+    )
 
 
 def complete(subject: Path) -> None:

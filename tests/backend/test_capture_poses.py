@@ -106,12 +106,12 @@ def test_few_poses_are_chosen_to_differ_and_the_choice_is_the_seeds(tmp_path):
     still[:, 3 * 16 + 2] = -1.2 + np.linspace(0, 0.01, 50)  # fifty frames of the same
     still[17, 3 * 18 + 1] = -2.0  # and one with a bent arm
     np.savez(tmp_path / "a.npz", poses=still)
-    chosen = choose_poses([tmp_path / "a.npz"], 3, seed=0)
+    chosen = choose_poses([read_motion(tmp_path / "a.npz")], 3, seed=0)
     assert torch.equal(chosen.joint_rotation[0], built_in_poses().joint_rotation[0])
     assert any(
         torch.allclose(pose, read_motion(tmp_path / "a.npz").joint_rotation[17]) for pose in chosen.joint_rotation
     )
-    assert torch.equal(chosen.joint_rotation, choose_poses([tmp_path / "a.npz"], 3, seed=0).joint_rotation)
+    assert torch.equal(chosen.joint_rotation, choose_poses([read_motion(tmp_path / "a.npz")], 3, seed=0).joint_rotation)
 
 
 def test_more_poses_than_there_are_are_refused():

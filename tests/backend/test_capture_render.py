@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from capture_scenes import box_person, captured, save_person, small_job
 from primdiffusion import cli
@@ -18,6 +19,7 @@ from primdiffusion.capture.command import parse_shard
 from primdiffusion.capture.glb import GlbError, read_glb
 from primdiffusion.capture.people_files import find_people, read_person
 from primdiffusion.capture.rasterised import render
+from primdiffusion.capture.verify import verify
 
 NAMES = ["person_000000", "person_000001"]
 
@@ -151,6 +153,7 @@ import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
 from pathlib import Path
 from capture_scenes import small_job
 from primdiffusion.capture.rasterised import render
+from primdiffusion.capture.verify import verify
 list(render(small_job(Path({str(tmp_path)!r}), frames=12)))
 """
     child = subprocess.Popen([sys.executable, "-c", program])
@@ -163,11 +166,70 @@ list(render(small_job(Path({str(tmp_path)!r}), frames=12)))
     child.wait()
     assert not (job.out / NAMES[1] / layout.COMPLETE_FILE).exists()
     assert {outcome.what for outcome in render(job)} <= {"done", "skipped"}
-    partial = [path for path in job.out.rglob(".*partial*")]
-    for path in partial:
-        path.unlink()
-    assert len(partial) <= 1
     assert everything(job.out) == expected
+    assert verify(job.out) == []
+
+
+def test_what_a_killed_process_left_half_written_goes(tmp_path):
+    job = small_job(tmp_path)
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    left = [job.out / NAMES[0] / "img/camera0000" / f".9999.{pid}.partial.jpg" for pid in (ended.pid, os.getpid())]
+    layout.claim(job.out, job.about)
+    left[0].parent.mkdir(parents=True)
+    for path in left:
+        path.write_bytes(b"half")
+    list(render(job))
+    assert [path.exists() for path in left] == [False, True]
+
+
+def test_workers_end_when_the_command_is_killed(tmp_path):
+    save_person(tmp_path / "people" / "p0" / "person.glb")
+    save_person(tmp_path / "people" / "p1" / "person.glb")
+    line = [
+        "captures",
+        "render",
+        "--people",
+        str(tmp_path / "people"),
+        "--out",
+        str(tmp_path / "out"),
+        "--workers",
+        "2",
+    ]
+    process = subprocess.Popen([sys.executable, "-m", "primdiffusion.cli", *line], stdout=subprocess.DEVNULL)
+    try:
+        assert within(90, lambda: list((tmp_path / "out").glob("*/img/*/*.jpg")))
+        workers = psutil.Process(process.pid).children(recursive=True)
+        assert len(workers) >= 2
+    finally:
+        process.kill()
+        process.wait()
+    assert within(10, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))
+
+
+def within(seconds: float, reached) -> bool:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline and not reached():
+        time.sleep(0.1)
+    return bool(reached())
+
+
+def test_files_of_poses_that_cannot_be_read_are_left_out_and_reported(tmp_path, capsys):
+    save_person(tmp_path / "people" / "p0" / "person.glb")
+    np.save(tmp_path / "good.npy", np.random.default_rng(0).normal(0, 0.3, (3, 72)))
+    np.save(tmp_path / "nan.npy", np.full((3, 72), np.nan))
+    line = ["captures", "render", "--people", str(tmp_path / "people"), "--out", str(tmp_path / "out"), "--size", "24",
+            "--cameras", "1", "--pose-count", "2", "--poses", str(tmp_path / "nan.npy")]  # fmt: skip
+    with pytest.raises(SystemExit):
+        cli.main(line)
+    assert "none of the 1 pose files" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as end:
+        cli.main([*line, str(tmp_path / "good.npy")])
+    assert end.value.code == 1
+    assert "0 of 1 people and 1 of 2 pose files failed" in capsys.readouterr().err
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["done"] == ["p0"]
+    assert "nan.npy" in report["failed"][0]["why"]
 
 
 def test_one_that_fails_leaves_the_others_alone_and_is_reported(tmp_path):

@@ -12,9 +12,10 @@ from typing import Annotated
 import tyro
 from tqdm import tqdm
 
+from primdiffusion.body.model import BodyPose
 from primdiffusion.capture import layout
 from primdiffusion.capture.people_files import find_people
-from primdiffusion.capture.poses import choose_poses, read_motion
+from primdiffusion.capture.poses import MotionFileError, choose_poses, read_motion, read_motions
 from primdiffusion.capture.rasterised import PASSES, Job, render
 from primdiffusion.capture.rig import Arrangement, Rig
 
@@ -70,7 +71,7 @@ class RenderCaptures:
         names = sorted(people)[index::count]
         if self.pose_count == 0 and len(self.poses) != 1:
             raise ValueError("pose_count 0 takes all frames of one motion file: give one with --poses")
-        poses = choose_poses(self.poses, self.pose_count, self.seed) if self.pose_count else read_motion(self.poses[0])
+        poses, unread = self._poses()
         job = Job(
             people={name: people[name] for name in names},
             poses=poses,
@@ -80,14 +81,29 @@ class RenderCaptures:
             samples=self.samples,
             seed=self.seed,
             released_reference=self.released_reference,
+            unread_poses=tuple(unread),
             part="report" if count == 1 else f"report-{index}-of-{count}",
         )
+        for why in unread:
+            print(f"poses  failed  {why}", flush=True)
         outcomes = Counter()
         for outcome in tqdm(render(job, self.workers), total=len(names), unit="person", disable=None):
             outcomes[outcome.what] += 1
             print(f"{outcome.subject}  {outcome.what}  {outcome.why or f'{outcome.views} views'}", flush=True)
-        if outcomes["failed"]:
-            raise ValueError(f"{outcomes['failed']} of {len(names)} people failed: {self.out / job.part}.json says why")
+        if outcomes["failed"] or unread:
+            poses_too = f" and {len(unread)} of {len(self.poses)} pose files" if unread else ""
+            raise ValueError(
+                f"{outcomes['failed']} of {len(names)} people{poses_too} failed: {self.out / job.part}.json says why"
+            )
+
+    def _poses(self) -> tuple[BodyPose, list[str]]:
+        """The poses, and why some files of poses are left out. Raises MotionFileError where all of them are."""
+        if not self.pose_count:
+            return read_motion(self.poses[0]), []
+        motions, unread = read_motions(self.poses)
+        if self.poses and not motions:
+            raise MotionFileError(f"none of the {len(self.poses)} pose files can be used: {unread[-1]}")
+        return choose_poses(motions, self.pose_count, self.seed), unread
 
 
 def parse_shard(text: str) -> tuple[int, int]:

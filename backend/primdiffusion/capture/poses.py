@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from primdiffusion.body.model import BodyPose, J, default_body
-from primdiffusion.capture.plain_npz import read_npz
+from primdiffusion.capture.plain_npz import NpzError, read_npz
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.pose_file import body_theta
 
@@ -62,22 +62,32 @@ def read_motion(path: str | Path) -> BodyPose:
     return _upright(pose) if is_amass else pose
 
 
-def choose_poses(files: Sequence[Path], count: int, seed: int) -> BodyPose:
-    """`count` poses: near T first, then those of `files` (none: built in) that lie farthest from the ones before.
+def read_motions(paths: Sequence[Path]) -> tuple[list[BodyPose], list[str]]:
+    """The motions of the files that can be read, and a sentence for each that cannot."""
+    motions, failures = [], []
+    for path in paths:
+        try:
+            motions.append(read_motion(path))
+        except (FileNotFoundError, NpzError, MotionFileError) as e:
+            failures.append(str(e))
+    return motions, failures
+
+
+def choose_poses(motions: Sequence[BodyPose], count: int, seed: int) -> BodyPose:
+    """`count` poses: near T first, then those of `motions` (none: built in) that lie farthest from the ones before.
 
     Distance is that of the joints about the pelvis of an average body. Poses are taken in place, without translation.
 
     Raises:
         ValueError: count is not positive, or there are fewer poses.
-        FileNotFoundError, NpzError, MotionFileError: a file cannot be read.
     """
     near_t = built_in_poses().map(lambda t: t[:1])
-    rest = [read_motion(file) for file in files] or [built_in_poses().map(lambda t: t[1:])]
+    rest = list(motions) or [built_in_poses().map(lambda t: t[1:])]
     rotation = torch.cat([near_t.joint_rotation, *(pose.joint_rotation for pose in rest)])
     if not 1 <= count <= len(rotation):
         raise ValueError(f"{count} poses were asked for: there are {len(rotation)}, the near-T pose included")
     chosen = rotation
-    if files:
+    if motions:
         candidates = np.unique(np.linspace(1, len(rotation) - 1, min(MOST_CANDIDATES, len(rotation) - 1)).astype(int))
         if len(candidates) < count - 1:
             candidates = np.arange(1, len(rotation))

@@ -11,14 +11,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from primdiffusion.body.model import JOINT_NAMES, BodyPose
 from primdiffusion.capture import layout, picture_files
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.rig import Rig
 from primdiffusion.capture.subject import Sitting, begin, draw_frames, sit
 from primdiffusion.failures import describe
+from primdiffusion.worker_process import begin_worker
 
 PASSES = tuple(kind for kind in layout.ENDINGS if kind in ("img", "mask", "depth", "normal", "part"))
 
@@ -39,6 +38,8 @@ class Job:
     seed: int = 0
     released_reference: bool = False
     """Whether the dataset has the subject by whose name the released code finds its rest sizes."""
+    unread_poses: tuple[str, ...] = ()
+    """Why files of poses were left out: for the report."""
     part: str = "report"
     """Name of the report, one for each of several runs that share the folder."""
 
@@ -113,9 +114,7 @@ def _outcomes(job: Job, workers: int) -> Iterator[Outcome]:
             yield _finish(job, name, [_try(job, name, share) for share in shares])
         return
     context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(
-        workers, context, initializer=torch.set_num_threads, initargs=(1,)
-    ) as pool:
+    with concurrent.futures.ProcessPoolExecutor(workers, context, begin_worker) as pool:
         tasks = {pool.submit(_try, job, name, share): name for name in waiting for share in shares}
         results: dict[str, list[Outcome]] = {name: [] for name in waiting}
         try:
@@ -173,7 +172,8 @@ def _note(job: Job, outcomes: Sequence[Outcome]) -> None:
     layout.write_list(job.out, finished_subjects(job.out))
     report = {
         "done": [outcome.subject for outcome in outcomes if outcome.what == "done"],
-        "failed": [
+        "failed": [{"subject": "", "what": "poses", "why": why} for why in job.unread_poses]
+        + [
             {"subject": outcome.subject, "what": "render", "why": outcome.why}
             for outcome in outcomes
             if outcome.what == "failed"

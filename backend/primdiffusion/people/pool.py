@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
-import signal
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any
+
+from primdiffusion.worker_process import begin_worker
 
 THREAD_COUNTS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -36,7 +36,7 @@ def each(work: Callable[..., object], jobs: Iterable[tuple[Any, ...]], workers: 
         return
     context = multiprocessing.get_context("spawn")
     with _single_threaded_children():
-        pool = ProcessPoolExecutor(workers, context, _begin_worker)
+        pool = ProcessPoolExecutor(workers, context, begin_worker)
         try:
             waiting = {pool.submit(work, *job) for job in jobs}
             while waiting:
@@ -66,23 +66,3 @@ def _single_threaded_children() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-
-
-def _begin_worker() -> None:
-    """One thread for torch, which does not heed all of the environment; no life after the process that gives the work.
-
-    A pool's workers outlive a parent that is killed, and keep its place on the processors. Ctrl-C is the parent's to
-    heed: it lets workers finish the person they are at.
-    """
-    import torch
-
-    torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
