@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
-import time
 from pathlib import Path
 
 import numpy as np
@@ -29,9 +28,6 @@ from .layout import (
 from .picture_files import is_whole_picture
 from .rig import View
 
-_STALE_S = 3600.0
-"""Files half written are another process's while they are younger."""
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sitting:
@@ -45,7 +41,7 @@ class Sitting:
 
 
 def begin(folder: Path, sitting: Sitting, layouts: tuple[str, ...]) -> None:
-    """Write all but the pictures and the completion mark, and sweep out what a killed process left half written.
+    """Write all but the pictures and the completion mark.
 
     Raises CaptureFolderError where the folder holds another person, or other poses.
     """
@@ -53,9 +49,6 @@ def begin(folder: Path, sitting: Sitting, layouts: tuple[str, ...]) -> None:
     theta = poses.axis_angle().reshape(len(poses), 72)
     smpl = (theta[:, :3], theta[:, 3:], sitting.betas, poses.translations)
     _refuse_others(folder, smpl)
-    for path in folder.glob("**/.*.partial.*"):
-        if time.time() - path.stat().st_mtime > _STALE_S:
-            path.unlink(missing_ok=True)
     write_smpl(folder, *smpl)
     write_joints(folder, sitting.views, sitting.joints)
     write_cameras(folder, sitting.views)

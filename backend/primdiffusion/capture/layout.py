@@ -165,7 +165,12 @@ def write_joints(subject: Path, views: Sequence[View], world: NDArray) -> None:
 
 
 def complete(subject: Path) -> None:
-    """Note every file of a finished subject with its size and checksum."""
+    """Note every file of a finished subject with its size and checksum; what killed processes left half written goes.
+
+    Only one process finishes a subject: call it when nobody writes to it any more.
+    """
+    for partial in subject.rglob(".*.partial.*"):
+        partial.unlink(missing_ok=True)
     files = {
         path.relative_to(subject).as_posix(): [path.stat().st_size, _crc(path)]
         for path in sorted(subject.rglob("*"))

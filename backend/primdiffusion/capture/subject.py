@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import psutil
 import torch
 from jaxtyping import Float
 from PIL import Image
@@ -25,8 +23,6 @@ from primdiffusion.capture.texture_pyramid import BYTE_OF_LINEAR, encode_bytes
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
 
 JPEG_QUALITY = 95
-PARTIAL = re.compile(r"\..+\.(\d+)\.partial\..+")
-"""What `layout.replacing` calls a file while the process of this number writes it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -76,7 +72,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def begin(subject: Path, sitting: Sitting) -> None:
-    """Write all but the pictures, and sweep out what a killed process of this machine left half written.
+    """Write all but the pictures.
 
     Raises:
         CaptureFolderError: the folder holds pictures of other poses or another shape.
@@ -85,10 +81,6 @@ def begin(subject: Path, sitting: Sitting) -> None:
     theta = matrix_to_axis_angle(sitting.poses.joint_rotation).numpy().reshape(len(sitting.skinning), -1)
     translation = sitting.poses.translation.numpy()
     _refuse_others(subject, theta, sitting.betas, translation)
-    for path in subject.rglob(".*.partial.*"):
-        owner = PARTIAL.fullmatch(path.name)
-        if owner and not psutil.pid_exists(int(owner[1])):
-            path.unlink(missing_ok=True)
     layout.write_smpl(subject, theta[:, :3], theta[:, 3:], sitting.betas, translation)
     layout.write_joints(subject, sitting.views, sitting.joints)
     camera_files.write_cameras(subject, sitting.views)
