@@ -52,6 +52,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
 
     arrangement: bpy.props.EnumProperty(
         name="Arrangement",
+        description="Where the cameras stand",
         items=[
             ("rings", "Rings", "Rings at several heights"),
             ("sphere", "Sphere", "Evenly all round (Fibonacci)"),
@@ -59,13 +60,25 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
             ("custom", "Cameras of the Scene", "The cameras of a collection; they stand still while people change"),
         ],
     )
-    camera_count: bpy.props.IntProperty(name="Cameras", default=36, min=1, soft_max=200)
-    rings: bpy.props.IntProperty(name="Rings", default=3, min=1, max=50)
+    camera_count: bpy.props.IntProperty(
+        name="Cameras", description="Views of each pose", default=36, min=1, soft_max=200
+    )
+    rings: bpy.props.IntProperty(name="Rings", description="Over which the cameras are dealt", default=3, min=1, max=50)
     lowest: bpy.props.FloatProperty(
-        name="Lowest", default=math.radians(-10), min=math.radians(-89), max=math.radians(89), subtype="ANGLE"
+        name="Lowest",
+        description="Ring, above the horizon",
+        default=math.radians(-10),
+        min=math.radians(-89),
+        max=math.radians(89),
+        subtype="ANGLE",
     )
     highest: bpy.props.FloatProperty(
-        name="Highest", default=math.radians(40), min=math.radians(-89), max=math.radians(89), subtype="ANGLE"
+        name="Highest",
+        description="Ring, above the horizon",
+        default=math.radians(40),
+        min=math.radians(-89),
+        max=math.radians(89),
+        subtype="ANGLE",
     )
     fov: bpy.props.FloatProperty(
         name="Field of View", description="Vertical", default=math.radians(30), min=math.radians(1),
@@ -79,28 +92,39 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     samples: bpy.props.IntProperty(name="Samples", description="Of a pixel", default=16, min=1, soft_max=1024)
     light: bpy.props.EnumProperty(
         name="Light",
+        description="What the people are seen in",
         items=[
             ("uniform", "Uniform", "Every surface shows its own colour"),
             ("dome", "Dome", "A white sky, soft shadows"),
             ("hdri", "HDRI", "A picture of the surroundings"),
         ],
     )
-    hdri: bpy.props.StringProperty(name="HDRI", subtype="FILE_PATH")
+    hdri: bpy.props.StringProperty(
+        name="HDRI", description="Picture of the surroundings, .exr or .hdr", subtype="FILE_PATH"
+    )
     denoise: bpy.props.BoolProperty(
         name="Denoise", description="Colours under a dome or HDRI light; never masks, depth, normals or parts"
     )
     device: bpy.props.EnumProperty(
-        name="Device", items=[("auto", "Automatic", "A GPU where there is one"), ("cpu", "CPU", ""), ("gpu", "GPU", "")]
+        name="Device",
+        description="What Cycles renders on",
+        items=[("auto", "Automatic", "A GPU where there is one"), ("cpu", "CPU", ""), ("gpu", "GPU", "")],
     )
 
-    width: bpy.props.IntProperty(name="Width", default=512, min=1, max=16384, subtype="PIXEL")
-    height: bpy.props.IntProperty(name="Height", default=512, min=1, max=16384, subtype="PIXEL")
+    width: bpy.props.IntProperty(
+        name="Width", description="Of the pictures", default=512, min=1, max=16384, subtype="PIXEL"
+    )
+    height: bpy.props.IntProperty(
+        name="Height", description="Of the pictures", default=512, min=1, max=16384, subtype="PIXEL"
+    )
     background: bpy.props.EnumProperty(
         name="Background",
+        description="Behind the people",
         items=[("black", "Black", ""), ("transparent", "Transparent", "One pass more: PNG with straight alpha")],
     )
     passes: bpy.props.EnumProperty(
         name="Passes",
+        description="Kinds of pictures to write",
         options={"ENUM_FLAG"},
         items=_PASS_ITEMS,
         default=set(PASSES),

@@ -1,4 +1,7 @@
-"""Reading .npz files that others made: plain arrays, of sane size; never a pickle, never a path out of the file."""
+"""Reading .npz files that others made: plain arrays, of sane size; never a pickle, never a path out of the file.
+
+The extension, which imports nothing of the backend, has `motion/arrays.py` for the same.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Finding damage in captures, and clearing it away so that rendering again makes just what is missing."""
+"""Finding damage in captures, and clearing it away so that rendering again makes just what is missing.
+
+The extension has a module of its own for this, as it imports nothing of the backend; what damage is, `layout` tells both.
+"""
 
 from __future__ import annotations
 
