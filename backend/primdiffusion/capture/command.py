@@ -200,14 +200,14 @@ class PackCaptures:
 
 @dataclasses.dataclass(frozen=True)
 class SheetOfCaptures:
-    """Draw many views side by side with the joints on them."""
+    """Draw many views side by side, every other one with the joints on it."""
 
     root: tyro.conf.Positional[Path]
     """Folder of captures."""
     out: Path
     """PNG to write."""
     rows: int = 8
-    """Poses: those of all people, evenly spaced."""
+    """People, each next one in the next pose."""
     columns: int = 12
     """Cameras, evenly spaced."""
     size: int = 160

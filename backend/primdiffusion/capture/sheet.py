@@ -13,12 +13,15 @@ from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.capture.layout import replacing
 from primdiffusion.capture.plain_npz import NpzError, read_npz
 from primdiffusion.capture.reader import Captures, Subject
+from primdiffusion.capture.rig import View
 
 BONE, JOINT = (255, 255, 255), (255, 64, 64)
 
 
 def draw_sheet(captures: Captures, out: Path, rows: int, columns: int, size: int) -> float:
-    """Write the sheet, a pose a row; returns the largest `reprojection_error` of the people on it, pixels.
+    """Write the sheet, a person in a pose a row; returns the largest `reprojection_error` of those people, pixels.
+
+    Rows take turns through the poses; every other picture has the joints drawn on it.
 
     Raises:
         ValueError: there is no row, column or pixel.
@@ -26,14 +29,15 @@ def draw_sheet(captures: Captures, out: Path, rows: int, columns: int, size: int
     """
     if min(rows, columns, size) < 1:
         raise ValueError(f"a sheet of {rows} x {columns} pictures of {size} pixels: ask for one or more of each")
-    poses = [(name, frame) for name in captures.subjects for frame in range(captures.subject(name).frames)]
-    chosen = [poses[i] for i in _evenly(len(poses), rows)]
+    chosen = _chosen(captures, rows)
     lines = []
     for name, frame in chosen:
         subject = captures.subject(name)
         joints = joints_of(subject)[frame]
         cameras = _evenly(len(subject.views), columns)
-        lines.append([_thumbnail(subject, frame, camera, joints, size) for camera in cameras])
+        lines.append([_thumbnail(subject, frame, camera, size) for camera in cameras])
+        for camera, picture in list(zip(cameras, lines[-1], strict=True))[1::2]:
+            _draw_joints(picture, subject.views[camera], joints)
     widths = max(sum(picture.width for picture in line) for line in lines)
     sheet = Image.new("RGB", (widths, size * len(lines)))
     for row, line in enumerate(lines):
@@ -88,21 +92,37 @@ def reprojection_error(subject: Subject) -> float:
     return float(np.linalg.norm(errors, axis=-1).max())
 
 
-def _thumbnail(subject: Subject, frame: int, camera: int, joints: Float[np.ndarray, "J 3"], size: int) -> Image.Image:
+def _chosen(captures: Captures, rows: int) -> list[tuple[str, int]]:
+    """People and frames: as many people as there are rows for, each next one in the next pose."""
+    names = [captures.subjects[i] for i in _evenly(len(captures.subjects), rows)]
+    frames = {name: captures.subject(name).frames for name in names}
+    turns = [
+        (name, (turn + place) % frames[name])
+        for turn in range(max(frames.values()))
+        for place, name in enumerate(names)
+        if turn < frames[name]
+    ]
+    return sorted(turns[:rows])
+
+
+def _thumbnail(subject: Subject, frame: int, camera: int, size: int) -> Image.Image:
     picture = Image.fromarray(subject.picture("img", frame, camera))
-    scale = size / picture.height
-    picture = picture.resize((max(1, round(picture.width * scale)), size), Image.Resampling.BOX)
-    pixels, depth = subject.views[camera].project(joints)
+    width = max(1, round(picture.width * size / picture.height))
+    return picture.resize((width, size), Image.Resampling.BOX)
+
+
+def _draw_joints(picture: Image.Image, view: View, joints: Float[np.ndarray, "J 3"]) -> None:
+    pixels, depth = view.project(joints)
+    scale = picture.height / view.height
     draw = ImageDraw.Draw(picture)
     places = [tuple(pixel * scale) for pixel in pixels]
     for joint, parent in enumerate(default_body().parents.tolist()):
         if parent >= 0 and min(depth[joint], depth[parent]) > 0:
             draw.line([places[parent], places[joint]], fill=BONE)
-    radius = max(size / 160, 1)
+    radius = max(picture.height / 160, 1)
     for (x, y), z in zip(places, depth, strict=True):
         if z > 0:
             draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=JOINT)
-    return picture
 
 
 def _evenly(count: int, wanted: int) -> list[int]:
