@@ -10,7 +10,9 @@ RESULTS = ROOT / "docs" / "results"
 SOURCES = {
     "demo": ("The demo", "benchmarks/demo.py --json docs/results/demo.json"),
     "people": ("Payloads against their meshes", "benchmarks/people.py --assets DIR --json docs/results/people.json"),
-    "march": ("The marcher", "benchmarks/march.py --json docs/results/march.json"),
+    "march": ("The marcher", "benchmarks/march.py --json docs/results/march.json --table docs/results/march_table.md"),
+    "march_cuda": ("The marcher on a CUDA device", "benchmarks/march_cuda.py --json docs/results/march_cuda.json"),
+    "engine": ("The engine in Blender", "benchmarks/engine.py --json docs/results/engine.json"),
     "denoisers": ("Denoisers on held-out people", "benchmarks/denoisers.py --json docs/results/denoisers.json"),
     "captures": ("Captures", "benchmarks/captures.py --assets DIR --json docs/results/captures.json"),
     "layout": ("The grid on the default body", "scripts/bake_layout"),
@@ -20,7 +22,7 @@ ABOUT = ("device", "cores", "memory_gb", "python", "commit", "date")
 
 
 def section(name: str) -> str:
-    """The table of docs/results/NAME.json; null is written as "not measured"."""
+    """The table of docs/results/NAME.json, null as "not measured", and the one that the benchmark wrote itself."""
     title, command = SOURCES[name]
     record = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
     about = ", ".join(f"{key} {record[key]}" for key in ABOUT if key in record)
@@ -28,6 +30,9 @@ def section(name: str) -> str:
     for key, value in record.items():
         if key not in ABOUT and not key.startswith("version_"):
             lines.append(f"| {key} | {_written(value)} |")
+    table = RESULTS / f"{name}_table.md"
+    if table.is_file():
+        lines += ["", table.read_text(encoding="utf-8").rstrip()]
     return "\n".join(lines)
 
 
