@@ -1,6 +1,6 @@
 """Finding damage in captures, and clearing it away so that rendering again makes just what is missing.
 
-The extension has a module of its own for this, as it imports nothing of the backend; what damage is, `layout` tells both.
+The extension, which imports nothing of the backend, has a module of its own; `layout` tells both what damage is.
 """
 
 from __future__ import annotations
