@@ -1,0 +1,184 @@
+"""Which pictures the encoder is given, and which captures it is not."""
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from capture_scenes import box, captured, save_person, small_job
+from PIL import Image
+from primdiffusion.body.model import default_body
+from primdiffusion.capture.conditioning import (
+    ConditioningError,
+    captured_person,
+    choose_subject,
+    conditioning_views,
+    default_betas,
+    spread_cameras,
+)
+from primdiffusion.capture.layout import picture_path, write_smpl
+from primdiffusion.capture.rasterised import render
+from primdiffusion.capture.reader import CaptureFileError, Subject, open_captures
+from primdiffusion.capture.rig import Rig
+from primdiffusion.capture.smpl_parameters import SmplParameters
+from primdiffusion.geometry.textured_mesh import TexturedMesh
+
+FIRST = "person_000000"
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return captured(tmp_path_factory.mktemp("conditioning"), people=2, frames=2, passes=("img", "mask"))
+
+
+@pytest.fixture
+def folder(dataset, tmp_path):
+    """A dataset to damage."""
+    return shutil.copytree(dataset, tmp_path / "captures")
+
+
+def ring(tmp_path, count: int, turn: float = 0.0) -> Subject:
+    """Somebody who looks `turn` radians to their left, in a ring of cameras; camera 0 is at +z."""
+    theta = np.zeros((1, 72), np.float32)
+    theta[0, 1] = turn
+    smpl = SmplParameters(theta, np.zeros((1, 3), np.float32), np.zeros(10, np.float32))
+    return Subject(tmp_path, tuple(Rig("rings", count, (0.0,)).views(np.zeros(3), 1.0)), smpl)
+
+
+@pytest.mark.parametrize(("turn", "front"), [(0.0, 0), (np.pi / 2, 2), (np.pi, 4)])
+def test_one_camera_is_the_one_before_the_face(tmp_path, turn, front):
+    assert spread_cameras(ring(tmp_path, 8, turn), 0, 1) == (front,)
+
+
+def test_fewer_cameras_are_evenly_around_the_person(tmp_path):
+    assert spread_cameras(ring(tmp_path, 8), 0, 2) == (0, 4)
+    assert spread_cameras(ring(tmp_path, 8), 0, 4) == (0, 2, 4, 6)
+
+
+def test_all_cameras_are_taken_where_there_are_no_more(tmp_path):
+    assert spread_cameras(ring(tmp_path, 5), 0, 8) == (0, 1, 2, 3, 4)
+
+
+def test_less_than_one_view_is_refused(tmp_path):
+    with pytest.raises(ConditioningError, match="0 views were asked for"):
+        spread_cameras(ring(tmp_path, 5), 0, 0)
+
+
+def test_views_are_the_pictures_and_masks_of_the_cameras(dataset):
+    captures = open_captures(dataset)
+    views = conditioning_views(captures, FIRST, 1, (3, 1))
+    assert views.rgba.shape == (2, 32, 32, 4)
+    for row, camera in enumerate((3, 1)):
+        wanted = captures.view(FIRST, 1, camera)
+        assert torch.equal(views.image[row], wanted.image)
+        assert torch.equal(views.mask[row], wanted.mask)
+        assert torch.allclose(views.camera.intrinsics[row], wanted.camera.intrinsics)
+        assert torch.equal(views.camera.world_to_camera[row], wanted.camera.world_to_camera)
+    assert torch.equal(views.pose.joint_rotation, wanted.pose.joint_rotation)
+
+
+def test_large_pictures_are_averaged_and_their_cameras_follow(dataset):
+    captures = open_captures(dataset)
+    small, whole = (conditioning_views(captures, FIRST, 0, (0,), side) for side in (8, 32))
+    assert small.rgba.shape == (1, 8, 8, 4)
+    averaged = whole.mask.float().unflatten(1, (8, 4)).unflatten(3, (8, 4)).mean((2, 4))
+    assert (small.mask.float() - averaged).abs().max() <= 0.5
+    assert torch.allclose(small.camera.intrinsics[0, :2] * 4, whole.camera.intrinsics[0, :2])
+
+
+def test_a_subjects_own_folder_needs_no_name(dataset):
+    captures, name = choose_subject(dataset / FIRST)
+    assert name == FIRST
+    assert captures.subjects == (FIRST,)
+    assert captured_person(dataset / FIRST).subject == FIRST
+
+
+def test_several_subjects_and_none_named_is_an_error_that_names_some(dataset):
+    with pytest.raises(ConditioningError, match=r"several subjects: name one of them \(person_000000, person_000001\)"):
+        choose_subject(dataset)
+
+
+def test_an_unknown_subject_is_an_error_that_names_the_nearest_first(dataset):
+    with pytest.raises(ConditioningError, match=r"no subject 'person_00001'.* choose of person_000001, person_000000"):
+        choose_subject(dataset, "person_00001")
+
+
+@pytest.mark.parametrize("frame", [-1, 2])
+def test_a_frame_that_was_not_captured_is_refused(dataset, frame):
+    with pytest.raises(ConditioningError, match=f"frames 0 to 1, not {frame}"):
+        captured_person(dataset, FIRST, frame)
+
+
+def test_a_missing_picture_is_named(folder):
+    path = picture_path(folder / FIRST, "img", 2, 1)
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match=str(path)):
+        captured_person(folder, FIRST, 1)
+    assert captured_person(folder, FIRST, 0).cameras == (0, 1, 2, 3)
+
+
+def test_a_mask_of_another_size_is_named(folder):
+    path = picture_path(folder / FIRST, "mask", 1, 0)
+    Image.new("L", (16, 32), 255).save(path)
+    with pytest.raises(CaptureFileError, match=f"{path} has 16 x 32 pixels, its camera 32 x 32"):
+        captured_person(folder, FIRST)
+
+
+def test_masks_without_anybody_are_refused(folder):
+    for camera in range(4):
+        Image.new("L", (32, 32), 0).save(picture_path(folder / FIRST, "mask", camera, 0))
+    with pytest.raises(ConditioningError, match="shows a person"):
+        captured_person(folder, FIRST)
+
+
+def rewrite_betas(folder, betas) -> None:
+    for path in (folder / FIRST / "outputs_re_fitting").iterdir():
+        path.unlink()
+    write_smpl(folder / FIRST, np.zeros((2, 3)), np.zeros((2, 69)), np.asarray(betas), np.zeros((2, 3)))
+
+
+def test_more_betas_than_the_default_body_has_are_refused(folder):
+    rewrite_betas(folder, np.zeros(300))
+    with pytest.raises(ConditioningError, match=r"300 betas.* at most 10 of the default body.*render the person again"):
+        captured_person(folder, FIRST)
+
+
+def test_betas_whose_body_has_other_joints_than_were_noted_are_refused(folder):
+    rewrite_betas(folder, [4.0, -4.0, 4.0, 0, 0, 0, 0, 0, 0, 0])
+    with pytest.raises(ConditioningError, match=r"cm from the default body's.*another body model"):
+        captured_person(folder, FIRST)
+
+
+def test_fewer_betas_are_filled_up(tmp_path):
+    person = ring(tmp_path, 3)
+    person = dataclasses.replace(person, smpl=dataclasses.replace(person.smpl, betas=np.ones(4, np.float32)))
+    assert default_betas(person).tolist() == [1.0] * 4 + [0.0] * 6
+    assert len(default_betas(person)) == default_body().shape_basis.shape[-1]
+
+
+def test_masks_beside_the_body_are_a_warning_and_masks_around_it_are_none(dataset, tmp_path):
+    (warning,) = captured_person(dataset, FIRST).warnings
+    assert "of the body of person_000000 lies inside the masks" in warning
+    job = small_job(tmp_path, people=1, frames=1, passes=("img", "mask"))
+    for path in job.people.values():
+        save_person(path, TexturedMesh((box(half=1.0),)))
+    list(render(job))
+    assert captured_person(job.out).warnings == ()
+
+
+def test_cameras_that_look_past_the_body_are_refused(folder):
+    path = folder / FIRST / "cameras.json"
+    cameras = json.loads(path.read_text())
+    for about in cameras.values():
+        about["T"] = [5.0, 0.0, 0.0]
+    path.write_text(json.dumps(cameras))
+    with pytest.raises(ConditioningError, match="do not belong together"):
+        captured_person(folder, FIRST)
+
+
+def test_one_view_works_and_warns(dataset):
+    person = captured_person(dataset, FIRST, views=1)
+    assert len(person.cameras) == 1
+    assert person.warnings[0] == "one view only: sides that it does not see are guessed"
