@@ -1,0 +1,193 @@
+"""How alike two pictures are: PSNR, SSIM, LPIPS, overlap of masks. Pictures are sRGB-encoded RGB in [0, 1].
+
+Written here rather than called from torchmetrics, which only the extra `training` installs: whoever has a checkpoint
+can evaluate it. The tests hold these against torchmetrics and scikit-image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from primdiffusion.picture_features import (
+    ALEXNET,
+    VGG16,
+    Architecture,
+    PictureFeatures,
+    WeightsFileError,
+    fill,
+    read_weights,
+)
+
+WINDOW, SIGMA = 11, 1.5
+"""Of SSIM's gaussian, pixels."""
+K1, K2 = 0.01, 0.03
+"""SSIM's constants, for a data range of 1."""
+LARGEST_PSNR = 100.0
+"""dB, of pictures that are equal: a mean over pictures stays finite."""
+LPIPS_LAYERS = {
+    "VGG16": ("relu1_2", "relu2_2", "relu3_3", "relu4_3", "relu5_3"),
+    "AlexNet": ("relu1_1", "relu2_1", "relu3_1", "relu3_2", "relu3_3"),
+}
+LPIPS_SHIFT, LPIPS_SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+"""Of values in [-1, 1]."""
+
+
+class Box(NamedTuple):
+    """A rectangle of a picture, pixels; right and bottom are the first ones outside."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def cut(self, picture: Float[Tensor, "*b H W c"]) -> Float[Tensor, "*b h w c"]:
+        """That part of pictures."""
+        return picture[..., self.top : self.bottom, self.left : self.right, :]
+
+
+def psnr(image: Float[Tensor, "*b H W 3"], target: Float[Tensor, "*b H W 3"]) -> Float[Tensor, "*b"]:
+    """Peak signal-to-noise ratio of each picture, -10 log10 mean (I - I*)^2, dB; `LARGEST_PSNR` at most.
+
+    Raises ValueError where shapes differ.
+    """
+    _check_pair(image, target)
+    squared = (image - target).square().mean((-3, -2, -1))
+    return -10 * squared.clamp_min(10 ** (-LARGEST_PSNR / 10)).log10()
+
+
+def ssim(image: Float[Tensor, "*b H W 3"], target: Float[Tensor, "*b H W 3"]) -> Float[Tensor, "*b"]:
+    """Structural similarity of each picture (Wang et al. 2004, eq. 13), mean over channels and whole windows.
+
+    Gaussian windows of 11 x 11 pixels, sigma 1.5, biased variances; windows that reach over the edge are left out, as
+    in the authors' program and in scikit-image. Raises ValueError where shapes differ or a side has under 11 pixels.
+    """
+    _check_pair(image, target)
+    height, width = image.shape[-3:-1]
+    if min(height, width) < WINDOW:
+        raise ValueError(f"pictures of {width} x {height} pixels: SSIM needs {WINDOW} a side")
+    x, y = (picture.reshape(-1, height, width, 3).movedim(-1, 1) for picture in (image, target))
+    moments = _blurred(torch.stack([x, y, x * x, y * y, x * y]).flatten(0, 2)[:, None])
+    mean_x, mean_y, square_x, square_y, product = moments.reshape(5, -1, *moments.shape[-2:])
+    c1, c2 = K1**2, K2**2
+    covariance, variances = product - mean_x * mean_y, square_x + square_y - mean_x**2 - mean_y**2
+    luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
+    similarity = luminance * (2 * covariance + c2) / (variances + c2)
+    return similarity.mean((-2, -1)).reshape(-1, 3).mean(-1).reshape(image.shape[:-3])
+
+
+def _blurred(pictures: Float[Tensor, "n 1 H W"]) -> Float[Tensor, "n 1 h w"]:
+    """Weighted means over the windows that lie wholly inside."""
+    place = torch.arange(WINDOW, dtype=pictures.dtype, device=pictures.device) - WINDOW // 2
+    weight = (-0.5 * (place / SIGMA).square()).exp()
+    weight = (weight / weight.sum())[None, None]
+    rows = torch.nn.functional.conv2d(pictures, weight[..., None])
+    return torch.nn.functional.conv2d(rows, weight[..., None, :])
+
+
+def overlap(first: Bool[Tensor, "H W"], second: Bool[Tensor, "H W"]) -> float:
+    """Intersection over union of two masks; 1 where both are empty."""
+    union = int((first | second).sum())
+    return int((first & second).sum()) / union if union else 1.0
+
+
+def bounding_box(mask: Bool[Tensor, "H W"]) -> Box | None:
+    """The least box around a mask, widened to SSIM's 11 pixels a side where the picture has them; None: it is empty."""
+    if not mask.any():
+        return None
+    left, right = _interval(mask.any(0))
+    top, bottom = _interval(mask.any(1))
+    return Box(left, top, right, bottom)
+
+
+def _interval(covered: Bool[Tensor, "n"]) -> tuple[int, int]:
+    places = covered.nonzero()[:, 0]
+    low, high = int(places[0]), int(places[-1]) + 1
+    length = min(max(high - low, WINDOW), len(covered))
+    low = min(max((low + high - length) // 2, 0), len(covered) - length)
+    return low, low + length
+
+
+class Lpips(nn.Module):
+    """Learned perceptual distance (Zhang et al. 2018): 0 of equal pictures. Its weights come from files."""
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(self, architecture: Architecture) -> None:
+        """With random weights, until `load_lpips` fills them. `architecture` is VGG16 or ALEXNET."""
+        super().__init__()
+        taps = LPIPS_LAYERS[architecture.name]
+        self.network = PictureFeatures(architecture, taps)
+        channels = [layer.out_channels for layer in self.network.features if isinstance(layer, nn.Conv2d)]
+        names = [
+            f"relu{block}_{number}"
+            for block, layers in enumerate(architecture.blocks, start=1)
+            for number in range(1, len(layers) + 1)
+        ]
+        widths = [channels[names.index(tap)] for tap in taps]
+        self.linear = nn.ModuleList(nn.Conv2d(width, 1, 1, bias=False) for width in widths)
+        for name, values in (("shift", LPIPS_SHIFT), ("scale", LPIPS_SCALE)):
+            self.register_buffer(name, torch.tensor(values)[:, None, None], persistent=False)
+        self.requires_grad_(False).eval()
+
+    def forward(self, image: Float[Tensor, "*b H W 3"], target: Float[Tensor, "*b H W 3"]) -> Float[Tensor, "*b"]:
+        """The distance of each picture; differentiable. Raises ValueError where shapes differ or are too small."""
+        _check_pair(image, target)
+        distance = image.new_zeros(())
+        pairs = zip(self._features(image), self._features(target), self.linear, strict=True)
+        for seen, wanted, linear in pairs:
+            distance = distance + linear((seen - wanted).square()).mean((-3, -2, -1))
+        return distance.reshape(image.shape[:-3])
+
+    def _features(self, pictures: Float[Tensor, "*b H W 3"]) -> list[Tensor]:
+        """Features of unit length in each place."""
+        signed = 2 * pictures.reshape(-1, *pictures.shape[-3:]).movedim(-1, 1) - 1
+        layers = self.network((signed - self.shift) / self.scale)
+        # The root never sees a zero, at which its slope is infinite.
+        return [layer / (layer.square().sum(1, keepdim=True) + 1e-20).sqrt() for layer in layers]
+
+
+def load_lpips(paths: Sequence[Path | str]) -> Lpips:
+    """LPIPS from files of weights, VGG16 or AlexNet as these say.
+
+    Either one file that holds all (the state_dict of lpips.LPIPS or of torchmetrics' twin), or two: torchvision's file
+    of the network, and the linear weights (alex.pth or vgg.pth of lpips or torchmetrics).
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        WeightsFileError: one is damaged, weights are missing, or those of two networks are mixed.
+    """
+    source = " and ".join(str(path) for path in paths)
+    weights: dict[str, Tensor] = {}
+    for path in paths:
+        weights |= {_own_name(name): value for name, value in read_weights(path).items()}
+    what = "torchvision's VGG16 or AlexNet and LPIPS' linear weights of the same network"
+    first = weights.get("network.features.0.weight")
+    if first is None:
+        raise WeightsFileError(f"{source or 'no file'} has no network's weights: give files of {what}")
+    lpips = Lpips(ALEXNET if tuple(first.shape[-2:]) == (11, 11) else VGG16)
+    fill(lpips, weights, what, source)
+    return lpips
+
+
+def _own_name(name: str) -> str:
+    """lpips: lin2.model.1.weight (or lins.2...), net.slice3.6.weight; torchvision: features.6.weight."""
+    parts = name.removeprefix("lins.").removeprefix("lin").removeprefix("net.").split(".")
+    if name.startswith("lin") and parts[1:3] == ["model", "1"]:
+        return f"linear.{parts[0]}.weight"
+    if parts[0].startswith("slice") or parts[0] == "features":
+        return f"network.features.{'.'.join(parts[1:])}"
+    return name
+
+
+def _check_pair(image: Tensor, target: Tensor) -> None:
+    if image.shape != target.shape or image.ndim < 3 or image.shape[-1] != 3:
+        raise ValueError(
+            f"pictures of shapes {tuple(image.shape)} and {tuple(target.shape)}: give two of the same [..., H, W, 3]"
+        )
