@@ -15,6 +15,9 @@ from . import (
     panel,
     preferences,
     properties,
+    reconstruct_operators,
+    reconstruct_panel,
+    reconstruct_settings,
     render_panels,
 )
 from .capture_session import captures
@@ -33,6 +36,9 @@ CLASSES = (
     capture_operators.PRIMDIFFUSION_OT_preview_rig,
     capture_panel.PRIMDIFFUSION_PT_captures,
     *capture_panel.SUB_PANELS,
+    reconstruct_settings.PRIMDIFFUSION_PG_reconstruct,
+    reconstruct_operators.PRIMDIFFUSION_OT_human_from_captures,
+    reconstruct_panel.PRIMDIFFUSION_PT_human_from_captures,
     render_panels.PRIMDIFFUSION_PT_marching,
     render_panels.PRIMDIFFUSION_PT_film,
     render_panels.PRIMDIFFUSION_PT_passes,
@@ -53,6 +59,9 @@ def register() -> None:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion = bpy.props.PointerProperty(type=properties.PRIMDIFFUSION_PG_settings)
     bpy.types.Scene.primdiffusion_captures = bpy.props.PointerProperty(type=capture_settings.PRIMDIFFUSION_PG_captures)
+    bpy.types.Scene.primdiffusion_reconstruct = bpy.props.PointerProperty(
+        type=reconstruct_settings.PRIMDIFFUSION_PG_reconstruct
+    )
     _commands.append(capture_command.register())
     render_panels.join_panels()
     bpy.app.handlers.load_pre.append(drop_job_before_loading)
@@ -71,6 +80,7 @@ def unregister() -> None:
     bpy.app.handlers.save_pre.remove(collect_before_saving)
     bpy.app.handlers.load_pre.remove(drop_job_before_loading)
     render_panels.leave_panels()
+    del bpy.types.Scene.primdiffusion_reconstruct
     del bpy.types.Scene.primdiffusion_captures
     del bpy.types.Scene.primdiffusion
     for cls in reversed(CLASSES):

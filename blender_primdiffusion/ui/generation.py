@@ -1,4 +1,4 @@
-"""The one generation that may run at a time, and what becomes of it in the scene."""
+"""The one person that may be in the making, generated or reconstructed, and what becomes of them in the scene."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from ..places import new_backend, preference
 from ..scene.human import build_human, overlap_warning
 from ..scene.human_file import HumanFileError
 from ..scene.volumes import VolumeWriteError
-from ..worker.job import Backend, GenerateJob
+from ..worker.job import Backend, GenerateJob, PersonJob, ReconstructJob
 
 TICK_S = 0.1
+_UNDO_NAMES = {"generate": "Generate Human", "reconstruct": "Human from Captures"}
 
 
 class Busy(RuntimeError):
-    """A person is being generated already."""
+    """A person is being made already."""
 
 
 class GenerationFailed(RuntimeError):
@@ -30,12 +31,14 @@ class Session:
     """Owns the child process and the running job. All methods are for Blender's main thread."""
 
     def __init__(self) -> None:
-        self.job: GenerateJob | None = None
+        self.job: PersonJob | None = None
         """The job under way, None when idle."""
         self.error: str = ""
         """Why the last generation failed, in a sentence; empty when it went well."""
         self.notice: str = ""
         """How the last generation ended otherwise."""
+        self.kind = ""
+        """The child's method of the job under way, or of the last one: generate or reconstruct."""
         self.device = ""
         """What the backend computes on, once it has said so."""
         self.seconds: dict[str, float] = {}
@@ -47,24 +50,35 @@ class Session:
 
     @property
     def busy(self) -> bool:
-        """A generation is under way."""
+        """A person is being made."""
         return self.job is not None
 
     def start(self, seed: int, steps: int) -> None:
         """Begin a generation. Raises Busy, or OSError when there is no folder to work in."""
-        if self.busy:
-            raise Busy("a person is being generated; wait for it or press Cancel")
-        self.error = self.notice = ""
-        self.seconds, self._started = {}, time.monotonic()
-        self._folder = Path(tempfile.mkdtemp(prefix="generate_", dir=bpy.app.tempdir or None))
-        checkpoint = preference("checkpoint")
-        self.job = GenerateJob(
-            self._backend_for(preference("backend_python")),
-            seed=seed,
-            steps=steps,
-            out_dir=self._folder,
-            checkpoint=Path(checkpoint) if checkpoint else None,
+        backend, folder = self._begin("generate")
+        self.job = GenerateJob(backend, seed=seed, steps=steps, out_dir=folder, checkpoint=_checkpoint("checkpoint"))
+
+    def start_reconstruction(self, capture: Path, subject: str, frame: int, views: int) -> None:
+        """Begin to make a person of captures; an empty subject: the only one. Raises as `start` does."""
+        backend, folder = self._begin("reconstruct")
+        self.job = ReconstructJob(
+            backend,
+            capture=capture,
+            subject=subject or None,
+            frame=frame,
+            views=views,
+            out_dir=folder,
+            checkpoint=_checkpoint("encoder"),
         )
+
+    def _begin(self, kind: str) -> tuple[Backend, Path]:
+        """The child for a job, and a new folder for its files; the last job's news are gone."""
+        if self.busy:
+            raise Busy("a person is being made; wait for it or press Cancel")
+        self.error = self.notice = ""
+        self.kind, self.seconds, self._started = kind, {}, time.monotonic()
+        self._folder = Path(tempfile.mkdtemp(prefix=f"{kind}_", dir=bpy.app.tempdir or None))
+        return self._backend_for(preference("backend_python")), self._folder
 
     def tick(self) -> bool:
         """Take in news of the job; True when something visible changed. When it has finished, see `finish`."""
@@ -115,15 +129,16 @@ class Session:
             self._backend.shutdown()
             self._backend = None
 
-    def _build(self, context: bpy.types.Context, job: GenerateJob) -> bpy.types.Collection:
+    def _build(self, context: bpy.types.Context, job: PersonJob) -> bpy.types.Collection:
         began = time.monotonic()
         result = job.result or {}
         human_npz = Path(result["human"])
         keep = [Path(result["person"])] if "person" in result else []  # for the exact marcher, later
         collection = build_human(context, human_npz, "Human", keep)
         self.seconds = {"generate": began - self._started, "build": time.monotonic() - began}
-        self.notice = overlap_warning(collection) or f"{job.message}, built in {self.seconds['build']:.1f} s"
-        bpy.ops.ed.undo_push(message="Generate Human")
+        warnings = [_sentence(text) for text in (*result.get("warnings", ()), overlap_warning(collection)) if text]
+        self.notice = " ".join(warnings) or f"{job.message}, built in {self.seconds['build']:.1f} s"
+        bpy.ops.ed.undo_push(message=_UNDO_NAMES[job.method])
         return collection
 
     def _backend_for(self, python: str) -> Backend:
@@ -136,7 +151,13 @@ class Session:
         return self._backend
 
 
-def _sentence(error: BaseException) -> str:
+def _checkpoint(name: str) -> Path | None:
+    """The file of a preference; None: the one that comes with the extension."""
+    path = preference(name)
+    return Path(path) if path else None
+
+
+def _sentence(error: BaseException | str) -> str:
     text = str(error).strip() or type(error).__name__
     text = text[:1].upper() + text[1:]
     return text if text.endswith(".") else f"{text}."

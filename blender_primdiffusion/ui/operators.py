@@ -30,29 +30,11 @@ class PRIMDIFFUSION_OT_generate(bpy.types.Operator):
         except (Busy, OSError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        if bpy.app.background:
-            return self._wait(context)
-        bpy.app.timers.register(follow, first_interval=TICK_S, persistent=True)
-        return {"FINISHED"}
-
-    def _wait(self, context: bpy.types.Context) -> set[str]:
-        told = 0.0
-        while (job := session.job) is not None and not job.finished:
-            if session.tick() and time.monotonic() - told > _TOLD_S:
-                told = time.monotonic()
-                print(f"PrimDiffusion: {job.message}", flush=True)
-            time.sleep(TICK_S / 4)
-        try:
-            session.finish(context)
-        except GenerationFailed as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        print(f"PrimDiffusion: {session.notice}", flush=True)
-        return {"FINISHED"}
+        return see_through(self, context)
 
 
 class PRIMDIFFUSION_OT_cancel(bpy.types.Operator):
-    """Stop generating; nothing is added to the scene"""
+    """Stop making the person; nothing is added to the scene"""
 
     bl_idname = "primdiffusion.cancel"
     bl_label = "Cancel"
@@ -67,6 +49,26 @@ class PRIMDIFFUSION_OT_cancel(bpy.types.Operator):
         """Ask; the timer sees it through."""
         session.cancel()
         return {"FINISHED"}
+
+
+def see_through(operator: bpy.types.Operator, context: bpy.types.Context) -> set[str]:
+    """Follow the job that `operator` has just started: with a window by a timer, in background mode by waiting here."""
+    if not bpy.app.background:
+        bpy.app.timers.register(follow, first_interval=TICK_S, persistent=True)
+        return {"FINISHED"}
+    told = 0.0
+    while (job := session.job) is not None and not job.finished:
+        if session.tick() and time.monotonic() - told > _TOLD_S:
+            told = time.monotonic()
+            print(f"PrimDiffusion: {job.message}", flush=True)
+        time.sleep(TICK_S / 4)
+    try:
+        session.finish(context)
+    except GenerationFailed as error:
+        operator.report({"ERROR"}, str(error))
+        return {"CANCELLED"}
+    print(f"PrimDiffusion: {session.notice}", flush=True)
+    return {"FINISHED"}
 
 
 def follow() -> float | None:

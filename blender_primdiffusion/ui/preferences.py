@@ -1,4 +1,4 @@
-"""Preferences: which Python runs the generator, which checkpoint it uses."""
+"""Preferences: which Python runs the backend, which checkpoints it uses."""
 
 from __future__ import annotations
 
@@ -22,8 +22,14 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         description="A .safetensors file of the diffusion model; empty: the one that comes with the add-on",
         subtype="FILE_PATH",
     )
+    encoder: bpy.props.StringProperty(
+        name="Encoder",
+        description="A .safetensors file of the encoder, for people from captures; empty: the one that comes with "
+        "the add-on",
+        subtype="FILE_PATH",
+    )
 
     def draw(self, _context: bpy.types.Context) -> None:
-        """Two file fields."""
-        self.layout.prop(self, "backend_python")
-        self.layout.prop(self, "checkpoint")
+        """File fields."""
+        for name in ("backend_python", "checkpoint", "encoder"):
+            self.layout.prop(self, name)

@@ -1,4 +1,4 @@
-"""One generation as Blender follows it: a small state machine that a timer ticks."""
+"""One person in the making as Blender follows it: a small state machine that a timer ticks."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ CANCELLED_CODE = -32001
 CANCEL_PATIENCE_S = 15.0
 """A cancel takes effect at the end of a step; a child that takes longer than this is ended."""
 STAGES = {
+    "read": "Reading the pictures",
     "load": "Loading the model",
     "sample": "Generating",
+    "encode": "Reconstructing",
     "preview": "Drawing the previews",
     "write": "Writing the person",
 }
@@ -35,9 +37,9 @@ class Backend:
         self._lock = threading.Lock()
         self._client: BackendClient | None = None
         self._closed = False
-        self._job: GenerateJob | None = None
+        self._job: PersonJob | None = None
 
-    def admit(self, job: GenerateJob) -> bool:
+    def admit(self, job: PersonJob) -> bool:
         """Takes `job` as the one at work; False while another is."""
         if self._job is not None and not self._job.finished:
             return False
@@ -88,25 +90,19 @@ def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
-class GenerateJob:
-    """Generates one person into `out_dir`. Call `tick` from a timer until `finished`; then read `result` or `error`.
+class PersonJob:
+    """Makes one person in `out_dir`. Call `tick` from a timer until `finished`; then read `result` or `error`.
 
     starting -> running -> done | failed;  cancel: -> cancelling -> cancelled.
     """
 
-    def __init__(
-        self,
-        backend: Backend,
-        *,
-        seed: int,
-        steps: int,
-        out_dir: Path,
-        sampler: str = "ddim",
-        checkpoint: Path | None = None,
-    ):
-        self._params = {"seed": seed, "steps": steps, "out_dir": str(out_dir), "sampler": sampler}
-        if checkpoint is not None:
-            self._params["checkpoint"] = str(checkpoint)
+    method: str
+    """Of the child."""
+    made: str
+    """What became of the person, for `message`."""
+
+    def __init__(self, backend: Backend, params: dict[str, Any], out_dir: Path, total: int):
+        self._params = {**params, "out_dir": str(out_dir)}
         self._backend = backend
         self._out_dir = out_dir
         self._out_dir_is_new = not out_dir.exists()
@@ -115,12 +111,12 @@ class GenerateJob:
         self._cancel_asked_at: float | None = None
         self.state: State = "starting"
         self.step = 0
-        self.total = steps
+        self.total = total
         self.eta_s: float | None = None
         """Seconds that are left, None while unknown."""
         self.message = "Starting the backend"
         self.result: dict[str, Any] | None = None
-        """Of generate: human, preview (paths), seed, steps, seconds."""
+        """The child's: human, person, preview (paths), seconds and what the method adds."""
         self.error: JobError | None = None
         self._connected: BackendClient | None = None
         self._connect_error: Exception | None = None
@@ -128,7 +124,7 @@ class GenerateJob:
         if backend.admit(self):
             self._connecting.start()
         else:
-            self._fail(JobError("a person is being generated already", "wait for it, or cancel it first", "busy"))
+            self._fail(JobError("a person is being made already", "wait for it, or cancel it first", "busy"))
 
     @property
     def finished(self) -> bool:
@@ -190,7 +186,7 @@ class GenerateJob:
             self._ask(self._client)
 
     def _ask(self, client: BackendClient) -> None:
-        self._request = client.request("generate", self._params)
+        self._request = client.request(self.method, self._params)
         if not client.info.get("ready"):
             self.message = "Loading PyTorch"
 
@@ -202,7 +198,7 @@ class GenerateJob:
         elif isinstance(event, Response) and event.id == self._request:
             self.result = event.result
             self.step, self.eta_s = self.total, 0.0
-            self._end("done", f"Generated in {event.result['seconds']:.1f} s")
+            self._end("done", f"{self.made} in {event.result['seconds']:.1f} s")
         elif isinstance(event, Failure) and event.id == self._request:
             if event.code == CANCELLED_CODE:
                 self._end("cancelled", "Cancelled")
@@ -226,9 +222,10 @@ class GenerateJob:
         self.state = "running"
         self.message = STAGES.get(stage, stage)
         self.eta_s = params.get("eta_s")
-        if stage == "sample":
-            self.step, self.total = params["step"], params["total"]
-            self.message = f"{self.message}: step {self.step} of {self.total}"
+        self._take_step(stage, params["step"], params["total"])
+
+    def _take_step(self, stage: str, step: int, total: int) -> None:
+        self.step, self.total = step, total
 
     def _lose_patience(self) -> None:
         asked = self._cancel_asked_at
@@ -258,3 +255,55 @@ class GenerateJob:
 
     def _end(self, state: State, message: str) -> None:
         self.state, self.message, self.eta_s = state, message, None
+
+
+class GenerateJob(PersonJob):
+    """A person from noise; progress counts the sampler's steps."""
+
+    method = "generate"
+    made = "Generated"
+
+    def __init__(
+        self,
+        backend: Backend,
+        *,
+        seed: int,
+        steps: int,
+        out_dir: Path,
+        sampler: str = "ddim",
+        checkpoint: Path | None = None,
+    ):
+        params = {"seed": seed, "steps": steps, "sampler": sampler}
+        if checkpoint is not None:
+            params["checkpoint"] = str(checkpoint)
+        super().__init__(backend, params, out_dir, steps)
+
+    def _take_step(self, stage: str, step: int, total: int) -> None:
+        if stage == "sample":
+            super()._take_step(stage, step, total)
+            self.message = f"{self.message}: step {step} of {total}"
+
+
+class ReconstructJob(PersonJob):
+    """A person from captures; progress counts reading, loading, encoding and writing."""
+
+    method = "reconstruct"
+    made = "Reconstructed"
+
+    def __init__(
+        self,
+        backend: Backend,
+        *,
+        capture: Path,
+        out_dir: Path,
+        subject: str | None = None,
+        frame: int = 0,
+        views: int = 8,
+        checkpoint: Path | None = None,
+    ):
+        params: dict[str, Any] = {"capture": str(capture), "frame": frame, "views": views}
+        if subject is not None:
+            params["subject"] = subject
+        if checkpoint is not None:
+            params["checkpoint"] = str(checkpoint)
+        super().__init__(backend, params, out_dir, 4)

@@ -122,7 +122,7 @@ def test_a_killed_child_is_reported_within_a_second(addon):
 
 def test_a_second_click_is_one_clear_error_and_does_not_disturb_the_first(addon):
     session.start(7, 2)
-    with pytest.raises(RuntimeError, match="being generated; wait for it or press Cancel"):
+    with pytest.raises(RuntimeError, match="being made; wait for it or press Cancel"):
         bpy.ops.primdiffusion.generate(seed=8, steps=1)
     drive()
     assert len(humans(addon.scene)) == 1

@@ -108,7 +108,7 @@ def test_the_second_of_two_clicks_is_refused_with_a_sentence_and_the_first_goes_
     first, second = start(3), start(3, "second")
     assert second.state == "failed"
     assert second.error.kind == "busy"
-    assert str(second.error) == "A person is being generated already. Wait for it, or cancel it first."
+    assert str(second.error) == "A person is being made already. Wait for it, or cancel it first."
     assert follow(first)[-1] == "done"
 
 

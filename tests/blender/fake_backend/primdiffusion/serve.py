@@ -1,4 +1,4 @@
-"""A child that answers generate with FAKE_HUMAN's file and draw with one colour, or misbehaves."""
+"""A child that answers generate and reconstruct with FAKE_HUMAN's file and draw with one colour, or misbehaves."""
 
 import json
 import os
@@ -47,6 +47,30 @@ def generate(id: int, params: dict, cancelled: threading.Event) -> None:
     say(id=id, result={"human": str(human), "person": person, "seed": seed, "steps": steps, "seconds": 0.1})
 
 
+def reconstruct(id: int, params: dict, cancelled: threading.Event) -> None:
+    """Does what is written in the file `order` of the captures; without one it makes the person."""
+    order, out = Path(params["capture"]) / "order", Path(params["out_dir"])
+    asked = order.read_text() if order.exists() else ""
+    for step in range(400 if asked == "take long" else 4):
+        say(method="progress", params={"id": id, "stage": "encode", "step": min(step, 3), "total": 4, "eta_s": None})
+        time.sleep(0.02)
+        if cancelled.is_set():
+            say(id=id, error={"code": -32001, "message": "cancelled"})
+            return
+    if asked == "die":
+        os._exit(9)
+    if asked == "fail":
+        data = {"kind": "bad_input", "remedy": ""}
+        say(id=id, error={"code": -32002, "message": "there is no subject 'nobody': choose of anna", "data": data})
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(os.environ["FAKE_HUMAN"], out / "human.npz")
+    (out / "person.human.safetensors").write_bytes(json.dumps(params).encode())
+    files = {"human": str(out / "human.npz"), "person": str(out / "person.human.safetensors")}
+    warnings = ["one view only"] if params["views"] == 1 else []
+    say(id=id, result={**files, "warnings": warnings, "seconds": 0.1})
+
+
 def draw(id: int, params: dict, cancelled: threading.Event) -> None:
     """Fills the frame with COLOUR and DEPTH from the top; takes FAKE_BAND_S a band, fails as FAKE_DRAW says."""
     _, _, width, height = params["region"] or [0, 0, params["width"], params["height"]]
@@ -70,16 +94,16 @@ def draw(id: int, params: dict, cancelled: threading.Event) -> None:
     say(id=id, result={"seconds": 0.0, "seconds_place": 0.0, "seconds_march": 0.0})
 
 
+WORK = {"generate": generate, "reconstruct": reconstruct, "draw": draw}
 cancelled = threading.Event()
 for line in sys.stdin:
     request = json.loads(line)
     id, method = request["id"], request["method"]
     if method == "hello":
         say(id=id, result={"version": "0-fake", "ready": True, "device": "cpu", "device_name": "fake device"})
-    elif method in ("generate", "draw"):
+    elif method in WORK:
         cancelled.clear()
-        work = generate if method == "generate" else draw
-        threading.Thread(target=work, args=(id, request["params"], cancelled), daemon=True).start()
+        threading.Thread(target=WORK[method], args=(id, request["params"], cancelled), daemon=True).start()
     elif method == "cancel":
         cancelled.set()
         say(id=id, result={})
