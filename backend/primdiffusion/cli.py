@@ -205,6 +205,11 @@ class Train:
     """Train the diffusion model on such primitives (own --help)."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+    """Measure how good trained models are: reconstruction (own --help)."""
+
+
 Command = (
     Annotated[Generate, tyro.conf.subcommand("generate")]
     | Annotated[Render, tyro.conf.subcommand("render")]
@@ -213,6 +218,7 @@ Command = (
     | Annotated[Payloads, tyro.conf.subcommand("payloads")]
     | Annotated[Captures, tyro.conf.subcommand("captures")]
     | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
 )
 
 
@@ -244,7 +250,19 @@ def _train(arguments: Sequence[str]) -> None:
     train(tyro.cli(TrainingConfig, args=arguments, prog="primdiffusion train"))
 
 
-FORWARDED = {"people": _people, "payloads": _payloads, "captures": _captures, "train": _train}
+def _evaluate(arguments: Sequence[str]) -> None:
+    from primdiffusion.evaluation.command import TrainedReconstructor, run
+
+    def load(path: Path | None) -> TrainedReconstructor:
+        from primdiffusion.machine import best_device
+        from primdiffusion.training.encoder_checkpoint import load_encoder
+
+        return load_encoder(path, best_device())
+
+    run(arguments, load)
+
+
+FORWARDED = {"people": _people, "payloads": _payloads, "captures": _captures, "train": _train, "evaluate": _evaluate}
 """Commands whose parameters their own modules state; importing these takes a second, so only when asked for."""
 
 

@@ -1,0 +1,223 @@
+"""Evaluation of reconstructions, by a model that needs no training: grey boxes on the body."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+from capture_scenes import captured
+from primdiffusion import cli
+from primdiffusion.body.model import default_body
+from primdiffusion.capture.conditioning import ConditioningError, spread_cameras
+from primdiffusion.capture.reader import open_captures
+from primdiffusion.evaluation import command
+from primdiffusion.evaluation.reconstruction import (
+    SPLITS,
+    EvaluationSettings,
+    Likeness,
+    PictureScore,
+    compare,
+    evaluate,
+    picture,
+    summary,
+    table,
+)
+from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.human import pose_body
+from primdiffusion.primitives.anchors import attach, default_anchors
+from primdiffusion.primitives.primitives import K, Payload, Primitives
+from primdiffusion.render.march import MarchSettings, Rendering, march
+
+COARSE = MarchSettings(step=0.016)
+
+
+class Grey:
+    """Everybody is grey; notes what it is given."""
+
+    def __init__(self, level=0.2):
+        self.card = {"name": "grey", "steps": 0}
+        self.level = level
+        self.given = []
+        self.placed = []
+
+    def encode(self, views, betas):
+        self.given.append((views, betas))
+        return Payload(
+            rgb=torch.full((K, 3, 8, 8, 8), self.level),
+            density=torch.full((K, 8, 8, 8), 50.0),
+            delta_scale=torch.ones(K, 3),
+        )
+
+    def place(self, payload, betas, pose):
+        self.placed.append(pose)
+        vertices = pose_body(betas, pose).vertices
+        return Primitives.place(attach(default_anchors(), vertices, default_body().faces), payload)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    return open_captures(captured(tmp_path_factory.mktemp("captures"), passes=("img", "mask")))
+
+
+@pytest.fixture(scope="module")
+def scored(captures):
+    model = Grey()
+    settings = EvaluationSettings(given_views=2, given_frame=1, size=32, march=COARSE)
+    return model, list(evaluate(model, captures, settings))
+
+
+def test_every_picture_is_scored_once_and_everybody_encoded_once(scored, captures):
+    model, scores = scored
+    places = [(score.subject, score.frame, score.camera) for score in scores]
+    assert places == [(name, frame, camera) for name in captures.subjects for frame in range(3) for camera in range(4)]
+    assert len(model.given) == len(captures.subjects)
+    assert len(model.placed) == 3 * len(captures.subjects)
+
+
+def test_encoder_is_given_spread_views_of_one_pose(scored, captures):
+    model, scores = scored
+    for (views, betas), name in zip(model.given, captures.subjects, strict=True):
+        subject = captures.subject(name)
+        cameras = spread_cameras(subject, 1, 2)
+        assert views.rgba.shape == (2, 32, 32, 4)
+        for view, camera in enumerate(cameras):
+            seen = captures.view(name, 1, camera)
+            assert torch.equal(views.image[view], seen.image)
+            assert torch.allclose(views.camera.world_to_camera[view], seen.camera.world_to_camera)
+        assert torch.equal(views.pose.joint_rotation, subject.smpl.pose(1).joint_rotation)
+        assert betas.shape == (10,)
+        assert {score.camera for score in scores if score.subject == name and score.given_view} == set(cameras)
+    assert {score.frame for score in scores if score.given_pose} == {1}
+
+
+def test_scores_are_those_of_the_drawn_pictures(scored, captures):
+    _, scores = scored
+    score = scores[6]
+    seen = captures.view(score.subject, score.frame, score.camera)
+    model = Grey()
+    primitives = model.place(model.encode(None, None), seen.betas, seen.pose)
+    image = picture(march(primitives, seen.camera, COARSE))
+    error = (image - seen.image / 255).square().mean()
+    assert score.likeness.psnr == pytest.approx(float(-10 * error.log10()), abs=1e-3)
+
+
+def test_evaluation_is_deterministic(scored, captures):
+    again = list(evaluate(Grey(), captures, EvaluationSettings(given_views=2, given_frame=1, size=32, march=COARSE)))
+    assert again == scored[1]
+
+
+def test_another_model_scores_otherwise(scored, captures):
+    settings = EvaluationSettings((captures.subjects[0],), (0,), (1,), 1, 0, 32, COARSE)
+    (dark,), (bright,) = (list(evaluate(Grey(level), captures, settings)) for level in (0.0, 1.0))
+    assert dark.likeness.psnr != bright.likeness.psnr
+    assert dark.likeness.mask_iou == bright.likeness.mask_iou > 0
+
+
+def test_chosen_subjects_frames_and_cameras_are_kept_to(captures):
+    name = captures.subjects[1]
+    scores = list(evaluate(Grey(), captures, EvaluationSettings((name,), (2,), (3, 0), 4, 0, 16, COARSE)))
+    assert [(score.subject, score.frame, score.camera) for score in scores] == [(name, 2, 3), (name, 2, 0)]
+    assert all(score.given_view and not score.given_pose for score in scores)
+
+
+def test_frames_that_are_not_there_are_refused(captures):
+    with pytest.raises(ConditioningError, match=r"frames 0 to 2, not 7"):
+        list(evaluate(Grey(), captures, EvaluationSettings(given_frame=7, size=32)))
+    with pytest.raises(KeyError, match="nobody"):
+        list(evaluate(Grey(), captures, EvaluationSettings(("nobody",), size=32)))
+
+
+@pytest.mark.parametrize(("name", "value"), [("given_views", 0), ("size", 10)])
+def test_impossible_settings_are_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name} of the evaluation is {value}"):
+        EvaluationSettings(**{name: value})
+
+
+def rendered(rgba):
+    """A rendering that looks like a captured picture."""
+    zeros = torch.zeros(rgba.shape[:2])
+    return Rendering(decode_srgb(rgba[..., :3].float() / 255), rgba[..., 3].float() / 255, zeros, zeros)
+
+
+def test_a_picture_is_most_like_itself():
+    rgba = torch.randint(0, 256, (24, 20, 4), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    likeness = compare(rendered(rgba), rgba)
+    assert likeness.psnr > 90
+    assert likeness.ssim == pytest.approx(1, abs=1e-5)
+    assert likeness.mask_iou == 1
+
+
+def test_the_box_leaves_out_what_is_black_around_the_person():
+    rgba = torch.zeros(40, 40, 4, dtype=torch.uint8)
+    rgba[10:30, 5:25] = 255
+    other = rgba.clone()
+    other[10:20, 5:25, 0] = 128
+    likeness = compare(rendered(other), rgba)
+    quarter = 20 * 20 / 40**2
+    assert likeness.psnr_box == pytest.approx(likeness.psnr + 10 * torch.tensor(quarter).log10().item(), abs=1e-3)
+    assert likeness.ssim_box < likeness.ssim
+
+
+def test_an_empty_picture_has_no_box():
+    rgba = torch.zeros(16, 16, 4, dtype=torch.uint8)
+    likeness = compare(rendered(rgba), rgba)
+    assert (likeness.psnr_box, likeness.ssim_box, likeness.mask_iou) == (None, None, 1)
+
+
+def test_colours_beyond_white_are_white():
+    rgba = torch.full((12, 12, 4), 255, dtype=torch.uint8)
+    bright = dataclasses.replace(rendered(rgba), rgb=torch.full((12, 12, 3), 7.0))
+    assert compare(bright, rgba).psnr == 100
+
+
+def score(psnr, given_view, given_pose, box=None):
+    return PictureScore("a", 0, 0, given_view, given_pose, Likeness(psnr, 0.5, box, box, 1.0))
+
+
+def test_summary_averages_each_part_alone():
+    scores = [score(30, True, True, 20), score(20, False, True), score(16, False, False, 10), score(18, False, False)]
+    means = summary(scores)
+    assert list(means) == list(SPLITS)
+    assert [(part.pictures, part.psnr, part.psnr_box) for part in means.values()] == [
+        (4, 21, 15), (1, 30, 20), (1, 20, None), (0, None, None), (2, 17, 10)
+    ]  # fmt: skip
+    rows = table(means).splitlines()
+    assert rows[2] == "| all views, all poses | 4 | 21.00 | 0.5000 | 15.00 | 15.0000 | 1.0000 | - |"
+    assert rows[5] == "| given views, novel poses | 0 | - | - | - | - | - | - |"
+
+
+def test_command_prints_the_table_and_writes_all_scores(captures, tmp_path, capsys):
+    paths = []
+
+    def load(path):
+        paths.append(path)
+        return Grey()
+
+    line = ["--captures", str(captures.root), "--people", "1", "--views", "2", "--size", "32", "--json"]
+    command.run(["reconstruction", *line, str(tmp_path / "new" / "scores.json")], load)
+    assert paths == [None]
+    assert capsys.readouterr().out.splitlines()[2].startswith("| all views, all poses | 12 | ")
+    record = json.loads((tmp_path / "new" / "scores.json").read_text())
+    assert record["checkpoint"] == Grey().card
+    assert record["settings"]["subjects"] == [captures.subjects[0]]
+    assert record["means"]["all"]["pictures"] == len(record["pictures"]) == 12
+
+
+def test_command_tells_wrong_folders_and_numbers(captures, tmp_path, capsys):
+    for arguments, sentence in (
+        (["--captures", str(tmp_path / "none")], "there is no folder of captures"),
+        (["--captures", str(captures.root), "--people", "-1"], "people is -1"),
+        (["--captures", str(captures.root), "--lpips", str(tmp_path / "w.pth")], "there is no file of weights"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            cli.main(["evaluate", "reconstruction", *arguments])
+        assert end.value.code == 1
+        assert sentence in capsys.readouterr().err
