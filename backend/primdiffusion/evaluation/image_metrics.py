@@ -72,8 +72,8 @@ def ssim(image: Float[Tensor, "*b H W 3"], target: Float[Tensor, "*b H W 3"]) ->
     if min(height, width) < WINDOW:
         raise ValueError(f"pictures of {width} x {height} pixels: SSIM needs {WINDOW} a side")
     x, y = (picture.reshape(-1, height, width, 3).movedim(-1, 1) for picture in (image, target))
-    moments = _blurred(torch.stack([x, y, x * x, y * y, x * y]).flatten(0, 2)[:, None])
-    mean_x, mean_y, square_x, square_y, product = moments.reshape(5, -1, *moments.shape[-2:])
+    moments = _blurred(torch.stack([x, y, x * x, y * y, x * y]).flatten(0, 2))
+    mean_x, mean_y, square_x, square_y, product = moments.unflatten(0, (5, -1))
     c1, c2 = K1**2, K2**2
     covariance, variances = product - mean_x * mean_y, square_x + square_y - mean_x**2 - mean_y**2
     luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
@@ -81,13 +81,15 @@ def ssim(image: Float[Tensor, "*b H W 3"], target: Float[Tensor, "*b H W 3"]) ->
     return similarity.mean((-2, -1)).reshape(-1, 3).mean(-1).reshape(image.shape[:-3])
 
 
-def _blurred(pictures: Float[Tensor, "n 1 H W"]) -> Float[Tensor, "n 1 h w"]:
+def _blurred(pictures: Float[Tensor, "n H W"]) -> Float[Tensor, "n h w"]:
     """Weighted means over the windows that lie wholly inside."""
+    count = len(pictures)
     place = torch.arange(WINDOW, dtype=pictures.dtype, device=pictures.device) - WINDOW // 2
     weight = (-0.5 * (place / SIGMA).square()).exp()
-    weight = (weight / weight.sum())[None, None]
-    rows = torch.nn.functional.conv2d(pictures, weight[..., None])
-    return torch.nn.functional.conv2d(rows, weight[..., None, :])
+    weight = (weight / weight.sum()).expand(count, 1, 1, WINDOW)
+    # As channels of one picture: as pictures of one channel it is nine times slower on the CPU.
+    columns = torch.nn.functional.conv2d(pictures[None], weight.mT, groups=count)
+    return torch.nn.functional.conv2d(columns, weight, groups=count)[0]
 
 
 def overlap(first: Bool[Tensor, "H W"], second: Bool[Tensor, "H W"]) -> float:
