@@ -37,6 +37,16 @@ class Position(NamedTuple):
 FIRST = Position()
 
 
+class Share(NamedTuple):
+    """Which of the processes that train together this is."""
+
+    index: int = 0
+    of: int = 1
+
+
+ALONE = Share()
+
+
 @dataclasses.dataclass(frozen=True)
 class SampleSettings:
     """What a sample holds."""
@@ -164,22 +174,27 @@ class CaptureDataset(Dataset[TrainingSample]):
 
 
 class _Order(Sampler[Position]):
-    """Positions from `start` on, without end."""
+    """Positions from `start` on, without end: of every `share.of` runs of `size`, the `share.index`-th."""
 
-    def __init__(self, length: int, start: Position) -> None:
-        self._length, self._start = length, start
+    def __init__(self, length: int, start: Position, size: int, share: Share) -> None:
+        self._length, self._start, self._size, self._share = length, start, size, share
 
     def __iter__(self) -> Iterator[Position]:
-        position = self._start
+        position = _after(self._start, self._share.index * self._size, self._length)
         while True:
-            yield position
-            position = _after(position, 1, self._length)
+            for _ in range(self._size):
+                yield position
+                position = _after(position, 1, self._length)
+            position = _after(position, (self._share.of - 1) * self._size, self._length)
 
 
 def batches(
-    dataset: CaptureDataset, size: int, start: Position = FIRST, workers: int = 0
-) -> Iterator[tuple[TrainingSample, Position]]:
+    dataset: Dataset[Record], size: int, start: Position = FIRST, workers: int = 0, share: Share = ALONE
+) -> Iterator[tuple[Record, Position]]:
     """Batches without end, each with the position behind it: save it, and `start` there to go on.
+
+    Of several processes each gets its own batches, and behind them is the place where all are done. The dataset is a
+    `CaptureDataset`, or one that makes other records of its samples.
 
     Raises:
         ValueError: the batch size is not positive.
@@ -190,14 +205,14 @@ def batches(
     loader = DataLoader(
         dataset,
         batch_size=size,
-        sampler=_Order(len(dataset), Position(*start)),
+        sampler=_Order(len(dataset), Position(*start), size, share),
         num_workers=workers,
         collate_fn=stack,
         pin_memory=torch.cuda.is_available(),
     )
     position = Position(*start)
     for batch in loader:
-        position = _after(position, size, len(dataset))
+        position = _after(position, size * share.of, len(dataset))
         yield batch, position
 
 

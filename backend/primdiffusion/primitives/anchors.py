@@ -110,9 +110,7 @@ def anchor_skin_weights(anchors: Anchors, body: BodyModel) -> Float[Tensor, "k j
 @functools.lru_cache(maxsize=1)
 def default_anchors() -> Anchors:
     """The anchors of the default body, from the layout in body/data/layout.npz (made by scripts/bake_layout)."""
-    with resources.files("primdiffusion.body").joinpath("data/layout.npz").open("rb") as file, np.load(file) as stored:
-        layout = {name: torch.from_numpy(stored[name].astype(np.float64)) for name in stored}
-    first, second = (layout["texel_barycentric"] / 65535).unbind(-1)
+    layout = _layout()
     body = default_body()
     # In float64: a tangent plane's weights must cancel to the last bit, or frames would depend on where a body stands.
     return footprint_anchors(
@@ -121,9 +119,25 @@ def default_anchors() -> Anchors:
         layout["cell_face"].long(),
         layout["cell_barycentric"],
         layout["cell_chart"].long(),
-        layout["texel_face"].long(),
-        torch.stack([first, second, 1 - first - second], -1),
+        *_texels_of(layout),
     ).to(dtype=torch.float32)
+
+
+@functools.lru_cache(maxsize=1)
+def default_texels() -> tuple[Int[Tensor, "h w"], Float[Tensor, "h w 3"]]:
+    """The surface point of the default body under every texel of its layout, 8 x 8 for each primitive: face, place."""
+    face, barycentric = _texels_of(_layout())
+    return face, barycentric.float()
+
+
+def _layout() -> dict[str, Tensor]:
+    with resources.files("primdiffusion.body").joinpath("data/layout.npz").open("rb") as file, np.load(file) as stored:
+        return {name: torch.from_numpy(stored[name].astype(np.float64)) for name in stored}
+
+
+def _texels_of(layout: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    first, second = (layout["texel_barycentric"] / 65535).unbind(-1)
+    return layout["texel_face"].long(), torch.stack([first, second, 1 - first - second], -1)
 
 
 def footprint_anchors(

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import os
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, Protocol
 
 from primdiffusion.diffusion.denoiser import DenoiserConfig
 
@@ -90,12 +90,37 @@ class TrainingConfig:
     )
 
 
-def to_json(config: TrainingConfig) -> str:
+def to_json(config: Any) -> str:
     """The configuration as readable JSON."""
     return json.dumps(dataclasses.asdict(config), indent=2, default=str)
 
 
-def check_resumable(saved: str, config: TrainingConfig) -> None:
+MAY_CHANGE = frozenset(
+    (
+        "run",
+        "data",
+        "held",
+        "minutes",
+        "save_every",
+        "threads",
+        "workers",
+        "steps",
+        "evaluate_every",
+        "pictures_every",
+        "log_every",
+    )
+)
+"""Settings that a resumed run may be given anew: none of them changes what a step does."""
+
+
+class RunConfig(Protocol):
+    """Any run's settings: a dataclass that says where its folder is."""
+
+    @property
+    def run(self) -> Path: ...  # noqa: D102
+
+
+def check_resumable(saved: str, config: RunConfig) -> None:
     """ValueError that names the settings in which a saved run differs from `config`, except when to stop."""
     before, now = (_comparable(json.loads(text)) for text in (saved, to_json(config)))
     changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
@@ -109,7 +134,7 @@ def _comparable(tree: dict, prefix: str = "") -> dict[str, object]:
     for key, value in tree.items():
         if isinstance(value, dict):
             flat |= _comparable(value, f"{prefix}{key}.")
-        elif prefix or key not in ("run", "data", "minutes", "save_every", "threads"):
+        elif prefix or key not in MAY_CHANGE:
             flat[prefix + key] = value
     return {key: value for key, value in flat.items() if not key.endswith((".steps", ".evaluate_every"))}
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 from typing import Protocol
 
 import torch
@@ -26,6 +24,7 @@ from primdiffusion.diffusion.model import CellCodec, DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import SCHEDULES
 from primdiffusion.training.checkpoint import save_checkpoint
 from primdiffusion.training.config import PhaseConfig, TrainingConfig, check_resumable, to_json, write_atomically
+from primdiffusion.training.interrupt import Interrupt
 from primdiffusion.training.latents import (
     LatentSet,
     encode_people,
@@ -74,29 +73,6 @@ class Objective(Protocol):
     def loss(self, generator: torch.Generator) -> Tensor:
         """Of a random batch."""
         ...
-
-
-class Interrupt:
-    """Asks loops to stop after the current step: at a deadline or on Ctrl-C, which thus never tears a step apart."""
-
-    def __init__(self, minutes: float | None):
-        self.deadline = time.monotonic() + 60 * minutes if minutes is not None else float("inf")
-        self.pressed = False
-
-    def __enter__(self) -> Interrupt:
-        self._before = signal.signal(signal.SIGINT, self._press)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGINT, self._before)
-
-    def _press(self, _number: int, _frame: FrameType | None) -> None:
-        log.info("stopping after this step")
-        self.pressed = True
-
-    def due(self) -> bool:
-        """Whether to stop now."""
-        return self.pressed or time.monotonic() > self.deadline
 
 
 def prepare(config: TrainingConfig) -> Prepared:

@@ -6,19 +6,37 @@ import copy
 import json
 import math
 from pathlib import Path
+from typing import Protocol
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from primdiffusion.training.config import PhaseConfig, write_atomically
+from primdiffusion.training.config import write_atomically
+
+
+class OptimiserConfig(Protocol):
+    """What of a run's settings the optimiser needs; as in `PhaseConfig`."""
+
+    @property
+    def steps(self) -> int: ...  # noqa: D102
+    @property
+    def learning_rate(self) -> float: ...  # noqa: D102
+    @property
+    def weight_decay(self) -> float: ...  # noqa: D102
+    @property
+    def gradient_clip(self) -> float: ...  # noqa: D102
+    @property
+    def ema(self) -> float: ...  # noqa: D102
+    @property
+    def evaluate_every(self) -> int: ...  # noqa: D102
 
 
 class TrainingState:
     """A network with its optimiser, average of weights, random state and place; saved and loaded as one file."""
 
-    def __init__(self, network: nn.Module, config: PhaseConfig, seed: int):
+    def __init__(self, network: nn.Module, config: OptimiserConfig, seed: int):
         self.network, self.config = network, config
         self.average = copy.deepcopy(network).eval().requires_grad_(False)
         self.optimiser = torch.optim.AdamW(
@@ -26,6 +44,8 @@ class TrainingState:
         )
         self.generator = torch.Generator().manual_seed(seed)
         self.step, self.seconds = 0, 0.0
+        self.place: dict[str, str] = {}
+        """What else belongs to the place in training: kept in the file, read back by `load`."""
 
     def update(self, loss: Tensor) -> float:
         """One optimiser step and one step of the average; returns the gradient norm. FloatingPointError if infinite."""
@@ -33,8 +53,7 @@ class TrainingState:
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = float(nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip))
+        norm = self._gradient(loss)
         if not norm < float("inf"):
             raise FloatingPointError(
                 f"the gradient at step {self.step} is not finite: lower the learning rate and resume"
@@ -47,6 +66,11 @@ class TrainingState:
         self.step += 1
         return norm
 
+    def _gradient(self, loss: Tensor) -> float:
+        """Of every parameter, clipped; returns its norm before that."""
+        loss.backward()
+        return float(nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip))
+
     def save(self, path: Path) -> None:
         """Write everything to one safetensors file, whole or not at all."""
         tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
@@ -54,7 +78,7 @@ class TrainingState:
         for index, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
         tensors |= {"random.data": self.generator.get_state(), "random.torch": torch.get_rng_state()}
-        place = {"step": str(self.step), "seconds": repr(self.seconds)}
+        place = {"step": str(self.step), "seconds": repr(self.seconds), **self.place}
         write_atomically(path, save({k: v.detach().contiguous() for k, v in tensors.items()}, metadata=place))
 
     def load(self, path: Path) -> None:
@@ -77,7 +101,8 @@ class TrainingState:
         self.optimiser.load_state_dict(optimiser)
         self.generator.set_state(tensors["random.data"])
         torch.set_rng_state(tensors["random.torch"])
-        self.step, self.seconds = int(place["step"]), json.loads(place["seconds"])
+        self.step, self.seconds = int(place.pop("step")), json.loads(place.pop("seconds"))
+        self.place = place
 
 
 def learning_rate_factor(step: int, steps: int, warm_up: int = 100, last: float = 0.1) -> float:

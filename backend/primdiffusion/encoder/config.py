@@ -1,0 +1,103 @@
+"""Settings of the encoder, and the named ones: ours, the paper's, the released code's, and the paper's ablations."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Literal
+
+
+@dataclasses.dataclass(frozen=True)
+class EncoderConfig:
+    """What the encoder is made of (paper sec. 3.2; SPEC 2)."""
+
+    appearance: Literal["voxels", "texels"] = "voxels"
+    """What is looked up in the pictures: the body's surface under every texel (paper), or every voxel of the boxes."""
+    facing: int = 2
+    """Views count by the cosine to the surface's normal to this power; 0: all visible ones alike (paper)."""
+    attention: Literal["cross", "concatenated", "none"] = "cross"
+    """cross: appearance queries motion and back (paper); concatenated: self-attention over both (released); none."""
+    delta_scale: Literal["varying", "shared"] = "varying"
+    """A box's own factors on its size, or the same for all boxes of a person (the paper's ablation)."""
+    frames: Literal["person", "template"] = "person"
+    """Whose body the boxes sit on: the person's, or one of mean shape (the paper's ablation "w/o R, T")."""
+    base: Literal["looked_up", "constant"] = "looked_up"
+    """What networks add to: what was looked up at each voxel, or nothing but a constant (paper)."""
+    detail: Literal["skips", "bottleneck"] = "skips"
+    """skips: the mapping networks see the image encoder's finer levels; bottleneck: the 32 x 32 features (paper)."""
+    stem: tuple[int, int, int] = (24, 48, 64)
+    """Channels of the image encoder at 128, 64 and 32 squared."""
+    grid: tuple[int, ...] = (64, 96, 96, 96)
+    """Channels of its U-Net at 32, 16, 8, ... squared."""
+    motion: int = 32
+    """Channels of the motion branch."""
+    attention_width: int = 128
+    """Channels of all heads together."""
+    attention_heads: int = 4
+    """Heads."""
+    attention_blocks: int = 1
+    """Blocks in a row."""
+    fused: int = 64
+    """Channels of what the mapping networks are given."""
+    colour: tuple[int, int] = (48, 24)
+    """Channels of the colour network at 64 and 128 squared."""
+    density: tuple[int, int] = (32, 16)
+    """Channels of the density network at 64 and 128 squared."""
+    finest: int = 16
+    """Channels of both at 256 squared, before what was looked up joins in."""
+    scale: tuple[int, ...] = (64, 64)
+    """Channels of the delta-scale network."""
+    scale_gain: float = 0.1
+    """delta scale = exp(gain x)."""
+    gain: float = 0.25
+    """Colours and relative densities = base + gain x, clamped to 0 ... 1."""
+    full_density: float = 100.0
+    """1/m: the density of 1."""
+
+    @property
+    def channels(self) -> int:
+        """Channels of what is looked up, a picture of 256 x 256."""
+        return 40 if self.appearance == "voxels" else 4
+
+
+DEFAULT = EncoderConfig()
+PAPER = EncoderConfig(
+    appearance="texels",
+    facing=0,
+    base="constant",
+    detail="bottleneck",
+    stem=(4, 8, 16),
+    grid=(64, 64, 64, 64, 64, 64),
+    attention_width=256,
+    attention_blocks=2,
+    colour=(32, 16),
+    density=(32, 16),
+    scale=(64, 128, 64, 64),
+    scale_gain=0.01,
+    gain=25 / 255,
+    full_density=25.5,
+)
+"""The paper's text, with the sizes of SPEC 2 where it names none."""
+PRESETS: Mapping[str, EncoderConfig] = {
+    "default": DEFAULT,
+    "shared_scale": dataclasses.replace(DEFAULT, delta_scale="shared"),
+    "template_rt": dataclasses.replace(DEFAULT, frames="template"),
+    "no_attention": dataclasses.replace(DEFAULT, attention="none"),
+    "paper": PAPER,
+    "released": dataclasses.replace(PAPER, attention="concatenated"),
+}
+"""Encoders by name: ours, its three ablations (paper Table 3), and the architectures of the paper and its code."""
+
+
+def config_from_json(tree: Mapping[str, Any]) -> EncoderConfig:
+    """A configuration from what `dataclasses.asdict` made of it and JSON carried.
+
+    Raises:
+        ValueError: it has settings that this version does not know, or lacks some.
+    """
+    names = {field.name for field in dataclasses.fields(EncoderConfig)}
+    if set(tree) != names:
+        differing = ", ".join(sorted(set(tree) ^ names))
+        raise ValueError(f"the encoder's configuration differs in {differing}: use the release that trained it")
+    settings: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in tree.items()}
+    return EncoderConfig(**settings)

@@ -1,0 +1,197 @@
+"""The generalizable encoder (paper sec. 3.2, SPEC 2): what pictures show of a person, and the pose -> payload."""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from primdiffusion.body.model import J
+from primdiffusion.encoder.blocks import (
+    ConcatenatedAttention,
+    CrossModalAttention,
+    GridNetwork,
+    ResidualConv,
+    UntiedConv,
+    rectified,
+)
+from primdiffusion.encoder.config import EncoderConfig
+from primdiffusion.encoder.unproject import SIDE, Unprojected
+from primdiffusion.geometry.rotation import matrix_to_axis_angle
+from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.primitives.primitives import GRID, Payload, S
+
+MOTION = 3 * (J - 1)
+"""Numbers of a pose: axis-angles of all joints but the pelvis, whose turn is not the body's."""
+CONSTANT_BASE = 100 / 255
+"""What the networks of the paper add to (SPEC 2: relu(25 x + 100))."""
+HULL_BASE = (1.2, -0.3)
+"""Relative density of a voxel that masks cover by c, before anything is learned: clamp(1.2 c - 0.3)."""
+
+
+class Encoder(nn.Module):
+    """Two branches, attention between them, three mapping networks."""
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__()
+        self.config = config
+        first, second, third = config.stem
+        self.stem = nn.ModuleList(
+            [
+                UntiedConv(config.channels, first, SIDE // 2, "down"),
+                UntiedConv(first, second, SIDE // 4, "down"),
+                UntiedConv(second, third, SIDE // 8, "down"),
+            ]
+        )
+        self.appearance = GridNetwork(third, config.grid, GRID)
+        self.motion = ResidualConv(MOTION, config.motion, GRID)
+        channels = config.grid[0], config.motion
+        attention = {"cross": CrossModalAttention, "concatenated": ConcatenatedAttention, "none": None}[
+            config.attention
+        ]
+        self.attention = None if attention is None else attention(
+            *channels, config.attention_width, config.attention_heads, config.attention_blocks
+        )  # fmt: skip
+        self.fuse = ResidualConv(sum(channels), config.fused, GRID)
+        self.colour = MappingNetwork(config, config.colour, 3 * S)
+        self.density = MappingNetwork(config, config.density, S)
+        scale = (config.fused, *config.scale)
+        self.scale = nn.ModuleList(UntiedConv(a, b, GRID) for a, b in itertools.pairwise(scale))
+        self.scale_out = UntiedConv(scale[-1], 3, GRID).quiet()
+
+    def forward(self, found: Unprojected, axis_angle: Float[Tensor, "b 24 3"]) -> Payload:
+        """Payloads [b] of people from what was looked up [b, d, ...] and the pose in which it was.
+
+        Raises:
+            ValueError: the input is of another kind than this encoder's.
+        """
+        x, base = self.read(found)
+        fine = [x]
+        for stem in self.stem:
+            fine.append(rectified(stem(fine[-1])))
+        appearance = self.appearance(fine[3])
+        motion = axis_angle[:, 1:].flatten(1)[:, :, None, None].expand(-1, -1, GRID, GRID)
+        motion = self.motion(motion)
+        if self.attention is not None:
+            appearance, motion = self.attention(appearance, motion)
+        fused = self.fuse(torch.cat([appearance, motion], dim=1))
+        config = self.config
+        colour = clamp(base[:, : 3 * S] + config.gain * self.colour(fused, fine))
+        density = clamp(base[:, 3 * S :] + config.gain * self.density(fused, fine))
+        value = fused
+        for layer in self.scale:
+            value = rectified(layer(value))
+        logarithm = config.scale_gain * self.scale_out(value)
+        if config.delta_scale == "shared":
+            logarithm = logarithm.mean((-1, -2), keepdim=True).expand_as(logarithm)
+        return Payload(
+            rgb=decode_srgb(voxels(colour, 3)),
+            density=config.full_density * voxels(density, 1)[:, :, 0],
+            delta_scale=logarithm.exp().flatten(2).mT,
+        )
+
+    def read(self, found: Unprojected) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 32 h w"]]:
+        """The image encoder's input, -1 ... 1, and what colours (d, c) and densities (d) add to."""
+        layers = found.seen.shape[-3]
+        if layers != (S if self.config.appearance == "voxels" else 1) or found.seen.shape[-1] != SIDE:
+            raise ValueError(
+                f"what was looked up has the shape {tuple(found.seen.shape)}, not that of {self.config.appearance}: "
+                "look it up with this encoder's configuration"
+            )
+        dtype = self.scale_out.bias.dtype
+        seen, covered = found.seen.to(dtype) / 255, found.covered.to(dtype) / 255
+        rgb = fill(found.rgb.to(dtype) / 255, seen)
+        inputs = [rgb.flatten(1, 2), seen] + ([covered] if self.config.appearance == "voxels" else [])
+        if self.config.base == "constant":
+            base = rgb.new_full((len(rgb), 4 * S, SIDE, SIDE), CONSTANT_BASE)
+        else:
+            slope, offset = HULL_BASE
+            base = torch.cat(
+                [rgb.expand(-1, S, -1, -1, -1).flatten(1, 2), (slope * covered + offset).expand(-1, S, -1, -1)], dim=1
+            )
+        return torch.cat(inputs, dim=1) * 2 - 1, base
+
+
+class MappingNetwork(nn.Module):
+    """From 32 x 32 features to a picture of 256 x 256: values of voxels, `layers` channels, depth slowest."""
+
+    def __init__(self, config: EncoderConfig, channels: tuple[int, int], layers: int) -> None:
+        super().__init__()
+        middle, fine = channels
+        self.skips = None
+        if config.detail == "skips":
+            self.skips = nn.ModuleList(
+                [
+                    UntiedConv(config.stem[1], middle, SIDE // 4, kernel=1),
+                    UntiedConv(config.stem[0], fine, SIDE // 2, kernel=1),
+                    UntiedConv(config.channels, layers, SIDE, kernel=1).quiet(),
+                ]
+            )
+        finest = config.finest if self.skips is not None else layers
+        self.up = nn.ModuleList(
+            [
+                UntiedConv(config.fused, middle, SIDE // 4, "up"),
+                UntiedConv(middle, fine, SIDE // 2, "up"),
+                UntiedConv(fine, finest, SIDE, "up"),
+            ]
+        )
+        self.out = UntiedConv(finest, layers, SIDE).quiet() if self.skips is not None else None
+
+    def forward(self, fused: Float[Tensor, "b c 32 32"], fine: list[Tensor]) -> Float[Tensor, "b l 256 256"]:
+        """`fine` are the image encoder's levels, the input first; used where it has skips."""
+        first, second, third = self.up
+        if self.skips is None or self.out is None:
+            return third(rectified(second(rectified(first(fused)))))
+        value = rectified(first(fused) + self.skips[0](fine[2]))
+        value = rectified(second(value) + self.skips[1](fine[1]))
+        return self.out(rectified(third(value))) + self.skips[2](fine[0])
+
+
+def voxels(picture: Float[Tensor, "b dc 256 256"], channels: int) -> Float[Tensor, "b k c 8 8 8"]:
+    """Pictures of 8 * c channels as primitives: channel = d * c + i, row = ny * 8 + h, column = nx * 8 + w (SPEC 2)."""
+    cells = picture.unflatten(1, (S, channels)).unflatten(-1, (GRID, S)).unflatten(-3, (GRID, S))  # b d c ny h nx w
+    return cells.permute(0, 3, 5, 2, 1, 4, 6).flatten(1, 2)
+
+
+def motion_of(joint_rotation: Float[Tensor, "*b 24 3 3"]) -> Float[Tensor, "*b 24 3"]:
+    """The motion branch's input of a pose: axis-angles, radians."""
+    return matrix_to_axis_angle(joint_rotation)
+
+
+class _Clamp(torch.autograd.Function):
+    """Clamped to 0 ... 1; the gradient passes outside too where it leads back in, so that nothing sticks there."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return x.clamp(0, 1)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> Tensor:
+        (x,) = ctx.saved_tensors
+        blocked = ((x < 0) & (gradient > 0)) | ((x > 1) & (gradient < 0))
+        return gradient.masked_fill(blocked, 0)
+
+
+def clamp(x: Tensor) -> Tensor:
+    """`x` clamped to 0 ... 1, with a gradient that leads values outside back in but never farther out."""
+    return _Clamp.apply(x)
+
+
+def fill(rgb: Float[Tensor, "b d c h w"], seen: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d c h w"]:
+    """Colours of points that no view sees, from seen ones: of the same column, then of ever wider surroundings."""
+    weight = seen[:, :, None]
+    total, weights = (rgb * weight).sum(1), weight.sum(1)
+    coarser = [(total, weights)]
+    while coarser[-1][0].shape[-1] > 1:
+        coarser.append((functional.avg_pool2d(coarser[-1][0], 2), functional.avg_pool2d(coarser[-1][1], 2)))
+    value = coarser[-1][0] / coarser[-1][1].clamp_min(1e-6)
+    for level, (part, share) in reversed(list(enumerate(coarser[:-1]))):
+        value = functional.interpolate(value, size=part.shape[-2:], mode="bilinear" if level else "nearest")
+        known = (share * 8).clamp(max=1)
+        value = known * part / share.clamp_min(1e-6) + (1 - known) * value
+    known = (weight * 8).clamp(max=1)
+    return known * rgb + (1 - known) * value[:, None]
