@@ -1,4 +1,4 @@
-"""The command `primdiffusion fit`: training of stage 1; on many devices `accelerate launch -m primdiffusion fit ...`."""
+"""The command `primdiffusion fit`: training of stage 1; on many devices by `accelerate launch -m primdiffusion fit`."""
 
 from __future__ import annotations
 
