@@ -186,6 +186,16 @@ class Info:
 
 
 @dataclasses.dataclass(frozen=True)
+class Reconstruct:
+    """Make a person from captures: pictures of them from several sides (own --help)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Refine:
+    """Optimise one captured person until they look like their pictures (own --help)."""
+
+
+@dataclasses.dataclass(frozen=True)
 class People:
     """Make dressed, rigged people (glTF) from a MakeHuman asset folder, to render captures from (own --help)."""
 
@@ -201,6 +211,11 @@ class Captures:
 
 
 @dataclasses.dataclass(frozen=True)
+class Fit:
+    """Train the encoder on captures: from pictures to primitives (own --help)."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Train:
     """Train the diffusion model on such primitives (own --help)."""
 
@@ -212,14 +227,29 @@ class Evaluate:
 
 Command = (
     Annotated[Generate, tyro.conf.subcommand("generate")]
+    | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
+    | Annotated[Refine, tyro.conf.subcommand("refine")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[People, tyro.conf.subcommand("people")]
     | Annotated[Payloads, tyro.conf.subcommand("payloads")]
     | Annotated[Captures, tyro.conf.subcommand("captures")]
+    | Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
 )
+
+
+def _reconstruct(arguments: Sequence[str]) -> None:
+    from primdiffusion.reconstruct_command import run
+
+    run(arguments)
+
+
+def _refine(arguments: Sequence[str]) -> None:
+    from primdiffusion.refine_command import run
+
+    run(arguments)
 
 
 def _people(arguments: Sequence[str]) -> None:
@@ -236,6 +266,12 @@ def _payloads(arguments: Sequence[str]) -> None:
 
 def _captures(arguments: Sequence[str]) -> None:
     from primdiffusion.capture.command import run
+
+    run(arguments)
+
+
+def _fit(arguments: Sequence[str]) -> None:
+    from primdiffusion.training.fit_command import run
 
     run(arguments)
 
@@ -262,7 +298,16 @@ def _evaluate(arguments: Sequence[str]) -> None:
     run(arguments, load)
 
 
-FORWARDED = {"people": _people, "payloads": _payloads, "captures": _captures, "train": _train, "evaluate": _evaluate}
+FORWARDED = {
+    "reconstruct": _reconstruct,
+    "refine": _refine,
+    "people": _people,
+    "payloads": _payloads,
+    "captures": _captures,
+    "fit": _fit,
+    "train": _train,
+    "evaluate": _evaluate,
+}
 """Commands whose parameters their own modules state; importing these takes a second, so only when asked for."""
 
 

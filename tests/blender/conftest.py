@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_blender_"))
-sys.path[:0] = [str(folder) for folder in (Path(__file__).parents[2], Path(__file__).parents[1], Path(__file__).parent)]
+_TESTS = Path(__file__).parents[1]
+sys.path[:0] = [str(folder) for folder in (_TESTS.parent, _TESTS, Path(__file__).parent, _TESTS / "backend")]
 
 bpy = pytest.importorskip("bpy", reason="bpy is not installed: pip install -e .[blender]")
 

@@ -16,7 +16,7 @@ import synthetic
 import blender_primdiffusion
 from blender_primdiffusion import places
 from blender_primdiffusion.scene.human import folder_of, humans
-from blender_primdiffusion.ui import reconstruct_operators, reconstruct_settings
+from blender_primdiffusion.ui import generation, reconstruct_operators, reconstruct_settings
 from blender_primdiffusion.ui.generation import session
 from blender_primdiffusion.ui.operators import follow
 from blender_primdiffusion.ui.panel import PRIMDIFFUSION_PT_generate
@@ -183,3 +183,28 @@ def test_the_search_offers_subjects_that_hold_what_was_typed(captures):
     asked = SimpleNamespace(capture=str(captures))
     assert list(reconstruct_settings._search(asked, None, "ann")) == ["HANNA", "anna"]
     assert list(reconstruct_settings._search(SimpleNamespace(capture=""), None, "")) == []
+
+
+@pytest.mark.slow
+def test_the_real_child_makes_a_person_of_real_captures(saved_scene, tmp_path, monkeypatch):
+    from capture_scenes import captured
+    from tiny_encoder import save_tiny_encoder
+
+    encoder = save_tiny_encoder(tmp_path / "encoder.safetensors")
+    folder = captured(tmp_path / "made", people=2, frames=1, passes=("img", "mask"))
+    python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
+    monkeypatch.setattr(places, "find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr(generation, "preference", lambda name: str(encoder) if name == "encoder" else "")
+    blender_primdiffusion.register()
+    try:
+        with pytest.raises(RuntimeError, match=r"holds several subjects: name one of them \(person_000000"):
+            bpy.ops.primdiffusion.human_from_captures(directory=str(folder))
+        asked = {"directory": str(folder), "subject": "person_000001", "views": 3}
+        assert bpy.ops.primdiffusion.human_from_captures(**asked) == {"FINISHED"}
+        (person,) = humans(saved_scene.scene)
+        about = json.loads(person["primdiffusion_human"])
+        assert (about["reconstructed_from"], about["checkpoint"]) == ("person_000001", "tiny encoder")
+        assert len(about["views"]) == 3
+        assert sum(thing.type == "VOLUME" for thing in person.all_objects) > 500
+    finally:
+        blender_primdiffusion.unregister()

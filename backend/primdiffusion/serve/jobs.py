@@ -1,4 +1,4 @@
-"""The work of the child: generate, render and draw. Imports torch, so the server loads it in its own time."""
+"""The work of the child: generate, reconstruct, render, draw. Imports torch, so the server loads it in its own time."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import Step
@@ -19,17 +19,21 @@ from primdiffusion.render.image import depth_to_png, to_png
 from primdiffusion.render.march import march
 from primdiffusion.serve.draw_params import DrawParams
 from primdiffusion.serve.drawing import FrameDrawer, Report
-from primdiffusion.serve.params import GenerateParams, RenderParams
+from primdiffusion.serve.params import GenerateParams, ReconstructParams, RenderParams
 from primdiffusion.staging import staged, written_whole
 from primdiffusion.training.checkpoint import load_checkpoint
 
+if TYPE_CHECKING:
+    from primdiffusion.serve.reconstruction import Reconstructor
+
 
 class Jobs:
-    """Runs jobs one after the other and keeps the model of the last one, and of pictures their people, in memory."""
+    """Runs jobs one after the other and keeps the models of the last ones, and of pictures their people, in memory."""
 
     def __init__(self) -> None:
         self._device = best_device()
         self._loaded: tuple[str | None, DiffusionModel] | None = None
+        self._reconstructor: Reconstructor | None = None
         self._drawer = FrameDrawer(self._device)
 
     def device_info(self) -> dict[str, Any]:
@@ -64,6 +68,14 @@ class Jobs:
             "seconds_sampling": round(sampled - began, 3),
             "peak_gb": round(peak_memory_gb(), 3),
         }
+
+    def reconstruct(self, params: ReconstructParams, report: Report) -> dict[str, Any]:
+        """Makes a person of captures (see `Reconstructor.reconstruct`)."""
+        if self._reconstructor is None:
+            from primdiffusion.serve.reconstruction import Reconstructor  # children that only generate start sooner
+
+            self._reconstructor = Reconstructor(self._device)
+        return self._reconstructor.reconstruct(params, report)
 
     def render(self, params: RenderParams, report: Report) -> dict[str, Any]:
         """Draws a saved person; returns the picture's path. Raises what load_human and read_pose do, and OSError."""

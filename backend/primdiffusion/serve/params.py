@@ -36,6 +36,36 @@ class GenerateParams:
 
 
 @dataclasses.dataclass(frozen=True)
+class ReconstructParams:
+    """Parameters of reconstruct."""
+
+    capture: str
+    """Folder of a dataset of captures, or of one subject in it."""
+    out_dir: str
+    """Folder for the same files as those of generate; made if missing."""
+    subject: str | None = None
+    """Whom; None where there is only one."""
+    frame: int = 0
+    views: int = 8
+    """Cameras spread around the person; all where there are fewer."""
+    checkpoint: str | None = None
+    """An encoder's .safetensors file; None for the one that ships with the package."""
+    size: int = 512
+    """Pixels a side of the pictures."""
+
+    def __post_init__(self) -> None:
+        if self.frame < 0:
+            raise ValueError(f"frame {self.frame}: they are counted from 0")
+        if self.views < 1:
+            raise ValueError(f"{self.views} views were asked for: the encoder needs one or more")
+        if self.size < 1:
+            raise ValueError(f"pictures of {self.size} pixels a side: choose 1 or more")
+        for name in ("capture", "out_dir"):
+            if not getattr(self, name):
+                raise ValueError(f"{name} is empty: name a folder")
+
+
+@dataclasses.dataclass(frozen=True)
 class RenderParams:
     """Parameters of render."""
 

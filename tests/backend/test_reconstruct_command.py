@@ -1,0 +1,218 @@
+"""`primdiffusion reconstruct` and the child's job of the same name, without the child."""
+
+import dataclasses
+import itertools
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from capture_scenes import box, captured, save_person, small_job
+from PIL import Image
+from primdiffusion import cli
+from primdiffusion.capture.conditioning import captured_person, choose_subject, conditioning_views
+from primdiffusion.capture.layout import LIST_FILE, SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE, picture_path
+from primdiffusion.capture.rasterised import render
+from primdiffusion.geometry.textured_mesh import TexturedMesh
+from primdiffusion.human_file import load_human
+from primdiffusion.reconstruction import reconstruct
+from primdiffusion.serve import reconstruction
+from primdiffusion.serve.jobs import Jobs
+from primdiffusion.serve.params import ReconstructParams
+from primdiffusion.training.encoder_checkpoint import load_encoder
+from tiny_encoder import save_tiny_encoder, tiny_encoder
+from tiny_model import save_tiny_checkpoint
+
+FILES = ["depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"]
+FIRST, SECOND = "person_000000", "person_000001"
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """Two people who fill the space about their bodies with green and white."""
+    job = small_job(tmp_path_factory.mktemp("reconstruct"), frames=2, passes=("img", "mask"))
+    for path, colour in zip(job.people.values(), [(0, 200, 0, 255), (255, 255, 255, 255)], strict=True):
+        save_person(path, TexturedMesh((box(half=1.1, colour=colour),)))
+    assert {outcome.what for outcome in render(job)} == {"done"}
+    return job.out
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    return save_tiny_encoder(tmp_path_factory.mktemp("encoder") / "tiny.safetensors")
+
+
+@pytest.fixture
+def line(checkpoint, tmp_path):
+    """The start of a command line that writes to tmp_path / "out"."""
+    return ["reconstruct", "--checkpoint", str(checkpoint), "--out", str(tmp_path / "out"), "--size", "32"]
+
+
+def failure(capsys, line, *more) -> str:
+    """The sentence that a line fails with, having left nothing."""
+    with pytest.raises(SystemExit) as end:
+        cli.main([*line, *(str(word) for word in more)])
+    assert end.value.code == 1
+    told = capsys.readouterr().err.splitlines()
+    assert not Path(line[line.index("--out") + 1]).exists()
+    return told[-1]
+
+
+def test_the_command_writes_what_generate_writes_and_says_where_it_comes_from(dataset, line, tmp_path, capsys):
+    cli.main([*line, "--capture", str(dataset), "--subject", FIRST, "--frame", "1", "--views", "3"])
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
+    with np.load(tmp_path / "out" / "human.npz") as human:
+        meta = json.loads(str(human["meta"]))
+    chosen = captured_person(dataset, FIRST, 1, 3).cameras
+    assert (meta["reconstructed_from"], meta["frame"], meta["views"]) == (FIRST, 1, list(chosen))
+    assert (meta["checkpoint"], meta["full_density"]) == ("tiny encoder", 100.0)
+    captured_out = capsys.readouterr()
+    assert captured_out.out.startswith(f"{tmp_path / 'out'}  {FIRST}, frame 1, 3 views, ")
+    assert captured_out.err == ""
+    with Image.open(tmp_path / "out" / "front.png") as picture:
+        assert picture.size == (32, 32)
+
+
+def test_the_person_has_the_colours_of_their_own_pictures(dataset, line, tmp_path):
+    cli.run([*line, "--capture", str(dataset / FIRST)])
+    picture = np.asarray(Image.open(tmp_path / "out" / "front.png")).astype(int)
+    red, green, blue = picture[picture.sum(-1) > 60].mean(0)
+    assert green > 3 * max(red, blue)
+
+
+def test_the_person_is_what_the_encoder_makes_of_the_views(dataset, line, tmp_path):
+    cli.run([*line, "--capture", str(dataset / SECOND)])
+    kept = load_human(tmp_path / "out" / "person.human.safetensors")
+    person = captured_person(dataset / SECOND)
+    model = tiny_encoder()
+    model.encoder.load_state_dict({key: value.half().float() for key, value in model.encoder.state_dict().items()})
+    wanted = reconstruct(model, person)
+    assert torch.allclose(kept.payload.rgb, wanted.payload.rgb, atol=1e-5)
+    assert torch.equal(kept.betas, person.betas)
+
+
+def test_a_dataset_in_the_released_layout_gives_the_same_person(dataset, line, tmp_path):
+    cli.run([*line, "--capture", str(dataset), "--subject", FIRST])
+    ours = load_human(tmp_path / "out" / "person.human.safetensors")
+    released = tmp_path / "released" / FIRST
+    for kind in ("img", "mask"):
+        shutil.copytree(dataset / FIRST / kind, released / kind)
+    shutil.copy(dataset / FIRST / "cameras.json", released)
+    (released / SMPL_FOLDER).mkdir()
+    shutil.copy(dataset / FIRST / SMPL_FOLDER / SMPL_FILE, released / SMPL_FOLDER)
+    assert not (released / SMPL_FOLDER / SMPL_PLAIN_FILE).exists()
+    (released.parent / LIST_FILE).write_text(f"{FIRST}\n")
+    cli.run([*line, "--capture", str(released.parent)])
+    theirs = load_human(tmp_path / "out" / "person.human.safetensors")
+    assert torch.equal(ours.payload.rgb, theirs.payload.rgb)
+
+
+def test_one_view_works_and_the_user_is_told_that_the_rest_is_guessed(dataset, line, tmp_path, capsys):
+    cli.main([*line, "--capture", str(dataset / FIRST), "--views", "1"])
+    told = "primdiffusion: warning: one view only: sides that it does not see are guessed\n"
+    assert capsys.readouterr().err == told
+    assert (tmp_path / "out" / "human.npz").exists()
+
+
+def test_views_from_behind_alone_work(dataset):
+    captures, name = choose_subject(dataset, FIRST)
+    behind = [number for number, view in enumerate(captures.subject(name).views) if view.position[2] < 0]
+    views = conditioning_views(captures, name, 0, behind)
+    person = dataclasses.replace(captured_person(dataset, FIRST), cameras=tuple(behind), views=views)
+    assert torch.isfinite(reconstruct(tiny_encoder(), person).payload.rgb).all()
+
+
+def test_a_camera_that_has_the_person_at_its_back_changes_nothing(dataset, tmp_path):
+    whole = reconstruct(tiny_encoder(), captured_person(dataset, FIRST))
+    turned = shutil.copytree(dataset / FIRST, tmp_path / "turned" / FIRST)
+    cameras = json.loads((turned / "cameras.json").read_text())
+    about = cameras["camera0000"]
+    away = np.diag([-1.0, 1.0, -1.0])
+    cameras["camera0004"] = {**about, "R": (away @ about["R"]).tolist(), "T": (away @ about["T"]).tolist()}
+    (turned / "cameras.json").write_text(json.dumps(cameras))
+    for kind in ("img", "mask"):
+        shutil.copytree(turned / kind / "camera0000", turned / kind / "camera0004")
+    person = captured_person(turned)
+    assert (person.cameras, person.warnings) == ((0, 1, 2, 3, 4), ())
+    assert torch.allclose(reconstruct(tiny_encoder(), person).payload.rgb, whole.payload.rgb, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([], "holds several subjects: name one of them (person_000000, person_000001)"),
+        (["--subject", "anna"], "there is no subject 'anna'"),
+        (["--subject", FIRST, "--frame", "7"], "person_000000 has frames 0 to 1, not 7"),
+        (["--subject", FIRST, "--views", "0"], "0 views were asked for"),
+        (["--subject", FIRST, "--size", "0"], "pictures of 0 pixels a side"),
+    ],
+)
+def test_impossible_wishes_are_one_sentence_and_leave_nothing(dataset, line, capsys, words, sentence):
+    assert sentence in failure(capsys, line, "--capture", dataset, *words)
+
+
+def test_a_missing_folder_picture_or_dataset_is_named(dataset, line, tmp_path, capsys):
+    assert "there is no folder of captures" in failure(capsys, line, "--capture", tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    assert "no finished captures" in failure(capsys, line, "--capture", tmp_path / "empty")
+    damaged = shutil.copytree(dataset / FIRST, tmp_path / "damaged" / FIRST)
+    missing = picture_path(damaged, "mask", 2, 0)
+    missing.unlink()
+    assert f"{missing} is missing" in failure(capsys, line, "--capture", damaged)
+
+
+def test_a_missing_damaged_or_foreign_checkpoint_is_named(dataset, checkpoint, tmp_path, capsys):
+    cut, other = tmp_path / "cut.safetensors", save_tiny_checkpoint(tmp_path / "diffusion.safetensors")
+    cut.write_bytes(checkpoint.read_bytes()[:-100])
+    for path, told in ((cut, "is truncated"), (other, "of format"), (tmp_path / "none", "there is no encoder at")):
+        line = ["reconstruct", "--capture", dataset / FIRST, "--checkpoint", path, "--out", tmp_path / "out"]
+        sentence = failure(capsys, [str(word) for word in line])
+        assert told in sentence
+        assert str(path) in sentence
+
+
+def test_the_encoder_stays_loaded_until_another_is_asked_for(dataset, checkpoint, tmp_path, monkeypatch):
+    loaded = []
+    load = load_encoder
+    monkeypatch.setattr(reconstruction, "write_person", lambda *_: None)
+    monkeypatch.setattr(reconstruction, "load_encoder", lambda path, device: loaded.append(path) or load(path, device))
+    other = save_tiny_encoder(tmp_path / "other.safetensors")
+    jobs = Jobs()
+    for path in (checkpoint, checkpoint, other):
+        params = ReconstructParams(str(dataset / FIRST), str(tmp_path / "out"), views=2, checkpoint=str(path))
+        jobs.reconstruct(params, lambda *report: None)
+    assert loaded == [checkpoint, other]
+
+
+def test_the_job_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypatch):
+    class Stop(Exception):
+        pass
+
+    folder = captured(tmp_path, people=1, frames=1, passes=("img", "mask"))
+    params = ReconstructParams(str(folder), str(tmp_path / "out"), checkpoint=str(checkpoint), size=32)
+    jobs, reports = Jobs(), []
+    result = jobs.reconstruct(params, lambda *report: reports.append(report))
+    stages = [("read", 0), ("load", 1), ("encode", 2), ("write", 3), ("write", 4)]
+    assert [report[:2] for report in reports] == stages
+    assert result["subject"] == FIRST
+    assert result["views"] == [0, 1, 2, 3]
+    assert "lies inside the masks" in result["warnings"][0]
+    shutil.rmtree(tmp_path / "out")
+    for end in range(len(reports)):
+        count = itertools.count()
+
+        def stop(*_, count=count, end=end):
+            if next(count) == end:
+                raise Stop
+
+        with pytest.raises(Stop):
+            jobs.reconstruct(params, stop)
+        assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("wrong", [{"frame": -1}, {"views": 0}, {"size": 0}, {"capture": ""}, {"out_dir": ""}])
+def test_impossible_parameters_of_the_job_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong)) if wrong != {"size": 0} else "pixels a side"):
+        ReconstructParams(**{"capture": "captures", "out_dir": "out", **wrong})

@@ -1,0 +1,149 @@
+"""A person from captures, with the real child: as the protocol promises it, and as the panel follows it."""
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_scenes import captured
+from conversation import Conversation
+from tiny_encoder import save_tiny_encoder
+from worker.client import BackendClient
+from worker.job import Backend, ReconstructJob
+
+CANCELLED, DOMAIN_ERROR, INVALID_PARAMS = -32001, -32002, -32602
+FIRST = "person_000000"
+
+
+@pytest.fixture(scope="module")
+def encoder(tmp_path_factory) -> Path:
+    return save_tiny_encoder(tmp_path_factory.mktemp("encoder") / "tiny.safetensors")
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory) -> Path:
+    return captured(tmp_path_factory.mktemp("captures"), frames=2, passes=("img", "mask"))
+
+
+@pytest.fixture(scope="module")
+def child():
+    child = Conversation()
+    yield child
+    child.close()
+
+
+@pytest.fixture
+def asked(captures, encoder, tmp_path) -> dict:
+    """Parameters of a good request."""
+    out = str(tmp_path / "new" / "person ü")
+    return {"capture": str(captures), "subject": FIRST, "out_dir": out, "checkpoint": str(encoder), "size": 32}
+
+
+def test_reconstruct_reports_its_stages_and_leaves_whole_files(child, asked):
+    child.send(1, "reconstruct", **asked, frame=1, views=2)
+    stages = []
+    while "method" in (message := child.until(lambda m: m.get("method") == "progress" or m.get("id") == 1)):
+        stages.append((message["params"]["stage"], message["params"]["step"], message["params"]["total"]))
+    assert stages == [("read", 0, 4), ("load", 1, 4), ("encode", 2, 4), ("write", 3, 4), ("write", 4, 4)]
+    result = message["result"]
+    assert (result["subject"], result["frame"], len(result["views"])) == (FIRST, 1, 2)
+    assert result["seconds"] >= result["seconds_encoding"] > 0
+    for name in ("human", "person", "preview", "side", "depth"):
+        assert Path(result[name]).parent == Path(asked["out_dir"])
+        assert Path(result[name]).stat().st_size > 0
+    with np.load(result["human"]) as human:
+        assert human["betas"].shape == (10,)
+    assert not list(Path(asked["out_dir"]).glob(".*"))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "code", "kind", "told"),
+    [
+        ({"subject": "nobody"}, DOMAIN_ERROR, "bad_input", "there is no subject 'nobody'"),
+        ({"subject": None}, DOMAIN_ERROR, "bad_input", "several subjects: name one of them (person_000000"),
+        ({"frame": 9}, DOMAIN_ERROR, "bad_input", "frames 0 to 1, not 9"),
+        ({"capture": "/nowhere"}, DOMAIN_ERROR, "missing_file", "no folder of captures /nowhere"),
+        ({"checkpoint": "/nowhere.safetensors"}, DOMAIN_ERROR, "missing_file", "no encoder at /nowhere.safetensors"),
+        ({"views": 0}, INVALID_PARAMS, None, "0 views"),
+        ({"views": "all"}, INVALID_PARAMS, None, "'views' of 'reconstruct' must be int"),
+    ],
+)
+def test_a_refusal_names_what_was_wrong_and_leaves_nothing(child, asked, wrong, code, kind, told):
+    error = child.ask(2, "reconstruct", **{**asked, **wrong})["error"]
+    assert error["code"] == code
+    assert told in error["message"]
+    assert (error.get("data") or {}).get("kind") == kind
+    assert not Path(asked["out_dir"]).parent.exists()
+
+
+def test_a_cancel_ends_the_job_and_leaves_nothing(child, asked):
+    child.send(3, "reconstruct", **asked)
+    child.send(4, "cancel", id=3)
+    assert child.answer(4)["result"] == {"cancelled": True}
+    assert child.answer(3)["error"]["code"] == CANCELLED
+    assert not Path(asked["out_dir"]).parent.exists()
+
+
+def follow(job: ReconstructJob, timeout_s: float = 60) -> list[str]:
+    """Ticks as Blender's timer does; returns the messages passed through."""
+    messages, end = [job.message], time.monotonic() + timeout_s
+    while not job.finished:
+        assert time.monotonic() < end, (job.state, job.message)
+        job.tick()
+        if job.message != messages[-1]:
+            messages.append(job.message)
+        time.sleep(0.005)
+    return messages
+
+
+@pytest.fixture(scope="module")
+def backend():
+    backend = Backend(lambda: BackendClient(Path(sys.executable)))
+    yield backend
+    backend.shutdown()
+
+
+@pytest.fixture
+def start(backend, captures, encoder, tmp_path):
+    def start(**more) -> ReconstructJob:
+        settings = {"capture": captures, "subject": FIRST, "checkpoint": encoder, "out_dir": tmp_path / "out", **more}
+        return ReconstructJob(backend, **settings)
+
+    return start
+
+
+def test_the_panels_job_runs_from_a_cold_start_to_its_files(start):
+    job = start(views=1)
+    messages = follow(job)
+    assert job.state == "done", job.message
+    assert messages[0] == "Starting the backend"
+    assert {"Reading the pictures", "Reconstructing", "Writing the person"} <= set(messages)
+    assert messages[-1].startswith("Reconstructed in ")
+    assert job.fraction == 1.0
+    assert Path(job.result["human"]).exists()
+    assert job.result["warnings"][0] == "one view only: sides that it does not see are guessed"
+
+
+def test_a_refusal_of_the_backend_becomes_the_jobs_error(start):
+    job = start(subject="nobody")
+    follow(job)
+    assert (job.state, job.error.kind) == ("failed", "bad_input")
+    assert str(job.error).startswith("There is no subject 'nobody'")
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+def test_a_killed_child_fails_the_job_leaves_nothing_and_the_next_job_works(start, tmp_path):
+    job = start()
+    while job.step < 1:
+        job.tick()
+        assert not job.finished
+    os.kill(job._client.pid, signal.SIGKILL)
+    follow(job)
+    assert (job.state, job.error.kind) == ("failed", "died")
+    assert not (tmp_path / "out").exists()
+    again = start()
+    follow(again)
+    assert again.state == "done"
