@@ -49,8 +49,10 @@ class EncoderConfig:
     """Channels of the delta-scale network."""
     scale_gain: float = 0.1
     """delta scale = exp(gain x)."""
-    gain: float = 0.25
-    """Colours and relative densities = base + gain x, clamped to 0 ... 1."""
+    colour_gain: float = 0.06
+    """Colours = base + gain x, clamped to 0 ... 1. Small, so that colours do not learn to hide what densities lack."""
+    density_gain: float = 0.25
+    """Relative densities likewise."""
     full_density: float = 100.0
     """1/m: the density of 1."""
 
@@ -74,7 +76,8 @@ PAPER = EncoderConfig(
     density=(32, 16),
     scale=(64, 128, 64, 64),
     scale_gain=0.01,
-    gain=25 / 255,
+    colour_gain=25 / 255,
+    density_gain=25 / 255,
     full_density=25.5,
 )
 """The paper's text, with the sizes of SPEC 2 where it names none."""

@@ -79,8 +79,8 @@ class Encoder(nn.Module):
             appearance, motion = self.attention(appearance, motion)
         fused = self.fuse(torch.cat([appearance, motion], dim=1))
         config = self.config
-        colour = clamp(base[:, : 3 * S] + config.gain * self.colour(fused, fine))
-        density = clamp(base[:, 3 * S :] + config.gain * self.density(fused, fine))
+        colour = clamp(base[:, : 3 * S] + config.colour_gain * self.colour(fused, fine))
+        density = clamp(base[:, 3 * S :] + config.density_gain * self.density(fused, fine))
         value = fused
         for layer in self.scale:
             value = rectified(layer(value))
