@@ -15,6 +15,11 @@ SOURCES = {
     "engine": ("The engine in Blender", "benchmarks/engine.py --json docs/results/engine.json"),
     "denoisers": ("Denoisers on held-out people", "benchmarks/denoisers.py --json docs/results/denoisers.json"),
     "captures": ("Captures", "benchmarks/captures.py --assets DIR --json docs/results/captures.json"),
+    "encoder": (
+        "The encoder",
+        "benchmarks/encoder.py --train DIR --heldout DIR --models DIR --json docs/results/encoder.json "
+        "--table docs/results/encoder_table.md",
+    ),
     "layout": ("The grid on the default body", "scripts/bake_layout"),
 }  # fmt: skip
 ABOUT = ("device", "cores", "memory_gb", "python", "commit", "date")

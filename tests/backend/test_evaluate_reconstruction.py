@@ -10,6 +10,9 @@ from primdiffusion import cli
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.conditioning import ConditioningError, spread_cameras
 from primdiffusion.capture.reader import open_captures
+from primdiffusion.encoder.config import EncoderConfig
+from primdiffusion.encoder.encode import EncoderModel
+from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation import command
 from primdiffusion.evaluation.reconstruction import (
     SPLITS,
@@ -27,6 +30,7 @@ from primdiffusion.human import pose_body
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.primitives import K, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
+from primdiffusion.training.encoder_checkpoint import save_encoder
 
 COARSE = MarchSettings(step=0.016)
 
@@ -211,10 +215,26 @@ def test_command_prints_the_table_and_writes_all_scores(captures, tmp_path, caps
     assert record["means"]["all"]["pictures"] == len(record["pictures"]) == 12
 
 
+def test_the_command_line_evaluates_a_checkpoint(captures, tmp_path, capsys):
+    small = EncoderConfig(
+        stem=(4, 4, 4), grid=(4, 4), motion=4, attention_width=8, attention_heads=2, fused=4, colour=(4, 4),
+        density=(4, 4), finest=4, scale=(4, 4)
+    )  # fmt: skip
+    path = tmp_path / "small.safetensors"
+    save_encoder(path, EncoderModel(Encoder(small), {"name": "small"}))
+    line = ["--captures", str(captures.root), "--people", "1", "--views", "3", "--size", "16"]
+    cli.run(["evaluate", "reconstruction", *line, "--checkpoint", str(path), "--json", str(tmp_path / "scores.json")])
+    record = json.loads((tmp_path / "scores.json").read_text())
+    assert record["checkpoint"] == {"name": "small"}
+    assert [part["pictures"] for part in record["means"].values()] == [12, 3, 1, 6, 2]
+    assert "| novel views, novel poses | 2 | " in capsys.readouterr().out
+
+
 def test_command_tells_wrong_folders_and_numbers(captures, tmp_path, capsys):
     for arguments, sentence in (
         (["--captures", str(tmp_path / "none")], "there is no folder of captures"),
         (["--captures", str(captures.root), "--people", "-1"], "people is -1"),
+        (["--captures", str(captures.root), "--checkpoint", str(tmp_path / "no.safetensors")], "no.safetensors"),
         (["--captures", str(captures.root), "--lpips", str(tmp_path / "w.pth")], "there is no file of weights"),
     ):
         with pytest.raises(SystemExit) as end:

@@ -1,0 +1,201 @@
+"""How well the encoder reconstructs people, trained on and not, and how fast: the paper's Table 3 beside ours.
+
+`python benchmarks/encoder.py --train CAPTURES --heldout CAPTURES --models DIR --json encoder.json --table encoder.md`
+evaluates the checkpoints full, shared_scale, template_rt, no_attention and full_at_equal_steps (.safetensors) of a
+folder, each if it is there; without --models the package's encoder. Everybody is encoded from eight views of one pose
+and compared in all views and poses at 512 x 512; figures with `_novel` are of views and poses that were not given.
+psnr_shared_scale and its like are of people trained on, as in the paper. Without folders of captures people of other
+seeds than those of the training are made from MakeHuman's assets (--assets) and held out. --quick looks at one person.
+Times are those of the processor, best or median of several, or the wall clock's where their name has no `processor`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from encoder_speed import VIEWS, reconstruct_seconds, step_seconds
+from march import from_script
+from primdiffusion.capture.people_files import find_people
+from primdiffusion.capture.poses import choose_poses
+from primdiffusion.capture.rasterised import Job, render
+from primdiffusion.capture.reader import Captures, open_captures
+from primdiffusion.capture.rig import Rig
+from primdiffusion.encoder.encode import EncoderModel
+from primdiffusion.evaluation.image_metrics import Lpips, load_lpips
+from primdiffusion.evaluation.reconstruction import EvaluationSettings, Means, evaluate, summary, table
+from primdiffusion.people.assets import open_assets
+from primdiffusion.people.folder import PeopleSet, make_people
+from primdiffusion.people.wardrobe import required_meshes
+from primdiffusion.training.encoder_checkpoint import load_encoder
+from record import tell
+
+FIRST_SEED = 30_000_000
+"""Of people made here; training sets count from 0."""
+PEOPLE, POSES, CAMERAS = 6, 4, 12
+REFINE_FIGURES = ("refine_psnr_heldout_views", "refine_seconds_cpu")
+Figures = dict[str, float | int | str | None]
+
+
+class Variant(NamedTuple):
+    """A row of the table."""
+
+    name: str
+    """Of its checkpoint."""
+    title: str
+    paper: tuple[float, float, float] | None
+    """PSNR, SSIM and LPIPS in the paper's Table 3: training people, all views and poses."""
+
+
+VARIANTS = (
+    Variant("full", "full model", (32.15, 0.984, 0.048)),
+    Variant("full_at_equal_steps", "full model, as many steps as those below", None),
+    Variant("shared_scale", "one delta scale for all boxes", (18.35, 0.803, 0.182)),
+    Variant("template_rt", "frames of the template body", (31.70, 0.982, 0.058)),
+    Variant("no_attention", "without attention", (28.39, 0.962, 0.081)),
+)
+
+
+class Quality(NamedTuple):
+    """A checkpoint's means on both sets of people; None: there is no such set."""
+
+    train: dict[str, Means] | None
+    heldout: dict[str, Means] | None
+    steps: int | None
+    people: int | None
+
+
+def main() -> None:
+    """Measures, prints and, if asked, writes figures and table."""
+    arguments = parsed()
+    with tempfile.TemporaryDirectory() as scratch:
+        sets = {name: getattr(arguments, name) for name in ("train", "heldout")}
+        if sets == {"train": None, "heldout": None}:
+            sets["heldout"] = made_people(Path(scratch), arguments.assets, 1 if arguments.quick else PEOPLE)
+        captures = {name: None if root is None else open_captures(root) for name, root in sets.items()}
+        lpips = load_lpips(arguments.lpips) if arguments.lpips else None
+        models = read_models(arguments.models)
+        qualities = {
+            name: Quality(
+                *(measured(model, captures[one], arguments, lpips) for one in ("train", "heldout")),
+                model.card.get("steps"),
+                model.card.get("people"),
+            )
+            for name, model in models.items()
+        }
+        some = captures["heldout"] or captures["train"]
+        assert some is not None
+        figures = quality_figures(qualities)
+        if "full" in models:
+            figures |= reconstruct_seconds(models["full"], some, 2 if arguments.quick else 7)
+        figures |= step_seconds(some, 2 if arguments.quick else 8)
+    refining = arguments.quick or arguments.without_refine
+    figures |= dict.fromkeys(REFINE_FIGURES) if refining else from_script("refine.py", REFINE_FIGURES)
+    tell(figures, arguments.json)
+    text = table_of(qualities)
+    print(text)
+    if arguments.table is not None:
+        arguments.table.write_text(text + "\n", encoding="utf-8")
+
+
+def parsed() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--train", type=Path, help="captures of people that the encoder was trained on")
+    parser.add_argument("--heldout", type=Path, help="captures of other people")
+    parser.add_argument("--models", type=Path, help="folder of checkpoints; without it the package's encoder")
+    parser.add_argument("--people", type=int, default=16, help="of each set, evenly of all")
+    parser.add_argument("--lpips", type=Path, nargs="*", default=(), help="files of LPIPS' weights")
+    parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
+    parser.add_argument("--without-refine", action="store_true", help="leave out benchmarks/refine.py")
+    parser.add_argument("--quick", action="store_true", help="one person, two poses")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--table", type=Path, help="markdown file for the tables")
+    return parser.parse_args()
+
+
+def made_people(folder: Path, assets: Path | None, count: int) -> Path:
+    """Captures of `count` people that no training set holds, from other sides than those of the default rig."""
+    for _ in make_people(open_assets(assets, required_meshes()), PeopleSet(folder / "people", FIRST_SEED, count), 1):
+        pass
+    rig = Rig(count=CAMERAS, elevations=(5.0, 30.0))
+    job = Job(find_people(folder / "people"), choose_poses([], POSES, 0), folder / "heldout", rig, ("img", "mask"))
+    failed = [outcome.why for outcome in render(job) if outcome.what == "failed"]
+    assert not failed, failed
+    return job.out
+
+
+def read_models(folder: Path | None) -> dict[str, EncoderModel]:
+    """The checkpoints that are there."""
+    if folder is None:
+        return {"full": load_encoder()}
+    paths = {variant.name: folder / f"{variant.name}.safetensors" for variant in VARIANTS}
+    return {name: load_encoder(path) for name, path in paths.items() if path.is_file()}
+
+
+def measured(
+    model: EncoderModel, captures: Captures | None, arguments: argparse.Namespace, lpips: Lpips | None
+) -> dict[str, Means] | None:
+    """Means of the parts of a set's pictures."""
+    if captures is None:
+        return None
+    count = 1 if arguments.quick else min(arguments.people, len(captures.subjects))
+    names = tuple(captures.subjects[i * len(captures.subjects) // count] for i in range(count))
+    settings = EvaluationSettings(names, frames=(0, 1) if arguments.quick else (), given_views=VIEWS)
+    return summary(evaluate(model, captures, settings, lpips))
+
+
+def quality_figures(qualities: dict[str, Quality]) -> Figures:
+    """The named figures: the full model's with all details, the others' PSNR and SSIM; None where not measured."""
+    figures: Figures = {}
+    for variant in VARIANTS:
+        quality = qualities.get(variant.name, Quality(None, None, None, None))
+        suffix = "" if variant.name == "full" else f"_{variant.name}"
+        for people, means in (("train", quality.train), ("heldout", quality.heldout)):
+            for metric in ("psnr", "ssim"):
+                figures[f"{metric}{suffix}_{people}"] = _mean(means, "all", metric)
+                figures[f"{metric}{suffix}_{people}_novel"] = _mean(means, "novel_views_novel_poses", metric)
+            if not suffix:
+                names = ("lpips", "psnr_box", "ssim_box", "mask_iou", "pictures")
+                figures |= {f"{name}_{people}": _mean(means, "all", name) for name in names}
+        if suffix:
+            figures[f"psnr{suffix}"] = figures.pop(f"psnr{suffix}_train")
+        figures |= {f"steps{suffix}": quality.steps, f"people{suffix}": quality.people}
+    return figures
+
+
+def _mean(means: dict[str, Means] | None, part: str, figure: str) -> float | int | None:
+    return None if means is None else getattr(means[part], figure)
+
+
+def table_of(qualities: dict[str, Quality]) -> str:
+    """The paper's Table 3 beside ours, then the full model's parts."""
+    lines = [
+        "| model | paper PSNR | SSIM | LPIPS | ours, trained on: PSNR | SSIM | held out: PSNR | SSIM "
+        "| novel views and poses: PSNR | SSIM | steps | people |",
+        "|---" * 12 + "|",
+    ]
+    for variant in VARIANTS:
+        quality = qualities.get(variant.name)
+        cells: list[object] = [None] * 8
+        if quality is not None:
+            parts = [(quality.train, "all"), (quality.heldout, "all"), (quality.heldout, "novel_views_novel_poses")]
+            pairs = [(_mean(*part, "psnr"), _mean(*part, "ssim")) for part in parts]
+            cells = [cell for p, s in pairs for cell in (p and f"{p:.2f}", s and f"{s:.4f}")]
+            cells += [quality.steps, quality.people]
+        paper: Sequence[object] = (None,) * 3
+        if variant.paper is not None:
+            paper = [f"{value:.{digits}f}" for value, digits in zip(variant.paper, (2, 3, 3), strict=True)]
+        lines.append(f"| {variant.title} | {' | '.join('-' if c is None else str(c) for c in (*paper, *cells))} |")
+    full = qualities.get("full")
+    for title, means in (("People trained on", full and full.train), ("People held out", full and full.heldout)):
+        if means:
+            lines += ["", f"{title}, full model:", "", table(means)]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
