@@ -87,6 +87,32 @@ class GridNetwork(nn.Module):
         return self.leave(torch.cat([value, x], dim=1))
 
 
+class HalvingGridNetwork(nn.Module):
+    """The U-Net of SPEC 2: it halves at once, with additive skips below, and what goes in joins in at the end."""
+
+    def __init__(self, inputs: int, channels: Sequence[int], side: int) -> None:
+        super().__init__()
+        sides = [side >> level for level in range(len(channels))]
+        inward = list(itertools.pairwise((inputs, *channels[1:])))
+        outward = list(itertools.pairwise(reversed(channels)))
+        self.down = nn.ModuleList(UntiedConv(a, b, s, "down") for (a, b), s in zip(inward, sides[1:], strict=True))
+        self.up = nn.ModuleList(UntiedConv(a, b, s, "up") for (a, b), s in zip(outward, sides[-2::-1], strict=True))
+        top = channels[0] if self.up else 0
+        self.leave = UntiedConv(top + inputs, channels[0], side, kernel=1)
+
+    def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
+        """Features of the grid, not rectified."""
+        levels = [x]
+        for down in self.down:
+            levels.append(rectified(down(levels[-1])))
+        value = levels.pop()
+        for up in self.up[:-1]:
+            value = rectified(up(value)) + levels.pop()
+        for up in self.up[-1:]:
+            value = torch.cat([rectified(up(value)), x], dim=1)
+        return self.leave(value)
+
+
 class Attention(nn.Module):
     """Multi-head attention of tokens to those of a context, which may be themselves."""
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from primdiffusion.primitives.primitives import GRID, S
 
 
 @dataclasses.dataclass(frozen=True)
@@ -13,6 +15,9 @@ class EncoderConfig:
 
     appearance: Literal["voxels", "texels"] = "voxels"
     """What is looked up in the pictures: the body's surface under every texel (paper), or every voxel of the boxes."""
+    unseen: Literal["filled", "black"] = "filled"
+    """filled: points that no view sees take colours from around them, and further channels hold what is seen and what
+    masks cover; black: they are black, and the network is given nothing but colours (SPEC 2)."""
     facing: int = 2
     """Views count by the cosine to the surface's normal to this power; 0: all visible ones alike (paper)."""
     attention: Literal["cross", "concatenated", "none"] = "cross"
@@ -29,6 +34,11 @@ class EncoderConfig:
     """Channels of the image encoder at 128, 64 and 32 squared."""
     grid: tuple[int, ...] = (64, 96, 96, 96)
     """Channels of its U-Net at 32, 16, 8, ... squared."""
+    grid_entry: Literal["residual", "halving"] = "residual"
+    """residual: a residual block at 32 squared comes first; halving: the U-Net's first layer is the one to 16 squared,
+    and what goes in joins in at the end (SPEC 2)."""
+    grid_gain: float = 1.0
+    """Factor on what the U-Net gives."""
     motion: int = 32
     """Channels of the motion branch."""
     attention_width: int = 128
@@ -47,6 +57,8 @@ class EncoderConfig:
     """Channels of both at 256 squared, before what was looked up joins in."""
     scale: tuple[int, ...] = (64, 64)
     """Channels of the delta-scale network."""
+    scale_outputs: int = 3
+    """Channels at its end, of which the last three count: the released code has six dead ones before (SPEC 1.7)."""
     scale_gain: float = 0.1
     """delta scale = exp(gain x)."""
     colour_gain: float = 0.06
@@ -58,18 +70,44 @@ class EncoderConfig:
 
     @property
     def channels(self) -> int:
-        """Channels of what is looked up, a picture of 256 x 256."""
-        return 40 if self.appearance == "voxels" else 4
+        """Channels of the picture of 256 x 256 that the image encoder reads."""
+        colours = 3 * self.layers
+        if self.unseen == "black":
+            return colours
+        return colours + self.layers * (2 if self.appearance == "voxels" else 1)
+
+    @property
+    def layers(self) -> int:
+        """Points that are looked up under each texel."""
+        return S if self.appearance == "voxels" else 1
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for settings that cannot be."""
+        for name, hint in get_type_hints(EncoderConfig).items():
+            value = getattr(self, name)
+            if get_origin(hint) is Literal and value not in get_args(hint):
+                raise ValueError(f"{name} is {value!r}: choose one of {', '.join(map(repr, get_args(hint)))}")
+        if not 1 <= len(self.grid) <= GRID.bit_length():
+            raise ValueError(f"grid has {len(self.grid)} levels: give 1 to {GRID.bit_length()}, down to one texel")
+        if self.attention_width % self.attention_heads:
+            raise ValueError(
+                f"attention_width {self.attention_width} is no multiple of attention_heads {self.attention_heads}"
+            )
+        if self.scale_outputs < 3:
+            raise ValueError(f"scale_outputs is {self.scale_outputs}: delta scales are 3 numbers")
 
 
 DEFAULT = EncoderConfig()
 PAPER = EncoderConfig(
     appearance="texels",
+    unseen="black",
     facing=0,
     base="constant",
     detail="bottleneck",
     stem=(4, 8, 16),
     grid=(64, 64, 64, 64, 64, 64),
+    grid_entry="halving",
+    grid_gain=0.1,
     attention_width=256,
     attention_blocks=2,
     colour=(32, 16),
@@ -87,20 +125,24 @@ PRESETS: Mapping[str, EncoderConfig] = {
     "template_rt": dataclasses.replace(DEFAULT, frames="template"),
     "no_attention": dataclasses.replace(DEFAULT, attention="none"),
     "paper": PAPER,
-    "released": dataclasses.replace(PAPER, attention="concatenated"),
+    "released": dataclasses.replace(PAPER, attention="concatenated", scale_outputs=9),
 }
 """Encoders by name: ours, its three ablations (paper Table 3), and the architectures of the paper and its code."""
+
+LATER = {"unseen", "grid_entry", "grid_gain", "scale_outputs"}
+"""Settings that the first encoders' files do not have: their defaults are what those encoders do."""
 
 
 def config_from_json(tree: Mapping[str, Any]) -> EncoderConfig:
     """A configuration from what `dataclasses.asdict` made of it and JSON carried.
 
     Raises:
-        ValueError: it has settings that this version does not know, or lacks some.
+        ValueError: it has settings that this version does not know, lacks some, or holds impossible ones.
     """
     names = {field.name for field in dataclasses.fields(EncoderConfig)}
-    if set(tree) != names:
-        differing = ", ".join(sorted(set(tree) ^ names))
-        raise ValueError(f"the encoder's configuration differs in {differing}: use the release that trained it")
+    differing = (set(tree) - names) | (names - set(tree) - LATER)
+    if differing:
+        listed = ", ".join(sorted(differing))
+        raise ValueError(f"the encoder's configuration differs in {listed}: use the release that trained it")
     settings: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in tree.items()}
     return EncoderConfig(**settings)

@@ -37,8 +37,9 @@ class EncoderModel:
         return encode(self.encoder, views, betas)
 
     def place(self, payload: Payload, betas: Float[Tensor, "n"], pose: BodyPose) -> Primitives:
-        """The payload on the body that this encoder's boxes sit on."""
-        return Primitives.place(frames_of(self.config, betas, pose)[1], payload)
+        """The payload on the body that this encoder's boxes sit on; on the payload's device."""
+        frames = frames_of(self.config, betas.cpu(), pose.to("cpu"))[1]
+        return Primitives.place(frames.to(payload.density.device), payload)
 
 
 @torch.no_grad()
@@ -49,6 +50,7 @@ def encode(encoder: Encoder, views: Views, betas: Float[Tensor, "n"]) -> Payload
         ValueError: there are no views, they are batched, or pose or betas are not finite or of another body.
     """
     device = encoder.scale_out.bias.device
+    views, betas = views.to("cpu"), betas.cpu()
     found = look_up(encoder.config, views, betas)
     axis_angle = motion_of(views.pose.joint_rotation)[None].to(device)
     payload = encoder(stacked([found]).to(device), axis_angle)

@@ -14,6 +14,7 @@ from primdiffusion.encoder.blocks import (
     ConcatenatedAttention,
     CrossModalAttention,
     GridNetwork,
+    HalvingGridNetwork,
     ResidualConv,
     UntiedConv,
     rectified,
@@ -46,7 +47,8 @@ class Encoder(nn.Module):
                 UntiedConv(second, third, SIDE // 8, "down"),
             ]
         )
-        self.appearance = GridNetwork(third, config.grid, GRID)
+        grid = {"residual": GridNetwork, "halving": HalvingGridNetwork}[config.grid_entry]
+        self.appearance = grid(third, config.grid, GRID)
         self.motion = ResidualConv(MOTION, config.motion, GRID)
         channels = config.grid[0], config.motion
         attention = {"cross": CrossModalAttention, "concatenated": ConcatenatedAttention, "none": None}[
@@ -60,31 +62,34 @@ class Encoder(nn.Module):
         self.density = MappingNetwork(config, config.density, S)
         scale = (config.fused, *config.scale)
         self.scale = nn.ModuleList(UntiedConv(a, b, GRID) for a, b in itertools.pairwise(scale))
-        self.scale_out = UntiedConv(scale[-1], 3, GRID).quiet()
+        self.scale_out = UntiedConv(scale[-1], config.scale_outputs, GRID).quiet()
 
     def forward(self, found: Unprojected, axis_angle: Float[Tensor, "b 24 3"]) -> Payload:
         """Payloads [b] of people from what was looked up [b, d, ...] and the pose in which it was.
 
         Raises:
-            ValueError: the input is of another kind than this encoder's.
+            ValueError: the input is of another kind than this encoder's, or there are not as many poses as people.
         """
+        self._check(found, axis_angle)
         x, base = self.read(found)
         fine = [x]
         for stem in self.stem:
             fine.append(rectified(stem(fine[-1])))
+        config = self.config
         appearance = self.appearance(fine[3])
-        motion = axis_angle[:, 1:].flatten(1)[:, :, None, None].expand(-1, -1, GRID, GRID)
+        if config.grid_gain != 1:
+            appearance = config.grid_gain * appearance
+        motion = axis_angle[:, 1:].to(x).flatten(1)[:, :, None, None].expand(-1, -1, GRID, GRID)
         motion = self.motion(motion)
         if self.attention is not None:
             appearance, motion = self.attention(appearance, motion)
         fused = self.fuse(torch.cat([appearance, motion], dim=1))
-        config = self.config
         colour = clamp(base[:, : 3 * S] + config.colour_gain * self.colour(fused, fine))
         density = clamp(base[:, 3 * S :] + config.density_gain * self.density(fused, fine))
         value = fused
         for layer in self.scale:
             value = rectified(layer(value))
-        logarithm = config.scale_gain * self.scale_out(value)
+        logarithm = config.scale_gain * self.scale_out(value)[:, -3:]
         if config.delta_scale == "shared":
             logarithm = logarithm.mean((-1, -2), keepdim=True).expand_as(logarithm)
         return Payload(
@@ -94,17 +99,20 @@ class Encoder(nn.Module):
         )
 
     def read(self, found: Unprojected) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 32 h w"]]:
-        """The image encoder's input, -1 ... 1, and what colours (d, c) and densities (d) add to."""
-        layers = found.seen.shape[-3]
-        if layers != (S if self.config.appearance == "voxels" else 1) or found.seen.shape[-1] != SIDE:
-            raise ValueError(
-                f"what was looked up has the shape {tuple(found.seen.shape)}, not that of {self.config.appearance}: "
-                "look it up with this encoder's configuration"
-            )
+        """What the image encoder reads, and what colours (d, c) and densities (d) add to; encoded, 0 ... 1.
+
+        The former is -1 ... 1 with `unseen` "filled": colours, what is seen and, of voxels, what masks cover; with
+        "black" it is colours alone, 0 ... 1.
+        """
         dtype = self.scale_out.bias.dtype
         seen, covered = found.seen.to(dtype) / 255, found.covered.to(dtype) / 255
-        rgb = fill(found.rgb.to(dtype) / 255, seen)
-        inputs = [rgb.flatten(1, 2), seen] + ([covered] if self.config.appearance == "voxels" else [])
+        rgb = found.rgb.to(dtype) / 255
+        if self.config.unseen == "black":
+            inputs = rgb.flatten(1, 2)
+        else:
+            rgb = fill(rgb, seen)
+            masks = [seen, covered] if self.config.appearance == "voxels" else [seen]
+            inputs = torch.cat([rgb.flatten(1, 2), *masks], dim=1) * 2 - 1
         if self.config.base == "constant":
             base = rgb.new_full((len(rgb), 4 * S, SIDE, SIDE), CONSTANT_BASE)
         else:
@@ -112,7 +120,20 @@ class Encoder(nn.Module):
             base = torch.cat(
                 [rgb.expand(-1, S, -1, -1, -1).flatten(1, 2), (slope * covered + offset).expand(-1, S, -1, -1)], dim=1
             )
-        return torch.cat(inputs, dim=1) * 2 - 1, base
+        return inputs, base
+
+    def _check(self, found: Unprojected, axis_angle: Tensor) -> None:
+        given, expected = tuple(found.seen.shape), (self.config.layers, SIDE, SIDE)
+        if len(given) != 4 or given[1:] != expected:
+            raise ValueError(
+                f"what was looked up has the shape {given}, not [b, {', '.join(map(str, expected))}] as for "
+                f"{self.config.appearance}: look it up with this encoder's configuration, and stack people"
+            )
+        if tuple(axis_angle.shape) != (given[0], J, 3):
+            raise ValueError(
+                f"{given[0]} people were looked up, but axis-angles have the shape {tuple(axis_angle.shape)}: "
+                f"give [{given[0]}, {J}, 3]"
+            )
 
 
 class MappingNetwork(nn.Module):

@@ -26,7 +26,7 @@ from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.surface import surface_points, vertex_normals
 from primdiffusion.geometry.uv_atlas import UvRaster, rasterise_uv
 from primdiffusion.primitives.anchors import default_texels
-from primdiffusion.primitives.primitives import GRID, Frames, S
+from primdiffusion.primitives.primitives import GRID, Frames, K, S
 from primdiffusion.render.triangles import nearest_triangles
 
 SIDE = GRID * S
@@ -59,7 +59,8 @@ def unproject_texels(
     to the power `facing`. Texels outside of every chart are seen by nobody.
 
     Raises:
-        ValueError: there are no views, they are batched, or vertices are not finite.
+        ValueError: there are no views, they are batched or their cameras are of other sizes or numbers; vertices are
+            not finite or not the body's; the body has no UV map.
     """
     body = default_body() if body is None else body
     face, barycentric = _texels(body)
@@ -80,9 +81,11 @@ def unproject_voxels(
     `unproject_texels`, by the angle to the box's normal; a voxel in front of the body's surface is seen too.
 
     Raises:
-        ValueError: there are no views, they are batched, or vertices are not finite.
+        ValueError: as `unproject_texels`, and for another number of frames than a person has boxes.
     """
     body = default_body() if body is None else body
+    if tuple(frames.position.shape) != (K, 3):
+        raise ValueError(f"the boxes' positions have the shape {tuple(frames.position.shape)}: give one person's {K}")
     local = torch.linspace(-1, 1, S, dtype=vertices.dtype, device=vertices.device)
     t, b, n = (frames.rotation * frames.half_extent[:, None, :]).unbind(-1)
     columns = local[:, None, None] * b[:, None, None] + local[None, :, None] * t[:, None, None]  # k h w 3
@@ -99,6 +102,8 @@ def _texels(body: BodyModel) -> tuple[Tensor, Tensor]:
     """Face and barycentric coordinates of SIDE x SIDE texels, -1 outside of the charts."""
     if body is default_body():
         return default_texels()
+    if body.uv.numel() == 0:
+        raise ValueError("the body has no UV coordinates: load it with a UV map, or look its voxels up")
     raster: UvRaster = rasterise_uv(body.uv[body.uv_faces].double().cpu().numpy(), SIDE, SIDE)
     return torch.from_numpy(raster.face), torch.from_numpy(raster.barycentric).to(body.template.dtype)
 
@@ -111,10 +116,7 @@ def _look_up(
     normals: Float[Tensor, "d n 3"],
     facing: int,
 ) -> Unprojected:
-    if views.rgba.ndim != 4 or not len(views.rgba):
-        raise ValueError(f"views have the shape {tuple(views.rgba.shape)}: give one person's, [v, H, W, 4], v > 0")
-    if not torch.isfinite(vertices).all():
-        raise ValueError("the posed vertices hold NaN or infinite values; check the pose and the betas they come from")
+    _check(views, vertices, body)
     rgba = np.ascontiguousarray(views.rgba.cpu().numpy())
     depth = np.stack([_body_depth(views, view, vertices, body) for view in range(len(rgba))])
     world_to_pixel = (views.camera.intrinsics @ views.camera.world_to_camera).cpu().numpy().astype(np.float32)
@@ -133,6 +135,28 @@ def _look_up(
     picture = torch.from_numpy(rgb).reshape(layers, SIDE, SIDE, 3).movedim(-1, 1).contiguous()
     found = Unprojected(picture, torch.from_numpy(seen).reshape(shape), torch.from_numpy(covered).reshape(shape))
     return found.to(views.rgba.device)
+
+
+def _check(views: Views, vertices: Tensor, body: BodyModel) -> None:
+    """Compiled code reads where these tell it to, so they must agree."""
+    shape, camera = tuple(views.rgba.shape), views.camera
+    if len(shape) != 4 or not shape[0] or shape[-1] != 4 or views.rgba.dtype != torch.uint8:
+        raise ValueError(f"views are {views.rgba.dtype} {shape}: give one person's, uint8 [v, H, W, 4], v > 0")
+    if tuple(camera.world_to_camera.shape) != (shape[0], 3, 4) or tuple(camera.intrinsics.shape) != (shape[0], 3, 3):
+        cameras = tuple(camera.world_to_camera.shape)
+        raise ValueError(f"there are {shape[0]} pictures, but cameras of shape {cameras}: give one for each picture")
+    if (camera.height, camera.width) != shape[1:3]:
+        raise ValueError(
+            f"the pictures are {shape[2]} x {shape[1]} pixels, but their cameras {camera.width} x {camera.height}: "
+            "scale the pictures, or the intrinsics with them"
+        )
+    if vertices.shape != body.template.shape:
+        raise ValueError(
+            f"the posed vertices have the shape {tuple(vertices.shape)}, the body {tuple(body.template.shape)}: "
+            "give one person's in one pose, of the same body"
+        )
+    if not torch.isfinite(vertices).all():
+        raise ValueError("the posed vertices hold NaN or infinite values; check the pose and the betas they come from")
 
 
 def _body_depth(views: Views, view: int, vertices: Float[Tensor, "V 3"], body: BodyModel) -> Float32[ndarray, "H W"]:
