@@ -92,8 +92,11 @@ def main() -> None:
         if "full" in models:
             figures |= reconstruct_seconds(models["full"], some, 2 if arguments.quick else 7)
         figures |= step_seconds(some, 2 if arguments.quick else 8)
-    refining = arguments.quick or arguments.without_refine
-    figures |= dict.fromkeys(REFINE_FIGURES) if refining else from_script("refine.py", REFINE_FIGURES)
+    if arguments.quick or arguments.without_refine:
+        figures |= dict.fromkeys(REFINE_FIGURES)
+    else:
+        assets = () if arguments.assets is None else ("--assets", str(arguments.assets))
+        figures |= from_script("refine.py", REFINE_FIGURES, *assets)
     tell(figures, arguments.json)
     text = table_of(qualities)
     print(text)
