@@ -1,0 +1,209 @@
+"""One person made to look like their pictures: gradient steps on what fills the boxes, through the marcher.
+
+    start = bare_body(betas)                        # or an encoder's, or from_mesh's, or any other person
+    refined = refine(start, views).human            # views: pictures of one pose each, several poses
+
+Adam on three fields of the payload: colours as sRGB encodes them, density, and the logarithm of the boxes' sizes. The
+objective is that of stage 1 (paper sec. 3.2: L_rgb, L_sil), on random views. What no view shows has no gradient, and
+stays as it was, bit for bit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from primdiffusion import __version__
+from primdiffusion.capture.dataset import Views
+from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.human import Human
+from primdiffusion.primitives.from_mesh import FULL_DENSITY
+from primdiffusion.primitives.primitives import Payload
+from primdiffusion.training.refine_views import Scene, drawn, psnr_of, scenes_of
+
+BETAS = (0.9, 0.99)
+"""Adam's memories. Short ones: a run is a few hundred steps."""
+WARM_UP = 10
+"""Steps in which the rates rise to their full size: Adam's first steps are all of one length, whatever the gradient."""
+LARGEST_CHANGE = 3.0
+"""How many times a box's side may grow or shrink."""
+MEASURED = 32
+"""Views, evenly chosen, on which the person is judged before and after."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RefineSettings:
+    """How a person is refined. The rates are found by search on people that are dressed in detail."""
+
+    steps: int = 300
+    """Steps of Adam."""
+    views: int = 2
+    """Pictures a step."""
+    colour_rate: float = 0.04
+    """Of sRGB-encoded colours in 0 ... 1."""
+    density_rate: float = 0.04
+    """Of density, in units of FULL_DENSITY."""
+    scale_rate: float = 0.03
+    """Of the logarithm of the boxes' sizes; 0: they stay as they are."""
+    last_rate: float = 0.1
+    """What is left of the rates at the end of their fall, half a cosine."""
+    largest_density: float = FULL_DENSITY
+    """1/m; more gains a tenth of a dB, and would not fit into the bytes of the diffusion model's training set."""
+    silhouette: float = 0.05
+    """Weight of the silhouette's mean square error, that of the colours' being 1."""
+    step: float = 0.006
+    """Metres between samples of a ray."""
+    seconds: float = math.inf
+    """Ends earlier, after the step in which so much time is over; the rates have not fallen as far then."""
+    seed: int = 0
+    """Of the order of views."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for numbers with which nothing can be refined."""
+        least = {"steps": 1, "views": 1, "colour_rate": 0, "density_rate": 0, "scale_rate": 0, "last_rate": 0,
+                 "largest_density": 1, "silhouette": 0, "step": 1e-4, "seconds": 0}  # fmt: skip
+        for name, lowest in least.items():
+            if not getattr(self, name) >= lowest:
+                raise ValueError(f"{name} of the refinement is {getattr(self, name)}: it must be {lowest} or more")
+
+
+class RefineStep(NamedTuple):
+    """What is known after a step."""
+
+    number: int
+    """From 1."""
+    loss: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Refined:
+    """A refined person and what it took."""
+
+    human: Human
+    """On the CPU."""
+    psnr_before: float
+    """Mean over up to MEASURED of the given views, dB (`view_psnr`)."""
+    psnr_after: float
+    """Likewise."""
+    steps: int
+    """Done; fewer than asked for where time ran out."""
+    seconds: float
+    """Of the steps."""
+
+
+def refine(
+    human: Human,
+    views: Sequence[Views],
+    settings: RefineSettings = RefineSettings(),
+    on_step: Callable[[RefineStep], None] | None = None,
+) -> Refined:
+    """The person, their betas kept, with a payload that looks like the views; on the payload's device.
+
+    `views` are records of one pose each, unbatched, pictures [v, H, W]; their poses are those of a body with the
+    human's betas. The same input and settings give the same bits on the same device. `on_step` sees each step after it
+    is done; an exception it raises ends the work (that is how cancelling works).
+
+    Raises:
+        ValueError: there are no views, or they do not fit their cameras, or nobody is in a record's masks; the human
+            is of another body, or holds NaN; the pictures lead to numbers that are not finite.
+        PictureOutOfMemory: pictures of this size do not fit.
+    """
+    human.validate()
+    scenes = scenes_of(human, views)
+    start = human.payload.map(lambda values: values.detach().float())
+    leaves = _Leaves.of(start)
+    groups = zip(leaves, (settings.colour_rate, settings.density_rate, settings.scale_rate), strict=True)
+    adam = torch.optim.Adam([{"params": [leaf], "lr": rate} for leaf, rate in groups], betas=BETAS, fused=True)
+    fall = torch.optim.lr_scheduler.LambdaLR(adam, lambda done: _share_of_rate(done, settings))
+    chosen = _shuffled(scenes, settings.seed)
+    covered = sum(float(scene.target[..., 3].sum()) for scene in scenes) / 255 / len(scenes)
+    began, number = time.perf_counter(), 0
+    for number in range(1, settings.steps + 1):
+        adam.zero_grad()
+        payload = leaves.payload(start)
+        losses = [_loss(scene, payload, settings) for scene in itertools.islice(chosen, settings.views)]
+        loss = torch.stack(losses).mean() / covered
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise ValueError(f"refining lost its way at step {number}, the loss is {value}: use smaller rates")
+        loss.backward()
+        adam.step()
+        fall.step()
+        leaves.clamp_(settings.largest_density)
+        if on_step is not None:
+            on_step(RefineStep(number, value))
+        if time.perf_counter() - began > settings.seconds:
+            break
+    seconds = time.perf_counter() - began
+    payload = leaves.result(start)
+    judged = scenes[:: math.ceil(len(scenes) / MEASURED)]
+    before, after = (float(psnr_of(judged, candidate).mean()) for candidate in (start, payload))
+    provenance = {**human.provenance, "refined_steps": number, "refined_views": len(scenes), "version": __version__}
+    refined = dataclasses.replace(human, payload=payload, provenance=provenance).to("cpu").validate()
+    return Refined(refined, before, after, number, seconds)
+
+
+class _Leaves(NamedTuple):
+    """What Adam moves."""
+
+    colour: Tensor
+    """sRGB-encoded."""
+    density: Tensor
+    """In units of FULL_DENSITY."""
+    log_scale: Tensor
+    """Of the boxes' sizes in units of those at the start."""
+
+    @classmethod
+    def of(cls, start: Payload) -> _Leaves:
+        colour = encode_srgb(start.rgb.clamp(0, 1))
+        density = start.density.clamp_min(0) / FULL_DENSITY
+        return cls(*(leaf.requires_grad_() for leaf in (colour, density, torch.zeros_like(start.delta_scale))))
+
+    def payload(self, start: Payload) -> Payload:
+        scale = start.delta_scale * self.log_scale.exp()
+        return Payload(decode_srgb(self.colour), self.density * FULL_DENSITY, scale)
+
+    @torch.no_grad()
+    def clamp_(self, largest_density: float) -> None:
+        """Back to values that mean something; not before the step, where a gradient would end at the border."""
+        self.colour.clamp_(0, 1)
+        self.density.clamp_(0, largest_density / FULL_DENSITY)
+        self.log_scale.clamp_(-math.log(LARGEST_CHANGE), math.log(LARGEST_CHANGE))
+
+    @torch.no_grad()
+    def result(self, start: Payload) -> Payload:
+        """The payload, with the start's very bits where nothing moved."""
+        now, then = self.payload(start), _Leaves.of(start)
+        return Payload(
+            torch.where(self.colour == then.colour, start.rgb, now.rgb),
+            torch.where(self.density == then.density, start.density, now.density),
+            torch.where(self.log_scale == 0, start.delta_scale, now.delta_scale),
+        )
+
+
+def _shuffled(scenes: Sequence[Scene], seed: int) -> Iterator[Scene]:
+    """Without end; each once before any comes again."""
+    generator = torch.Generator().manual_seed(seed)
+    while True:
+        for place in torch.randperm(len(scenes), generator=generator).tolist():
+            yield scenes[place]
+
+
+def _share_of_rate(done: int, settings: RefineSettings) -> float:
+    fall = 0.5 + 0.5 * math.cos(math.pi * min(done / settings.steps, 1))
+    return min(1, (done + 1) / WARM_UP) * (settings.last_rate + (1 - settings.last_rate) * fall)
+
+
+def _loss(scene: Scene, payload: Payload, settings: RefineSettings) -> Tensor:
+    """L_rgb + silhouette * L_sil as sums over the pixels; colours mean over their channels."""
+    rendering = drawn(scene, payload, settings.step)
+    target = scene.target.float() / 255
+    colour = (encode_srgb(rendering.rgb) - target[..., :3]).square().mean(-1)
+    return (colour + settings.silhouette * (rendering.alpha - target[..., 3]).square()).sum()

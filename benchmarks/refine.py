@@ -1,0 +1,127 @@
+"""What refining makes of a captured person: PSNR on cameras that were held out and in a pose that was, and how long.
+
+`python benchmarks/refine.py --assets DIR --json F` makes one dressed person of a seed that no training set uses, draws
+them in nine poses from 24 sides at 256 x 256 with the rasteriser, and refines on eight poses and 21 cameras, once from
+`from_mesh` of their mesh and once from the bare grey body. PSNR is of whole sRGB-encoded pictures, mean over them:
+`heldout_views` three cameras in the eight poses, `unseen_pose` all cameras in the ninth. Seconds are those of the
+steps, by the clock and of the processor. `--quick` takes 60 steps from the mesh alone. `--pictures DIR` keeps held-out
+views side by side: before, after, target, from the mesh in the first row and from the body in the second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from PIL import Image
+from primdiffusion.capture.conditioning import conditioning_views, default_betas
+from primdiffusion.capture.dataset import Views
+from primdiffusion.capture.people_files import find_people
+from primdiffusion.capture.poses import choose_poses
+from primdiffusion.capture.rasterised import Job, render
+from primdiffusion.capture.reader import open_captures
+from primdiffusion.capture.rig import Rig
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.human import Human, place
+from primdiffusion.machine import best_device
+from primdiffusion.people.assets import open_assets
+from primdiffusion.people.folder import PeopleSet, make_people
+from primdiffusion.people.wardrobe import required_meshes
+from primdiffusion.refine_command import dealt_cameras
+from primdiffusion.render.march import march
+from primdiffusion.training.refine import RefineSettings, refine
+from primdiffusion.training.refine_start import bare_body, meshed_person
+from primdiffusion.training.refine_views import view_psnr
+from record import tell
+
+SEED = 30_000_000
+"""Of the person; training sets count from 0."""
+POSES, CAMERAS, HELD, SIZE = 9, 24, 3, 256
+QUICK_STEPS = 60
+
+
+def main() -> None:
+    """Measures, prints and, if asked, writes the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
+    parser.add_argument("--steps", type=int, default=RefineSettings().steps, help="of each refinement")
+    parser.add_argument("--seed", type=int, default=SEED, help="of the person")
+    parser.add_argument("--quick", action="store_true", help="few steps, from the mesh alone")
+    parser.add_argument("--pictures", type=Path, help="folder for a PNG")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    arguments = parser.parse_args()
+    steps = QUICK_STEPS if arguments.quick else arguments.steps
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        assets = open_assets(arguments.assets, required_meshes())
+        list(make_people(assets, PeopleSet(folder / "people", arguments.seed, 1), 1))
+        (name, path), *_ = find_people(folder / "people").items()
+        poses = choose_poses((), POSES, seed=0)
+        job = Job({name: path}, poses, folder / "captures", Rig(count=CAMERAS, width=SIZE, height=SIZE),
+                  ("img", "mask"))  # fmt: skip
+        assert all(outcome.what == "done" for outcome in render(job))
+        captures = open_captures(job.out)
+        betas = default_betas(captures.subject(name))
+        held, given = dealt_cameras(CAMERAS, HELD)
+        sets = [
+            [conditioning_views(captures, name, frame, cameras) for frame in frames]
+            for frames, cameras in ((range(POSES - 1), given), (range(POSES - 1), held), ((POSES - 1,), None))
+        ]
+        starts = {"": meshed_person(path)} | ({} if arguments.quick else {"_from_body": bare_body(betas)})
+    figures, rows = {"refine_steps": steps}, []
+    for suffix, start in starts.items():
+        measured, refined = measure(start.to(best_device()), *sets, steps)
+        figures |= {f"{figure}{suffix}": value for figure, value in measured.items()}
+        rows.append(compared((start, refined), [sets[1][0], sets[1][4], sets[2][0]]))
+    if arguments.pictures:
+        arguments.pictures.mkdir(parents=True, exist_ok=True)
+        pixels = (torch.cat(rows).cpu() * 255).round().to(torch.uint8).numpy()
+        Image.fromarray(pixels).save(arguments.pictures / "refine.png")
+    tell(figures, arguments.json)
+
+
+def measure(
+    start: Human, given: list[Views], held: list[Views], unseen: list[Views], steps: int
+) -> tuple[dict[str, float], Human]:
+    """Figures of one refinement, and its person. A step beforehand compiles the marcher."""
+    refine(start, given[:1], RefineSettings(steps=1))
+    moments = []
+
+    def note(_: object) -> None:
+        moments.append((time.perf_counter(), time.process_time()))
+
+    note(None)
+    refined = refine(start, given, RefineSettings(steps=steps), note).human
+    figures = {
+        "refine_psnr_start": mean_psnr(start, held),
+        "refine_psnr_heldout_views": mean_psnr(refined, held),
+        "refine_psnr_unseen_pose_start": mean_psnr(start, unseen),
+        "refine_psnr_unseen_pose": mean_psnr(refined, unseen),
+        "refine_seconds_cpu": moments[-1][0] - moments[0][0],
+        "refine_processor_seconds": moments[-1][1] - moments[0][1],
+    }
+    return figures, refined
+
+
+def mean_psnr(human: Human, views: Sequence[Views]) -> float:
+    """Over all pictures, dB."""
+    return float(view_psnr(human, views).mean())
+
+
+@torch.no_grad()
+def compared(people: Sequence[Human], views: Sequence[Views]) -> torch.Tensor:
+    """The first picture of each record as each of the people shows it, then as it is; encoded [H, W, 3] in one row."""
+    columns = []
+    for record in views:
+        camera = record.camera.map(lambda values: values[0])
+        drawn = [march(place(person.to("cpu"), record.pose), camera).rgb for person in people]
+        columns += [*(encode_srgb(rgb).clamp(0, 1) for rgb in drawn), record.image[0] / 255]
+    return torch.cat(columns, dim=1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,312 @@
+"""Refining a person: tiny pictures of a person of random boxes, and the command on captures of boxes."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from capture_scenes import captured, save_person
+from primdiffusion import cli
+from primdiffusion.body.model import BodyPose, J, default_body
+from primdiffusion.capture.conditioning import conditioning_views
+from primdiffusion.capture.dataset import Views, stack
+from primdiffusion.capture.poses import built_in_poses
+from primdiffusion.capture.rasterised import Job, render
+from primdiffusion.capture.reader import open_captures
+from primdiffusion.capture.rig import Rig
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+from primdiffusion.human import Human, framing, place
+from primdiffusion.human_file import load_human, save_human
+from primdiffusion.primitives.primitives import K, Payload, S
+from primdiffusion.refine_command import dealt_cameras
+from primdiffusion.render.march import march
+from primdiffusion.staging import STAGING_PREFIX
+from primdiffusion.training.refine import RefineSettings, refine
+from primdiffusion.training.refine_start import bare_body
+from primdiffusion.training.refine_views import view_psnr
+
+QUICK = RefineSettings(steps=15, views=1, density_rate=0.01)
+"""So few steps on so few pixels of random boxes: density, which is right at the start, must not run ahead of colour."""
+FRONT, SIDE, BACK = 0.0, math.pi / 2, math.pi
+
+
+def person(seed: int) -> Human:
+    """Boxes of one colour each, solid towards the body."""
+    generator = torch.Generator().manual_seed(seed)
+    rgb = torch.rand(K, 3, 1, 1, 1, generator=generator).expand(K, 3, S, S, S).clone()
+    density = torch.linspace(100, -100, S).clamp_min(0)[:, None, None].expand(K, S, S, S).clone()
+    return Human(Payload(rgb, density, torch.ones(K, 3)), torch.zeros(10), {"seed": seed})
+
+
+def pose(turn: float) -> BodyPose:
+    theta = torch.zeros(3 * J)
+    theta[3 * 16 + 2] = turn  # the left shoulder
+    return BodyPose.from_axis_angle(theta)
+
+
+@torch.no_grad()
+def views_of(human: Human, yaws=(FRONT, SIDE, BACK), turn: float = 0.0, size: int = 40) -> Views:
+    primitives = place(human, pose(turn))
+    cameras = stack([framing(primitives, yaw, size, size) for yaw in yaws])
+    pictures = march(primitives, cameras)
+    rgba = torch.cat([encode_srgb(pictures.rgb).clamp(0, 1), pictures.alpha[..., None]], dim=-1)
+    return Views((rgba * 255).round().to(torch.uint8), cameras, pose(turn))
+
+
+@pytest.fixture(scope="module")
+def views() -> list[Views]:
+    wanted = person(1)
+    return [views_of(wanted), views_of(wanted, (0.5,), turn=-0.8)]
+
+
+def test_a_person_comes_to_look_like_the_pictures_and_like_those_it_was_not_shown(views):
+    start = person(2)
+    unseen = [views_of(person(1), (FRONT + 0.2, BACK + 0.2), turn=-0.4)]
+    before = float(view_psnr(start, unseen).mean())
+    refined = refine(start, views, QUICK)
+    assert refined.steps == 15
+    assert refined.psnr_after > refined.psnr_before + 3
+    assert float(view_psnr(refined.human, unseen).mean()) > before + 0.5
+    assert refined.psnr_after == pytest.approx(float(view_psnr(refined.human, views).mean()), abs=1e-4)
+    assert torch.equal(refined.human.betas, start.betas)
+    assert refined.human.provenance["refined_steps"] == 15
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_seed_others(views):
+    once, again, other = (
+        refine(person(2), views, dataclasses.replace(QUICK, steps=4, seed=seed)).human.payload for seed in (3, 3, 4)
+    )
+    assert all(torch.equal(one, two) for one, two in zip(vars(once).values(), vars(again).values(), strict=True))
+    assert not torch.equal(once.rgb, other.rgb)
+
+
+def test_what_no_picture_shows_stays_bit_for_bit(views):
+    start, whole = person(2), views[0]
+    half = dataclasses.replace(whole, rgba=whole.rgba[:, :20], camera=whole.camera.crop(0, 0, 40, 20))
+    payload = refine(start, [half], dataclasses.replace(QUICK, steps=4)).human.payload
+    primitives = place(start)
+    reach = primitives.half_extent.norm(dim=-1) + 0.2  # metres; a pixel is a tenth of that
+    lowest_seen = float(primitives.position[:, 1].mean() - 0.05)
+    below = primitives.position[:, 1] + reach < lowest_seen
+    assert below.sum() > 20
+    for name in ("rgb", "density", "delta_scale"):
+        assert torch.equal(getattr(payload, name)[below], getattr(start.payload, name)[below])
+    moved = (payload.rgb != start.payload.rgb).flatten(1).any(1)
+    assert 0.1 < moved.float().mean() < 0.9
+
+
+def test_boxes_keep_their_sizes_and_densities_their_limit_where_this_is_asked(views):
+    start, settings = person(2), dataclasses.replace(QUICK, scale_rate=0, largest_density=100)
+    payload = refine(start, views, settings).human.payload
+    assert torch.equal(payload.delta_scale, start.payload.delta_scale)
+    assert float(payload.density.max()) == pytest.approx(100)
+    assert float(payload.rgb.min()) >= 0
+    assert float(payload.rgb.max()) <= 1
+
+
+def test_the_inputs_are_left_alone(views):
+    start = person(2)
+    before = start.map(torch.clone)
+    refine(start, views, dataclasses.replace(QUICK, steps=2))
+    assert torch.equal(start.payload.rgb, before.payload.rgb)
+    assert torch.equal(start.payload.density, before.payload.density)
+    assert not start.payload.rgb.requires_grad
+
+
+def test_the_work_ends_when_time_is_over_and_when_its_owner_says_so(views):
+    assert refine(person(2), views, dataclasses.replace(QUICK, seconds=0)).steps == 1
+
+    class Cancelled(Exception):
+        pass
+
+    seen = []
+
+    def stop(step):
+        seen.append(step)
+        if step.number == 2:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        refine(person(2), views, QUICK, stop)
+    assert [step.number for step in seen] == [1, 2]
+    assert all(math.isfinite(step.loss) for step in seen)
+
+
+def spoiled(human: Human, name: str) -> Human:
+    return dataclasses.replace(
+        human, payload=dataclasses.replace(human.payload, **{name: getattr(human.payload, name) * torch.nan})
+    )
+
+
+@pytest.mark.parametrize(
+    ("broken", "sentence"),
+    [
+        (lambda human, views: (human, []), "no views"),
+        (lambda human, views: (human, [dataclasses.replace(views, rgba=views.rgba[:, :30])]), "their cameras see"),
+        (lambda human, views: (human, [dataclasses.replace(views, rgba=views.rgba[..., :3])]), "uint8"),
+        (lambda human, views: (human, [dataclasses.replace(views, rgba=views.rgba / 255)]), "uint8"),
+        (lambda human, views: (human, [dataclasses.replace(views, pose=BodyPose.rest(3))]), "one pose a record"),
+        (lambda human, views: (human, [dataclasses.replace(views, rgba=views.rgba * 0)]), "views 0 shows a person"),
+        (lambda human, views: (spoiled(human, "rgb"), [views]), "'rgb' holds NaN"),
+        (lambda human, views: (spoiled(human, "density"), [views]), "'density' holds NaN"),
+        (lambda human, views: (dataclasses.replace(human, betas=torch.zeros(300)), [views]), "another body's"),
+        (lambda human, views: (dataclasses.replace(human, betas=torch.full((10,), torch.nan)), [views]), "betas"),
+    ],
+)
+def test_what_cannot_be_refined_is_refused_in_a_sentence(views, broken, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        refine(*broken(person(2), views[0]), QUICK)
+
+
+@pytest.mark.parametrize("wrong", [{"steps": 0}, {"views": 0}, {"seconds": math.nan}, {"colour_rate": -1}])
+def test_impossible_settings_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        RefineSettings(**wrong)
+
+
+def test_rates_that_lead_nowhere_end_in_a_sentence(views, monkeypatch):
+    monkeypatch.setattr("primdiffusion.training.refine._loss", lambda *_: torch.tensor(torch.nan))
+    with pytest.raises(ValueError, match="step 1"):
+        refine(person(2), views, QUICK)
+
+
+def test_pictures_too_large_for_memory_are_named(views, monkeypatch):
+    def full(*_):
+        raise RuntimeError("[enforce fail at alloc_cpu.cpp] not enough memory: you tried to allocate 9 bytes")
+
+    monkeypatch.setattr("primdiffusion.training.refine_views.march", full)
+    with pytest.raises(MemoryError, match="40 x 40 pixels"):
+        refine(person(2), views, QUICK)
+
+
+def test_cameras_are_held_out_evenly():
+    assert dealt_cameras(12, 3)[0] == [2, 6, 10]
+    assert dealt_cameras(4, 0) == ([], [0, 1, 2, 3])
+    held, given = dealt_cameras(5, 4)
+    assert sorted(held + given) == [0, 1, 2, 3, 4]
+    with pytest.raises(ValueError, match="0 to 3"):
+        dealt_cameras(4, 4)
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    return captured(tmp_path_factory.mktemp("refined"), people=2, frames=2, passes=("img", "mask"))
+
+
+@pytest.fixture
+def line(captures, tmp_path):
+    save_human(tmp_path / "start.human.safetensors", person(2))
+    start = ["--start", str(tmp_path / "start.human.safetensors"), "--out", str(tmp_path / "out")]
+    return ["refine", "--capture", str(captures), "--subject", "person_000001", "--steps", "3", "--size", "32",
+            "--hold-out-cameras", "1", *start]  # fmt: skip
+
+
+def test_the_command_leaves_a_person_and_says_how_good_it_is(line, tmp_path, capsys):
+    cli.main(line)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"
+    ]  # fmt: skip
+    human = load_human(tmp_path / "out" / "person.human.safetensors")
+    assert human.provenance["refined_from"] == "person_000001"
+    assert (human.provenance["refined_views"], human.provenance["refined_steps"]) == (6, 3)
+    printed = capsys.readouterr().out.splitlines()
+    assert "2 frames, 3 cameras, 3 steps" in printed[0]
+    before, after = (float(word) for word in printed[2].split()[2:5:2])
+    assert printed[2].endswith("(cameras 2)")
+    assert after > before
+
+
+def test_a_cancelled_command_leaves_nothing(line, tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("primdiffusion.training.refine.refine", interrupted)
+    with pytest.raises(SystemExit) as end:
+        cli.main(line)
+    assert end.value.code == 130
+    assert not (tmp_path / "out").exists()
+    assert not list(tmp_path.rglob(f"{STAGING_PREFIX}*"))
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (("--subject", "nobody"), "no subject 'nobody'"),
+        (("--start", "missing.human.safetensors"), "no person in missing"),
+        (("--start", "missing.glb"), "missing.glb"),
+        (("--hold-out-cameras", "4"), "cannot be held out"),
+        (("--size", "0"), "0 pixels"),
+        (("--steps", "0"), "steps"),
+        (("--minutes", "-1"), "seconds"),
+    ],
+)
+def test_the_command_refuses_in_one_sentence(line, tmp_path, capsys, change, sentence):
+    option, value = change
+    given = [*line, option, value] if option not in line else [*line[: line.index(option) + 1], value,
+                                                               *line[line.index(option) + 2 :]]  # fmt: skip
+    with pytest.raises(SystemExit) as end:
+        cli.main(given)
+    assert end.value.code == 1
+    assert sentence in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_mask_and_betas_of_another_body_are_named(tmp_path, capsys):
+    root = captured(tmp_path, people=1, frames=1, passes=("img", "mask"))
+    line = ["refine", "--capture", str(root), "--out", str(tmp_path / "out"), "--steps", "1"]
+    mask = next(root.glob("person_000000/mask/camera0001/*.png"))
+    content = mask.read_bytes()
+    mask.unlink()
+    with pytest.raises(SystemExit):
+        cli.main(line)
+    assert "camera0001" in capsys.readouterr().err
+    mask.write_bytes(content)
+    plain = next(root.glob("person_000000/**/*plain*.npz"))
+    with np.load(plain) as file:
+        arrays = {name: file[name] for name in file}
+    np.savez(plain, **{**arrays, "betas": np.zeros((1, 300), np.float32)})
+    with pytest.raises(SystemExit):
+        cli.main(line)
+    assert "300 betas" in capsys.readouterr().err
+
+
+def striped_body(betas: torch.Tensor) -> TexturedMesh:
+    """The bare body, rings of colours around all limbs: no asset is needed."""
+    body = default_body()
+    stripes = np.zeros((64, 64, 4), np.uint8)
+    stripes[..., 3] = 255
+    stripes[..., 0] = np.where(np.arange(64) // 4 % 2, 220, 40)[None]
+    stripes[..., 1] = np.where(np.arange(64) // 4 % 2, 200, 60)[:, None]
+    stripes[..., 2] = 90
+    weights, joints = body.skin_weights.topk(4)
+    skin = TexturedPart(
+        name="body",
+        vertices=body.shape(betas).vertices.double().numpy(),
+        faces=body.faces.numpy().astype(np.int32),
+        corner_uv=body.uv[body.uv_faces].numpy(),
+        texture=stripes,
+        skin_index=joints.numpy().astype(np.int32),
+        skin_weight=(weights / weights.sum(1, keepdim=True)).double().numpy(),
+    )
+    return TexturedMesh((skin,))
+
+
+@pytest.mark.slow
+def test_a_bare_body_takes_on_the_captured_one_s_colours(tmp_path):
+    """From grey to 33 dB on cameras that were held out, and to 31 dB in a pose that was."""
+    people = {"striped": save_person(tmp_path / "people" / "striped.glb", striped_body(torch.zeros(10)))}
+    job = Job(people, built_in_poses().map(lambda t: t[:5]), tmp_path / "out", Rig(count=12, width=160, height=160),
+              ("img", "mask"))  # fmt: skip
+    assert {outcome.what for outcome in render(job)} == {"done"}
+    captures = open_captures(job.out)
+    held, given = dealt_cameras(12, 3)
+    shown = [conditioning_views(captures, "striped", frame, given) for frame in range(4)]
+    start = bare_body(torch.zeros(10))
+    refined = refine(start, shown, RefineSettings(steps=150)).human
+    for frames, cameras, least in ((range(4), held, 33.0), ((4,), range(12), 31.0)):
+        judged = [conditioning_views(captures, "striped", frame, cameras) for frame in frames]
+        reached = float(view_psnr(refined, judged).mean())
+        assert reached > least
+        assert reached > float(view_psnr(start, judged).mean()) + 5
