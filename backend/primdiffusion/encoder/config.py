@@ -59,8 +59,11 @@ class EncoderConfig:
     """Channels of the delta-scale network."""
     scale_outputs: int = 3
     """Channels at its end, of which the last three count: the released code has six dead ones before (SPEC 1.7)."""
+    extent: tuple[float, float, float] = (0.85, 0.85, 0.6)
+    """Delta scales along T, B, N before anything is learned: the anchors' boxes reach for all that may hang off a body,
+    and most of a person is seen sharper in smaller ones."""
     scale_gain: float = 0.1
-    """delta scale = exp(gain x)."""
+    """delta scale = extent exp(gain x)."""
     colour_gain: float = 0.06
     """Colours = base + gain x, clamped to 0 ... 1. Small, so that colours do not learn to hide what densities lack."""
     density_gain: float = 0.25
@@ -113,6 +116,7 @@ PAPER = EncoderConfig(
     colour=(32, 16),
     density=(32, 16),
     scale=(64, 128, 64, 64),
+    extent=(1.0, 1.0, 1.0),
     scale_gain=0.01,
     colour_gain=25 / 255,
     density_gain=25 / 255,

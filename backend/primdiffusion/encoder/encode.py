@@ -66,6 +66,7 @@ def look_up(config: EncoderConfig, views: Views, betas: Float[Tensor, "n"]) -> U
             "another body model must be fitted to the default body first"
         )
     vertices, frames = frames_of(config, betas, views.pose)
+    frames = dataclasses.replace(frames, half_extent=frames.half_extent * vertices.new_tensor(config.extent))
     if config.appearance == "texels":
         return unproject_texels(views, vertices, config.facing)
     return unproject_voxels(views, vertices, frames, config.facing)

@@ -29,8 +29,9 @@ MOTION = 3 * (J - 1)
 """Numbers of a pose: axis-angles of all joints but the pelvis, whose turn is not the body's."""
 CONSTANT_BASE = 100 / 255
 """What the networks of the paper add to (SPEC 2: relu(25 x + 100))."""
-HULL_BASE = (1.2, -0.3)
-"""Relative density of a voxel that masks cover by c, before anything is learned: clamp(1.2 c - 0.3)."""
+HULL_BASE = (0.8, -0.5)
+"""Relative density of a voxel that masks cover by c, before anything is learned: clamp(0.8 c - 0.5). A voxel inside
+reaches half way to its neighbour outside, so that silhouettes would grow if this were steeper."""
 
 
 class Encoder(nn.Module):
@@ -95,7 +96,7 @@ class Encoder(nn.Module):
         return Payload(
             rgb=decode_srgb(voxels(colour, 3)),
             density=config.full_density * voxels(density, 1)[:, :, 0],
-            delta_scale=logarithm.exp().flatten(2).mT,
+            delta_scale=logarithm.exp().flatten(2).mT * logarithm.new_tensor(config.extent),
         )
 
     def read(self, found: Unprojected) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 32 h w"]]:

@@ -63,6 +63,7 @@ def unproject_texels(
             not finite or not the body's; the body has no UV map.
     """
     body = default_body() if body is None else body
+    _check(views, vertices, body)
     face, barycentric = _texels(body)
     known = (face >= 0).flatten()
     face, barycentric = face.clamp_min(0).flatten(), barycentric.flatten(0, 1)
@@ -84,6 +85,7 @@ def unproject_voxels(
         ValueError: as `unproject_texels`, and for another number of frames than a person has boxes.
     """
     body = default_body() if body is None else body
+    _check(views, vertices, body)
     if tuple(frames.position.shape) != (K, 3):
         raise ValueError(f"the boxes' positions have the shape {tuple(frames.position.shape)}: give one person's {K}")
     local = torch.linspace(-1, 1, S, dtype=vertices.dtype, device=vertices.device)
@@ -116,7 +118,6 @@ def _look_up(
     normals: Float[Tensor, "d n 3"],
     facing: int,
 ) -> Unprojected:
-    _check(views, vertices, body)
     rgba = np.ascontiguousarray(views.rgba.cpu().numpy())
     depth = np.stack([_body_depth(views, view, vertices, body) for view in range(len(rgba))])
     world_to_pixel = (views.camera.intrinsics @ views.camera.world_to_camera).cpu().numpy().astype(np.float32)
