@@ -133,9 +133,6 @@ PRESETS: Mapping[str, EncoderConfig] = {
 }
 """Encoders by name: ours, its three ablations (paper Table 3), and the architectures of the paper and its code."""
 
-LATER = {"unseen", "grid_entry", "grid_gain", "scale_outputs"}
-"""Settings that the first encoders' files do not have: their defaults are what those encoders do."""
-
 
 def config_from_json(tree: Mapping[str, Any]) -> EncoderConfig:
     """A configuration from what `dataclasses.asdict` made of it and JSON carried.
@@ -144,9 +141,8 @@ def config_from_json(tree: Mapping[str, Any]) -> EncoderConfig:
         ValueError: it has settings that this version does not know, lacks some, or holds impossible ones.
     """
     names = {field.name for field in dataclasses.fields(EncoderConfig)}
-    differing = (set(tree) - names) | (names - set(tree) - LATER)
-    if differing:
-        listed = ", ".join(sorted(differing))
-        raise ValueError(f"the encoder's configuration differs in {listed}: use the release that trained it")
+    if set(tree) != names:
+        differing = ", ".join(sorted(set(tree) ^ names))
+        raise ValueError(f"the encoder's configuration differs in {differing}: use the release that trained it")
     settings: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in tree.items()}
     return EncoderConfig(**settings)
