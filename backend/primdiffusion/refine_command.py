@@ -30,7 +30,8 @@ class Refine:
     """Optimise one captured person: human.npz for Blender, person.human.safetensors to keep, and pictures.
 
     Captures are those of `primdiffusion captures`, of Blender's Render Captures, or a dataset in the released code's
-    layout, in one or, better, several poses. Some cameras are held out and tell how good the result is.
+    layout, in several poses from many sides: with few views the person fits those and gets worse from elsewhere. Some
+    cameras are held out and tell how good the result is.
     """
 
     capture: Path
@@ -93,6 +94,10 @@ class Refine:
         if held:
             before, after = (float(view_psnr(one, judged).mean()) for one in (human, refined.human))
             print(f"held-out views  {before:.2f} -> {after:.2f} dB (cameras {', '.join(map(str, held))})")
+            if after < before:
+                print(
+                    "primdiffusion: warning: on held-out cameras the start was better: give more views", file=sys.stderr
+                )
         if refined.steps < self.steps:
             print(f"primdiffusion: warning: {self.minutes:g} minutes were over after {seconds}", file=sys.stderr)
 
