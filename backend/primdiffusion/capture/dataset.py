@@ -209,6 +209,7 @@ def batches(
         num_workers=workers,
         collate_fn=stack,
         pin_memory=torch.cuda.is_available(),
+        generator=torch.Generator(),  # the loader draws seeds for its workers: not from what training draws from
     )
     position = Position(*start)
     for batch in loader:

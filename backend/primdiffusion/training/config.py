@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from primdiffusion.diffusion.denoiser import DenoiserConfig
+from primdiffusion.staging import written_whole
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,9 +108,11 @@ MAY_CHANGE = frozenset(
         "evaluate_every",
         "pictures_every",
         "log_every",
+        "loss.perceptual_weights",
     )
 )
-"""Settings that a resumed run may be given anew: none of them changes what a step does."""
+"""Settings that a resumed run may be given anew. None changes what a step does, but for `steps`: it stretches what is
+left of the learning rate's cosine."""
 
 
 class RunConfig(Protocol):
@@ -122,26 +124,30 @@ class RunConfig(Protocol):
 
 def check_resumable(saved: str, config: RunConfig) -> None:
     """ValueError that names the settings in which a saved run differs from `config`, except when to stop."""
-    before, now = (_comparable(json.loads(text)) for text in (saved, to_json(config)))
+    try:
+        before = _comparable(json.loads(saved))
+    except (ValueError, AttributeError) as error:
+        raise ValueError(f"the settings in {config.run} are damaged ({error}): give a new folder") from error
+    now = _comparable(json.loads(to_json(config)))
     changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     if changed:
-        differing = ", ".join(changed)
+        differing = ", ".join(f"{key} ({before.get(key)}, not {now.get(key)})" for key in changed)
         raise ValueError(f"the run in {config.run} was begun with another {differing}: give the same, or a new folder")
 
 
 def _comparable(tree: dict, prefix: str = "") -> dict[str, object]:
     flat = {}
     for key, value in tree.items():
+        name = prefix + key
         if isinstance(value, dict):
-            flat |= _comparable(value, f"{prefix}{key}.")
-        elif prefix or key not in MAY_CHANGE:
-            flat[prefix + key] = value
+            flat |= _comparable(value, f"{name}.")
+        elif name not in MAY_CHANGE:
+            flat[name] = value
     return {key: value for key, value in flat.items() if not key.endswith((".steps", ".evaluate_every"))}
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """The whole file or none: written under a temporary name in the same folder, then renamed."""
+    """The whole file or none, and nothing beside it. Raises OSError, which names `path`."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_bytes(content.encode() if isinstance(content, str) else content)
-    os.replace(temporary, path)
+    with written_whole(path) as unfinished:
+        unfinished.write_bytes(content.encode() if isinstance(content, str) else content)

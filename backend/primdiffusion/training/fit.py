@@ -2,135 +2,125 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
-import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import torch
 from accelerate import Accelerator
 from accelerate.utils import set_seed
-from torch import Tensor, nn
-from tqdm import tqdm
+from torch import Tensor
+from tqdm.contrib.logging import logging_redirect_tqdm
 
 from primdiffusion import __version__
-from primdiffusion.capture.dataset import Position, Share, batches
+from primdiffusion.capture.dataset import Position, Share
 from primdiffusion.capture.reader import Captures, open_captures
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.encode import EncoderModel
 from primdiffusion.encoder.network import Encoder
+from primdiffusion.failures import out_of_memory
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
-from primdiffusion.training.config import check_resumable, to_json, write_atomically
-from primdiffusion.training.encoder_checkpoint import save_encoder
 from primdiffusion.training.fit_config import FitConfig
-from primdiffusion.training.fit_data import FitSample, fit_dataset
+from primdiffusion.training.fit_data import FitDataset, FitSample, betas_of, fit_batches, fit_dataset
+from primdiffusion.training.fit_folder import STATE, begin, save
 from primdiffusion.training.fit_losses import Features, loss_terms
-from primdiffusion.training.fit_pictures import measure, write_pictures
+from primdiffusion.training.fit_perceptual import load_perceptual
+from primdiffusion.training.fit_record import Clock, Progress, Recorder
 from primdiffusion.training.fit_state import FitState, versions
 from primdiffusion.training.interrupt import Interrupt
-
-log = logging.getLogger(__name__)
-
-STATE, MODEL, CONFIG, METRICS, RUN = (
-    "state.safetensors",
-    "encoder.safetensors",
-    "config.json",
-    "metrics.jsonl",
-    "run.json",
-)
-"""Files of a run's folder; beside them pictures/."""
+from primdiffusion.training.state import NotFiniteError
 
 
-@dataclasses.dataclass(frozen=True)
-class Progress:
-    """One optimiser step."""
-
-    step: int
-    terms: dict[str, float]
-    """The objective's terms, weighted."""
-    gradient: float
-    """Norm, before clipping."""
-    seconds: dict[str, float]
-    """data, forward, march, backward, update."""
-
-
-def fit(config: FitConfig, perceptual: Features | None = None) -> EncoderModel:
+def fit(config: FitConfig) -> EncoderModel:
     """Run or resume a run; returns the encoder as far as it got, which is also in run/encoder.safetensors.
 
-    Under `accelerate launch` each process trains on its own batches, and gradients are averaged.
+    Under `accelerate launch` each process trains on its own batches, and gradients are averaged. Ctrl-C or a polite
+    kill stops after the step and saves.
 
     Raises:
-        ValueError: settings that cannot be, or others than those with which the run in this folder began; memory of the
-            graphics card that does not suffice (says which batch to try).
-        FileNotFoundError, CaptureFileError, NpzError, BodyFileError: captures are missing or damaged.
-        FloatingPointError: the objective or its gradient is not finite.
+        ValueError: settings that cannot be, or others than those with which the run in this folder began; captures
+            without a frame, or of another body; objective or gradient that are not finite (NotFiniteError); too little
+            memory (says which batch to try).
+        FileNotFoundError, CaptureFileError, NpzError, BodyFileError, WeightsFileError: files are missing or damaged.
         OSError: there is no room; the last whole state remains.
     """
     if config.threads:
         torch.set_num_threads(config.threads)
     accelerator = Accelerator(mixed_precision=config.mixed_precision, cpu=not torch.cuda.is_available())
-    if isinstance(perceptual, nn.Module):
-        perceptual.to(accelerator.device)
+    perceptual = _features(config, accelerator.device)
     captures = open_captures(config.data)
     held = None if config.held is None else open_captures(config.held)
+    if held is not None:
+        betas_of(held)
+    dataset = fit_dataset(captures, config)
+    if not len(dataset):
+        raise ValueError(f"the captures in {config.data} have no frames: render some")
     if accelerator.is_main_process:
-        _begin(config, captures)
+        begin(config, captures, accelerator.num_processes)
     accelerator.wait_for_everyone()
     set_seed(config.seed)
-    state = FitState(Encoder(PRESETS[config.encoder]), config, accelerator)
-    if (config.run / STATE).exists():
-        state.load(config.run / STATE)
-    record = _Recorder(config, captures, held, state)
-    saved = began = time.monotonic()
-    before = state.seconds
-    with Interrupt(config.minutes) as interrupt:
-        for progress in steps(config, state, captures, perceptual):
-            state.seconds = before + time.monotonic() - began
-            stop = _agreed(accelerator, interrupt.due()) or progress.step >= config.steps
-            if accelerator.is_main_process:
-                record(progress)
-                if stop or time.monotonic() - saved > config.save_every:
-                    state.save(config.run / STATE)
-                    save_encoder(config.run / MODEL, model_of(config, state, captures))
-                    saved = time.monotonic()
-            if stop:
-                break
-    accelerator.wait_for_everyone()
+    with _memory_named(config):
+        state = FitState(Encoder(PRESETS[config.encoder]), config, accelerator)
+        if (config.run / STATE).exists():
+            state.load(config.run / STATE)
+    recorder = Recorder(config, captures, held, state) if accelerator.is_main_process else None
+    _run(config, state, dataset, recorder, perceptual)
+    accelerator.end_training()
     return model_of(config, state, captures)
 
 
+def _run(
+    config: FitConfig, state: FitState, dataset: FitDataset, recorder: Recorder | None, perceptual: Features | None
+) -> None:
+    """Steps until the last one or an interrupt, saved now and then."""
+    captures = dataset.samples.captures
+    saved = began = time.monotonic()
+    before = state.seconds
+    with contextlib.ExitStack() as stack:
+        interrupt = stack.enter_context(Interrupt(config.minutes))
+        if recorder is not None:
+            stack.enter_context(logging_redirect_tqdm())
+            stack.enter_context(recorder)
+        for progress in steps(config, state, dataset, perceptual):
+            state.seconds = before + time.monotonic() - began
+            if recorder is not None:
+                recorder(progress)
+            stop = _agreed(state.accelerator, interrupt.due()) or progress.step >= config.steps
+            if recorder is not None and (stop or time.monotonic() - saved > config.save_every):
+                save(config, state, model_of(config, state, captures))
+                saved = time.monotonic()
+            if stop:
+                break
+    state.accelerator.wait_for_everyone()
+
+
 def steps(
-    config: FitConfig, state: FitState, captures: Captures, perceptual: Features | None = None
+    config: FitConfig, state: FitState, dataset: FitDataset, perceptual: Features | None = None
 ) -> Iterator[Progress]:
     """Optimiser steps from where the state is to `config.steps`; the caller owns progress, saving and stopping."""
     accelerator = state.accelerator
     share = Share(accelerator.process_index, accelerator.num_processes)
     start = Position(*json.loads(state.place.get("position", "[0, 0]")))
-    source = batches(fit_dataset(captures, config), config.batch, start, config.workers, share)
+    source = fit_batches(dataset, config, start, share)
     settings = MarchSettings(step=config.step)
     while state.step < config.steps:
-        clock = _Clock(accelerator.device)
+        clock = Clock(accelerator.device)
         sample, position = next(source)
-        sample = sample.to(accelerator.device)
-        clock.lap("data")
-        try:
+        with _memory_named(config):
+            sample = sample.to(accelerator.device)
+            clock.lap("data")
             terms = objective(config, state, sample, settings, clock, perceptual)
             total = torch.stack(list(terms.values())).sum()
             if not torch.isfinite(total):
                 bad = ", ".join(name for name, value in terms.items() if not torch.isfinite(value))
-                raise FloatingPointError(
-                    f"{bad} at step {state.step} is not finite: lower the learning rate and resume"
+                raise NotFiniteError(
+                    f"the loss ({bad}) at step {state.step} is not finite: lower the learning rate in a new run folder"
                 )
             gradient = state.update(total)
-        except torch.cuda.OutOfMemoryError as error:
-            smaller = max(config.batch // 2, 1)
-            raise ValueError(
-                f"the graphics card's memory does not hold {config.batch} people with {config.targets} targets of "
-                f"{config.size} pixels each: try --batch {smaller} or fewer targets, in a new run folder"
-            ) from error
         clock.lap("backward")
         state.place["position"] = json.dumps(list(position))
         yield Progress(
@@ -143,7 +133,7 @@ def objective(
     state: FitState,
     sample: FitSample,
     settings: MarchSettings,
-    clock: _Clock,
+    clock: Clock,
     perceptual: Features | None = None,
 ) -> dict[str, Tensor]:
     """The weighted terms of one batch."""
@@ -152,7 +142,8 @@ def objective(
     payload = payload.to(dtype=torch.float32)
     if state.step < config.hold_scale:
         # Times zero and not left out: distributed training wants a gradient of every parameter.
-        payload = dataclasses.replace(payload, delta_scale=1 + 0 * payload.delta_scale)
+        start = payload.delta_scale.new_tensor(PRESETS[config.encoder].extent)
+        payload = dataclasses.replace(payload, delta_scale=start + 0 * payload.delta_scale)
     clock.lap("forward")
     primitives = Primitives.place(sample.frames, payload)
     picture = drawn(primitives, sample, settings)
@@ -191,31 +182,24 @@ def model_of(config: FitConfig, state: FitState, captures: Captures) -> EncoderM
     return EncoderModel(state.encoder, card)
 
 
-def _begin(config: FitConfig, captures: Captures) -> None:
-    """The run's folder: settings, versions and what it is trained on, or the proof that they are as before."""
-    saved = config.run / CONFIG
-    if saved.exists():
-        check_resumable(saved.read_text(), config)
-        _cut_metrics(config)
-    write_atomically(saved, to_json(config))
-    about = {"version": __version__, **versions(), "people": list(captures.subjects)}
-    write_atomically(config.run / RUN, json.dumps(about, indent=1))
+def _features(config: FitConfig, device: torch.device) -> Features | None:
+    path = config.loss.perceptual_weights
+    return load_perceptual(path).to(device) if config.loss.perceptual and path is not None else None
 
 
-def _cut_metrics(config: FitConfig) -> None:
-    """Lines behind the saved state belong to steps that a kill undid; they will be written again."""
-    path = config.run / METRICS
-    if path.exists():
-        step = FitState.saved_step(config.run / STATE)
-        lines = [line for line in path.read_text().splitlines() if _step_of(line) <= step]
-        write_atomically(path, "".join(line + "\n" for line in lines))
-
-
-def _step_of(line: str) -> float:
+@contextlib.contextmanager
+def _memory_named(config: FitConfig) -> Iterator[None]:
+    """ValueError that says what to try, where memory runs out."""
     try:
-        return json.loads(line)["step"]
-    except (ValueError, KeyError, TypeError):
-        return float("inf")
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if not out_of_memory(error):
+            raise
+        remedy = f"--batch {config.batch // 2}" if config.batch > 1 else "fewer --targets, or a smaller --size"
+        raise ValueError(
+            f"memory does not hold {config.batch} people with {config.targets} targets of {config.size} x "
+            f"{config.size} pixels each: try {remedy} in a new run folder"
+        ) from error
 
 
 def _agreed(accelerator: Accelerator, stop: bool) -> bool:
@@ -224,60 +208,3 @@ def _agreed(accelerator: Accelerator, stop: bool) -> bool:
         return stop
     wishes = accelerator.gather(torch.tensor([stop], device=accelerator.device))
     return bool(torch.as_tensor(wishes).any())
-
-
-class _Clock:
-    """Seconds between laps, with the device's work waited for."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.device, self.seconds = device, {}
-        self._last = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-        now = time.perf_counter()
-        self.seconds[name] = now - self._last
-        self._last = now
-
-
-class _Recorder:
-    """metrics.jsonl, pictures and the bar; of the main process."""
-
-    def __init__(self, config: FitConfig, captures: Captures, held: Captures | None, state: FitState) -> None:
-        self.config, self.captures, self.held, self.state = config, captures, held, state
-        self.bar = tqdm(total=config.steps, initial=state.step, unit="step", disable=None)
-        self.mean: dict[str, float] = {}
-
-    def __call__(self, progress: Progress) -> None:
-        row = {**progress.terms, "gradient": progress.gradient}
-        row |= {f"seconds_{name}": value for name, value in progress.seconds.items()}
-        for name, value in row.items():
-            before = self.mean.get(name, value)
-            self.mean[name] = before + (value - before) * 0.04
-        self.bar.update()
-        if self._due(progress.step, self.config.log_every):
-            self._write({"step": progress.step, "seconds": self.state.seconds, **self.mean})
-        if self._due(progress.step, self.config.evaluate_every):
-            self._measure(progress.step)
-        if self._due(progress.step, self.config.pictures_every):
-            path = self.config.run / "pictures" / f"{progress.step:07d}.png"
-            write_pictures(path, self._model(), self.held or self.captures)
-
-    def _due(self, step: int, every: int) -> bool:
-        return step % every == 0 or step == self.config.steps
-
-    def _model(self) -> EncoderModel:
-        return EncoderModel(self.state.encoder, {})
-
-    def _measure(self, step: int) -> None:
-        sets: dict[str, Callable[[], float]] = {"psnr_train": lambda: measure(self._model(), self.captures)}
-        if self.held is not None:
-            held = self.held
-            sets["psnr_held"] = lambda: measure(self._model(), held)
-        self._write({"step": step, "seconds": self.state.seconds, **{name: find() for name, find in sets.items()}})
-
-    def _write(self, row: dict[str, float]) -> None:
-        log.info(" ".join(f"{name}={value:.4g}" for name, value in row.items()))
-        with (self.config.run / METRICS).open("a") as file:
-            file.write(json.dumps(row) + "\n")

@@ -3,11 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Literal
 
-PRESET_NAMES = ("default", "shared_scale", "template_rt", "no_attention", "paper", "released")
+from primdiffusion.encoder.config import PRESETS
+
 Preset = Literal["default", "shared_scale", "template_rt", "no_attention", "paper", "released"]
+AT_LEAST_ONE = (
+    "steps",
+    "batch",
+    "views",
+    "targets",
+    "size",
+    "threads",
+    "log_every",
+    "evaluate_every",
+    "pictures_every",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +40,14 @@ class LossConfig:
     perceptual_weights: Path | None = None
     """A file of torchvision's VGG19 weights."""
 
+    def __post_init__(self) -> None:
+        """Raises ValueError for weights that are negative or not finite."""
+        for name in ("rgb", "silhouette", "volume", "alpha_prior", "perceptual"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"loss.{name} is {getattr(self, name)}: it must be 0 or more")
+        if not (self.rgb or self.perceptual):
+            raise ValueError("neither loss.rgb nor loss.perceptual has a weight: nothing would teach colours")
+
 
 @dataclasses.dataclass(frozen=True)
 class FitConfig:
@@ -45,7 +66,7 @@ class FitConfig:
     batch: int = 4
     """People in a step, of each process."""
     views: int = 6
-    """Pictures that the encoder is given."""
+    """Pictures that the encoder is given; where a person has fewer, some are given twice."""
     targets: int = 2
     """Pictures that are compared, of each person."""
     size: int = 256
@@ -78,21 +99,29 @@ class FitConfig:
     threads: int | None = None
     """Processor threads; None leaves torch's choice."""
     save_every: float = 120.0
-    """Seconds between checkpoints: what a kill can lose."""
+    """Seconds between checkpoints: what a kill can lose. 0 writes one after every step."""
     log_every: int = 25
-    """Steps between lines of metrics.jsonl."""
+    """Steps between lines of metrics.jsonl; what they hold are running means."""
     evaluate_every: int = 500
-    """Steps between measurements on `held`."""
+    """Steps between measurements on a few people of `data` and of `held`."""
     pictures_every: int = 500
     """Steps between pictures."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for settings that cannot be."""
-        for name in ("steps", "batch", "views", "targets", "size", "log_every", "evaluate_every", "pictures_every"):
-            if getattr(self, name) < 1:
+        for name in AT_LEAST_ONE:
+            if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be 1 or more")
-        if not (self.learning_rate > 0 and self.step > 0):
-            raise ValueError(f"learning_rate {self.learning_rate} and step {self.step} must be above 0")
+        for name in ("learning_rate", "step", "gradient_clip"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}: it must be above 0")
+        for name in ("weight_decay", "hold_scale", "workers", "save_every", "minutes"):
+            if not (getattr(self, name) or 0) >= 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: it must be 0 or more")
+        if not 0 <= self.ema < 1:
+            raise ValueError(f"ema is {self.ema}: it must be 0 or more, and below 1")
+        if self.encoder not in PRESETS:
+            raise ValueError(f"there is no encoder {self.encoder!r}: choose one of {', '.join(PRESETS)}")
         if self.loss.perceptual and self.loss.perceptual_weights is None:
             raise ValueError(
                 "the perceptual loss needs a file of VGG19's weights: name it with --loss.perceptual-weights"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -36,7 +35,7 @@ def volume_loss(half_extent: Float[Tensor, "*b K 3"]) -> Tensor:
 
 
 def alpha_prior(alpha: Float[Tensor, "*b H W"]) -> Tensor:
-    """Zero where alpha is 0 or 1, up to 1.69 between: the released code's taste for solid silhouettes (SPEC 2)."""
+    """Zero where alpha is 0 or 1, 1.19 where it is a half: the released code's taste for solid silhouettes (SPEC 2)."""
     return ((0.1 + alpha).log() + (1.1 - alpha).log() + ALPHA_PRIOR_FLOOR).mean()
 
 
@@ -49,13 +48,20 @@ def loss_terms(
     weights: LossConfig,
     perceptual: Features | None = None,
 ) -> dict[str, Tensor]:
-    """The terms that have a weight, by name, weighted: their sum is the objective."""
+    """The terms that have a weight, by name, weighted: their sum is the objective.
+
+    Raises:
+        ValueError: the perceptual loss has a weight, but its function is not given.
+    """
+    if weights.perceptual and perceptual is None:
+        raise ValueError("the perceptual loss has a weight but no features: give those of `load_perceptual`")
     terms: dict[str, Callable[[], Tensor]] = {
         "rgb": lambda: rgb_loss(image, target),
         "silhouette": lambda: silhouette_loss(alpha, mask),
         "volume": lambda: volume_loss(half_extent),
         "alpha_prior": lambda: alpha_prior(alpha),
-        "perceptual": lambda: torch.zeros(()) if perceptual is None else perceptual(image, target),
     }
+    if perceptual is not None:
+        terms["perceptual"] = lambda: perceptual(image, target)
     weight = {name: float(getattr(weights, name)) for name in terms}
     return {name: weight[name] * term() for name, term in terms.items() if weight[name]}

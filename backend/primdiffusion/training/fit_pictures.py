@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from primdiffusion.capture.conditioning import default_betas
 from primdiffusion.capture.dataset import CaptureDataset, SampleSettings, TrainingSample
 from primdiffusion.capture.reader import Captures
 from primdiffusion.encoder.encode import EncoderModel
@@ -52,8 +53,9 @@ def _compared(
     device = model.encoder.scale_out.bias.device
     for index in range(min(people, len(dataset))):
         sample: TrainingSample = dataset[0, index]
-        payload = model.encode(sample.conditioning, sample.betas)
-        primitives = model.place(payload.to("cpu"), sample.betas, sample.target.pose).to(device)
+        betas = default_betas(captures.subject(captures.subjects[int(sample.subject)]))
+        payload = model.encode(sample.conditioning, betas)
+        primitives = model.place(payload.to("cpu"), betas, sample.target.pose).to(device)
         picture = march(primitives, sample.target.camera.to(device))
         image = encode_srgb(picture.rgb).cpu()
         yield image, sample.target.image.float() / 255, sample.conditioning.image[0].float() / 255

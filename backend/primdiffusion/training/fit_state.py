@@ -45,23 +45,28 @@ class FitState(TrainingState):
         try:
             with safe_open(path, framework="pt") as file:
                 return int(file.metadata()["step"])
-        except (SafetensorError, OSError, KeyError, TypeError) as error:
+        except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} is damaged ({error}): start a new run folder") from error
 
 
 def versions() -> dict[str, str]:
-    """What ran: Python, torch, accelerate, the commit of a checkout."""
+    """What ran: Python, torch, accelerate, and of a checkout its commit, "-dirty" where files differ from it."""
     found = {
         "python": platform.python_version(),
         "torch": torch.__version__,
         "accelerate": accelerate.__version__,
         "machine": platform.machine(),
     }
+    here = Path(__file__)
     try:
-        commit = subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"],
-            cwd=Path(__file__).parent, capture_output=True, text=True, timeout=10, check=True,
-        )  # fmt: skip
+        _git(here.parent, "ls-files", "--error-unmatch", here.name)  # an environment may lie in another checkout
+        return {**found, "commit": _git(here.parent, "describe", "--always", "--dirty", "--exclude", "*")}
     except (OSError, subprocess.SubprocessError):
         return found
-    return {**found, "commit": commit.stdout.strip()}
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    done = subprocess.run(
+        ["git", *arguments], cwd=folder, capture_output=True, text=True, timeout=10, check=True
+    )  # fmt: skip
+    return done.stdout.strip()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import math
 from pathlib import Path
 from typing import Protocol
@@ -33,6 +32,10 @@ class OptimiserConfig(Protocol):
     def evaluate_every(self) -> int: ...  # noqa: D102
 
 
+class NotFiniteError(FloatingPointError, ValueError):
+    """Training that diverged: one sentence that says where and what to do."""
+
+
 class TrainingState:
     """A network with its optimiser, average of weights, random state and place; saved and loaded as one file."""
 
@@ -48,15 +51,15 @@ class TrainingState:
         """What else belongs to the place in training: kept in the file, read back by `load`."""
 
     def update(self, loss: Tensor) -> float:
-        """One optimiser step and one step of the average; returns the gradient norm. FloatingPointError if infinite."""
+        """One optimiser step and one step of the average; returns the gradient norm. NotFiniteError where it is not."""
         rate = self.config.learning_rate * learning_rate_factor(self.step, self.config.steps)
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         self.optimiser.zero_grad(set_to_none=True)
         norm = self._gradient(loss)
         if not norm < float("inf"):
-            raise FloatingPointError(
-                f"the gradient at step {self.step} is not finite: lower the learning rate and resume"
+            raise NotFiniteError(
+                f"the gradient at step {self.step} is not finite: lower the learning rate in a new run folder"
             )
         self.optimiser.step()
         decay = min(self.config.ema, (1 + self.step) / (10 + self.step))
@@ -72,11 +75,19 @@ class TrainingState:
         return float(nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip))
 
     def save(self, path: Path) -> None:
-        """Write everything to one safetensors file, whole or not at all."""
+        """Write everything to one safetensors file, whole or not at all.
+
+        Raises NotFiniteError rather than replace a good state by weights that are not finite, and OSError.
+        """
         tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
         tensors |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
         for index, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
+        if bad := next((key for key, value in tensors.items() if not torch.isfinite(value).all()), None):
+            raise NotFiniteError(
+                f"{bad} is not finite after step {self.step}: lower the learning rate in a new run folder; {path} "
+                "remains as it was"
+            )
         tensors |= {"random.data": self.generator.get_state(), "random.torch": torch.get_rng_state()}
         place = {"step": str(self.step), "seconds": repr(self.seconds), **self.place}
         write_atomically(path, save({k: v.detach().contiguous() for k, v in tensors.items()}, metadata=place))
@@ -86,23 +97,26 @@ class TrainingState:
         try:
             with safe_open(path, framework="pt") as file:
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
-                place = file.metadata()
+                place = dict(file.metadata() or {})
+            step, seconds = int(place.pop("step")), float(place.pop("seconds"))
             for name, module in (("network", self.network), ("average", self.average)):
                 module.load_state_dict(_under(tensors, name))
-        except (SafetensorError, OSError, RuntimeError, KeyError) as error:
+            self._load_moments(_under(tensors, "optimiser"))
+            self.generator.set_state(tensors["random.data"])
+            torch.set_rng_state(tensors["random.torch"])
+        except (SafetensorError, OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+            reason = " ".join(str(error).split())[:200]
             raise ValueError(
-                f"{path} does not fit this network or is damaged ({error}): start a new run folder"
+                f"{path} does not fit this network or is damaged ({reason}): start a new run folder"
             ) from error
-        optimiser = self.optimiser.state_dict()
-        optimiser["state"] = {}
-        for key, value in _under(tensors, "optimiser").items():
+        self.step, self.seconds, self.place = step, seconds, place
+
+    def _load_moments(self, tensors: dict[str, Tensor]) -> None:
+        moments: dict[int, dict[str, Tensor]] = {}
+        for key, value in tensors.items():
             index, name = key.split(".")
-            optimiser["state"].setdefault(int(index), {})[name] = value
-        self.optimiser.load_state_dict(optimiser)
-        self.generator.set_state(tensors["random.data"])
-        torch.set_rng_state(tensors["random.torch"])
-        self.step, self.seconds = int(place.pop("step")), json.loads(place.pop("seconds"))
-        self.place = place
+            moments.setdefault(int(index), {})[name] = value
+        self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": moments})
 
 
 def learning_rate_factor(step: int, steps: int, warm_up: int = 100, last: float = 0.1) -> float:

@@ -1,0 +1,84 @@
+"""Runs of stage 1 that take seconds: boxes for people, few pixels, an encoder of few channels."""
+
+import dataclasses
+import functools
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from accelerate.state import AcceleratorState
+from primdiffusion.cli import main
+from primdiffusion.encoder.config import PRESETS
+from primdiffusion.failures import describe
+from primdiffusion.training import fit_pictures, fit_record
+from primdiffusion.training.fit_config import FitConfig
+from primdiffusion.training.fit_folder import METRICS, MODEL, STATE
+from safetensors.torch import load_file
+from tiny_encoder import TINY
+
+FEW = {"steps": 6, "batch": 1, "views": 2, "targets": 1, "size": 16, "step": 0.02, "hold_scale": 2, "log_every": 1}
+WHOLE = {"config.json", "run.json", METRICS, MODEL, STATE, "pictures"}
+"""What lies in the folder of a run that was not torn."""
+
+
+def make_small(patch: pytest.MonkeyPatch) -> None:
+    """The default encoder becomes a tiny one, and what is measured small; accelerate forgets earlier runs."""
+    patch.setitem(PRESETS, "default", dataclasses.replace(TINY, appearance="texels"))
+    patch.setattr(fit_pictures, "SIZE", 24)
+    patch.setattr(fit_record, "measure", functools.partial(fit_pictures.measure, people=1))
+    patch.setattr(fit_record, "write_pictures", functools.partial(fit_pictures.write_pictures, people=2))
+    AcceleratorState._reset_state(reset_partial_state=True)
+
+
+def settings(data: Path, run: Path, **changes) -> FitConfig:
+    """Six quick steps."""
+    return FitConfig(data=data, run=run, **{**FEW, "threads": 1, "learning_rate": 0.01, **changes})
+
+
+def rows(run: Path) -> list[dict]:
+    """Of metrics.jsonl."""
+    return [json.loads(line) for line in (run / METRICS).read_text().splitlines()]
+
+
+def logged(run: Path) -> list[int]:
+    """Steps of the lines that tell the loss."""
+    return [row["step"] for row in rows(run) if "rgb" in row]
+
+
+def same_tensors(one: Path, other: Path) -> bool:
+    """Whether two safetensors files hold the same, bit for bit."""
+    a, b = load_file(one), load_file(other)
+    return a.keys() == b.keys() and all(torch.equal(a[key], b[key]) for key in a)
+
+
+def child_environment() -> dict[str, str]:
+    """For processes that import this file."""
+    folder = Path(__file__).parent
+    paths = (folder, folder.parent, os.environ.get("PYTHONPATH", ""))
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths)), "OMP_NUM_THREADS": "1"}
+
+
+def files(run: Path) -> set[str]:
+    """What lies in a run's folder."""
+    return {path.name for path in run.iterdir()}
+
+
+def flags(config: FitConfig) -> list[str]:
+    """A command line for it, as far as it is of `settings`."""
+    names = ("data", "run", *FEW, "threads", "learning_rate", "save_every")
+    return [f"--{name.replace('_', '-')}={getattr(config, name)}" for name in names]
+
+
+def sentence(error: BaseException) -> str:
+    """What the command line would print; a defect has none."""
+    failure = describe(error)
+    assert failure is not None
+    assert "\n" not in str(failure)
+    return str(failure)
+
+
+if __name__ == "__main__":  # a run in a process of its own, that a test may kill
+    make_small(pytest.MonkeyPatch())
+    main()

@@ -1,0 +1,95 @@
+"""The encoder's file: what comes back, and what is refused."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+from primdiffusion.encoder.encode import EncoderModel
+from primdiffusion.encoder.network import Encoder
+from primdiffusion.training.checkpoint import CheckpointError
+from primdiffusion.training.encoder_checkpoint import load_encoder, save_encoder
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from tiny_encoder import TINY, save_tiny_encoder, tiny_encoder
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    return save_tiny_encoder(tmp_path_factory.mktemp("encoder") / "encoder.safetensors")
+
+
+def changed(saved, path, tensors=None, **metadata):
+    """The same file with other tensors or metadata; None takes an entry away."""
+    with safe_open(saved, framework="pt") as file:
+        before = file.metadata()
+    after = {key: value for key, value in {**before, **metadata}.items() if value is not None}
+    save_file(load_file(saved) if tensors is None else tensors, path, metadata=after)
+    return path
+
+
+def test_an_encoder_comes_back_with_its_settings_card_and_weights_to_half_precision(saved):
+    back, before = load_encoder(saved), tiny_encoder()
+    assert back.config == TINY
+    assert back.card == {"name": "tiny encoder"}
+    assert not back.encoder.training
+    for (name, value), expected in zip(
+        back.encoder.state_dict().items(), before.encoder.state_dict().values(), strict=True
+    ):
+        assert value.dtype == torch.float32, name
+        assert torch.equal(value, expected.half().float())
+        assert not value.requires_grad
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nothing\.safetensors"):
+        load_encoder(tmp_path / "nothing.safetensors")
+
+
+@pytest.mark.parametrize("kept", [0, 5, 400, -100])
+def test_a_truncated_file_is_refused(saved, tmp_path, kept):
+    (tmp_path / "cut").write_bytes(saved.read_bytes()[:kept])
+    with pytest.raises(CheckpointError, match="truncated"):
+        load_encoder(tmp_path / "cut")
+
+
+@pytest.mark.parametrize(
+    ("metadata", "said"),
+    [
+        ({"format": "pt"}, "format 'pt'"),
+        ({"format_version": "9"}, "format version 9"),
+        ({"config": json.dumps({"stem": [2, 2, 4]})}, "configuration differs in"),
+        ({"config": "{"}, "does not match its own description"),
+        ({"config": None}, "does not match its own description"),
+        ({"card": "["}, "does not match its own description"),
+        ({"config": json.dumps(dataclasses.asdict(dataclasses.replace(TINY, fused=8)))}, "size mismatch"),
+        ({"config": json.dumps(dataclasses.asdict(TINY) | {"stem": 3})}, "does not match its own description"),
+    ],
+)
+def test_a_file_that_is_something_else_is_refused_in_one_line(saved, tmp_path, metadata, said):
+    with pytest.raises(CheckpointError, match=said) as error:
+        load_encoder(changed(saved, tmp_path / "other", **metadata))
+    assert "\n" not in str(error.value)
+    assert str(tmp_path / "other") in str(error.value)
+
+
+def test_weights_that_are_missing_or_not_finite_are_refused(saved, tmp_path):
+    tensors = load_file(saved)
+    key = next(iter(tensors))
+    with pytest.raises(CheckpointError, match="Missing key"):
+        load_encoder(changed(saved, tmp_path / "less", {k: v for k, v in tensors.items() if k != key}))
+    with pytest.raises(CheckpointError, match="NaN"):
+        load_encoder(changed(saved, tmp_path / "nan", {**tensors, key: torch.full_like(tensors[key], float("nan"))}))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1e6])
+def test_weights_that_half_precision_cannot_hold_replace_no_file(saved, tmp_path, bad):
+    path = tmp_path / "encoder.safetensors"
+    path.write_bytes(saved.read_bytes())
+    encoder = Encoder(TINY)
+    with torch.no_grad():
+        encoder.scale_out.bias[0, 0, 0] = bad
+    with pytest.raises(CheckpointError, match=r"scale_out\.bias"):
+        save_encoder(path, EncoderModel(encoder, {}))
+    assert path.read_bytes() == saved.read_bytes()
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]

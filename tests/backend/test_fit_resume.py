@@ -1,0 +1,250 @@
+"""A run of stage 1 that was stopped, killed or ran out of disk goes on as if it had not."""
+
+import errno
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from capture_scenes import captured
+from fit_scenes import WHOLE, child_environment, files, logged, make_small, rows, same_tensors, sentence, settings
+from primdiffusion.encoder.config import PRESETS
+from primdiffusion.training import interrupt as interrupt_module
+from primdiffusion.training.encoder_checkpoint import load_encoder
+from primdiffusion.training.fit import fit
+from primdiffusion.training.fit_config import LossConfig
+from primdiffusion.training.fit_folder import CONFIG, METRICS, MODEL, RUN, STATE
+from primdiffusion.training.fit_state import FitState
+from primdiffusion.training.interrupt import Interrupt
+from primdiffusion.training.state import TrainingState
+from safetensors import safe_open
+from tiny_encoder import TINY
+
+DIES_IN_THE_THIRD_SAVE = """
+import os, signal, sys
+from pathlib import Path
+import pytest
+from fit_scenes import make_small, settings
+from primdiffusion.training.fit import fit
+
+make_small(pytest.MonkeyPatch())
+whole, saves = Path.write_bytes, []
+
+def write(path, content):
+    if path.name.startswith(".state"):
+        saves.append(path)
+        if len(saves) == 3:
+            whole(path, content[: len(content) // 2])
+            os.kill(os.getpid(), signal.SIGKILL)
+    return whole(path, content)
+
+Path.write_bytes = write
+fit(settings(Path(sys.argv[1]), Path(sys.argv[2]), save_every=0.0))
+"""
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    return captured(tmp_path_factory.mktemp("captures"), people=2, frames=2, passes=("img", "mask"))
+
+
+@pytest.fixture(scope="module")
+def whole(captures, tmp_path_factory):
+    """A run of six steps that nothing disturbed; its four samples come round again."""
+    with pytest.MonkeyPatch.context() as patch:
+        make_small(patch)
+        config = settings(captures, tmp_path_factory.mktemp("whole") / "run")
+        fit(config)
+        return config.run
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    make_small(monkeypatch)
+
+
+@pytest.fixture
+def begun(captures, tmp_path):
+    """The settings of a run that took one step."""
+    config = settings(captures, tmp_path / "run", minutes=0.0)
+    fit(config)
+    return config
+
+
+def timeless(run: Path) -> list[dict]:
+    """Lines of metrics.jsonl without what a clock says."""
+    return [{name: value for name, value in row.items() if not name.startswith("seconds")} for row in rows(run)]
+
+
+def place(run: Path) -> dict[str, str]:
+    with safe_open(run / STATE, framework="pt") as file:
+        return {name: value for name, value in file.metadata().items() if name in ("step", "position")}
+
+
+def contents(run: Path) -> dict[str, bytes]:
+    return {name: (run / name).read_bytes() for name in (STATE, MODEL, CONFIG)}
+
+
+def test_a_run_in_parts_is_bit_identical_to_one_in_one_go(captures, whole, tmp_path):
+    run = tmp_path / "run"
+    for workers in (0, 1, 0):
+        fit(settings(captures, run, minutes=0.0, workers=workers))
+        torch.randn(3)  # whatever else is drawn in between does not matter
+    assert place(run) == {"step": "3", "position": "[0, 3]"}
+    fit(settings(captures, run))
+    assert place(run) == place(whole) == {"step": "6", "position": "[1, 2]"}
+    assert same_tensors(run / STATE, whole / STATE)
+    assert same_tensors(run / MODEL, whole / MODEL)
+    assert timeless(run) == timeless(whole)
+    starts = json.loads((run / RUN).read_text())["starts"]
+    assert [start["step"] for start in starts] == [0, 1, 2, 3]
+
+
+def test_a_kill_in_the_middle_of_a_save_loses_one_interval_and_leaves_whole_files(captures, whole, tmp_path):
+    run = tmp_path / "run"
+    died = subprocess.run(
+        [sys.executable, "-c", DIES_IN_THE_THIRD_SAVE, str(captures), str(run)],
+        env=child_environment(), capture_output=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert died.returncode == -signal.SIGKILL
+    assert FitState.saved_step(run / STATE) == 2
+    assert load_encoder(run / MODEL).card["steps"] == 3
+    assert logged(run) == [1, 2, 3]
+    assert len(list(run.glob(".*.partial"))) == 1
+    with (run / METRICS).open("a") as file:
+        file.write('{"step": 4, "rg')
+    fit(settings(captures, run))
+    assert logged(run) == [1, 2, 3, 4, 5, 6]
+    assert files(run) == WHOLE
+    assert same_tensors(run / STATE, whole / STATE)
+
+
+def test_a_kill_before_the_first_save_begins_again(captures, whole, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / CONFIG).write_bytes((whole / CONFIG).read_bytes())
+    (run / RUN).write_bytes((whole / RUN).read_bytes())
+    (run / METRICS).write_bytes((whole / METRICS).read_bytes())
+    fit(settings(captures, run, minutes=0.0))
+    assert logged(run) == [1]
+
+
+def test_a_finished_run_is_left_as_it_is_and_one_given_more_steps_goes_on(captures, begun):
+    fit(settings(captures, begun.run, steps=2))
+    before = contents(begun.run)
+    assert fit(settings(captures, begun.run, steps=2)).card["steps"] == 2
+    assert contents(begun.run) == before
+    assert fit(settings(captures, begun.run, steps=3)).card["steps"] == 3
+    assert logged(begun.run) == [1, 2, 3]
+
+
+@pytest.mark.parametrize("name", [STATE, MODEL])
+def test_a_full_disk_leaves_the_last_checkpoint_whole_and_nothing_beside_it(captures, begun, monkeypatch, name):
+    before, write = contents(begun.run), Path.write_bytes
+
+    def full(path, content):
+        if path.name.startswith(f".{name}"):
+            write(path, content[:1000])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, content)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError) as error:
+        fit(settings(captures, begun.run, steps=3))
+    assert sentence(error.value) == (
+        f"{begun.run / name}: no space left on device: check the disk's free space and the path, then try again"
+    )
+    assert (begun.run / STATE).read_bytes() == before[STATE]
+    assert load_encoder(begun.run / MODEL).card["steps"] in (1, 3)
+    assert files(begun.run) >= WHOLE - {"pictures"}
+    assert not list(begun.run.glob(".*"))
+    monkeypatch.undo()
+    make_small(monkeypatch)
+    fit(settings(captures, begun.run, steps=3))
+    assert logged(begun.run) == [1, 2, 3]
+
+
+@pytest.mark.parametrize("part", ["network", "average"])
+def test_weights_that_are_not_finite_replace_nothing(captures, begun, monkeypatch, part):
+    before, update = contents(begun.run), TrainingState.update
+
+    def diverge(self, loss):
+        norm = update(self, loss)
+        next(getattr(self, part).parameters()).data[:] = float("nan")
+        return norm
+
+    monkeypatch.setattr(TrainingState, "update", diverge)
+    with pytest.raises(ValueError, match=r"stem\.0\.bias"):
+        fit(begun)
+    assert (begun.run / STATE).read_bytes() == before[STATE]
+    assert torch.isfinite(load_encoder(begun.run / MODEL).encoder.stem[0].bias).all()
+
+
+def test_other_settings_in_the_same_folder_are_named_and_limits_may_change(captures, begun):
+    before = contents(begun.run)
+    with pytest.raises(ValueError, match=r"learning_rate \(0.01, not 0.02\), loss.silhouette \(2.0") as error:
+        fit(settings(captures, begun.run, learning_rate=0.02, loss=LossConfig(silhouette=1.0)))
+    assert str(begun.run) in sentence(error.value)
+    assert contents(begun.run) == before
+    fit(settings(captures, begun.run, steps=2, save_every=1.0, log_every=2, workers=1))
+    assert logged(begun.run) == [1, 2]
+
+
+def test_other_people_in_the_same_folder_are_refused(begun, tmp_path):
+    others = captured(tmp_path / "others", people=3, frames=1, passes=("img", "mask"))
+    with pytest.raises(ValueError, match=r"other people .*\(2 and 3 of them\)"):
+        fit(settings(others, begun.run))
+
+
+def test_captures_and_run_may_move(captures, begun, tmp_path):
+    (tmp_path / "link").symlink_to(captures)
+    begun.run.rename(tmp_path / "moved")
+    assert fit(settings(tmp_path / "link", tmp_path / "moved", steps=2)).card["steps"] == 2
+
+
+@pytest.mark.parametrize("name", [STATE, CONFIG, RUN])
+def test_a_damaged_file_of_the_run_is_named_and_kept(captures, begun, name):
+    path = begun.run / name
+    damaged = path.read_bytes()[:-20] if name == STATE else path.read_bytes()[:30]
+    path.write_bytes(damaged)
+    with pytest.raises(ValueError, match=r"damaged.*new") as error:
+        fit(settings(captures, begun.run, steps=2))
+    assert str(begun.run) in sentence(error.value)
+    assert path.read_bytes() == damaged
+
+
+def test_a_state_of_another_encoder_is_refused_in_one_sentence(captures, begun, tmp_path):
+    other = settings(captures, tmp_path / "other", minutes=0.0, encoder="no_attention")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "no_attention", TINY)
+        fit(other)
+    (begun.run / STATE).write_bytes((other.run / STATE).read_bytes())
+    with pytest.raises(ValueError, match="does not fit this network") as error:
+        fit(settings(captures, begun.run, steps=2))
+    assert len(sentence(error.value)) < 500
+
+
+def test_another_number_of_processes_is_told(captures, begun, caplog):
+    about = json.loads((begun.run / RUN).read_text())
+    about["starts"][0]["processes"] = 4
+    (begun.run / RUN).write_text(json.dumps(about))
+    with caplog.at_level(logging.WARNING):
+        fit(settings(captures, begun.run, steps=2))
+    assert "1 processes, before 4: other batches follow" in caplog.text
+
+
+def test_a_polite_kill_asks_to_stop_and_a_second_ctrl_c_stops_at_once(monkeypatch):
+    before = signal.getsignal(signal.SIGTERM)
+    with Interrupt(None) as interrupt:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert interrupt.due()
+        os.kill(os.getpid(), signal.SIGINT)  # within the two seconds in which launchers pass the same one on
+        monkeypatch.setattr(interrupt_module, "IMPATIENT", 0.0)
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGTERM) is before
