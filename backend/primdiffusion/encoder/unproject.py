@@ -10,7 +10,7 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numba
 import numpy as np
@@ -119,7 +119,7 @@ def _look_up(
     facing: int,
 ) -> Unprojected:
     rgba = np.ascontiguousarray(views.rgba.cpu().numpy())
-    depth = np.stack([_body_depth(views, view, vertices, body) for view in range(len(rgba))])
+    depth = _body_depth(views, vertices, body)
     world_to_pixel = (views.camera.intrinsics @ views.camera.world_to_camera).cpu().numpy().astype(np.float32)
     origin = views.camera.position.cpu().numpy().astype(np.float32)
     arrays = [
@@ -160,13 +160,21 @@ def _check(views: Views, vertices: Tensor, body: BodyModel) -> None:
         raise ValueError("the posed vertices hold NaN or infinite values; check the pose and the betas they come from")
 
 
-def _body_depth(views: Views, view: int, vertices: Float[Tensor, "V 3"], body: BodyModel) -> Float32[ndarray, "H W"]:
-    camera = views.camera.map(lambda tensor: tensor[view])
+def _body_depth(views: Views, vertices: Float[Tensor, "V 3"], body: BodyModel) -> Float32[ndarray, "v H W"]:
+    """Metres along each view's axis to the body's surface; inf beside it."""
     corners = vertices.detach()[body.faces].cpu().numpy().astype(np.float64)
-    return nearest_triangles(corners, camera).depth
+    camera = views.camera.to("cpu")
+    depth = np.empty(views.rgba.shape[:3], np.float32)
+
+    def draw(first: int, last: int) -> None:
+        for view in range(first, last):
+            depth[view] = nearest_triangles(corners, camera.map(lambda tensor, view=view: tensor[view])).depth
+
+    _in_parts(len(depth), draw)
+    return depth
 
 
-def _in_parts(count: int, work) -> None:
+def _in_parts(count: int, work: Callable[[int, int], None]) -> None:
     """`work(first, last)` over all of 0 ... count, on torch's threads; a loader's worker has one."""
     threads = 1 if get_worker_info() is not None else max(torch.get_num_threads(), 1)
     edges = np.linspace(0, count, threads + 1).astype(int).tolist()
