@@ -268,6 +268,16 @@ def test_the_papers_layers_have_the_sizes_of_the_reference():
         assert [tuple(layer.bias.shape) for layer in network.up] == [(32, 64, 64), (16, 128, 128), (last, 256, 256)]
 
 
+@pytest.mark.parametrize(
+    ("preset", "parameters"),
+    [("default", 11_507_515), ("no_attention", 10_954_523), ("paper", 9_115_359), ("released", 7_546_213)],
+)
+def test_presets_have_the_size_that_the_documents_state(preset, parameters):
+    with torch.device("meta"):
+        encoder = Encoder(PRESETS[preset])
+    assert sum(parameter.numel() for parameter in encoder.parameters()) == parameters
+
+
 def test_the_papers_image_encoder_has_as_many_layers_as_released_files_have_keys():
     """Of three keys each: a gain, a direction and a bias (SPEC 6)."""
     with torch.device("meta"):
