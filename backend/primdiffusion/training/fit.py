@@ -114,18 +114,11 @@ def steps(
             sample = sample.to(accelerator.device)
             clock.lap("data")
             terms = objective(config, state, sample, settings, clock, perceptual)
-            total = torch.stack(list(terms.values())).sum()
-            if not torch.isfinite(total):
-                bad = ", ".join(name for name, value in terms.items() if not torch.isfinite(value))
-                raise NotFiniteError(
-                    f"the loss ({bad}) at step {state.step} is not finite: lower the learning rate in a new run folder"
-                )
-            gradient = state.update(total)
+            gradient = state.update(_total(terms, state.step))
         clock.lap("backward")
         state.place["position"] = json.dumps(list(position))
-        yield Progress(
-            state.step, {name: float(value.detach()) for name, value in terms.items()}, gradient, clock.seconds
-        )
+        values = {name: float(value.detach()) for name, value in terms.items()}
+        yield Progress(state.step, values, gradient, clock.seconds)
 
 
 def objective(
@@ -153,6 +146,16 @@ def objective(
     terms = loss_terms(image, picture.alpha, primitives.half_extent, target, mask, config.loss, perceptual)
     clock.lap("march")
     return terms
+
+
+def _total(terms: dict[str, Tensor], step: int) -> Tensor:
+    total = torch.stack(list(terms.values())).sum()
+    if not torch.isfinite(total):
+        bad = ", ".join(name for name, value in terms.items() if not torch.isfinite(value))
+        raise NotFiniteError(
+            f"the loss ({bad}) at step {step} is not finite: lower the learning rate in a new run folder"
+        )
+    return total
 
 
 def drawn(primitives: Primitives, sample: FitSample, settings: MarchSettings) -> Rendering:

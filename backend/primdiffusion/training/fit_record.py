@@ -75,7 +75,7 @@ class Recorder:
         row |= {f"seconds_{name}": value for name, value in progress.seconds.items()}
         for name, value in row.items():
             before = self.means.get(name, value)
-            self.means[name] = before + (value - before) / MEMORY
+            self.means[name] = before + (value - before) / min(progress.step, MEMORY)
         self.state.place["means"] = json.dumps(self.means)
         self.bar.update()
         if self._due(progress.step, self.config.log_every):
