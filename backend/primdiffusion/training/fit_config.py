@@ -77,8 +77,10 @@ class FitConfig:
     """Pose in which the encoder sees the person: near T (released), that of the targets, or any."""
     step: float = 0.004
     """Metres between samples of a ray."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-5
     """AdamW's, after a warm-up of 100 steps."""
+    place_rate: float = 60.0
+    """Times as fast learn the biases that every place of the UV square has of its own."""
     weight_decay: float = 0.0
     """AdamW's."""
     gradient_clip: float = 1.0
@@ -112,7 +114,7 @@ class FitConfig:
         for name in AT_LEAST_ONE:
             if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be 1 or more")
-        for name in ("learning_rate", "step", "gradient_clip"):
+        for name in ("learning_rate", "place_rate", "step", "gradient_clip"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be above 0")
         for name in ("weight_decay", "hold_scale", "workers", "save_every", "minutes"):

@@ -12,6 +12,7 @@ from accelerate import Accelerator
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from primdiffusion.encoder.blocks import UntiedConv
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.state import TrainingState
@@ -21,10 +22,18 @@ class FitState(TrainingState):
     """`TrainingState` whose gradients go through accelerate; `place["position"]` is the place in the data, as JSON."""
 
     def __init__(self, encoder: Encoder, config: FitConfig, accelerator: Accelerator) -> None:
+        self.place_rate = config.place_rate
         super().__init__(encoder.to(accelerator.device), config, config.seed)
         self.accelerator = accelerator
         self.prepared, self.optimiser = accelerator.prepare(self.network, self.optimiser)
         """The network as it is called in training."""
+
+    def _groups(self) -> list[dict[str, object]]:
+        """A place's own bias is met once a picture, a weight at every place: at one rate the weights run away."""
+        biases = [m.bias for m in self.network.modules() if isinstance(m, UntiedConv)]
+        known = {id(bias) for bias in biases}
+        others = [parameter for parameter in self.network.parameters() if id(parameter) not in known]
+        return [{"params": others, "factor": 1.0}, {"params": biases, "factor": self.place_rate}]
 
     @property
     def encoder(self) -> Encoder:

@@ -43,18 +43,22 @@ class TrainingState:
         self.network, self.config = network, config
         self.average = copy.deepcopy(network).eval().requires_grad_(False)
         self.optimiser = torch.optim.AdamW(
-            network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, betas=(0.9, 0.99)
+            self._groups(), lr=config.learning_rate, weight_decay=config.weight_decay, betas=(0.9, 0.99)
         )
         self.generator = torch.Generator().manual_seed(seed)
         self.step, self.seconds = 0, 0.0
         self.place: dict[str, str] = {}
         """What else belongs to the place in training: kept in the file, read back by `load`."""
 
+    def _groups(self) -> list[dict[str, object]]:
+        """Parameters that learn at one rate, each with its factor on the configured one."""
+        return [{"params": list(self.network.parameters()), "factor": 1.0}]
+
     def update(self, loss: Tensor) -> float:
         """One optimiser step and one step of the average; returns the gradient norm. NotFiniteError where it is not."""
         rate = self.config.learning_rate * learning_rate_factor(self.step, self.config.steps)
         for group in self.optimiser.param_groups:
-            group["lr"] = rate
+            group["lr"] = rate * group["factor"]
         self.optimiser.zero_grad(set_to_none=True)
         norm = self._gradient(loss)
         if not norm < float("inf"):
