@@ -62,7 +62,7 @@ class EncoderConfig:
     extent: tuple[float, float, float] = (0.85, 0.85, 0.6)
     """Delta scales along T, B, N before anything is learned: the anchors' boxes reach for all that may hang off a body,
     and most of a person is seen sharper in smaller ones."""
-    scale_gain: float = 0.1
+    scale_gain: float = 0.02
     """delta scale = extent exp(gain x)."""
     colour_gain: float = 0.06
     """Colours = base + gain x, clamped to 0 ... 1. Small, so that colours do not learn to hide what densities lack."""

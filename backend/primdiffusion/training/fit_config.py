@@ -77,9 +77,9 @@ class FitConfig:
     """Pose in which the encoder sees the person: near T (released), that of the targets, or any."""
     step: float = 0.004
     """Metres between samples of a ray."""
-    learning_rate: float = 3e-5
+    learning_rate: float = 2e-5
     """AdamW's, after a warm-up of 100 steps."""
-    place_rate: float = 60.0
+    place_rate: float = 80.0
     """Times as fast learn the biases that every place of the UV square has of its own."""
     weight_decay: float = 0.0
     """AdamW's."""
