@@ -3,10 +3,11 @@
 `python benchmarks/encoder.py --train CAPTURES --heldout CAPTURES --models DIR --json encoder.json --table encoder.md`
 evaluates the checkpoints full, shared_scale, template_rt, no_attention and full_at_equal_steps (.safetensors) of a
 folder, each if it is there; without --models the package's encoder. Everybody is encoded from eight views of one pose
-and compared in all views and poses at 512 x 512; figures with `_novel` are of views and poses that were not given.
-psnr_shared_scale and its like are of people trained on, as in the paper. Without folders of captures people of other
-seeds than those of the training are made from MakeHuman's assets (--assets) and held out. --quick looks at one person.
-Times are those of the processor, best or median of several, or the wall clock's where their name has no `processor`.
+and compared in all views (or --cameras of them) and poses at 512 x 512; figures with `_novel` are of views and poses
+that were not given. psnr_shared_scale and its like are of people trained on, as in the paper. Without folders of
+captures people of other seeds than those of the training are made from MakeHuman's assets (--assets) and held out.
+--quick looks at one person. Times are those of the processor, best or median of several, or the wall clock's where
+their name has no `processor`.
 """
 
 from __future__ import annotations
@@ -111,6 +112,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--heldout", type=Path, help="captures of other people")
     parser.add_argument("--models", type=Path, help="folder of checkpoints; without it the package's encoder")
     parser.add_argument("--people", type=int, default=16, help="of each set, evenly of all")
+    parser.add_argument("--cameras", type=int, help="to compare in, evenly of all; without it all")
     parser.add_argument("--lpips", type=Path, nargs="*", default=(), help="files of LPIPS' weights")
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
     parser.add_argument("--without-refine", action="store_true", help="leave out benchmarks/refine.py")
@@ -147,7 +149,14 @@ def measured(
         return None
     count = 1 if arguments.quick else min(arguments.people, len(captures.subjects))
     names = tuple(captures.subjects[i * len(captures.subjects) // count] for i in range(count))
-    settings = EvaluationSettings(names, frames=(0, 1) if arguments.quick else (), given_views=VIEWS)
+    every = len(captures.subject(names[0]).views)
+    wanted = min(arguments.cameras or every, every)
+    settings = EvaluationSettings(
+        names,
+        frames=(0, 1) if arguments.quick else (),
+        cameras=tuple(i * every // wanted for i in range(wanted)),
+        given_views=VIEWS,
+    )
     return summary(evaluate(model, captures, settings, lpips))
 
 
