@@ -6,12 +6,16 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from accelerate.state import AcceleratorState
+from PIL import Image
+from primdiffusion.body.model import default_body
 from primdiffusion.cli import main
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.failures import describe
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.training import fit_pictures, fit_record
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.fit_folder import METRICS, MODEL, STATE
@@ -24,11 +28,16 @@ WHOLE = {"config.json", "run.json", METRICS, MODEL, STATE, "pictures"}
 
 
 def make_small(patch: pytest.MonkeyPatch) -> None:
-    """The default encoder becomes a tiny one, and what is measured small; accelerate forgets earlier runs."""
+    """The default encoder becomes a tiny one, and what is measured small."""
     patch.setitem(PRESETS, "default", dataclasses.replace(TINY, appearance="texels"))
     patch.setattr(fit_pictures, "SIZE", 24)
     patch.setattr(fit_record, "measure", functools.partial(fit_pictures.measure, people=1))
     patch.setattr(fit_record, "write_pictures", functools.partial(fit_pictures.write_pictures, people=2))
+    forget_processes()
+
+
+def forget_processes() -> None:
+    """accelerate keeps the precision of a process' first run."""
     AcceleratorState._reset_state(reset_partial_state=True)
 
 
@@ -77,6 +86,25 @@ def sentence(error: BaseException) -> str:
     assert failure is not None
     assert "\n" not in str(failure)
     return str(failure)
+
+
+def patched_person() -> TexturedMesh:
+    """The default body in patches of colours that fade into each other."""
+    body = default_body()
+    draws = np.random.default_rng(0).integers(60, 190, (12, 12, 4), np.uint8)
+    draws[..., 3] = 255
+    texture = Image.fromarray(draws).resize((256, 256), Image.Resampling.BICUBIC)
+    joints = body.skin_weights.topk(4, dim=-1)
+    part = TexturedPart(
+        name="body",
+        vertices=body.shape(torch.zeros(10)).vertices.double().numpy(),
+        faces=body.faces.int().numpy(),
+        corner_uv=body.uv[body.uv_faces].float().numpy(),
+        texture=np.asarray(texture),
+        skin_index=joints.indices.int().numpy(),
+        skin_weight=(joints.values / joints.values.sum(-1, keepdim=True)).double().numpy(),
+    )
+    return TexturedMesh((part,))
 
 
 if __name__ == "__main__":  # a run in a process of its own, that a test may kill

@@ -38,6 +38,7 @@ def launched(*words: str) -> subprocess.CompletedProcess:
     )
 
 
+@pytest.mark.slow
 def test_two_processes_of_one_person_train_as_one_of_two_and_save_once(captures, tmp_path):
     config = settings(captures, tmp_path / "two", steps=2)
     launcher = ("torch.distributed.run", "--standalone", "--nproc-per-node", "2", "--")  # or --run reads as --run-path
