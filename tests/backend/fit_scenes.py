@@ -43,7 +43,7 @@ def forget_processes() -> None:
 
 def settings(data: Path, run: Path, **changes) -> FitConfig:
     """Six quick steps."""
-    return FitConfig(data=data, run=run, **{**FEW, "threads": 1, "learning_rate": 0.01, **changes})
+    return FitConfig(data=data, run=run, **{**FEW, "threads": 1, "learning_rate": 1e-4, **changes})
 
 
 def rows(run: Path) -> list[dict]:

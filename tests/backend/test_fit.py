@@ -45,7 +45,7 @@ def test_a_run_leaves_settings_versions_metrics_pictures_state_and_encoder(captu
     config = settings(captures, tmp_path / "run", steps=4, evaluate_every=2, held=captures)
     model = fit(config)
     assert files(config.run) == WHOLE
-    assert json.loads((config.run / "config.json").read_text())["learning_rate"] == 0.01
+    assert json.loads((config.run / "config.json").read_text())["learning_rate"] == 1e-4
     about = json.loads((config.run / "run.json").read_text())
     assert about["people"] == ["person_000000", "person_000001"]
     assert about["starts"][0].keys() >= {"torch", "accelerate", "python", "primdiffusion", "processes"}

@@ -187,7 +187,7 @@ def test_weights_that_are_not_finite_replace_nothing(captures, begun, monkeypatc
 
 def test_other_settings_in_the_same_folder_are_named_and_limits_may_change(captures, begun):
     before = contents(begun.run)
-    with pytest.raises(ValueError, match=r"learning_rate \(0.01, not 0.02\), loss.silhouette \(2.0") as error:
+    with pytest.raises(ValueError, match=r"learning_rate \(0.0001, not 0.02\), loss.silhouette \(2.0") as error:
         fit(settings(captures, begun.run, learning_rate=0.02, loss=LossConfig(silhouette=1.0)))
     assert str(begun.run) in sentence(error.value)
     assert contents(begun.run) == before
