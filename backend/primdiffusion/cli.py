@@ -159,7 +159,7 @@ class Info:
     """Say what this installation, a checkpoint or a person is, as JSON."""
 
     file: tyro.conf.Positional[Path | None] = None
-    """A .human.safetensors or a checkpoint; without it versions, device, memory and the default checkpoint's card."""
+    """A .human.safetensors, a checkpoint or an encoder; without it versions, device, memory and the package's cards."""
 
     def run(self) -> None:
         """Prints one JSON object."""
@@ -168,12 +168,15 @@ class Info:
         from primdiffusion.human_file import HumanFileError, load_human
         from primdiffusion.machine import best_device, device_info, memory
         from primdiffusion.training.checkpoint import default_checkpoint, read_card
+        from primdiffusion.training.encoder_checkpoint import default_encoder
 
         if self.file is None:
-            path = default_checkpoint()
-            card = read_card(path) if path.exists() else None
+            cards = {
+                name: read_card(path) if path.exists() else None
+                for name, path in (("checkpoint", default_checkpoint()), ("encoder", default_encoder()))
+            }
             about = {"version": __version__, "torch": torch.__version__, **device_info(best_device()), **memory()}
-            print(json.dumps({**about, "checkpoint": card}, indent=2))
+            print(json.dumps({**about, **cards}, indent=2))
             return
         try:
             human = load_human(self.file)

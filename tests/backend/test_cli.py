@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from primdiffusion import cli
+from tiny_encoder import save_tiny_encoder
 from tiny_model import save_tiny_checkpoint
 
 FILES = ["depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"]
@@ -101,11 +102,13 @@ def test_a_finer_step_changes_little_and_a_coarse_one_much(person, tmp_path):
     assert 10 * np.abs(fine - usual).mean() < np.abs(fine - coarse).mean()
 
 
-def test_info_tells_what_a_file_is(person, checkpoint, capsys):
+def test_info_tells_what_a_file_is(person, checkpoint, capsys, tmp_path):
     cli.run(["info", str(person / "person.human.safetensors")])
     assert json.loads(capsys.readouterr().out)["seed"] == 5
     cli.run(["info", str(checkpoint)])
     assert json.loads(capsys.readouterr().out)["name"] == "tiny"
+    cli.run(["info", str(save_tiny_encoder(tmp_path / "encoder.safetensors"))])
+    assert json.loads(capsys.readouterr().out)["name"] == "tiny encoder"
     cli.run(["info"])
     assert json.loads(capsys.readouterr().out)["device"] in ("cpu", "cuda")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,8 @@ from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.training.config import write_atomically
 
 FORMAT = "primdiffusion-checkpoint"
+ENCODER_FORMAT = "primdiffusion-encoder"
+"""Of encoders' files, which `encoder_checkpoint` reads."""
 FORMAT_VERSION = 1
 _HALVED = ("codec.mean", "denoiser.")
 
@@ -87,9 +89,9 @@ def load_checkpoint(path: Path | str | None = None, device: torch.device | str =
 
 
 def read_card(path: Path | str | None = None) -> dict[str, Any]:
-    """The card of a checkpoint, without its weights; errors as in `load_checkpoint`."""
+    """The card of a checkpoint or an encoder, without its weights; errors as in `load_checkpoint`."""
     path = default_checkpoint() if path is None else Path(path)
-    return json.loads(_read_metadata(path)["card"])
+    return json.loads(_read_metadata(path, (FORMAT, ENCODER_FORMAT))["card"])
 
 
 def _build(tensors: Mapping[str, Tensor], architecture: dict[str, Any], card: dict[str, Any]) -> DiffusionModel:
@@ -125,7 +127,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         return {key: file.get_tensor(key) for key in file.keys()}, metadata  # noqa: SIM118 - safe_open is no mapping
 
 
-def _read_metadata(path: Path) -> dict[str, str]:
+def _read_metadata(path: Path, formats: Sequence[str] = (FORMAT,)) -> dict[str, str]:
     if not path.is_file():
         raise FileNotFoundError(
             f"there is no checkpoint at {path}: give the path of a .safetensors file, or reinstall the package"
@@ -137,7 +139,7 @@ def _read_metadata(path: Path) -> dict[str, str]:
         raise CheckpointError(
             f"{path} is truncated or no safetensors file ({error}): download or train it again"
         ) from error
-    if metadata.get("format") != FORMAT:
+    if metadata.get("format") not in formats:
         raise CheckpointError(
             f"{path} is a safetensors file of format {metadata.get('format')!r}, not {FORMAT!r}: choose another file"
         )

@@ -15,10 +15,9 @@ from torch import Tensor
 from primdiffusion.encoder.config import config_from_json
 from primdiffusion.encoder.encode import EncoderModel
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.training.checkpoint import CheckpointError
+from primdiffusion.training.checkpoint import ENCODER_FORMAT, CheckpointError
 from primdiffusion.training.config import write_atomically
 
-FORMAT = "primdiffusion-encoder"
 FORMAT_VERSION = 1
 
 
@@ -34,7 +33,7 @@ def save_encoder(path: Path, model: EncoderModel) -> None:
     }
     _check_finite(path, tensors)
     metadata = {
-        "format": FORMAT,
+        "format": ENCODER_FORMAT,
         "format_version": str(FORMAT_VERSION),
         "config": json.dumps(dataclasses.asdict(model.config)),
         "card": json.dumps(dict(model.card)),
@@ -59,9 +58,11 @@ def load_encoder(path: Path | str | None = None, device: torch.device | str = "c
         raise CheckpointError(
             f"{path} is truncated or no safetensors file ({error}): download or train it again"
         ) from error
-    if metadata.get("format") != FORMAT:
+    if metadata.get("format") != ENCODER_FORMAT:
         given = metadata.get("format")
-        raise CheckpointError(f"{path} is a safetensors file of format {given!r}, not {FORMAT!r}: choose another file")
+        raise CheckpointError(
+            f"{path} is a safetensors file of format {given!r}, not {ENCODER_FORMAT!r}: choose another file"
+        )
     if metadata.get("format_version") != str(FORMAT_VERSION):
         version = metadata.get("format_version")
         raise CheckpointError(

@@ -168,10 +168,12 @@ def model_of(config: FitConfig, state: FitState, captures: Captures) -> EncoderM
     card = {
         "name": f"PrimDiffusion encoder, {config.encoder}",
         "version": __version__,
-        "licence": "CC0-1.0",
         "encoder": config.encoder,
         "people": len(captures.subjects),
         "captures": dict(captures.about),
+        "views": config.views,
+        "targets": config.targets,
+        "size": config.size,
         "steps": state.step,
         "batch": config.batch * state.accelerator.num_processes,
         "seconds": round(state.seconds, 1),
