@@ -6,6 +6,7 @@ goes on from a `Position` as if it had never stopped.
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
@@ -104,7 +105,15 @@ class TrainingSample(TensorRecord):
     """Of the targets."""
 
 
-class CaptureDataset(Dataset[TrainingSample]):
+class SampleSet(Dataset[Record], abc.ABC):
+    """Samples by `Position`; `len` is how many an epoch has."""
+
+    @abc.abstractmethod
+    def __len__(self) -> int:
+        """Samples of an epoch."""
+
+
+class CaptureDataset(SampleSet[TrainingSample]):
     """Samples by `Position`; an epoch shows every pose of everybody once."""
 
     def __init__(self, captures: Captures, settings: SampleSettings | None = None, seed: int = 0) -> None:
@@ -189,7 +198,7 @@ class _Order(Sampler[Position]):
 
 
 def batches(
-    dataset: Dataset[Record], size: int, start: Position = FIRST, workers: int = 0, share: Share = ALONE
+    dataset: SampleSet[Record], size: int, start: Position = FIRST, workers: int = 0, share: Share = ALONE
 ) -> Iterator[tuple[Record, Position]]:
     """Batches without end, each with the position behind it: save it, and `start` there to go on.
 

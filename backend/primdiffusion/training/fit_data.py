@@ -8,10 +8,9 @@ from collections.abc import Iterator
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
-from torch.utils.data import Dataset
 
 from primdiffusion.capture.conditioning import default_betas
-from primdiffusion.capture.dataset import CaptureDataset, Position, SampleSettings, Share, Views, batches
+from primdiffusion.capture.dataset import CaptureDataset, Position, SampleSet, SampleSettings, Share, Views, batches
 from primdiffusion.capture.reader import Captures
 from primdiffusion.encoder.config import PRESETS, EncoderConfig
 from primdiffusion.encoder.encode import frames_of, look_up
@@ -45,7 +44,7 @@ Batch = tuple[FitSample, Position]
 """Samples, and the place behind them."""
 
 
-class FitDataset(Dataset[FitSample]):
+class FitDataset(SampleSet[FitSample]):
     """`CaptureDataset`'s samples, unprojected where they are read: in the loader's workers."""
 
     def __init__(self, samples: CaptureDataset, encoder: EncoderConfig) -> None:
