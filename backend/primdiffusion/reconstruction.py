@@ -1,10 +1,10 @@
-"""A captured person as a human: the encoder's payload, the capture's betas."""
+"""A captured person as a human: the encoder's payload on the body that its boxes sit on."""
 
 from __future__ import annotations
 
 from primdiffusion import __version__
 from primdiffusion.capture.conditioning import CapturedPerson
-from primdiffusion.encoder.encode import EncoderModel
+from primdiffusion.encoder.encode import EncoderModel, betas_of_frames
 from primdiffusion.human import Human
 
 
@@ -22,4 +22,4 @@ def reconstruct(model: EncoderModel, person: CapturedPerson) -> Human:
         "full_density": model.config.full_density,
         "version": __version__,
     }
-    return Human(payload, person.betas, provenance).to("cpu").validate()
+    return Human(payload, betas_of_frames(model.config, person.betas), provenance).to("cpu").validate()

@@ -1,23 +1,19 @@
 """The encoder's network: shapes, what reaches what, what learns, and what it refuses."""
 
 import dataclasses
-import itertools
-import json
 
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose, J
-from primdiffusion.capture.dataset import Views, stack
 from primdiffusion.encoder.blocks import ConcatenatedAttention, CrossModalAttention, UntiedConv
-from primdiffusion.encoder.config import PRESETS, EncoderConfig, config_from_json
-from primdiffusion.encoder.encode import encode, frames_of, look_up
+from primdiffusion.encoder.config import PRESETS, EncoderConfig
+from primdiffusion.encoder.encode import frames_of
 from primdiffusion.encoder.network import Encoder, clamp, fill, voxels
 from primdiffusion.encoder.unproject import Unprojected
-from primdiffusion.geometry.camera import look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import GRID, K, Payload, S
 from primdiffusion.primitives.slab import pack
-from tiny_encoder import TINY, tiny_encoder
+from tiny_encoder import TINY
 
 SMALL = {
     "stem": (2, 2, 4), "grid": (32, 8, 8), "motion": 32, "attention_width": 8, "attention_heads": 2, "fused": 4,
@@ -362,44 +358,7 @@ def test_each_output_channel_of_a_convolution_has_one_gain(resize, shape):
     assert layer.convolution.parametrizations.weight.original0.numel() == 5
 
 
-# From pictures to people.
-
-
-def blank_views(count: int = 2, pixels: int = 24) -> Views:
-    yaws = (torch.tensor([0.0, 0, 3]), torch.tensor([3.0, 0, 0.1]))
-    cameras = [
-        look_at(at, torch.zeros(3), vertical_fov=0.8, width=pixels, height=pixels)
-        for at in itertools.islice(itertools.cycle(yaws), count)
-    ]
-    return Views(torch.full((count, pixels, pixels, 4), 200, dtype=torch.uint8), stack(cameras), BodyPose.rest())
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_a_person_comes_out_of_one_view_or_more(count):
-    model = tiny_encoder()
-    payload = model.encode(blank_views(count), torch.zeros(10)).validate()
-    assert payload.rgb.shape == (K, 3, S, S, S)
-    assert not payload.rgb.requires_grad
-    assert model.place(payload, torch.zeros(10), BodyPose.rest()).position.shape == (K, 3)
-
-
-def test_pictures_without_the_person_still_give_finite_values():
-    views = blank_views()
-    views = dataclasses.replace(views, rgba=torch.zeros_like(views.rgba))
-    tiny_encoder().encode(views, torch.zeros(10)).validate()
-
-
-@pytest.mark.parametrize("betas", [torch.zeros(9), torch.zeros(2, 10), torch.full((10,), torch.nan)])
-def test_betas_of_another_body_are_refused(betas):
-    with pytest.raises(ValueError, match="needs 10 finite numbers"):
-        look_up(TINY, blank_views(), betas.reshape(-1) if betas.ndim > 1 else betas)
-
-
-def test_poses_that_are_not_finite_are_refused():
-    views = blank_views()
-    broken = dataclasses.replace(views, pose=views.pose.map(lambda tensor: tensor * torch.nan))
-    with pytest.raises(ValueError, match="NaN"):
-        encode(Encoder(TINY), broken, torch.zeros(10))
+# What it refuses.
 
 
 def test_what_another_kind_of_encoder_looks_up_is_refused():
@@ -417,43 +376,3 @@ def test_what_another_kind_of_encoder_looks_up_is_refused():
 def test_poses_must_be_as_many_as_people():
     with pytest.raises(ValueError, match=r"2 people were looked up, .* give \[2, 24, 3\]"):
         Encoder(TINY)(seen_from(TINY, 2), poses(1))
-
-
-# Configurations.
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_configurations_come_back_from_json(preset):
-    config = PRESETS[preset]
-    assert config_from_json(json.loads(json.dumps(dataclasses.asdict(config)))) == config
-
-
-def test_unknown_and_missing_settings_are_refused_by_name():
-    tree = dataclasses.asdict(TINY)
-    with pytest.raises(ValueError, match="differs in colour_of_eyes: use the release"):
-        config_from_json({**tree, "colour_of_eyes": "blue"})
-    with pytest.raises(ValueError, match="differs in motion"):
-        config_from_json({name: value for name, value in tree.items() if name != "motion"})
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"appearance": "pixels"}, "appearance is 'pixels': choose one of 'voxels', 'texels'"),
-        ({"attention": "some"}, "attention is 'some'"),
-        ({"grid": ()}, "0 levels: give 1 to 6"),
-        ({"grid": (8,) * 7}, "7 levels"),
-        ({"attention_width": 6, "attention_heads": 4}, "6 is no multiple"),
-        ({"scale_outputs": 2}, "3 numbers"),
-    ],
-)
-def test_impossible_settings_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(TINY, **settings)
-
-
-def test_each_ablation_differs_from_the_default_in_one_setting():
-    default = dataclasses.asdict(PRESETS["default"])
-    for preset in ("shared_scale", "template_rt", "no_attention"):
-        changed = [name for name, value in dataclasses.asdict(PRESETS[preset]).items() if default[name] != value]
-        assert len(changed) == 1, preset

@@ -9,16 +9,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from accelerate import Accelerator
 from capture_scenes import captured
 from fit_scenes import WHOLE, files, flags, make_small, rows, sentence, settings
 from PIL import Image
+from primdiffusion.capture.dataset import ALONE, FIRST
+from primdiffusion.capture.reader import open_captures
+from primdiffusion.encoder.config import PRESETS
+from primdiffusion.encoder.network import Encoder
+from primdiffusion.render.march import MarchSettings
 from primdiffusion.training import fit as fit_module
 from primdiffusion.training import fit_folder, fit_record
 from primdiffusion.training.encoder_checkpoint import load_encoder
 from primdiffusion.training.fit import fit
 from primdiffusion.training.fit_command import run
-from primdiffusion.training.fit_config import LossConfig
+from primdiffusion.training.fit_config import FitConfig, LossConfig
+from primdiffusion.training.fit_data import fit_batches, fit_dataset
 from primdiffusion.training.fit_folder import METRICS, MODEL, PICTURES, STATE
+from primdiffusion.training.fit_losses import volume_loss
+from primdiffusion.training.fit_state import FitState
 from safetensors.torch import load_file
 
 ROOT = Path(__file__).parents[2]
@@ -227,3 +236,34 @@ def test_metrics_that_find_no_room_name_their_file(captures, tmp_path):
 def test_the_command_says_where_the_encoder_is(captures, tmp_path, capsys):
     run([*flags(settings(captures, tmp_path / "run", steps=1)), "--loss.silhouette", "0.01"])
     assert capsys.readouterr().out == f"{tmp_path / 'run' / MODEL}  1 of 1 steps\n"
+
+
+def test_held_boxes_are_drawn_as_large_as_they_start_and_then_learn(captures, tmp_path):
+    terms = {}
+    for hold_scale in (1, 0):
+        config = settings(captures, tmp_path / "run", hold_scale=hold_scale)
+        state, dataset = first_state(config), fit_dataset(open_captures(captures), config)
+        sample, _ = next(fit_batches(dataset, config, FIRST, ALONE))
+        with torch.no_grad():
+            state.network.scale_out.bias.fill_(30.0)  # as if boxes had learned to be larger
+        clock = fit_record.Clock(torch.device("cpu"))
+        terms[hold_scale] = fit_module.objective(config, state, sample, MarchSettings(step=0.02), clock)
+        start = sample.frames.half_extent * torch.tensor(PRESETS["default"].extent)
+    assert torch.allclose(terms[1]["volume"], config.loss.volume * volume_loss(start))
+    assert terms[0]["volume"] > 1.2 * terms[1]["volume"]
+
+
+def test_biases_of_places_learn_so_many_times_as_fast_as_weights(captures, tmp_path):
+    config = settings(captures, tmp_path / "run", place_rate=50.0)
+    state = first_state(config)
+    before = {name: value.detach().clone() for name, value in state.network.named_parameters()}
+    state.update(sum(value.sum() for value in state.network.parameters()))
+    after = {name: value.detach() for name, value in state.network.named_parameters()}
+    moved = {name: float((value - before[name]).abs().max()) for name, value in after.items()}
+    weight, place = (moved[f"scale_out.{part}"] for part in ("convolution.parametrizations.weight.original1", "bias"))
+    assert place / weight == pytest.approx(50, rel=0.01)
+    assert moved["colour.up.0.bias"] == pytest.approx(place, rel=0.01)
+
+
+def first_state(config: FitConfig) -> FitState:
+    return FitState(Encoder(PRESETS["default"]), config, Accelerator(cpu=True))

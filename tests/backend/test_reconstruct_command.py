@@ -15,14 +15,17 @@ from primdiffusion import cli
 from primdiffusion.capture.conditioning import captured_person, choose_subject, conditioning_views
 from primdiffusion.capture.layout import LIST_FILE, SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE, picture_path
 from primdiffusion.capture.rasterised import render
+from primdiffusion.encoder.encode import EncoderModel
+from primdiffusion.encoder.network import Encoder
 from primdiffusion.geometry.textured_mesh import TexturedMesh
+from primdiffusion.human import place
 from primdiffusion.human_file import load_human
 from primdiffusion.reconstruction import reconstruct
 from primdiffusion.serve import reconstruction
 from primdiffusion.serve.jobs import Jobs
 from primdiffusion.serve.params import ReconstructParams
 from primdiffusion.training.encoder_checkpoint import load_encoder
-from tiny_encoder import save_tiny_encoder, tiny_encoder
+from tiny_encoder import TINY, save_tiny_encoder, tiny_encoder
 from tiny_model import save_tiny_checkpoint
 
 FILES = ["depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"]
@@ -91,6 +94,15 @@ def test_the_person_is_what_the_encoder_makes_of_the_views(dataset, line, tmp_pa
     wanted = reconstruct(model, person)
     assert torch.allclose(kept.payload.rgb, wanted.payload.rgb, atol=1e-5)
     assert torch.equal(kept.betas, person.betas)
+
+
+@pytest.mark.parametrize("frames", ["person", "template"])
+def test_the_person_stands_on_the_body_that_the_encoders_boxes_sit_on(dataset, frames):
+    model = EncoderModel(Encoder(dataclasses.replace(TINY, frames=frames)), {})
+    person = dataclasses.replace(captured_person(dataset / SECOND), betas=torch.linspace(-1, 1, 10))
+    human, pose = reconstruct(model, person), person.views.pose
+    wanted = model.place(human.payload, person.betas, pose)
+    assert torch.allclose(place(human, pose).position, wanted.position, atol=1e-6)
 
 
 def test_a_dataset_in_the_released_layout_gives_the_same_person(dataset, line, tmp_path):

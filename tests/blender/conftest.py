@@ -34,3 +34,23 @@ def saved_scene(empty_scene, tmp_path):
     """A context with an empty file saved as shot.blend."""
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
     return empty_scene
+
+
+@pytest.fixture
+def addon(saved_scene, tmp_path, monkeypatch):
+    """The add-on registered from the checkout, on an interpreter that runs the fake child."""
+    import synthetic
+
+    import blender_primdiffusion
+    from blender_primdiffusion import places
+    from blender_primdiffusion.ui.generation import session
+    from blender_primdiffusion.worker.environment import BackendPython
+
+    monkeypatch.setenv("FAKE_HUMAN", str(synthetic.write(tmp_path / "prepared.npz", 8)))
+    python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
+    monkeypatch.setattr(places, "find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr(places, "backend_module_path", lambda: Path(__file__).parent / "fake_backend")
+    session.error = session.notice = session.kind = session.device = ""
+    blender_primdiffusion.register()
+    yield saved_scene
+    blender_primdiffusion.unregister()

@@ -13,33 +13,17 @@ from unittest.mock import MagicMock
 
 import bpy
 import pytest
-import synthetic
 
 import blender_primdiffusion
-from blender_primdiffusion import places
 from blender_primdiffusion.scene.human import folder_of, humans
 from blender_primdiffusion.ui import generation, operators
 from blender_primdiffusion.ui.generation import session
 from blender_primdiffusion.ui.operators import follow
 from blender_primdiffusion.ui.panel import PRIMDIFFUSION_PT_generate
-from blender_primdiffusion.worker.environment import BackendPython
 
 DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
 """Seeds that the fake child takes as orders."""
 FAKE = Path(__file__).parent / "fake_backend"
-
-
-@pytest.fixture
-def addon(saved_scene, tmp_path, monkeypatch):
-    """The add-on registered from the checkout, on an interpreter that runs the fake child."""
-    monkeypatch.setenv("FAKE_HUMAN", str(synthetic.write(tmp_path / "prepared.npz", 8)))
-    python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-    monkeypatch.setattr(places, "find_backend_python", lambda *_, **__: python)
-    monkeypatch.setattr(places, "backend_module_path", lambda: FAKE)
-    session.error = session.notice = session.device = ""
-    blender_primdiffusion.register()
-    yield saved_scene
-    blender_primdiffusion.unregister()
 
 
 def drive(seconds: float = 30.0) -> None:

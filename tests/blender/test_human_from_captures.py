@@ -11,7 +11,6 @@ from unittest.mock import MagicMock
 
 import bpy
 import pytest
-import synthetic
 
 import blender_primdiffusion
 from blender_primdiffusion import places
@@ -24,19 +23,6 @@ from blender_primdiffusion.ui.reconstruct_panel import PRIMDIFFUSION_PT_human_fr
 from blender_primdiffusion.worker.environment import BackendPython
 
 FAKE = Path(__file__).parent / "fake_backend"
-
-
-@pytest.fixture
-def addon(saved_scene, tmp_path, monkeypatch):
-    """The add-on registered from the checkout, on an interpreter that runs the fake child."""
-    monkeypatch.setenv("FAKE_HUMAN", str(synthetic.write(tmp_path / "prepared.npz", 8)))
-    python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-    monkeypatch.setattr(places, "find_backend_python", lambda *_, **__: python)
-    monkeypatch.setattr(places, "backend_module_path", lambda: FAKE)
-    session.error = session.notice = session.kind = ""
-    blender_primdiffusion.register()
-    yield saved_scene
-    blender_primdiffusion.unregister()
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.capture.dataset import Views
+from primdiffusion.capture.dataset import Views, stack
 from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.network import Encoder, motion_of
-from primdiffusion.encoder.unproject import Unprojected, stacked, unproject_texels, unproject_voxels
+from primdiffusion.encoder.unproject import Unprojected, unproject_texels, unproject_voxels
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 
@@ -53,7 +53,7 @@ def encode(encoder: Encoder, views: Views, betas: Float[Tensor, "n"]) -> Payload
     views, betas = views.to("cpu"), betas.cpu()
     found = look_up(encoder.config, views, betas)
     axis_angle = motion_of(views.pose.joint_rotation)[None].to(device)
-    payload = encoder(stacked([found]).to(device), axis_angle)
+    payload = encoder(stack([found]).to(device), axis_angle)
     return payload.map(lambda tensor: tensor[0].float())
 
 
@@ -75,6 +75,10 @@ def look_up(config: EncoderConfig, views: Views, betas: Float[Tensor, "n"]) -> U
 def frames_of(config: EncoderConfig, betas: Float[Tensor, "n"], pose: BodyPose) -> tuple[Tensor, Frames]:
     """The posed body's vertices [V, 3] and the boxes' frames on it; of mean shape with `frames` "template"."""
     body = default_body()
-    betas = torch.zeros_like(betas) if config.frames == "template" else betas
-    vertices = body.shape(betas).pose(pose).vertices
+    vertices = body.shape(betas_of_frames(config, betas)).pose(pose).vertices
     return vertices, attach(default_anchors(), vertices, body.faces)
+
+
+def betas_of_frames(config: EncoderConfig, betas: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """The shape of the body that the boxes sit on: the person's, or with `frames` "template" the mean one."""
+    return torch.zeros_like(betas) if config.frames == "template" else betas

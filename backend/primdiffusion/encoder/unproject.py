@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float, UInt8
@@ -115,10 +114,3 @@ def _look_up(
         for found in sample(views, depth, points.flatten(0, 1), normals.flatten(0, 1), facing)
     )
     return Unprojected(rgb.movedim(-1, 1).contiguous(), seen, covered).to(views.rgba.device)
-
-
-def stacked(found: Sequence[Unprojected]) -> Unprojected:
-    """A batch of several people's."""
-    return Unprojected(
-        *(torch.stack([getattr(one, field.name) for one in found]) for field in dataclasses.fields(Unprojected))
-    )

@@ -14,6 +14,7 @@ from primdiffusion.capture.conditioning import default_betas
 from primdiffusion.capture.dataset import CaptureDataset, SampleSettings, TrainingSample
 from primdiffusion.capture.reader import Captures
 from primdiffusion.encoder.encode import EncoderModel
+from primdiffusion.evaluation.image_metrics import psnr
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.render.march import march
 from primdiffusion.staging import written_whole
@@ -25,10 +26,8 @@ SEED = 7
 
 def measure(model: EncoderModel, captures: Captures, people: int = PEOPLE) -> float:
     """Mean PSNR (dB, whole pictures of SIZE pixels a side) of two views of each of a few people, in another pose."""
-    errors = [
-        (image - target).square().mean((-1, -2, -3)) for image, target, _ in _compared(model, captures, people, "whole")
-    ]
-    return float((-10 * torch.cat(errors).log10()).mean())
+    found = [psnr(image, target) for image, target, _ in _compared(model, captures, people, "whole")]
+    return float(torch.cat(found).mean())
 
 
 def write_pictures(path: Path, model: EncoderModel, captures: Captures, people: int = PEOPLE) -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.dataset import Views
+from primdiffusion.evaluation.image_metrics import psnr
 from primdiffusion.failures import PictureOutOfMemory, out_of_memory
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb
@@ -80,11 +81,11 @@ def _check(number: int, record: Views) -> None:
 @torch.no_grad()
 def psnr_of(scenes: Sequence[Scene], payload: Payload) -> Float[Tensor, "n"]:
     """As `view_psnr`."""
-    errors = []
+    found = []
     for scene in scenes:
         image = encode_srgb(drawn(scene, payload, MarchSettings().step).rgb.clamp(0, 1))
-        errors.append((image - scene.target[..., :3].float() / 255).square().mean())
-    return -10 * torch.stack(errors).clamp_min(1e-10).log10().cpu()
+        found.append(psnr(image, scene.target[..., :3].float() / 255))
+    return torch.stack(found).cpu()
 
 
 def drawn(scene: Scene, payload: Payload, step: float) -> Rendering:
