@@ -106,6 +106,17 @@ def test_boxes_keep_their_sizes_and_densities_their_limit_where_this_is_asked(vi
     assert float(payload.rgb.max()) <= 1
 
 
+def test_masks_alone_make_a_thin_person_in_black_solid():
+    black = person(1)
+    black = dataclasses.replace(black, payload=dataclasses.replace(black.payload, rgb=0 * black.payload.rgb))
+    thin = dataclasses.replace(black, payload=dataclasses.replace(black.payload, density=0.02 * black.payload.density))
+    settings = dataclasses.replace(QUICK, scale_rate=0)
+    refined = refine(thin, [views_of(black)], settings).human.payload
+    assert refined.density.sum() > 1.5 * thin.payload.density.sum()
+    without = refine(thin, [views_of(black)], dataclasses.replace(settings, silhouette=0)).human.payload
+    assert torch.equal(without.density, thin.payload.density)
+
+
 def test_the_inputs_are_left_alone(views):
     start = person(2)
     before = start.map(torch.clone)
