@@ -1,11 +1,13 @@
 """Samplers: pure functions of a denoiser, a schedule and a start that yield each step back (paper sec. 3.3).
 
-The caller owns progress and cancelling: it stops by not asking for the next step.
+The caller owns progress and cancelling: it stops by not asking for the next step. Noise of each sample comes from a
+generator of its own, so that a person does not depend on who else is in the batch.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 
@@ -16,6 +18,8 @@ from primdiffusion.diffusion.schedule import CLEAN, Schedule
 
 Denoise = Callable[[Tensor, int], Tensor]
 """x0 guess from a batch x [b, ...] that holds noise of step t."""
+Generators = torch.Generator | Sequence[torch.Generator]
+"""One for each sample of a batch, or one for the whole batch."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,19 +38,19 @@ class Step:
 
 
 def ddpm(
-    denoise: Denoise, schedule: Schedule, x: Tensor, steps: Sequence[int], generator: torch.Generator
+    denoise: Denoise, schedule: Schedule, x: Tensor, steps: Sequence[int], generators: Generators
 ) -> Iterator[Step]:
     """Ancestral sampling with the posterior's variance (paper eq. 6-7) down the descending `steps`."""
     for index, (t, t_prev) in enumerate(pairwise((*steps, CLEAN))):
         x0 = denoise(x, t)
         x = schedule.posterior_mean(x, x0, t, t_prev)
         if t_prev != CLEAN:
-            x = x + schedule.posterior_std(t, t_prev) * gaussian_noise(x, generator)
+            x = x + schedule.posterior_std(t, t_prev) * gaussian_noise(x, generators)
         yield Step(index, len(steps), t, x0, x)
 
 
 def ddim(
-    denoise: Denoise, schedule: Schedule, x: Tensor, steps: Sequence[int], generator: torch.Generator, eta: float = 0.0
+    denoise: Denoise, schedule: Schedule, x: Tensor, steps: Sequence[int], generators: Generators, eta: float = 0.0
 ) -> Iterator[Step]:
     """Implicit sampling (Song et al. 2021, eq. 12) down the descending `steps`.
 
@@ -62,14 +66,50 @@ def ddim(
             kept = (schedule.noise(t_prev) ** 2 - added**2) ** 0.5
             x = schedule.signal(t_prev) * x0 + kept * schedule.epsilon(x, x0, t)
             if added > 0:
-                x = x + added * gaussian_noise(x, generator)
+                x = x + added * gaussian_noise(x, generators)
         yield Step(index, len(steps), t, x0, x)
 
 
-def gaussian_noise(like: Tensor, generator: torch.Generator) -> Tensor:
-    """Standard normal noise of the shape, type and device of `like`."""
+def dpmpp_2m(
+    denoise: Denoise, schedule: Schedule, x: Tensor, steps: Sequence[int], generators: Generators
+) -> Iterator[Step]:
+    """DPM-Solver++(2M) (Lu et al. 2022, alg. 2) down the descending `steps`; draws no noise.
+
+    A multistep method of second order: the clean guess is extrapolated to the middle of the step, in half log SNR, from
+    this one and the one before. The first step has none before it, and the last reaches infinite SNR, where the guess
+    itself is the answer: both are those of `ddim`.
+    """
+    before: tuple[Tensor, float] | None = None
+    for index, (t, t_prev) in enumerate(pairwise((*steps, CLEAN))):
+        x0 = denoise(x, t)
+        gain = schedule.half_log_snr_gain(t, t_prev)
+        if t_prev == CLEAN:
+            x = x0
+        else:
+            middle = x0 if before is None else x0 + gain / (2 * before[1]) * (x0 - before[0])
+            kept = schedule.noise(t_prev) / schedule.noise(t)
+            x = kept * x - schedule.signal(t_prev) * math.expm1(-gain) * middle
+        before = x0, gain
+        yield Step(index, len(steps), t, x0, x)
+
+
+def gaussian_noise(like: Tensor, generators: Generators) -> Tensor:
+    """Standard normal noise of the shape, type and device of `like`.
+
+    With a sequence of generators, one for each sample of `like` [b, ...], sample i is drawn from generators[i] alone
+    and is the same in any batch; a single generator draws the batch at once. Raises ValueError for another number of
+    generators than samples.
+    """
+    if isinstance(generators, torch.Generator):
+        return _normal(like, generators)
+    if len(generators) != len(like):
+        raise ValueError(f"a batch of {len(like)} samples needs as many generators; {len(generators)} were given")
+    return torch.stack([_normal(one, generator) for one, generator in zip(like, generators, strict=True)])
+
+
+def _normal(like: Tensor, generator: torch.Generator) -> Tensor:
     return torch.randn(like.shape, generator=generator, dtype=like.dtype, device=like.device)
 
 
-SAMPLERS = {"ddim": ddim, "ddpm": ddpm}
+SAMPLERS = {"ddim": ddim, "ddpm": ddpm, "dpmpp_2m": dpmpp_2m}
 """Samplers by the name a user states."""

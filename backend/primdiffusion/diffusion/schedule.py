@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import torch
 from jaxtyping import Float, Int
@@ -65,9 +66,20 @@ class Schedule(TensorRecord):
         """Standard deviation sqrt(beta tilde) of q(x_prev | x, x0); 0 when t_prev is `CLEAN`."""
         return (self.noise(t_prev) ** 2 / self.noise(t) ** 2 * (1.0 - self._alpha(t, t_prev))) ** 0.5
 
+    def half_log_snr(self, t: int) -> float:
+        """lambda_t = log(signal / noise), time to exponential integrators; inf at `CLEAN`, -inf without signal."""
+        if t == CLEAN:
+            return math.inf
+        alpha_bar = float(self.alpha_bar[t])
+        return 0.5 * (math.log(alpha_bar) - math.log1p(-alpha_bar)) if alpha_bar > 0 else -math.inf
+
+    def half_log_snr_gain(self, t: int, t_prev: int) -> float:
+        """h = lambda_prev - lambda_t > 0: the length of one step back for an exponential integrator."""
+        _check_back(t, t_prev)
+        return self.half_log_snr(t_prev) - self.half_log_snr(t)
+
     def _alpha(self, t: int, t_prev: int) -> float:
-        if not CLEAN <= t_prev < t:
-            raise ValueError(f"a step back goes from t to an earlier t_prev >= {CLEAN}; got t={t}, t_prev={t_prev}")
+        _check_back(t, t_prev)
         return (self.signal(t) / self.signal(t_prev)) ** 2
 
 
@@ -104,6 +116,11 @@ def leading_steps(length: int, steps: int, offset: int = 1) -> list[int]:
     """Descending t = offset + i * (T // steps), as released: 991, 981, ... 1 for 100 of 1000."""
     _check_steps(length, steps)
     return [i * (length // steps) + offset for i in reversed(range(steps))]
+
+
+def _check_back(t: int, t_prev: int) -> None:
+    if not CLEAN <= t_prev < t:
+        raise ValueError(f"a step back goes from t to an earlier t_prev >= {CLEAN}; got t={t}, t_prev={t_prev}")
 
 
 def _check_steps(length: int, steps: int) -> None:
