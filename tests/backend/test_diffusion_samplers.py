@@ -1,32 +1,62 @@
+import math
+from itertools import pairwise
+
+import numpy as np
 import pytest
 import torch
-from diffusers import DDIMScheduler, DDPMScheduler
-from primdiffusion.diffusion.samplers import ddim, ddpm
-from primdiffusion.diffusion.schedule import leading_steps, linear, trailing_steps
+from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
+from primdiffusion.diffusion.samplers import SAMPLERS, ddim, ddpm, dpmpp_2m, gaussian_noise
+from primdiffusion.diffusion.schedule import (
+    CLEAN,
+    leading_steps,
+    linear,
+    sqrt_linear,
+    trailing_steps,
+    zero_terminal_snr,
+)
 
 F64 = torch.float64
+CENTRES = torch.tensor([[2.0, -1.0, 0.5], [-1.0, 1.5, 0.0], [0.0, 0.0, -2.0]], dtype=F64)
+SPREADS = torch.tensor([0.3, 0.7, 0.1], dtype=F64)
+SHARES = torch.tensor([0.5, 0.3, 0.2], dtype=F64)
 
 
-def crooked(x, t):
-    """A denoiser that is nonlinear and depends on t, so that a mistake in any coefficient shows."""
-    return torch.tanh(x * (0.5 + t / 1000)) + 0.1 * x.flip(-1)
+def of_mixture(schedule):
+    """E[x0 | x] for x0 of a mixture of three Gaussians: nonlinear and steep where x lies between two of them."""
+
+    def denoise(x, t):
+        signal, noise = schedule.signal(t), schedule.noise(t)
+        total = signal**2 * SPREADS**2 + noise**2
+        off = x[..., None, :] - signal * CENTRES
+        share = (SHARES.log() - 1.5 * total.log() - off.square().sum(-1) / (2 * total)).softmax(-1)
+        means = CENTRES + (signal * SPREADS**2 / total)[:, None] * off
+        return (share[..., None] * means).sum(-2)
+
+    return denoise
 
 
-def theirs(kind, x, steps, seed, extra=None, **settings):
-    scheduler = kind(1000, prediction_type="sample", clip_sample=False, **settings)
+def theirs(kind, schedule, x, steps, seed, extra=None, **settings):
+    scheduler = kind(1000, prediction_type="sample", **settings)
     scheduler.set_timesteps(steps)
     # diffusers keeps its schedule in float32: give it ours, to compare the formulas and not the rounding
-    scheduler.alphas_cumprod = linear().alpha_bar
-    scheduler.alphas = scheduler.alphas_cumprod / torch.cat([torch.ones(1, dtype=F64), scheduler.alphas_cumprod[:-1]])
+    scheduler.alphas_cumprod = schedule.alpha_bar
+    scheduler.alphas = schedule.alpha_bar / torch.cat([torch.ones(1, dtype=F64), schedule.alpha_bar[:-1]])
     scheduler.betas, scheduler.one = 1 - scheduler.alphas, torch.ones((), dtype=F64)
-    generator = torch.Generator().manual_seed(seed)
+    if kind is DPMSolverMultistepScheduler:
+        alpha_bar = torch.cat([schedule.alpha_bar[scheduler.timesteps], torch.ones(1, dtype=F64)])
+        scheduler.sigmas = ((1 - alpha_bar) / alpha_bar).sqrt()
+    denoise, generator = of_mixture(schedule), torch.Generator().manual_seed(seed)
     for t in scheduler.timesteps:
-        x = scheduler.step(crooked(x, int(t)), t, x, generator=generator, **(extra or {})).prev_sample
+        x = scheduler.step(denoise(x, int(t)), t, x, generator=generator, **(extra or {})).prev_sample
     return x, scheduler.timesteps.tolist()
 
 
-def start():
-    return torch.randn(2, 3, 4, dtype=F64, generator=torch.Generator().manual_seed(5))
+def start(count=4):
+    return torch.randn(count, 3, dtype=F64, generator=torch.Generator().manual_seed(5))
+
+
+def seeded(*seeds):
+    return [torch.Generator().manual_seed(seed) for seed in seeds]
 
 
 def last(steps):
@@ -34,24 +64,79 @@ def last(steps):
     return step
 
 
+both_schedules = pytest.mark.parametrize("schedule", [linear(), sqrt_linear()], ids=["linear", "sqrt_linear"])
+every_sampler = pytest.mark.parametrize("sampler", [ddpm, ddim, dpmpp_2m])
+
+
+@both_schedules
 @pytest.mark.parametrize("steps", [1000, 40])
-def test_ddpm_is_that_of_diffusers(steps):
-    expected, chain = theirs(DDPMScheduler, start(), steps, 3, timestep_spacing="trailing")
+def test_ddpm_is_that_of_diffusers(schedule, steps):
+    expected, chain = theirs(DDPMScheduler, schedule, start(), steps, 3, clip_sample=False, timestep_spacing="trailing")
     assert chain == trailing_steps(1000, steps)
-    ours = last(ddpm(crooked, linear(), start(), chain, torch.Generator().manual_seed(3)))
+    ours = last(ddpm(of_mixture(schedule), schedule, start(), chain, torch.Generator().manual_seed(3)))
     assert (ours.x - expected).abs().max() < 1e-5
 
 
+@both_schedules
 @pytest.mark.parametrize("eta", [0.0, 0.5, 1.0])
-def test_ddim_is_that_of_diffusers(eta):
-    expected, chain = theirs(DDIMScheduler, start(), 100, 3, {"eta": eta}, timestep_spacing="leading", steps_offset=1)
+def test_ddim_is_that_of_diffusers(schedule, eta):
+    settings = {"clip_sample": False, "timestep_spacing": "leading", "steps_offset": 1}
+    expected, chain = theirs(DDIMScheduler, schedule, start(), 100, 3, {"eta": eta}, **settings)
     assert chain == leading_steps(1000, 100)
-    ours = last(ddim(crooked, linear(), start(), chain, torch.Generator().manual_seed(3), eta))
+    ours = last(ddim(of_mixture(schedule), schedule, start(), chain, torch.Generator().manual_seed(3), eta))
     assert (ours.x - expected).abs().max() < 1e-5
+
+
+@both_schedules
+@pytest.mark.parametrize("steps", [1, 2, 8, 30])
+def test_dpmpp_2m_is_that_of_diffusers(schedule, steps):
+    settings = {"algorithm_type": "dpmsolver++", "solver_type": "midpoint", "solver_order": 2}
+    expected, chain = theirs(
+        DPMSolverMultistepScheduler, schedule, start(), steps, 0, timestep_spacing="trailing", **settings
+    )
+    assert chain == trailing_steps(1000, steps)
+    ours = last(dpmpp_2m(of_mixture(schedule), schedule, start(), chain, []))
+    assert (ours.x - expected).abs().max() < 1e-5
+
+
+# where the two leading errors of 2M have one sign: at 0.6 they cancel near 20 steps, and hide its order until 300
+MEAN, STD, END = 1.0, 1.5, 99
+
+
+def slope(sampler, schedule):
+    """Measured order: error on the probability-flow ODE of Gaussian data against the number of steps from 999 to END.
+
+    Where x0 ~ N(m, s^2), the flow keeps (x - signal m) / sqrt(signal^2 s^2 + noise^2), so its end is known exactly.
+    It is read before the last denoising: that step has infinite length in half log SNR, and its error is the spread of
+    x0 at level END, whatever came before.
+    """
+
+    def marginal(t):
+        return (schedule.signal(t) ** 2 * STD**2 + schedule.noise(t) ** 2) ** 0.5
+
+    def denoise(x, t):
+        signal = schedule.signal(t)
+        return MEAN + signal * STD**2 / marginal(t) ** 2 * (x - signal * MEAN)
+
+    x = start()
+    exact = schedule.signal(END) * MEAN + marginal(END) / marginal(999) * (x - schedule.signal(999) * MEAN)
+    counts, errors = (30, 60, 100, 180, 300, 450), []
+    for count in counts:
+        chain = list(range(999, END - 1, -900 // count))
+        *_, before_last, _ = sampler(denoise, schedule, x, chain, [])
+        errors.append(float((before_last.x - exact).abs().max()))
+    return -np.polyfit(np.log(counts), np.log(errors), 1)[0]
+
+
+@both_schedules
+@pytest.mark.parametrize(("sampler", "order"), [(ddim, 1), (dpmpp_2m, 2)])
+def test_error_falls_with_the_sampler_s_order(schedule, sampler, order):
+    assert slope(sampler, schedule) == pytest.approx(order, abs=0.06)
 
 
 @pytest.mark.parametrize(
-    ("sampler", "steps", "tolerance"), [(ddpm, 1000, 0.03), (ddim, 1000, 0.03), (ddim, 100, 0.05), (ddpm, 30, 0.35)]
+    ("sampler", "steps", "tolerance"),
+    [(ddpm, 1000, 0.03), (ddim, 1000, 0.03), (ddim, 100, 0.05), (ddpm, 30, 0.35), (dpmpp_2m, 30, 0.05)],
 )
 def test_an_exact_denoiser_gives_back_its_gaussian(sampler, steps, tolerance):
     # few ancestral steps are known to narrow the distribution: the tolerance says by how much at 30
@@ -68,16 +153,27 @@ def test_an_exact_denoiser_gives_back_its_gaussian(sampler, steps, tolerance):
     assert x.std().item() == pytest.approx(std, rel=tolerance)
 
 
-@pytest.mark.parametrize("sampler", [ddpm, ddim])
+def test_samplers_are_found_by_name():
+    assert {"ddpm": ddpm, "ddim": ddim, "dpmpp_2m": dpmpp_2m} == SAMPLERS
+
+
+@every_sampler
 def test_steps_count_up_go_down_and_end_clean(sampler):
-    steps = list(sampler(crooked, linear(), start(), trailing_steps(1000, 7), torch.Generator()))
+    steps = list(sampler(of_mixture(linear()), linear(), start(), trailing_steps(1000, 7), torch.Generator()))
     assert [s.index for s in steps] == list(range(7))
     assert {s.total for s in steps} == {7}
     assert [s.t for s in steps] == trailing_steps(1000, 7)
     assert torch.equal(steps[-1].x, steps[-1].x0)
 
 
-@pytest.mark.parametrize("sampler", [ddpm, ddim])
+@every_sampler
+@pytest.mark.parametrize("chain", [[10, 20], [10, 10], [5, CLEAN, 3]])
+def test_steps_that_do_not_go_down_are_refused(sampler, chain):
+    with pytest.raises(ValueError, match=r"goes from t to an earlier"):
+        list(sampler(of_mixture(linear()), linear(), start(), chain, torch.Generator()))
+
+
+@every_sampler
 def test_a_sampler_that_is_not_asked_does_no_work(sampler):
     calls = []
 
@@ -92,8 +188,58 @@ def test_a_sampler_that_is_not_asked_does_no_work(sampler):
     assert len(calls) == 2
 
 
-def test_ddim_without_eta_draws_nothing():
+@pytest.mark.parametrize("sampler", [ddim, dpmpp_2m])
+def test_deterministic_samplers_draw_nothing(sampler):
     generator = torch.Generator().manual_seed(0)
     before = generator.get_state()
-    list(ddim(crooked, linear(), start(), trailing_steps(1000, 5), generator))
+    list(sampler(of_mixture(linear()), linear(), start(), trailing_steps(1000, 5), generator))
     assert torch.equal(before, generator.get_state())
+
+
+def test_a_sample_is_the_same_in_any_batch():
+    schedule, x = linear(), start(4)
+    together = last(ddpm(of_mixture(schedule), schedule, x, trailing_steps(1000, 20), seeded(7, 8, 9, 10))).x
+    for i, seed in enumerate((7, 8, 9, 10)):
+        alone = last(ddpm(of_mixture(schedule), schedule, x[i : i + 1], trailing_steps(1000, 20), seeded(seed))).x
+        assert torch.allclose(alone[0], together[i], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_noise_of_a_sample_is_bit_identical_in_any_batch(dtype):
+    like = torch.zeros(3, 2, 5, dtype=dtype)
+    together = gaussian_noise(like, seeded(1, 2, 3))
+    assert together.dtype == dtype
+    assert torch.equal(together[1:2], gaussian_noise(like[:1], seeded(2)))
+    assert torch.equal(together[[2, 0]], gaussian_noise(like[:2], seeded(3, 1)))
+    assert not torch.equal(together[0], together[1])
+
+
+def test_one_generator_draws_a_whole_batch_at_once():
+    expected = torch.randn(3, 4, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(gaussian_noise(torch.zeros(3, 4), torch.Generator().manual_seed(1)), expected)
+
+
+def test_too_few_generators_are_refused():
+    with pytest.raises(ValueError, match=r"3 samples.*2"):
+        gaussian_noise(torch.zeros(3, 4), seeded(1, 2))
+
+
+def test_dpmpp_2m_starts_where_there_is_no_signal():
+    # the first step is then infinitely long, and the second must not extrapolate from it
+    schedule = zero_terminal_snr(linear())
+    chain = trailing_steps(1000, 6)
+    steps = list(dpmpp_2m(of_mixture(schedule), schedule, start(), chain, []))
+    assert steps[-1].x.isfinite().all()
+    first = next(iter(ddim(of_mixture(schedule), schedule, start(), chain, [])))
+    assert torch.allclose(steps[0].x, first.x, atol=1e-12)
+
+
+def test_dpmpp_2m_takes_the_midpoint_in_half_log_snr():
+    # by hand: lambda of the third step, extrapolated half a step beyond the guess at the second
+    schedule, chain = linear(), (900, 600, 300, 100)
+    steps = list(dpmpp_2m(lambda x, t: torch.full_like(x, t / 100), schedule, start(), chain, []))
+    gains = [schedule.half_log_snr(b) - schedule.half_log_snr(a) for a, b in pairwise(chain)]
+    middle = 6 + gains[1] / gains[0] * (6 - 9) / 2
+    kept = schedule.noise(300) / schedule.noise(600)
+    expected = kept * steps[0].x + schedule.signal(300) * (1 - math.exp(-gains[1])) * middle
+    assert torch.allclose(steps[1].x, expected, atol=1e-12)

@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -83,8 +85,24 @@ def test_impossible_numbers_of_steps_are_refused(steps):
 def test_steps_forward_and_noise_of_a_clean_sample_are_refused():
     with pytest.raises(ValueError, match="t_prev=5"):
         linear().posterior_std(5, 5)
+    with pytest.raises(ValueError, match="t_prev=7"):
+        linear().half_log_snr_gain(5, 7)
     with pytest.raises(ValueError, match="clean"):
         linear().epsilon(torch.zeros(1), torch.zeros(1), CLEAN)
+
+
+@pytest.mark.parametrize("schedule", [linear(), sqrt_linear()])
+def test_half_log_snr_is_the_logarithm_of_signal_over_noise(schedule):
+    for t in (0, 10, 500, 999):
+        assert schedule.half_log_snr(t) == pytest.approx(math.log(schedule.signal(t) / schedule.noise(t)), abs=1e-9)
+    assert schedule.half_log_snr(CLEAN) == math.inf
+    assert schedule.half_log_snr_gain(900, 100) == pytest.approx(
+        schedule.half_log_snr_gain(900, 500) + schedule.half_log_snr_gain(500, 100), abs=1e-12
+    )
+
+
+def test_half_log_snr_without_a_signal_is_minus_infinite():
+    assert zero_terminal_snr(linear()).half_log_snr(999) == -math.inf
 
 
 def test_betas_outside_their_range_are_refused():

@@ -64,7 +64,8 @@ class Schedule(TensorRecord):
 
     def posterior_std(self, t: int, t_prev: int) -> float:
         """Standard deviation sqrt(beta tilde) of q(x_prev | x, x0); 0 when t_prev is `CLEAN`."""
-        return (self.noise(t_prev) ** 2 / self.noise(t) ** 2 * (1.0 - self._alpha(t, t_prev))) ** 0.5
+        alpha = self._alpha(t, t_prev)
+        return (self.noise(t_prev) ** 2 / self.noise(t) ** 2 * (1.0 - alpha)) ** 0.5
 
     def half_log_snr(self, t: int) -> float:
         """lambda_t = log(signal / noise), time to exponential integrators; inf at `CLEAN`, -inf without signal."""
