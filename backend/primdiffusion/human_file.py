@@ -1,9 +1,23 @@
-"""People as files: `.human.safetensors` to keep them, `human.npz` to hand them to Blender. No pickle in either."""
+"""People as files: `.human.safetensors` to keep and share, `human.npz` to hand them to Blender. No pickle in either.
+
+A `.human.safetensors` file holds rgb, density, delta_scale and betas as they are in memory, and in its metadata
+`format`, `format_version` and `provenance`: a JSON object that says where the person comes from. Of it are known
+
+    seed, steps, sampler, guidance, attributes      how it was sampled
+    checkpoint, checkpoint_sha256, full_density     by which model
+    version                                         by which PrimDiffusion
+    edits                                           what was done to it since, oldest first: objects with a name "edit"
+
+and every other entry is kept as it is.
+"""
 
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, NoReturn
 
 import numpy as np
 import safetensors
@@ -19,6 +33,8 @@ from primdiffusion.staging import written_whole
 FORMAT = "primdiffusion.human"
 FORMAT_VERSION = 1
 """Of both files; readers refuse a higher one."""
+LARGEST_BETA = 5.0
+"""Standard deviations of body shape; beyond, no body is a person's."""
 SHAPES = {"rgb": (K, 3, S, S, S), "density": (K, S, S, S), "delta_scale": (K, 3), "betas": (10,)}
 """What a .human.safetensors file holds."""
 
@@ -28,15 +44,19 @@ class HumanFileError(ValueError):
 
 
 def save_human(path: str | Path, human: Human) -> None:
-    """Writes the person whole or not at all, every bit as it is in memory. Raises ValueError for NaN, OSError."""
-    human.validate()
+    """Writes the person whole or not at all, every bit as it is in memory.
+
+    Raises ValueError for NaN, betas out of range and a provenance that is no plain JSON; OSError.
+    """
+    _check_betas(human.validate())
+    _check_provenance(human.provenance)
     payload = human.payload
     tensors = {"rgb": payload.rgb, "density": payload.density, "delta_scale": payload.delta_scale, "betas": human.betas}
     tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     metadata = {
         "format": FORMAT,
         "format_version": str(FORMAT_VERSION),
-        "provenance": json.dumps(dict(human.provenance)),
+        "provenance": json.dumps(dict(human.provenance), allow_nan=False),
     }
     with written_whole(path) as unfinished:
         unfinished.write_bytes(safetensors.torch.save(tensors, metadata))
@@ -53,23 +73,104 @@ def load_human(path: str | Path) -> Human:
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
+            _check_format(path, metadata)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  safe_open is no mapping
     except safetensors.SafetensorError as e:
-        raise HumanFileError(f"{path} is damaged or no safetensors file ({e}): generate the person again") from e
-    if metadata.get("format") != FORMAT or not set(SHAPES) <= set(tensors):
+        raise HumanFileError(f"{path} is truncated or no safetensors file ({e}): generate the person again") from e
+    _check_shapes(path, tensors)
+    payload = Payload(tensors["rgb"], tensors["density"], tensors["delta_scale"])
+    try:
+        human = Human(payload, tensors["betas"], _provenance(metadata)).validate()
+        _check_betas(human)
+    except ValueError as e:
+        raise HumanFileError(f"{path} holds no whole person: {e}") from e
+    return human
+
+
+def _check_format(path: Path, metadata: Mapping[str, str]) -> None:
+    if metadata.get("format") != FORMAT:
         raise HumanFileError(f"{path} is a safetensors file but holds no person: choose a .human.safetensors file")
-    if metadata.get("format_version") != str(FORMAT_VERSION):
-        given = metadata.get("format_version")
-        raise HumanFileError(f"{path} has format {given}, this version reads {FORMAT_VERSION}: update PrimDiffusion")
+    version = metadata.get("format_version", "")
+    if not version.isdecimal() or int(version) < 1:
+        raise HumanFileError(f"{path} holds no whole person (its format version is {version!r}): generate it again")
+    if int(version) > FORMAT_VERSION:
+        raise HumanFileError(
+            f"{path} comes from a newer PrimDiffusion (format {version}, this one reads {FORMAT_VERSION}): update it"
+        )
+
+
+def _check_shapes(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
     for name, shape in SHAPES.items():
+        if name not in tensors:
+            raise HumanFileError(f"{path} holds no whole person ({name} is missing): generate it again")
         if tuple(tensors[name].shape) != shape or not tensors[name].is_floating_point():
             given = f"{tensors[name].dtype} {tuple(tensors[name].shape)}"
             raise HumanFileError(f"{path} holds no whole person ({name} is {given}, not {shape}): generate it again")
-    payload = Payload(tensors["rgb"], tensors["density"], tensors["delta_scale"])
+
+
+def _check_betas(human: Human) -> None:
+    largest = float(human.betas.abs().max())
+    if largest > LARGEST_BETA:
+        raise ValueError(
+            f"one of the betas is {largest:.3g} in size, beyond {LARGEST_BETA:g} no body is a person's: "
+            "choose smaller betas, or generate the person again"
+        )
+
+
+def _provenance(metadata: Mapping[str, str]) -> dict[str, Any]:
     try:
-        return Human(payload, tensors["betas"], json.loads(metadata["provenance"])).validate()
-    except (ValueError, KeyError) as e:
-        raise HumanFileError(f"{path} holds no whole person: {e}") from e
+        provenance = json.loads(metadata.get("provenance", ""))
+    except (ValueError, RecursionError) as e:
+        raise ValueError(f"its provenance is no JSON ({e}): generate the person again") from e
+    _check_provenance(provenance)
+    return provenance
+
+
+_KINDS: dict[str, tuple[str, Any]] = {
+    "seed": ("a whole number", int),
+    "steps": ("a whole number", int),
+    "sampler": ("a text", str),
+    "guidance": ("a number", (int, float)),
+    "checkpoint": ("a text", str),
+    "checkpoint_sha256": ("a text", str),
+    "full_density": ("a number", (int, float)),
+    "version": ("a text", str),
+}
+
+
+def _check_provenance(provenance: Any) -> None:
+    """ValueError, naming the entry, where a known one is of another kind than this version writes."""
+    if not isinstance(provenance, Mapping):
+        raise ValueError(f"its provenance is no JSON object but {provenance!r:.60}: generate the person again")
+    for name, (wanted, kind) in _KINDS.items():
+        if name in provenance and not _is(provenance[name], kind):
+            _refuse(name, provenance[name], wanted)
+    _check_attributes("attributes", provenance.get("attributes", {}))
+    edits = provenance.get("edits", [])
+    if not isinstance(edits, list):
+        _refuse("edits", edits, "a list of objects")
+    for edit in edits:
+        if not isinstance(edit, Mapping) or not _is(edit.get("edit"), str):
+            _refuse("edits", edit, 'objects with a name "edit"')
+
+
+def _check_attributes(name: str, attributes: Any) -> None:
+    wanted = "an object of texts and numbers"
+    if not isinstance(attributes, Mapping):
+        _refuse(name, attributes, wanted)
+    for value in attributes.values():
+        if not _is(value, (str, int, float)):
+            _refuse(name, value, wanted)
+
+
+def _is(value: Any, kind: Any) -> bool:
+    if isinstance(value, bool) or (isinstance(value, float) and not math.isfinite(value)):
+        return False
+    return isinstance(value, kind)
+
+
+def _refuse(name: str, value: Any, wanted: str) -> NoReturn:
+    raise ValueError(f"{name!r} of its provenance is {value!r:.60}, not {wanted}: generate the person again")
 
 
 def export_for_blender(path: str | Path, human: Human) -> None:

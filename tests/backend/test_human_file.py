@@ -40,38 +40,129 @@ def test_a_person_with_nan_is_not_written(human, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+META = {"format": "primdiffusion.human", "format_version": "1", "provenance": "{}"}
+
+
 def damage(path, human, how):
     save_human(path, human)
     content = safetensors.torch.load_file(path)
-    meta = {"format": "primdiffusion.human", "format_version": "1", "provenance": "{}"}
     if how == "truncated":
         path.write_bytes(path.read_bytes()[:-1000])
+    elif how == "cut in its header":
+        path.write_bytes(path.read_bytes()[:20])
+    elif how == "empty":
+        path.write_bytes(b"")
     elif how == "text":
         path.write_text("hello")
     elif how == "no metadata":
         safetensors.torch.save_file(content, path)
-    elif how == "newer":
-        safetensors.torch.save_file(content, path, {**meta, "format_version": "2"})
     elif how == "no density":
         del content["density"]
-        safetensors.torch.save_file(content, path, meta)
+        safetensors.torch.save_file(content, path, META)
     elif how == "wrong shape":
-        safetensors.torch.save_file({**content, "rgb": content["rgb"][..., :4].contiguous()}, path, meta)
+        safetensors.torch.save_file({**content, "rgb": content["rgb"][..., :4].contiguous()}, path, META)
+    elif how == "whole numbers":
+        safetensors.torch.save_file({**content, "betas": content["betas"].to(torch.int64)}, path, META)
     elif how == "NaN":
         content["density"][3, 0, 0, 0] = float("nan")
-        safetensors.torch.save_file(content, path, meta)
-    elif how == "bad provenance":
-        safetensors.torch.save_file(content, path, {**meta, "provenance": "{"})
+        safetensors.torch.save_file(content, path, META)
+    elif how == "giant":
+        safetensors.torch.save_file({**content, "betas": torch.full((10,), 6.0)}, path, META)
 
 
 @pytest.mark.parametrize(
-    "how", ["truncated", "text", "no metadata", "newer", "no density", "wrong shape", "NaN", "bad provenance"]
+    ("how", "told"),
+    [
+        ("truncated", "truncated"),
+        ("cut in its header", "truncated"),
+        ("empty", "truncated"),
+        ("text", "no safetensors file"),
+        ("no metadata", "holds no person"),
+        ("no density", "density is missing"),
+        ("wrong shape", "rgb is torch.float32"),
+        ("whole numbers", "betas is torch.int64"),
+        ("NaN", "'density' holds NaN"),
+        ("giant", "betas is 6 in size"),
+    ],
 )
-def test_a_damaged_file_is_refused_by_name(human, tmp_path, how):
+def test_a_damaged_file_is_refused_by_name_with_its_damage(human, tmp_path, how, told):
     path = tmp_path / "bad.human.safetensors"
     damage(path, human, how)
-    with pytest.raises(HumanFileError, match=r"bad\.human\.safetensors"):
+    with pytest.raises(HumanFileError, match=r"bad\.human\.safetensors") as error:
         load_human(path)
+    assert told in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("version", "told"),
+    [("2", "newer PrimDiffusion"), ("10", "newer PrimDiffusion"), ("one", "format version is 'one'"), ("0", "'0'")],
+)
+def test_a_file_of_another_version_is_refused_with_what_to_do(human, tmp_path, version, told):
+    path = tmp_path / "other.human.safetensors"
+    save_human(path, human)
+    safetensors.torch.save_file(safetensors.torch.load_file(path), path, {**META, "format_version": version})
+    with pytest.raises(HumanFileError, match=told):
+        load_human(path)
+
+
+def test_a_newer_file_is_refused_for_its_version_even_where_its_tensors_are_others(human, tmp_path):
+    path = tmp_path / "newer.human.safetensors"
+    safetensors.torch.save_file({"latents": torch.zeros(3)}, path, {**META, "format_version": "2"})
+    with pytest.raises(HumanFileError, match="newer PrimDiffusion"):
+        load_human(path)
+
+
+def test_a_file_of_the_first_release_is_read(human, tmp_path):
+    """Written before people had attributes, hashes and edits."""
+    path = tmp_path / "old.human.safetensors"
+    save_human(path, human)
+    first = {"seed": 3, "steps": 3, "sampler": "ddim", "checkpoint": "tiny", "full_density": 100.0, "version": "0.1.0"}
+    safetensors.torch.save_file(safetensors.torch.load_file(path), path, {**META, "provenance": json.dumps(first)})
+    assert load_human(path).provenance == first
+
+
+@pytest.mark.parametrize(
+    ("provenance", "told"),
+    [
+        ("{", "provenance is no JSON"),
+        ("[" * 100_000, "provenance is no JSON"),
+        ("[1]", "no JSON object"),
+        ('{"seed": "seven"}', "'seed' of its provenance is 'seven', not a whole number"),
+        ('{"steps": true}', "'steps'"),
+        ('{"checkpoint": null}', "'checkpoint'"),
+        ('{"guidance": NaN}', "'guidance'"),
+        ('{"attributes": ["sex"]}', "'attributes'"),
+        ('{"attributes": {"sex": null}}', "'attributes'"),
+        ('{"edits": {"edit": "vary"}}', "'edits'"),
+        ('{"edits": [{"amount": 0.5}]}', "'edits'"),
+    ],
+)
+def test_a_provenance_of_the_wrong_kind_is_refused_by_its_entry(human, tmp_path, provenance, told):
+    path = tmp_path / "odd.human.safetensors"
+    save_human(path, human)
+    safetensors.torch.save_file(safetensors.torch.load_file(path), path, {**META, "provenance": provenance})
+    with pytest.raises(HumanFileError, match=r"odd\.human\.safetensors") as error:
+        load_human(path)
+    assert told in str(error.value)
+    assert len(str(error.value)) < 300 + len(str(tmp_path))
+
+
+def test_entries_of_the_provenance_that_nobody_knows_are_kept(human, tmp_path):
+    path = tmp_path / "person.human.safetensors"
+    more = {**human.provenance, "studio": {"shot": [1, None]}, "edits": [{"edit": "vary", "amount": 0.5}]}
+    save_human(path, dataclasses.replace(human, provenance=more))
+    assert load_human(path).provenance == more
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [({"betas": torch.full((10,), -5.5)}, "betas"), ({"provenance": {"edits": "many"}}, "edits")],
+)
+def test_what_could_not_be_read_again_is_not_written(human, tmp_path, change, told):
+    with pytest.raises(ValueError, match=told):
+        save_human(tmp_path / "file", dataclasses.replace(human, **change))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_missing_file_is_named(tmp_path):

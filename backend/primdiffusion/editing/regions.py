@@ -1,0 +1,158 @@
+"""Regions of a person: sets of primitives, named as an artist names them or painted on the body.
+
+A part is a set of the default body's primitives: those whose anchor follows a certain joint most, cut where cloth and
+hair are rather than where bones end. The cuts were chosen by looking at which rows of the grid have the colour of the
+shirt, of the face, of the hair on the people that the default checkpoint learnt from; docs/editing.md shows them.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from primdiffusion.body.model import JOINT_NAMES, default_body
+from primdiffusion.geometry.surface import surface_points
+from primdiffusion.primitives.anchors import anchor_skin_weights, attach, default_anchors, default_texels
+from primdiffusion.primitives.primitives import GRID, K, S
+
+HEM = -0.248
+"""Metres up on the rest body (whose chest is near 0): where most shirts end, down to which the torso reaches."""
+SEAT = -0.345
+"""Metres up on the rest body: between the hips and the thighs."""
+COLLAR_HEIGHT, COLLAR_SLOPE = 0.353, -0.42
+"""The plane y = height + slope * z (metres): below it a neck wears a shirt, above it skin."""
+NAPE_HEIGHT, NAPE_DEPTH, HAIRLINE_SLOPE = 0.45, 0.023, 1.4
+"""The plane z = depth + slope * (y - height): behind it, from the nape over the ears to the hairline, grows hair."""
+
+_TRUNK = ("pelvis", "spine1", "spine2", "spine3", "left_collar", "right_collar")
+_SIDED = {
+    "upper_arms": ("shoulder",),
+    "forearms": ("elbow",),
+    "hands": ("wrist", "hand"),
+    "thighs": ("hip",),
+    "shins": ("knee",),
+    "feet": ("ankle", "foot"),
+}
+"""Parts that come in pairs, and the joints that move them."""
+_ONE_OF = {
+    "upper_arms": "upper_arm",
+    "forearms": "forearm",
+    "hands": "hand",
+    "thighs": "thigh",
+    "shins": "shin",
+    "feet": "foot",
+}
+_UNIONS = {
+    "head": ("face", "hair", "neck"),
+    "arms": ("upper_arms", "forearms"),
+    "legs": ("thighs", "shins"),
+    "top": ("torso", "upper_arms", "forearms"),
+    "bottom": ("hips", "thighs", "shins"),
+    "shoes": ("feet",),
+    "clothes": ("top", "bottom", "shoes"),
+    "skin": ("face", "neck", "hands"),
+}
+"""What an artist picks: several parts under one name."""
+SIDES = tuple(f"{side}_{_ONE_OF[part]}" for part in _SIDED for side in ("left", "right"))
+"""Halves of the parts that come in pairs, by the person's own left and right."""
+DISJOINT = ("face", "hair", "neck", "torso", "hips", *SIDES)
+"""Parts that share no primitive; together they are the whole person."""
+PARTS = ("face", "hair", "neck", "torso", *_SIDED, "hips", *_UNIONS, *SIDES)
+"""All names that `region_of` knows."""
+
+
+def region_of(names: Sequence[str]) -> Bool[Tensor, "k"]:
+    """The primitives of the parts with these names, together. Raises ValueError for no name or an unknown one."""
+    if not names:
+        raise ValueError(f"the region names no part of the body: choose one or more of {', '.join(PARTS)}")
+    parts = _parts()
+    for name in names:
+        if name not in parts:
+            raise ValueError(f"there is no part of the body {name!r}: choose from {', '.join(PARTS)}")
+    return torch.stack([parts[name] for name in names]).any(0)
+
+
+def region_from_weights(weights: Float[Tensor, "v"], threshold: float = 0.5) -> Bool[Tensor, "k"]:
+    """The primitives under paint: those on whose patch of skin the weight is at least `threshold` on average.
+
+    `weights` hold a number from 0 to 1 for each vertex of the default body, in the order of `human.npz` (a vertex group
+    in Blender). A patch is the primitive's 8 x 8 texels. Raises ValueError for another number of vertices, values that
+    are not finite, a threshold outside 0 ... 1 and paint that covers no primitive.
+    """
+    body = default_body()
+    if tuple(weights.shape) != (len(body.template),):
+        given, wanted = tuple(weights.shape), len(body.template)
+        raise ValueError(
+            f"the painted weights have shape {given}: give one number for each of the body's {wanted} vertices"
+        )
+    if not torch.isfinite(weights).all():
+        raise ValueError("the painted weights hold NaN or infinite values: paint them again")
+    if not 0 < threshold <= 1:
+        raise ValueError(f"the threshold of painted weights is {threshold}: choose one above 0, at most 1")
+    face, barycentric = default_texels()
+    texels = surface_points(weights.float()[:, None].cpu(), body.faces, face.flatten(), barycentric.flatten(0, 1))
+    covered = texels.reshape(GRID, S, GRID, S).mean((1, 3)).flatten()
+    # Weights of exactly the threshold, as from a brush of that strength, come back a rounding error below it.
+    region = covered >= threshold - 1e-6
+    if not region.any():
+        raise ValueError(
+            f"the painted region covers no primitive (at most {float(covered.max()):.2f} of one, {threshold} needed): "
+            "paint a larger area, or more strongly"
+        )
+    return region
+
+
+def check_region(region: Tensor) -> Bool[Tensor, "k"]:
+    """Itself, on the CPU, if it is a mask of the person's primitives with one or more of them; otherwise ValueError."""
+    if tuple(region.shape) != (K,) or region.dtype != torch.bool:
+        given = f"{region.dtype} {tuple(region.shape)}".removeprefix("torch.")
+        raise ValueError(f"a region is a mask bool ({K},), a value for each primitive, not {given}")
+    if not region.any():
+        raise ValueError("the region is empty: name a part of the body, or paint one")
+    return region.cpu()
+
+
+def name_region(region: Bool[Tensor, "k"]) -> list[str] | str:
+    """How files tell a region: the names of its parts, or 1024 bits in hexadecimal, primitive 0 first, for paint."""
+    parts = _parts()
+    for name in PARTS:
+        if torch.equal(parts[name], region):
+            return [name]
+    inside = [name for name in DISJOINT if bool(region[parts[name]].all())]
+    if inside and torch.equal(region_of(inside), region):
+        return inside
+    return int("".join("1" if chosen else "0" for chosen in region.tolist()), 2).to_bytes(K // 8, "big").hex()
+
+
+@functools.lru_cache(maxsize=1)
+def _parts() -> Mapping[str, Bool[Tensor, "k"]]:
+    body, anchors = default_body(), default_anchors()
+    rest = attach(anchors, body.template, body.faces).position
+    joint = anchor_skin_weights(anchors, body).argmax(-1)
+    by_joint = {name: joint == i for i, name in enumerate(JOINT_NAMES)}
+    _, height, depth = rest.unbind(-1)
+    neck_or_head = by_joint["neck"] | by_joint["head"]
+    collar = by_joint["neck"] & (height < COLLAR_HEIGHT + COLLAR_SLOPE * depth)
+    hair = neck_or_head & (depth < NAPE_DEPTH + HAIRLINE_SLOPE * (height - NAPE_HEIGHT))
+    trunk = torch.stack([by_joint[name] for name in _TRUNK]).any(0)
+    to_the_knees = trunk | by_joint["left_hip"] | by_joint["right_hip"]
+    above_hem, above_seat = to_the_knees & (height > HEM), to_the_knees & (height > SEAT)
+    parts = {
+        "face": by_joint["head"] & ~hair,
+        "hair": hair,
+        "neck": by_joint["neck"] & ~hair & ~collar,
+        "torso": above_hem | collar,
+        "hips": above_seat & ~above_hem,
+    }
+    for part, joints in _SIDED.items():
+        for side in ("left", "right"):
+            moved = torch.stack([by_joint[f"{side}_{name}"] for name in joints]).any(0)
+            parts[f"{side}_{_ONE_OF[part]}"] = moved & ~above_seat
+        parts[part] = parts[f"left_{_ONE_OF[part]}"] | parts[f"right_{_ONE_OF[part]}"]
+    for name, members in _UNIONS.items():
+        parts[name] = torch.stack([parts[member] for member in members]).any(0)
+    return parts
