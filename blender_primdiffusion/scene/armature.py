@@ -70,6 +70,37 @@ def build_armature(context: bpy.types.Context, name: str, joints: NDArray) -> bp
     return armature
 
 
+def move_rest_joints(context: bpy.types.Context, data: bpy.types.Armature, joints: NDArray) -> None:
+    """Give an armature that exists other rest joints [24, 3] (z up, metres); poses and further bones stay.
+
+    Each bone is moved as it is, not turned towards the new joints: its axes stay, so a pose or an animation means the
+    same joint rotations afterwards. An object of its own carries the armature into edit mode, since a person's may be
+    hidden or in another scene. Raises ValueError when a joint's bone is missing.
+    """
+    missing = [name for name in JOINT_NAMES if name not in data.bones]
+    if missing:
+        raise ValueError(f"the armature {data.name!r} has no bone {missing[0]!r}: its shape cannot be changed")
+    carrier = bpy.data.objects.new(f"{data.name}_carrier", data)
+    layer = context.view_layer
+    active = layer.objects.active
+    if active is not None and active.mode != "OBJECT":
+        bpy.ops.object.mode_set(mode="OBJECT")
+    context.scene.collection.objects.link(carrier)
+    mirrored, data.use_mirror_x = data.use_mirror_x, False
+    try:
+        layer.objects.active = carrier
+        bpy.ops.object.mode_set(mode="EDIT")
+        for name, joint in zip(JOINT_NAMES, joints, strict=True):
+            bone = data.edit_bones[name]
+            along, bone.head = bone.tail - bone.head, Vector(joint)
+            bone.tail = bone.head + along
+        bpy.ops.object.mode_set(mode="OBJECT")
+    finally:
+        data.use_mirror_x = mirrored
+        bpy.data.objects.remove(carrier)
+        layer.objects.active = active
+
+
 def rest_rotations(armature: bpy.types.Object) -> NDArray[np.float64]:
     """Bone axes at rest [24, 3, 3] in the armature's space, in SMPL's joint order.
 

@@ -52,3 +52,8 @@ def build_body_mesh(
     body.hide_render = True
     body.hide_viewport = True
     return body
+
+
+def body_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
+    """The body mesh of a person; None when it was deleted."""
+    return next((thing for thing in collection.all_objects if thing.type == "MESH" and MARK in thing), None)

@@ -4,34 +4,36 @@ from __future__ import annotations
 
 import os
 import shutil
-from pathlib import Path
 
 import bpy
 from bpy.app.handlers import persistent
 
+from .human import people_files, volume_path
 from .volumes import humans_folder
 
 
 def collect_temporary_volumes(blend_path: str) -> int:
     """Copy volumes from the temporary folder to the one of `blend_path`, point to the copies, and count them.
 
-    What else lies with them (the person's own file) is copied too. Paths become absolute: Blender makes them relative
-    when it writes a .blend for the first time. Raises OSError when the folder beside the .blend cannot be written.
+    The people's own files go along; what the .blend does not use stays behind, for undo. Paths become absolute: Blender
+    makes them relative when it writes a .blend for the first time. Raises OSError when the folder beside the .blend
+    cannot be written.
     """
     temporary, target = humans_folder(""), humans_folder(blend_path)
     moved = {}
     for volume in bpy.data.volumes:
-        source = Path(bpy.path.abspath(volume.filepath))
+        source = volume_path(volume)
         if source.is_relative_to(temporary) and source.is_file():
             moved[volume] = target / source.relative_to(temporary)
-    for folder in {Path(bpy.path.abspath(volume.filepath)).parent for volume in moved}:
-        destination = target / folder.relative_to(temporary)
-        destination.mkdir(parents=True, exist_ok=True)
-        for source in folder.iterdir():
-            if source.is_file():
-                unfinished = destination / f".{source.name}.part"
-                shutil.copyfile(source, unfinished)
-                os.replace(unfinished, destination / source.name)
+    sources = {volume_path(volume) for volume in moved}
+    for person in people_files():
+        sources |= {folder / person for folder in {path.parent for path in sources} if (folder / person).is_file()}
+    for source in sources:
+        destination = target / source.relative_to(temporary)
+        destination.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = destination.with_name(f".{source.name}.part")
+        shutil.copyfile(source, unfinished)
+        os.replace(unfinished, destination)
     for volume, path in moved.items():
         volume.filepath = str(path)
     return len(moved)

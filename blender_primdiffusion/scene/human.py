@@ -25,6 +25,9 @@ BETAS = "primdiffusion_betas"
 """Custom property of a person's armature: the body's shape, which the engine draws and which may be animated."""
 PERSON_FILE = "person.human.safetensors"
 """The person as the backend keeps it, beside the volumes."""
+PERSON = "primdiffusion_person_file"
+"""Custom property of a person's collection: the name of the backend's file since the person was edited. It goes back
+and forth with undo, as the paths of the volumes do."""
 _NAME_LENGTH = 40
 _KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials")
 
@@ -55,7 +58,8 @@ def build_human(
         collection.children.link(primitives)
         rotation = frames_to_blender(human.rotation)
         grids = volumes.bake(human.density, human.rgb, human.half_extent)
-        with volumes.written(grids, folder_of(collection), keep) as files:
+        kept = {path.name: path for path in keep}
+        with volumes.written(grids, folder_of(collection), kept) as files:
             attach_volumes(
                 label,
                 armature,
@@ -66,7 +70,7 @@ def build_human(
                 human.primitive_weights,
                 volume_material(),
             )
-            collection[MARK] = _provenance(human, grids)
+            collection[MARK] = provenance(human, grids)
             context.scene.collection.children.link(collection)
     return collection
 
@@ -82,17 +86,28 @@ def person_file(collection: bpy.types.Collection) -> Path:
     Volumes keep their paths when a collection is renamed and when a .blend is saved elsewhere. Raises FileNotFoundError
     with a sentence that names the person and the file.
     """
+    name = person_file_name(collection)
     volume = next((thing.data for thing in collection.all_objects if thing.type == "VOLUME"), None)
     folders = [folder_of(collection)]
     if volume is not None and volume.filepath:
-        folders.insert(0, Path(bpy.path.abspath(volume.filepath, library=volume.library)).parent)
+        folders.insert(0, volume_path(volume).parent)
     for folder in folders:
-        if (folder / PERSON_FILE).is_file():
-            return folder / PERSON_FILE
+        if (folder / name).is_file():
+            return folder / name
     raise FileNotFoundError(
-        f"the file of the person {collection.name!r} is missing: {str(folders[0] / PERSON_FILE)!r}; put it back beside "
+        f"the file of the person {collection.name!r} is missing: {str(folders[0] / name)!r}; put it back beside "
         "the person's volumes, or generate the person again"
     )
+
+
+def person_file_name(collection: bpy.types.Collection) -> str:
+    """The name of `person_file`, which is another one after each edit."""
+    return str(collection.get(PERSON, PERSON_FILE))
+
+
+def volume_path(volume: bpy.types.Volume) -> Path:
+    """The absolute path of a volume's file."""
+    return Path(bpy.path.abspath(volume.filepath, library=volume.library))
 
 
 def overlap_warning(collection: bpy.types.Collection) -> str | None:
@@ -119,6 +134,23 @@ def humans(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
     return [collection for collection in scene.collection.children_recursive if MARK in collection]
 
 
+def human_of(thing: bpy.types.Object | None, scene: bpy.types.Scene) -> bpy.types.Collection | None:
+    """The person that an object is a part of, hangs on (a hat parented to a bone), or instances; None for others."""
+    while thing is not None:
+        for collection in humans(scene):
+            if collection.all_objects.get(thing.name) == thing:
+                return collection
+        if thing.instance_collection is not None and MARK in thing.instance_collection:
+            return thing.instance_collection
+        thing = thing.parent
+    return None
+
+
+def people_files() -> set[str]:
+    """Names of the backend's files that people of this .blend use, those linked included."""
+    return {person_file_name(collection) for collection in bpy.data.collections if MARK in collection}
+
+
 def remove_human(collection: bpy.types.Collection) -> None:
     """Take a person out of the .blend: objects, their data and the actions only they use.
 
@@ -131,7 +163,8 @@ def remove_human(collection: bpy.types.Collection) -> None:
     bpy.data.batch_remove([thing for thing in {*data, *actions} if thing.users == 0])
 
 
-def _provenance(human: HumanFile, grids: volumes.Grids) -> str:
+def provenance(human: HumanFile, grids: volumes.Grids) -> str:
+    """What `MARK` holds: where the person comes from, their betas, and how many boxes meet at most."""
     offset, half = grids.drawn_box()
     centre = human.position + np.einsum("kij,kj->ki", human.rotation, offset)
     most = most_overlapping(centre, human.rotation, half)

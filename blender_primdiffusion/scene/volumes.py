@@ -7,7 +7,7 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -110,12 +110,15 @@ def file_name(grids: Grids, k: int, blender_version: tuple[int, ...]) -> str:
 
 
 @contextmanager
-def written(grids: Grids, folder: Path, keep: Sequence[Path] = ()) -> Iterator[list[Path]]:
+def written(
+    grids: Grids, folder: Path, keep: Mapping[str, Path] | None = None, which: Sequence[int] | None = None
+) -> Iterator[list[Path]]:
     """Write the VDBs in a hidden part of `folder`, and move them into it when the block ends well.
 
-    Files in `keep` are copied there too. Yields the final paths [K], which exist only after the block. When the block
-    or a write fails, neither the files nor folders made for them remain. Raises VolumeWriteError when the folder cannot
-    be written or the disk is full.
+    `which` primitives, None for all. The files in `keep` are copied there too, under the names given. Yields the final
+    paths, one for each written primitive, which exist only after the block. When the block or a write fails, neither
+    the files nor folders made for them remain. Raises VolumeWriteError when the folder cannot be written or the disk is
+    full.
     """
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     try:
@@ -127,8 +130,8 @@ def written(grids: Grids, folder: Path, keep: Sequence[Path] = ()) -> Iterator[l
     published: list[Path] = []
     try:
         try:
-            names = _write_files(grids, staging)
-            kept = [Path(shutil.copyfile(path, staging / path.name)).name for path in keep]
+            names = _write_files(grids, staging, range(len(grids.density)) if which is None else which)
+            kept = [Path(shutil.copyfile(path, staging / name)).name for name, path in (keep or {}).items()]
         except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
             raise _write_error(folder, error) from error
         yield [folder / name for name in names]
@@ -148,12 +151,12 @@ def written(grids: Grids, folder: Path, keep: Sequence[Path] = ()) -> Iterator[l
         _remove_empty(folder, existing)
 
 
-def _write_files(grids: Grids, folder: Path) -> list[str]:
+def _write_files(grids: Grids, folder: Path, which: Sequence[int]) -> list[str]:
     bpy.utils.expose_bundled_modules()
     import openvdb  # Blender's own, importable only after the line above
 
     names = []
-    for k in range(len(grids.density)):
+    for k in which:
         transform = openvdb.createLinearTransform(index_to_local(grids.half_extent[k], bpy.app.version).tolist())
         written_part = tuple(slice(a, b + 1) for a, b in zip(grids.first[k], grids.last[k], strict=True))
         start = tuple((grids.first[k] - PAD).tolist())

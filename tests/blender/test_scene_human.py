@@ -202,7 +202,7 @@ def test_a_failure_in_the_middle_of_building_leaves_scene_and_disk_as_they_were(
     def failing(*_):
         raise MemoryError("no memory for the volumes")
 
-    monkeypatch.setattr(human_module, "_provenance", failing)
+    monkeypatch.setattr(human_module, "provenance", failing)
     with pytest.raises(MemoryError):
         build_human(saved_scene, synthetic.write(tmp_path / "second.npz", 8, seed=3))
     assert datablocks() == before

@@ -1,0 +1,275 @@
+"""A person replaced in place: what an edit left alone is untouched, and undo finds every file it needs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+import synthetic
+from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices
+
+from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.body_mesh import body_of
+from blender_primdiffusion.scene.collect import collect_before_saving
+from blender_primdiffusion.scene.edited import check_editable, replace_person, unused
+from blender_primdiffusion.scene.human import (
+    BETAS,
+    MARK,
+    armature_of,
+    build_human,
+    folder_of,
+    human_of,
+    humans,
+    person_file,
+)
+from blender_primdiffusion.scene.human_file import HumanFileError
+from blender_primdiffusion.scene.volumes import VolumeWriteError
+
+COUNT = 12
+TALLER = 1.1
+
+
+def person_bytes(folder: Path, contents: bytes) -> Path:
+    folder.mkdir(exist_ok=True)
+    (folder / "person.human.safetensors").write_bytes(contents)
+    return folder / "person.human.safetensors"
+
+
+def redyed(tmp_path, *which: int, seed: int = 0, **changes) -> tuple[Path, Path]:
+    """The file of a person of whom some primitives have another colour, and the backend's own."""
+    rgb = synthetic.arrays(COUNT, seed)["rgb"].copy()
+    rgb[list(which)] = 1 - rgb[list(which)]
+    meta = np.array(json.dumps({"seed": seed, "edited": list(which), "steps": 5}))
+    path = synthetic.write(tmp_path / "edited.npz", COUNT, seed, rgb=rgb, meta=meta, **changes)
+    return path, person_bytes(tmp_path / "edited", f"edited {which} {sorted(changes)}".encode())
+
+
+def reshaped(tmp_path, *which: int) -> tuple[Path, Path]:
+    before = synthetic.arrays(COUNT)
+    taller = {name: before[name] * TALLER for name in ("vertices", "position")}
+    joints = before["joints"] * TALLER + np.random.default_rng(5).normal(0, 0.01, (24, 3))
+    return redyed(tmp_path, *which, betas=before["betas"] + 1, joints=joints, **taller)
+
+
+def paths(collection) -> dict[str, str]:
+    return {o.name: o.data.filepath for o in collection.all_objects if o.type == "VOLUME"}
+
+
+def changed(before: dict[str, str], after: dict[str, str]) -> set[int]:
+    assert before.keys() == after.keys()
+    return {int(name[-4:]) for name in before if before[name] != after[name]}
+
+
+def transforms(collection) -> dict[str, list]:
+    bpy.context.view_layer.update()
+    return {o.name: [list(row) for row in o.matrix_world] for o in collection.all_objects}
+
+
+@pytest.fixture
+def person(saved_scene, tmp_path):
+    npz = synthetic.write(tmp_path / "human.npz", COUNT)
+    collection = build_human(saved_scene, npz, keep=[person_bytes(tmp_path / "first", b"first")])
+    pose_from_joint_rotations(
+        armature_of(collection), synthetic.axis_angle(np.random.default_rng(3).normal(0, 0.5, (24, 3)))
+    )
+    armature_of(collection).location.x = 2.0
+    return collection
+
+
+def test_only_volumes_of_changed_primitives_get_new_files(person, saved_scene, tmp_path):
+    before, places = paths(person), transforms(person)
+    files = {path: path.stat().st_mtime_ns for path in folder_of(person).iterdir()}
+    done = replace_person(saved_scene, person, *redyed(tmp_path, 3, 7))
+    assert changed(before, paths(person)) == {3, 7}
+    assert (done.volumes, done.of, done.reshaped, done.warning) == (2, COUNT, False, "")
+    assert transforms(person) == places
+    assert {path: path.stat().st_mtime_ns for path in files} == files
+    assert len(list(folder_of(person).iterdir())) == len(files) + 3  # two volumes, the person
+    assert all(volume.grids.load() for volume in bpy.data.volumes)
+    assert person_file(person).read_bytes().startswith(b"edited (3, 7)")
+    assert json.loads(person[MARK])["edited"] == [3, 7]
+
+
+def test_undo_and_redo_bring_back_volumes_and_the_persons_file(person, saved_scene, tmp_path):
+    bpy.ops.ed.undo_push(message="before")
+    before = paths(person)
+    replace_person(saved_scene, person, *redyed(tmp_path, 3))
+    after = paths(person)
+    bpy.ops.ed.undo_push(message="edit")
+    bpy.ops.ed.undo()
+    (person,) = humans(bpy.context.scene)
+    assert paths(person) == before
+    assert person_file(person).read_bytes() == b"first"
+    assert all(volume.grids.load() for volume in bpy.data.volumes)
+    bpy.ops.ed.redo()
+    (person,) = humans(bpy.context.scene)
+    assert paths(person) == after
+    assert person_file(person).read_bytes().startswith(b"edited")
+
+
+def test_an_edit_and_its_reverse_meet_in_the_same_files(person, saved_scene, tmp_path):
+    before = paths(person)
+    replace_person(saved_scene, person, *redyed(tmp_path, 3))
+    files = len(list(folder_of(person).iterdir()))
+    replace_person(saved_scene, person, tmp_path / "human.npz", tmp_path / "first" / "person.human.safetensors")
+    assert paths(person) == before
+    assert len(list(folder_of(person).iterdir())) == files + 1  # the first person under an edit's name
+    assert person_file(person).read_bytes() == b"first"
+
+
+def test_other_betas_move_bones_mesh_and_volumes_and_keep_the_pose(person, saved_scene, tmp_path):
+    rotations = synthetic.axis_angle(np.random.default_rng(3).normal(0, 0.5, (24, 3)))
+    before = [list(bone.rotation_quaternion) for bone in armature_of(person).pose.bones]
+    objects = {o.name for o in bpy.data.objects}
+    saved_scene.view_layer.objects.active = body_of(person)
+    done = replace_person(saved_scene, person, *reshaped(tmp_path, 3))
+    assert done.reshaped
+    assert {o.name for o in bpy.data.objects} == objects
+    assert saved_scene.view_layer.objects.active == body_of(person)
+    armature = armature_of(person)
+    np.testing.assert_allclose([list(bone.rotation_quaternion) for bone in armature.pose.bones], before, atol=1e-6)
+    with np.load(tmp_path / "edited.npz") as archive:
+        arrays = dict(archive)
+    body_of(person).hide_viewport = False  # hidden things are not evaluated
+    bpy.context.view_layer.update()
+    expected = np.array(armature.matrix_world) @ blended_frames(arrays, rotations, np.zeros(3))
+    corners = np.array([[x, y, z, 1] for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
+    assert np.abs((evaluated_matrices(person) - expected) @ corners.T)[:, :3].max() < TOLERANCE_M
+    body = body_of(person).evaluated_get(bpy.context.evaluated_depsgraph_get())
+    vertices = np.array([vertex.co for vertex in body.data.vertices])
+    np.testing.assert_allclose(vertices, blended_vertices(arrays, rotations, np.zeros(3)), atol=2e-5)
+    np.testing.assert_allclose(list(armature[BETAS]), arrays["betas"])
+
+
+def test_undo_takes_another_shape_back(person, saved_scene, tmp_path):
+    bpy.ops.ed.undo_push(message="before")
+    places = transforms(person)
+    replace_person(saved_scene, person, *reshaped(tmp_path))
+    assert transforms(person) != places
+    bpy.ops.ed.undo_push(message="edit")
+    bpy.ops.ed.undo()
+    assert transforms(humans(bpy.context.scene)[0]) == places
+
+
+def test_a_shape_the_user_chose_stays_while_the_betas_do(person, saved_scene, tmp_path):
+    armature_of(person)[BETAS] = [2.0] * 10
+    replace_person(saved_scene, person, *redyed(tmp_path, 3))
+    assert list(armature_of(person)[BETAS]) == [2.0] * 10
+
+
+def test_a_mesh_changed_by_hand_keeps_its_shape_and_is_named(person, saved_scene, tmp_path):
+    body_of(person).shape_key_add(name="Basis")
+    assert "changed by hand" in replace_person(saved_scene, person, *reshaped(tmp_path)).warning
+
+
+def test_what_was_renamed_moved_or_deleted_by_hand_stays_so(person, saved_scene, tmp_path):
+    objects = sorted((o for o in person.all_objects if o.type == "VOLUME"), key=lambda o: o.name)
+    objects[3].name = "brooch"
+    objects[4].location.z += 1
+    height = objects[4].location.z
+    bpy.data.objects.remove(objects[5])
+    done = replace_person(saved_scene, person, *redyed(tmp_path, 3, 4, 5))
+    assert (done.volumes, done.of) == (2, COUNT - 1)
+    assert bpy.data.objects["Human_prim_0004"].location.z == height
+    assert "Human_prim_0005" not in bpy.data.objects
+
+
+def test_a_duplicate_that_shares_volumes_is_not_edited_with_the_original(person, saved_scene, tmp_path):
+    twin = bpy.data.collections.new("Twin")
+    saved_scene.scene.collection.children.link(twin)
+    twin[MARK] = person[MARK]
+    for thing in list(person.all_objects):
+        twin.objects.link(thing.copy())
+    before = {o.name: o.data.filepath for o in twin.objects if o.type == "VOLUME"}
+    bones = [list(bone.head_local) for bone in armature_of(twin).data.bones]
+    replace_person(saved_scene, person, *reshaped(tmp_path, 3))
+    assert {o.name: o.data.filepath for o in twin.objects if o.type == "VOLUME"} == before
+    assert [list(bone.head_local) for bone in armature_of(twin).data.bones] == bones
+    assert person_file(twin).read_bytes() == b"first"
+
+
+def test_a_damaged_result_leaves_scene_and_disk_as_they_were(person, saved_scene, tmp_path):
+    before, files = paths(person), sorted(tmp_path.rglob("*.*"))
+    (tmp_path / "bad.npz").write_bytes(b"PK no more")
+    with pytest.raises(HumanFileError):
+        replace_person(saved_scene, person, tmp_path / "bad.npz", tmp_path / "first" / "person.human.safetensors")
+    (tmp_path / "bad.npz").unlink()
+    assert paths(person) == before
+    assert sorted(tmp_path.rglob("*.*")) == files
+
+
+def test_a_full_disk_leaves_scene_and_disk_as_they_were(person, saved_scene, tmp_path, monkeypatch):
+    from blender_primdiffusion.scene import volumes
+
+    def full(*_):
+        raise OSError("no space left on device")
+
+    before, files = paths(person), sorted(folder_of(person).iterdir())
+    edited = redyed(tmp_path, 3)
+    monkeypatch.setattr(volumes, "_write_files", full)
+    with pytest.raises(VolumeWriteError, match="no space left"):
+        replace_person(saved_scene, person, *edited)
+    assert paths(person) == before
+    assert sorted(folder_of(person).iterdir()) == files
+
+
+def test_after_saving_under_another_name_an_edit_brings_all_of_the_person_along(person, saved_scene, tmp_path):
+    first = folder_of(person)
+    files = sorted(first.iterdir())
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "second.blend"))
+    replace_person(saved_scene, person, *redyed(tmp_path, 3))
+    assert sorted(first.iterdir()) == files
+    assert all(path.startswith("//second_humans/Human/") for path in paths(person).values())
+    assert person_file(person).parent == tmp_path / "second_humans" / "Human"
+    assert all(volume.grids.load() for volume in bpy.data.volumes)
+
+
+def test_an_edit_before_the_first_save_is_collected_without_the_states_before_it(empty_scene, tmp_path):
+    npz = synthetic.write(tmp_path / "human.npz", COUNT)
+    person = build_human(empty_scene, npz, keep=[person_bytes(tmp_path / "first", b"first")])
+    replace_person(empty_scene, person, *redyed(tmp_path, 3))
+    bpy.app.handlers.save_pre.append(collect_before_saving)
+    try:
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    finally:
+        bpy.app.handlers.save_pre.remove(collect_before_saving)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "shot.blend"))
+    (person,) = humans(bpy.context.scene)
+    assert person_file(person).read_bytes().startswith(b"edited")
+    assert len(list((tmp_path / "shot_humans" / "Human").iterdir())) == COUNT + 1
+    assert all(volume.grids.load() for volume in bpy.data.volumes)
+
+
+def test_a_linked_person_is_refused_with_what_to_do(person, tmp_path):
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.read_homefile(use_empty=True)
+    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True) as (_, wanted):
+        wanted.collections = ["Human"]
+    bpy.context.scene.collection.children.link(wanted.collections[0])
+    with pytest.raises(ValueError, match=r"'Human' is linked from .*shot\.blend.*make it local"):
+        check_editable(wanted.collections[0])
+
+
+def test_files_of_earlier_states_are_unused_and_those_shown_are_not(person, saved_scene, tmp_path):
+    humans_folder = tmp_path / "shot_humans"
+    first = paths(person)["Human_prim_0003"]
+    assert unused(humans_folder) == []
+    (folder_of(person) / "notes.txt").write_text("mine")
+    replace_person(saved_scene, person, *redyed(tmp_path, 3))
+    names = [path.name for path in unused(humans_folder)]
+    assert names == ["person.human.safetensors", Path(first).name]
+    assert unused(tmp_path / "nowhere") == []
+
+
+def test_every_part_of_a_person_leads_to_it_and_other_things_do_not(person, saved_scene):
+    hat = bpy.data.objects.new("hat", None)
+    hat.parent = armature_of(person)
+    cube = bpy.data.objects.new("cube", None)
+    for thing in (hat, cube):
+        saved_scene.scene.collection.objects.link(thing)
+    assert {human_of(thing, saved_scene.scene) for thing in [*person.all_objects, hat]} == {person}
+    assert human_of(cube, saved_scene.scene) is None
+    assert human_of(None, saved_scene.scene) is None
