@@ -2,16 +2,16 @@
 
 A file `person_NNNNNN.npz` holds one geometry in several colourings: `voxels` uint8 [variants, K, 8, 8, 8, 4] (axes D,
 H, W; sRGB-encoded colour and density * 255 / full_density), `betas` [10], `attributes` (JSON: those of the first
-colouring, and under "variants" those of each), `full_density` (1/m) and `seed`. Files are made whole or not
-at all; a second run keeps the whole ones.
+colouring, and under "variants" those of each), `full_density` (1/m) and `seed`. People whose boxes are not as large as
+the anchors' have `delta_scale` float16 [variants, K, 3] too; those of captures have `source` (JSON: which pictures,
+which encoder) and may have no seed. Files are made whole or not at all; a second run keeps the whole ones.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,7 @@ from primdiffusion.people.pool import each
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Frames, K, Payload, S
+from primdiffusion.staging import written_whole
 
 VARIANT_STRIDE = 1 << 32
 """Variant j of the person with seed s is coloured with seed s + j * VARIANT_STRIDE."""
@@ -79,17 +80,19 @@ def write_person(assets: Assets, path: Path, variants: int, seed: int) -> None:
     for number, variant in enumerate(people):
         voxels[number] = voxels_from_payload(colour(field, variant.mesh))
     attributes = {**person.attributes, "variants": [variant.attributes for variant in people]}
-    arrays = (voxels, person.betas, np.array(json.dumps(attributes)), np.array(FULL_DENSITY), np.array(seed))
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
+    store_person(path, {"voxels": voxels, "betas": person.betas, "attributes": json.dumps(attributes), "seed": seed})
+
+
+def store_person(path: Path, entries: Mapping[str, np.ndarray | str | int]) -> None:
+    """Write a person's file, whole or not at all; its `full_density` is ours. Raises OSError, which names it."""
+    with (
+        written_whole(path) as unfinished,
+        zipfile.ZipFile(unfinished, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as z,
+    ):
         # Level 1: a person shrinks to a third; more effort gains little and takes longer than making the person.
-        with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-            for key, array in zip(KEYS, arrays, strict=True):
-                with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
-                    np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+        for key, value in {**entries, "full_density": FULL_DENSITY}.items():
+            with z.open(f"{key}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asarray(value), allow_pickle=False)
 
 
 def rest_frames(betas: Float[np.ndarray, "10"]) -> Frames:

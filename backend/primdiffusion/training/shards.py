@@ -1,0 +1,184 @@
+"""Many people in few files that training maps into memory, each with its checksum.
+
+    index.json                 format, full density; of every shard its SHA-256 and its people; written last
+    shard_NNNN.safetensors     some tens of people: voxels uint8 [n, K, 8, 8, 8, 4], betas [people, 10] and, where boxes
+                               differ from the anchors', delta_scale float16 [n, K, 3]; a person's n lie together
+
+A colouring takes 2 MiB and is read alone, without unpacking anything: files of single people are a third as large, but
+have to be unpacked whole. Shards hold the same bytes as the files they are made from.
+"""
+
+from __future__ import annotations
+
+import bisect
+import hashlib
+import itertools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from primdiffusion.primitives.primitives import K
+from primdiffusion.staging import written_whole
+from primdiffusion.training.config import write_atomically
+from primdiffusion.training.stored_people import People, PeopleFolder, StoredPerson
+
+INDEX, FORMAT, VERSION = "index.json", "primdiffusion-payloads", 1
+PEOPLE_EACH = 32
+
+
+class ShardError(ValueError):
+    """Packed people that cannot be used; one sentence that names the file and says what to do."""
+
+
+def open_people(folder: Path) -> People:
+    """The people of a folder: packed ones where there is an index, files of single people otherwise.
+
+    Raises:
+        FileNotFoundError: there are fewer than two.
+        ValueError: a file or the index is damaged, or people have several full densities.
+    """
+    return PackedPeople(folder) if (folder / INDEX).exists() else PeopleFolder(folder)
+
+
+def pack_people(folder: Path, out: Path, people_each: int = PEOPLE_EACH) -> Iterator[int]:
+    """Write the people of a folder as shards; yields how many are packed. A second run begins anew.
+
+    Raises:
+        ValueError: `out` holds packed people already, or a person's file is damaged (it is named); no people a shard.
+        FileNotFoundError: there are fewer than two people.
+        OSError: there is no room; no index is written then.
+    """
+    if people_each < 1:
+        raise ValueError(f"{people_each} people a shard: pack 1 or more")
+    if (out / INDEX).exists():
+        raise ShardError(f"{out} holds packed people already: choose another folder, or remove it")
+    people = PeopleFolder(folder)
+    out.mkdir(parents=True, exist_ok=True)
+    shards, done = [], 0
+    for number, first in enumerate(range(0, len(people.names), people_each)):
+        indices = range(first, min(first + people_each, len(people.names)))
+        path = out / f"shard_{number:04d}.safetensors"
+        _write_shard(path, [people.person(index) for index in indices])
+        about = [
+            {"name": people.names[i], "variants": people.variants[i], "attributes": dict(people.attributes[i])}
+            for i in indices
+        ]
+        shards.append({"file": path.name, "sha256": digest_of(path), "people": about})
+        done += len(indices)
+        yield done
+    index = {"format": FORMAT, "version": VERSION, "full_density": people.full_density, "shards": shards}
+    write_atomically(out / INDEX, json.dumps(index, indent=1))
+
+
+def _write_shard(path: Path, people: Sequence[StoredPerson]) -> None:
+    tensors = {
+        "voxels": torch.cat([person.voxels for person in people]),
+        "betas": torch.stack([person.betas for person in people]),
+    }
+    scales = torch.cat([person.delta_scale for person in people])
+    if (scales != 1).any():
+        tensors["delta_scale"] = scales
+    with written_whole(path) as unfinished:
+        save_file(tensors, unfinished)
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal. Raises OSError."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def damaged_shards(folder: Path) -> list[str]:
+    """A sentence for each shard that is not as it was written; raises ShardError for a damaged index."""
+    people, found = PackedPeople(folder), []
+    for number in range(len(people.paths)):
+        try:
+            people.check(number)
+        except (ShardError, OSError) as error:
+            found.append(str(error))
+    return found
+
+
+class PackedPeople:
+    """People in shards; each shard is checked against its SHA-256 when first read (half a second for 256 MiB)."""
+
+    def __init__(self, folder: Path) -> None:
+        """Reads the index alone. Raises FileNotFoundError, ShardError where it is damaged or of another version."""
+        index = _read_index(folder / INDEX)
+        try:
+            self.full_density = float(index["full_density"])
+            self.paths = [folder / shard["file"] for shard in index["shards"]]
+            self._digests = [str(shard["sha256"]) for shard in index["shards"]]
+            people = [person for shard in index["shards"] for person in shard["people"]]
+            self.names: Sequence[str] = [str(person["name"]) for person in people]
+            self.variants: Sequence[int] = [int(person["variants"]) for person in people]
+            self.attributes: Sequence[Mapping[str, Any]] = [dict(person["attributes"]) for person in people]
+            self._firsts = [0, *itertools.accumulate(len(shard["people"]) for shard in index["shards"])]
+        except (KeyError, TypeError, ValueError) as error:
+            raise ShardError(f"{folder / INDEX} is damaged ({error}): pack the people again") from error
+        self._open: dict[int, Any] = {}
+
+    def person(self, index: int) -> StoredPerson:
+        """One of them. Raises ShardError that names the shard where it is damaged, OSError."""
+        shard, place, rows = self._rows(index)
+        scale = self._scale(shard, rows)
+        betas = self._slice(shard, "betas")[place].float()
+        return StoredPerson(self._slice(shard, "voxels")[rows], scale, betas, self.attributes[index], self.full_density)
+
+    def variant(self, index: int, number: int) -> tuple[Tensor, Tensor]:
+        """Voxels and delta scales of one colouring; nothing else is read. Raises what `person` does."""
+        shard, _, rows = self._rows(index)
+        row = slice(rows.start + number, rows.start + number + 1)
+        return self._slice(shard, "voxels")[row][0], self._scale(shard, row)[0]
+
+    def check(self, shard: int) -> None:
+        """Whether a shard is as it was written. Raises ShardError, FileNotFoundError."""
+        path = self.paths[shard]
+        if not path.is_file():
+            raise FileNotFoundError(f"there is no {path}, which {INDEX} names: pack the people again")
+        if digest_of(path) != self._digests[shard]:
+            raise ShardError(f"{path} is damaged, its SHA-256 is not that of {INDEX}: pack the people again")
+
+    def _rows(self, index: int) -> tuple[int, int, slice]:
+        """Shard of a person, their place in it, and their rows."""
+        shard = bisect.bisect_right(self._firsts, index) - 1
+        first = self._firsts[shard]
+        start = sum(self.variants[first:index])
+        return shard, index - first, slice(start, start + self.variants[index])
+
+    def _scale(self, shard: int, rows: slice) -> Tensor:
+        if "delta_scale" in self._shard(shard).keys():  # noqa: SIM118 - safe_open is no mapping
+            return self._slice(shard, "delta_scale")[rows]
+        return torch.ones(rows.stop - rows.start, K, 3, dtype=torch.float16)
+
+    def _slice(self, shard: int, name: str) -> Any:
+        return self._shard(shard).get_slice(name)
+
+    def _shard(self, number: int) -> Any:
+        if number not in self._open:
+            self.check(number)
+            try:
+                self._open[number] = safe_open(self.paths[number], framework="pt")
+            except SafetensorError as error:
+                raise ShardError(f"{self.paths[number]} is no safetensors file ({error}): pack again") from error
+        return self._open[number]
+
+
+def _read_index(path: Path) -> dict[str, Any]:
+    try:
+        index = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FileNotFoundError(f"there is no {path}: pack people with `primdiffusion payloads pack`") from None
+    except ValueError as error:
+        raise ShardError(f"{path} is damaged ({error}): pack the people again") from error
+    if not isinstance(index, dict) or index.get("format") != FORMAT:
+        raise ShardError(f"{path} is not the index of packed people: choose another folder")
+    if index.get("version") != VERSION:
+        raise ShardError(f"{path} has version {index.get('version')}, this program reads {VERSION}: pack again")
+    return index

@@ -1,0 +1,174 @@
+"""People on disk as payloads in bytes: what stage 2 is trained on, from a folder of files or from shards."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from primdiffusion.diffusion.model import BETAS
+from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.primitives.primitives import K, Payload, S
+
+_DAMAGED = (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile)
+_NO_PERSON = "{path} is no person's payload ({error}): make it again with `primdiffusion payloads`"
+_VOXELS = (K, S, S, S, 4)
+
+
+@dataclasses.dataclass(frozen=True)
+class StoredPerson:
+    """One geometry with several colourings, or several looks of one captured person."""
+
+    voxels: UInt8[Tensor, "n k 8 8 8 4"]
+    """sRGB-encoded colour and relative density of each colouring."""
+    delta_scale: Float[Tensor, "n k 3"]
+    """float16: factors on the anchors' half extents; 1 where the file holds none."""
+    betas: Float[Tensor, "10"]
+    attributes: Mapping[str, Any]
+    full_density: float
+    """1/m that 255 stands for."""
+
+    def payload(self, variant: int) -> Payload:
+        """One colouring, in float32."""
+        return payload_of_bytes(self.voxels[variant], self.delta_scale[variant], self.full_density)
+
+
+class People(Protocol):
+    """People that are read when they are asked for; the same order for the same files."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Of all people, sorted."""
+        ...
+
+    @property
+    def variants(self) -> Sequence[int]:
+        """How many colourings each has."""
+        ...
+
+    @property
+    def attributes(self) -> Sequence[Mapping[str, Any]]:
+        """What is known of each."""
+        ...
+
+    @property
+    def full_density(self) -> float:
+        """1/m that 255 stands for, in all of them."""
+        ...
+
+    def person(self, index: int) -> StoredPerson:
+        """One of them. Raises ValueError that names the file where it is damaged, OSError."""
+        ...
+
+    def variant(self, index: int, number: int) -> tuple[UInt8[Tensor, "k 8 8 8 4"], Float[Tensor, "k 3"]]:
+        """Voxels and delta scales of one colouring; raises what `person` does."""
+        ...
+
+
+def payload_of_bytes(
+    voxels: UInt8[Tensor, "*b k 8 8 8 4"], delta_scale: Float[Tensor, "*b k 3"], full_density: float
+) -> Payload:
+    """Stored voxels and delta scales as payloads, in float32."""
+    values = voxels.movedim(-1, -4).float() / 255
+    return Payload(decode_srgb(values[..., :3, :, :, :]), values[..., 3, :, :, :] * full_density, delta_scale.float())
+
+
+def read_person(path: Path) -> StoredPerson:
+    """A person's file; ValueError if it is damaged or of another shape."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            voxels = torch.from_numpy(file["voxels"])
+            scale = torch.from_numpy(file["delta_scale"]).half() if "delta_scale" in file else None
+            betas = torch.from_numpy(file["betas"]).float()
+            attributes = json.loads(str(file["attributes"]))
+            full_density = float(file["full_density"])
+    except _DAMAGED as error:
+        raise ValueError(_NO_PERSON.format(path=path, error=error)) from error
+    if voxels.dtype != torch.uint8 or tuple(voxels.shape[1:]) != _VOXELS:
+        raise ValueError(
+            f"{path} holds voxels {voxels.dtype} {tuple(voxels.shape)}; uint8 [n, {K}, {S}, {S}, {S}, 4] is needed"
+        )
+    scale = voxels.new_ones((len(voxels), K, 3), dtype=torch.float16) if scale is None else scale
+    if tuple(scale.shape) != (len(voxels), K, 3) or not (torch.isfinite(scale) & (scale > 0)).all():
+        raise ValueError(f"{path} holds delta_scale {tuple(scale.shape)}; positive [{len(voxels)}, {K}, 3] is needed")
+    if tuple(betas.shape) != (BETAS,) or not torch.isfinite(betas).all():
+        raise ValueError(f"{path} holds betas {tuple(betas.shape)}; {BETAS} finite numbers are needed")
+    return StoredPerson(voxels, scale, betas, attributes, full_density)
+
+
+class PeopleFolder:
+    """A folder of people, a file each."""
+
+    def __init__(self, folder: Path) -> None:
+        """Looks into every file, without reading voxels.
+
+        Raises:
+            FileNotFoundError: there are fewer than two.
+            ValueError: one is damaged, or people have several full densities.
+        """
+        self.paths = find_people(folder)
+        outlines = [_outline(path) for path in self.paths]
+        self.names = [path.stem for path in self.paths]
+        self.variants = [outline.variants for outline in outlines]
+        self.attributes = [outline.attributes for outline in outlines]
+        self.full_density = one_density([outline.full_density for outline in outlines])
+
+    def person(self, index: int) -> StoredPerson:
+        """One of them. Raises ValueError where its file is damaged."""
+        return read_person(self.paths[index])
+
+    def variant(self, index: int, number: int) -> tuple[Tensor, Tensor]:
+        """Voxels and delta scales of one colouring; all of the person's are read for it."""
+        person = self.person(index)
+        return person.voxels[number], person.delta_scale[number]
+
+
+def find_people(folder: Path) -> list[Path]:
+    """The people's files in a folder, sorted; FileNotFoundError if there are fewer than two."""
+    paths = sorted(folder.glob("*.npz"))
+    if len(paths) < 2:
+        raise FileNotFoundError(
+            f"{folder} holds {len(paths)} people (*.npz): make some with `primdiffusion payloads --out {folder}`"
+        )
+    return paths
+
+
+def one_density(densities: Sequence[float]) -> float:
+    """What all of them have; ValueError where they differ."""
+    if len(found := set(densities)) != 1:
+        raise ValueError(
+            f"people with full densities {sorted(found)} cannot be trained together: regenerate them with one"
+        )
+    return found.pop()
+
+
+@dataclasses.dataclass(frozen=True)
+class _Outline:
+    """What a file holds, but for its voxels."""
+
+    variants: int
+    attributes: Mapping[str, Any]
+    full_density: float
+
+
+def _outline(path: Path) -> _Outline:
+    try:
+        with np.load(path, allow_pickle=False) as file, file.zip.open("voxels.npy") as member:
+            return _Outline(_length(member), json.loads(str(file["attributes"])), float(file["full_density"]))
+    except _DAMAGED as error:
+        raise ValueError(_NO_PERSON.format(path=path, error=error)) from error
+
+
+def _length(member: IO[bytes]) -> int:
+    """First dimension of an array in numpy's format, from its header."""
+    major, _ = np.lib.format.read_magic(member)
+    read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+    return read(member)[0][0]

@@ -1,0 +1,155 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+from diffusion_people import write_people
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.primitives.primitives import K
+from primdiffusion.training import shards
+from primdiffusion.training.shards import INDEX, PackedPeople, ShardError, damaged_shards, open_people, pack_people
+from primdiffusion.training.stored_people import PeopleFolder, read_person
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Five people, of whom the third has only one colouring and boxes of other sizes."""
+    folder = tmp_path_factory.mktemp("people")
+    write_people(folder, geometries=5, variants=2)
+    path = folder / "person_000002.npz"
+    with np.load(path) as file:
+        entries = dict(file)
+    sizes = np.random.default_rng(0).uniform(0.5, 2, (1, K, 3)).astype(np.float16)
+    np.savez(path, **{**entries, "voxels": entries["voxels"][:1], "delta_scale": sizes})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def packed(folder, tmp_path_factory):
+    out = tmp_path_factory.mktemp("packed") / "shards"
+    assert list(pack_people(folder, out, people_each=2)) == [2, 4, 5]
+    return out
+
+
+@pytest.fixture
+def copied(packed, tmp_path):
+    for path in packed.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    return tmp_path
+
+
+def same(one, other):
+    return (
+        torch.equal(one.voxels, other.voxels)
+        and torch.equal(one.delta_scale, other.delta_scale)
+        and torch.equal(one.betas, other.betas)
+        and (one.attributes, one.full_density) == (other.attributes, other.full_density)
+    )
+
+
+def test_packed_people_are_those_of_the_folder_bit_for_bit(folder, packed):
+    files, people = open_people(folder), open_people(packed)
+    assert isinstance(files, PeopleFolder)
+    assert isinstance(people, PackedPeople)
+    assert sorted(path.name for path in packed.iterdir()) == [INDEX, *(f"shard_000{i}.safetensors" for i in range(3))]
+    assert list(people.names) == list(files.names) == [f"person_00000{i}" for i in range(5)]
+    assert list(people.variants) == list(files.variants) == [2, 2, 1, 2, 2]
+    assert list(people.attributes) == list(files.attributes)
+    assert people.full_density == files.full_density == 100
+    for index in range(5):
+        assert same(people.person(index), files.person(index))
+        for number in range(people.variants[index]):
+            one, other = people.variant(index, number), files.variant(index, number)
+            assert torch.equal(one[0], other[0])
+            assert torch.equal(one[1], other[1])
+    assert (people.person(2).delta_scale != 1).any()
+    assert (people.person(1).delta_scale == 1).all()
+
+
+def test_stored_voxels_become_the_payload_they_came_from(folder):
+    person = read_person(folder / "person_000002.npz")
+    payload = person.payload(0).validate()
+    assert torch.allclose(encode_srgb(payload.rgb[7, 1, 2, 3, 4]), person.voxels[0, 7, 2, 3, 4, 1] / 255, atol=1e-5)
+    assert payload.density.max().item() == pytest.approx(int(person.voxels[0, ..., 3].max()) / 255 * 100, rel=1e-5)
+    assert torch.equal(payload.delta_scale, person.delta_scale[0].float())
+
+
+@pytest.mark.parametrize("harm", ["a flipped bit", "a cut", "no file"])
+def test_a_damaged_shard_is_named_before_anything_of_it_is_used(copied, harm):
+    path = copied / "shard_0001.safetensors"
+    content = bytearray(path.read_bytes())
+    content[-1000] ^= 1
+    path.unlink()
+    if harm != "no file":
+        path.write_bytes(content if harm == "a flipped bit" else content[: len(content) // 2])
+    people = open_people(copied)
+    people.person(0)
+    with pytest.raises((ShardError, FileNotFoundError), match=r"shard_0001.*pack"):
+        people.variant(2, 0)
+    assert [("shard_0001" in found) for found in damaged_shards(copied)] == [True]
+
+
+def test_a_shard_is_checked_once(packed, monkeypatch):
+    digests, digest_of = [], shards.digest_of
+    monkeypatch.setattr(shards, "digest_of", lambda path: digests.append(path.name) or digest_of(path))
+    people = open_people(packed)
+    for index in (0, 1, 0, 4):
+        people.person(index)
+    assert digests == ["shard_0000.safetensors", "shard_0002.safetensors"]
+
+
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [
+        ("{", "damaged"),
+        ("[]", "not the index"),
+        ('{"format": "primdiffusion-payloads", "version": 9}', "version 9"),
+        ('{"format": "primdiffusion-payloads", "version": 1, "full_density": 100}', "damaged"),
+    ],
+)
+def test_an_index_that_cannot_be_used_is_refused(copied, content, word):
+    (copied / INDEX).write_text(content)
+    with pytest.raises(ShardError, match=word):
+        open_people(copied)
+
+
+def test_a_damaged_person_is_named_and_leaves_no_index(folder, tmp_path):
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    path = tmp_path / "person_000003.npz"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 255
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="person_000003"):
+        list(pack_people(tmp_path, tmp_path / "out", people_each=2))
+    assert not (tmp_path / "out" / INDEX).exists()
+
+
+def test_packing_into_packed_people_is_refused(folder, copied):
+    before = (copied / INDEX).read_bytes()
+    with pytest.raises(ShardError, match="already"):
+        list(pack_people(folder, copied))
+    assert (copied / INDEX).read_bytes() == before
+
+
+def test_people_of_several_densities_are_refused(folder, tmp_path):
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    with np.load(tmp_path / "person_000001.npz") as file:
+        np.savez(tmp_path / "person_000001.npz", **{**file, "full_density": np.array(25.5)})
+    with pytest.raises(ValueError, match=r"25\.5, 100"):
+        open_people(tmp_path)
+
+
+def test_delta_scales_of_another_shape_are_refused(folder, tmp_path):
+    with np.load(folder / "person_000001.npz") as file:
+        np.savez(tmp_path / "person.npz", **file, delta_scale=np.ones((1, K, 3), np.float16))
+    with pytest.raises(ValueError, match="delta_scale"):
+        read_person(tmp_path / "person.npz")
+
+
+def test_the_index_is_plain_json_with_what_is_known_of_everybody(folder, packed):
+    index = json.loads((packed / INDEX).read_text())
+    assert [len(shard["people"]) for shard in index["shards"]] == [2, 2, 1]
+    assert index["shards"][0]["people"][1]["attributes"] == read_person(folder / "person_000001.npz").attributes
+    assert all(len(shard["sha256"]) == 64 for shard in index["shards"])
