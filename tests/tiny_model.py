@@ -3,7 +3,8 @@
 from pathlib import Path
 
 import torch
-from primdiffusion.diffusion.codec import LinearCodec
+from primdiffusion.diffusion.codec import SCALE_VALUE, LinearCodec
+from primdiffusion.diffusion.conditioning import Vocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import STANDARD_SHAPES, CellCodec, DiffusionModel
@@ -14,6 +15,7 @@ from primdiffusion.training.checkpoint import save_checkpoint
 FULL_DENSITY = 100.0
 CHANNELS = 4
 COMPONENTS = 3
+VOCABULARY = Vocabulary({"outfit": ("jeans", "suit")}, {"height": (1.75, 0.1), "weight": (66.0, 8.0)})
 
 
 def tiny_model() -> DiffusionModel:
@@ -22,7 +24,9 @@ def tiny_model() -> DiffusionModel:
     voxels[3] = torch.linspace(1.0, 0.0, S)[:, None, None]
     basis = torch.zeros(CHANNELS, 4, S**3)
     basis[torch.arange(CHANNELS), torch.arange(CHANNELS)] = S**-1.5
-    codec = LinearCodec(voxels.flatten().expand(K, -1).contiguous(), basis.flatten(1), torch.ones(CHANNELS))
+    values = torch.cat([voxels.flatten(), torch.full((3,), SCALE_VALUE)])
+    basis = torch.nn.functional.pad(basis.flatten(1), (0, 3))
+    codec = LinearCodec(values.expand(K, -1).contiguous(), basis, torch.ones(CHANNELS))
     person = torch.zeros(COMPONENTS, CHANNELS, GRID * GRID)
     person[torch.arange(COMPONENTS), torch.arange(COMPONENTS)] = 1 / GRID
     prior = PersonPrior(
@@ -30,15 +34,16 @@ def tiny_model() -> DiffusionModel:
         basis=person.flatten(1),
         parity=torch.ones(COMPONENTS),
         rest_variance=torch.full((CHANNELS, GRID, GRID), 0.01),
-        weight=torch.ones(1),
-        centre=torch.zeros(1, COMPONENTS),
+        log_weight=torch.tensor([[0.5, 0.5]]).log(),
+        centre=torch.tensor([-1.0, 1.0])[None, :, None].repeat(1, 1, COMPONENTS),
         axes=torch.eye(COMPONENTS)[None],
         variance=torch.full((1, COMPONENTS), (1.2 * GRID) ** 2),
+        kind=torch.nn.functional.pad(torch.eye(2), (0, VOCABULARY.width - 2))[None],
     )
     schedule = SCHEDULES["linear"]()
     denoiser = PersonDenoiser(DenoiserConfig(person=None, local=None), prior, schedule)
     card = {"name": "tiny", "full_density": FULL_DENSITY}
-    return DiffusionModel(denoiser, schedule, CellCodec(codec), STANDARD_SHAPES, FULL_DENSITY, card)
+    return DiffusionModel(denoiser, schedule, CellCodec(codec), STANDARD_SHAPES, FULL_DENSITY, card, VOCABULARY)
 
 
 def save_tiny_checkpoint(path: Path) -> Path:

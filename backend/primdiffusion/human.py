@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -20,8 +21,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion import __version__
+from primdiffusion.body.measures import betas_of_measures
 from primdiffusion.body.model import JOINT_NAMES, BodyModel, BodyPose, PosedBody, default_body
-from primdiffusion.diffusion.model import DiffusionModel, sample
+from primdiffusion.diffusion.conditioning import Attributes
+from primdiffusion.diffusion.model import (
+    DEFAULT_GUIDANCE,
+    DEFAULT_SAMPLER,
+    DEFAULT_STEPS,
+    DiffusionModel,
+    sample,
+)
 from primdiffusion.diffusion.samplers import Step
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.records import TensorRecord
@@ -49,7 +58,8 @@ class Human(TensorRecord):
     betas: Float[Tensor, "n"]
     """Shape coefficients of the default body."""
     provenance: Mapping[str, Any]
-    """Where the person comes from; JSON values. Of a generated one: seed, steps, sampler, checkpoint, full_density."""
+    """Where the person comes from; JSON values. Of a generated one: seed, steps, sampler, attributes if any were asked
+    for, checkpoint, checkpoint_sha256, full_density, version."""
 
     def validate(self) -> Human:
         """Itself, if it is one whole person with finite values; otherwise ValueError that names what is wrong."""
@@ -66,31 +76,65 @@ class Human(TensorRecord):
 def generate(
     model: DiffusionModel,
     seed: int,
-    steps: int = 30,
-    sampler: str = "ddim",
+    steps: int = DEFAULT_STEPS,
+    sampler: str = DEFAULT_SAMPLER,
     on_step: Callable[[Step], None] | None = None,
+    attributes: Attributes = MappingProxyType({}),
+    guidance: float = DEFAULT_GUIDANCE,
 ) -> Human:
-    """A new person, on the CPU; the same for the same model, seed, steps, sampler and device.
+    """A new person, on the CPU; the same for the same model, seed, steps, sampler, attributes, guidance and device.
 
+    `attributes` are what the person is asked to be, of what `model.vocabulary` knows; by default anybody (the paper).
     `on_step` sees each step after it is done; an exception it raises ends the work (that is how cancelling works).
-    Raises ValueError for an unknown sampler, a number of steps outside 1 ... T, or a seed outside 0 ... 2^63-1.
+    Raises ValueError for an unknown sampler or attribute, a number of steps outside 1 ... T, or a seed outside
+    0 ... 2^63-1.
     """
+    return generate_batch(model, [seed], steps, sampler, on_step, attributes, guidance)[0]
+
+
+def generate_batch(
+    model: DiffusionModel,
+    seeds: Sequence[int],
+    steps: int = DEFAULT_STEPS,
+    sampler: str = DEFAULT_SAMPLER,
+    on_step: Callable[[Step], None] | None = None,
+    attributes: Attributes = MappingProxyType({}),
+    guidance: float = DEFAULT_GUIDANCE,
+) -> list[Human]:
+    """People of several seeds, who share the work; each as `generate` makes them, but for rounding. Errors likewise."""
+    condition = model.condition(attributes)
+    if not math.isfinite(guidance):
+        raise ValueError(f"guidance is {guidance}: give a number, 1 for none")
     final = None
-    for step in sample(model, seed, steps, sampler):
+    for step in sample(model, seeds, steps, sampler, condition, guidance):
         if on_step is not None:
             on_step(step)
         final = step.x0
     assert final is not None, "a sampler yields at least one step"
-    payload = model.decode(final).map(lambda values: values[0])
-    provenance = {
-        "seed": seed,
-        "steps": steps,
-        "sampler": sampler,
+    asked = {"attributes": dict(attributes), "guidance": guidance} if attributes else {}
+    made = {"steps": steps, "sampler": sampler, **asked, **made_by(model)}
+    people = []
+    for index, (seed, betas) in enumerate(zip(seeds, model.betas(final, seeds), strict=True)):
+        payload = model.decode(final[index])
+        betas = betas_of_measures(betas.cpu(), model.shapes.scale.cpu(), default_body(), *measures_of(attributes))
+        people.append(Human(payload, betas, {"seed": seed, **made}).to("cpu").validate())
+    return people
+
+
+def made_by(model: DiffusionModel) -> dict[str, Any]:
+    """What a person's provenance says of the model and program that made them."""
+    return {
         "checkpoint": model.card.get("name", "unnamed"),
+        "checkpoint_sha256": model.card.get("sha256"),
         "full_density": model.full_density,
         "version": __version__,
     }
-    return Human(payload, model.betas(final, seed)[0], provenance).to("cpu").validate()
+
+
+def measures_of(attributes: Attributes) -> tuple[float | None, float | None]:
+    """Height (m) and weight (kg) that are asked for; None where they are not."""
+    height, weight = (attributes.get(name) for name in ("height", "weight"))
+    return None if height is None else float(height), None if weight is None else float(weight)
 
 
 def pose_body(betas: Float[Tensor, "n"], pose: BodyPose | None = None, body: BodyModel | None = None) -> PosedBody:

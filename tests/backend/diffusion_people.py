@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from primdiffusion.diffusion.codec import VALUES, LinearCodec
+from primdiffusion.diffusion.codec import SCALE_VALUE, VALUES, LinearCodec
+from primdiffusion.diffusion.conditioning import Vocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkConfig
@@ -16,14 +17,17 @@ from primdiffusion.diffusion.schedule import linear
 from primdiffusion.primitives.primitives import GRID, K, S
 
 CHANNELS, COMPONENTS = 4, 6
+VOCABULARY = Vocabulary({"outfit": ("jeans", "suit")}, {})
 SMALL = DenoiserConfig(
     PersonNetworkConfig(width=16, blocks=1),
     LocalUNetConfig(widths=(8, 8), position_channels=2, condition_width=8, heads=2),
 )
 
 
-def random_prior(shape: tuple[int, int, int], components: int, parts: int, seed: int) -> PersonPrior:
-    """A mixture over latents of any shape, with variances that fall along the components."""
+def random_prior(
+    shape: tuple[int, int, int], components: int, parts: int, seed: int, groups: int = 1, asked: int = 0
+) -> PersonPrior:
+    """A mixture over latents of any shape, with variances that fall along the components; parts in each group."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*size: int) -> torch.Tensor:
@@ -35,23 +39,36 @@ def random_prior(shape: tuple[int, int, int], components: int, parts: int, seed:
         basis=torch.linalg.qr(normal(size, components))[0].T.contiguous(),
         parity=torch.ones(components),
         rest_variance=0.02 + 0.05 * torch.rand(shape, generator=generator, dtype=torch.float64),
-        weight=torch.full((parts,), 1 / parts, dtype=torch.float64),
-        centre=2 * normal(parts, components),
-        axes=torch.linalg.qr(normal(parts, components, components))[0],
-        variance=(1.0 / (1 + torch.arange(components, dtype=torch.float64))).expand(parts, -1).contiguous(),
+        log_weight=torch.rand(groups, parts, generator=generator, dtype=torch.float64)
+        .flatten()
+        .log_softmax(0)
+        .view(groups, parts),
+        centre=2 * normal(groups, parts, components),
+        axes=torch.linalg.qr(normal(groups, components, components))[0],
+        variance=(0.5 + torch.rand(groups, components, generator=generator, dtype=torch.float64))
+        / (1 + torch.arange(components, dtype=torch.float64)),
+        kind=torch.nn.functional.one_hot(torch.arange(groups * parts) % max(asked, 1), max(asked, 1))[:, :asked]
+        .double()
+        .view(groups, parts, asked),
     )
 
 
 def small_model(seed: int = 0, scale: float = 3.0) -> DiffusionModel:
     """A model of the default architecture with few channels; its networks' outputs are made to differ from 0."""
-    prior = random_prior((CHANNELS, GRID, GRID), COMPONENTS, 2, seed).to(dtype=torch.float32)
+    asked = VOCABULARY.width
+    prior = random_prior((CHANNELS, GRID, GRID), COMPONENTS, 2, seed, asked=asked).to(dtype=torch.float32)
     prior = PersonPrior(**{**vars(prior), "centre": prior.centre * scale, "variance": prior.variance * scale**2})
     torch.manual_seed(seed)
     denoiser = PersonDenoiser(SMALL, prior, linear()).eval()
     torch.nn.init.normal_(denoiser.person.outer.weight, std=0.1)
     torch.nn.init.normal_(denoiser.local.outer.weight, std=0.1)
+    torch.nn.init.normal_(denoiser.person.asked.weight)
     basis = torch.linalg.qr(torch.randn(VALUES, CHANNELS))[0].T.contiguous()
-    codec = LinearCodec(torch.full((K, VALUES), 0.5), basis, torch.ones(CHANNELS))
+    basis[:, -3:] = 0.0
+    basis = torch.linalg.qr(basis.T)[0].T.contiguous()
+    mean = torch.full((K, VALUES), 0.5)
+    mean[:, -3:] = SCALE_VALUE
+    codec = LinearCodec(mean, basis, torch.ones(CHANNELS))
     shapes = ShapePrior(torch.randn(10, 3), torch.zeros(10), torch.eye(10), torch.full((10,), 2.5))
     return DiffusionModel(
         denoiser.requires_grad_(False),
@@ -60,6 +77,7 @@ def small_model(seed: int = 0, scale: float = 3.0) -> DiffusionModel:
         shapes,
         100.0,
         {"name": "small", "licence": "CC0-1.0"},
+        VOCABULARY,
     )
 
 

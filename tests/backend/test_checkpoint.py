@@ -1,3 +1,4 @@
+import hashlib
 import json
 
 import pytest
@@ -38,7 +39,9 @@ def test_a_saved_model_generates_the_same_people(path):
     x, t = torch.randn(2, 4, 32, 32), 300
     assert torch.allclose(loaded.denoise(x, t), model.denoise(x, t), atol=0.02)
     assert loaded.full_density == 100.0
-    assert read_card(path) == loaded.card == {"name": "small", "licence": "CC0-1.0"}
+    card = {"name": "small", "licence": "CC0-1.0"}
+    assert read_card(path) == card
+    assert loaded.card == {**card, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
     again = path.with_name("again.safetensors")
     save_checkpoint(again, loaded, "linear")
     assert torch.equal(load_checkpoint(again).denoise(x, t), loaded.denoise(x, t))
@@ -133,7 +136,7 @@ def test_the_default_card_s_claim_follows_from_its_numbers(default):
 
 
 def test_the_default_checkpoint_draws_people_that_differ(default):
-    people = [list(sample(default, seed, 5))[-1].x0 for seed in (1, 2)]
+    people = [list(sample(default, [seed], 5))[-1].x0 for seed in (1, 2)]
     payloads = [default.decode(x0).validate() for x0 in people]
     filled = [(payload.density > 0.5 * default.full_density).float().mean().item() for payload in payloads]
     assert all(0.2 < share < 0.8 for share in filled)

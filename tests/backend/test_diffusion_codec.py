@@ -1,7 +1,7 @@
 import pytest
 import torch
 from primdiffusion.diffusion.codec import (
-    DEAD_ZONE,
+    SCALE_VALUE,
     SLAB_UNIT,
     VALUES,
     cells_from_payload,
@@ -24,22 +24,24 @@ def cells():
     colour = torch.rand(6, K, 3, 1, 1, 1, generator=generator) * torch.ones(S, S, S)
     tilt = torch.rand(6, K, 1, 1, 1, 1, generator=generator) * ramp
     density = (ramp[:, None, None] * torch.ones(S, S, S)).expand(6, K, 1, S, S, S)
-    return torch.cat([(colour + 0.3 * tilt).clamp(0, 1), density], 2).flatten(2)
+    voxels = torch.cat([(colour + 0.3 * tilt).clamp(0, 1), density], 2).flatten(2)
+    scale = 1 + 0.1 * torch.rand(6, K, 3, generator=generator)
+    return torch.cat([voxels, scale * SCALE_VALUE], 2)
 
 
 @pytest.fixture(scope="module")
 def codec(cells):
-    return fit_codec(cells, channels=12, generator=torch.Generator().manual_seed(1))
+    return fit_codec(cells, channels=16, generator=torch.Generator().manual_seed(1))
 
 
 def test_basis_is_orthonormal_so_projected_noise_is_standard(codec):
-    assert torch.allclose(codec.basis @ codec.basis.T, torch.eye(12), atol=1e-5)
+    assert torch.allclose(codec.basis @ codec.basis.T, torch.eye(16), atol=1e-5)
     projected = torch.randn(4000, VALUES, generator=torch.Generator().manual_seed(2)) @ codec.basis.T
-    assert (torch.cov(projected.T) - torch.eye(12)).abs().max() < 0.1
+    assert (torch.cov(projected.T) - torch.eye(16)).abs().max() < 0.1
 
 
 def test_what_the_basis_spans_survives_the_round_trip(codec):
-    latents = torch.randn(2, 12, GRID, GRID, generator=torch.Generator().manual_seed(3))
+    latents = torch.randn(2, 16, GRID, GRID, generator=torch.Generator().manual_seed(3))
     assert torch.allclose(codec.encode(codec.decode(latents)), latents, atol=1e-4)
 
 
@@ -49,10 +51,11 @@ def test_smooth_people_are_kept_by_few_channels(codec, cells):
 
 
 def test_latents_are_in_the_units_of_the_slab(codec, cells):
-    # a change of colour moves latents as far as it moves the slab's 2048 numbers, if the basis holds all of it
-    voxels = cells[:2].unflatten(-1, (4, S, S, S))
-    slabs = [pack(payload_from_cells(person.flatten(1), 100.0), 100.0) for person in voxels]
-    payloads = [payload_from_cells(person.flatten(1), 100.0) for person in voxels]
+    cells = cells.clone()
+    # a change of colours and delta scales moves latents as far as it moves the slab, if the basis holds all of it
+    cells[:, :, 3 * S**3 : 4 * S**3] = cells[:1, :, 3 * S**3 : 4 * S**3]
+    payloads = [payload_from_cells(person, 100.0) for person in cells[:2]]
+    slabs = [pack(payload, 100.0) for payload in payloads]
     again = torch.stack([cells_from_payload(payload, 100.0) for payload in payloads])
     latents = codec.encode(again)
     moved = (slabs[0] - slabs[1]).square().sum().sqrt()
@@ -61,7 +64,7 @@ def test_latents_are_in_the_units_of_the_slab(codec, cells):
 
 
 def test_mirroring_latents_mirrors_cells(codec):
-    latents = torch.randn(1, 12, GRID, GRID, generator=torch.Generator().manual_seed(4))
+    latents = torch.randn(1, 16, GRID, GRID, generator=torch.Generator().manual_seed(4))
     assert torch.allclose(codec.decode(codec.mirror(latents)), mirror_cells(codec.decode(latents)), atol=1e-4)
     assert torch.equal(codec.mirror(codec.mirror(latents)), latents)
     assert set(codec.parity.tolist()) == {1.0, -1.0}
@@ -88,27 +91,31 @@ def default_body():
 def test_voxels_become_cells_in_the_payload_s_order():
     voxels = torch.zeros(K, S, S, S, 4, dtype=torch.uint8)
     voxels[5, 1, 2, 3] = torch.tensor([255, 0, 51, 204], dtype=torch.uint8)
-    values = cells_from_voxels(voxels).unflatten(-1, (4, S, S, S))[5, :, 1, 2, 3]
+    cells = cells_from_voxels(voxels)
+    values = cells[:, : 4 * S**3].unflatten(-1, (4, S, S, S))[5, :, 1, 2, 3]
     assert torch.allclose(values, torch.tensor([1.0, 0.0, 0.2, 0.8]))
+    assert (cells[:, 4 * S**3 :] == SCALE_VALUE).all()
 
 
-def test_payload_and_cells_agree_outside_the_dead_zone():
-    payload = Payload(torch.rand(K, 3, S, S, S), 20 + 60 * torch.rand(K, S, S, S), torch.ones(K, 3))
-    start, width = DEAD_ZONE
+def test_cells_of_a_payload_are_what_it_is_decoded_from():
+    density = (120 * torch.rand(K, S, S, S) - 10).clamp(0, 100)  # empty and full voxels too
+    payload = Payload(torch.rand(K, 3, S, S, S), density, 0.5 + torch.rand(K, 3))
     again = payload_from_cells(cells_from_payload(payload, 100.0), 100.0)
     assert torch.allclose(again.rgb, payload.rgb, atol=1e-4)
-    assert torch.allclose(again.density, (payload.density - 100 * start) / width, atol=1e-3)
+    assert torch.allclose(again.density, payload.density, atol=1e-3)
+    assert torch.allclose(again.delta_scale, payload.delta_scale, atol=1e-5)
 
 
 def test_decoded_payloads_are_clamped_and_their_haze_removed():
     cells = torch.full((K, VALUES), 3.0)
-    cells[:, -(S**3) :] = 0.07
+    cells[:, 3 * S**3 : 4 * S**3] = 0.07
     payload = payload_from_cells(cells, 100.0).validate()
     assert payload.rgb.max() == 1
     assert payload.density.max() == 0
     assert payload_from_cells(-cells, 100.0).rgb.min() == 0
+    assert payload_from_cells(-cells, 100.0).delta_scale.min() == 0
 
 
 def test_too_few_people_are_refused(cells):
     with pytest.raises(ValueError, match="components"):
-        fit_codec(cells[:0], channels=12, generator=torch.Generator())
+        fit_codec(cells[:0], channels=16, generator=torch.Generator())

@@ -1,7 +1,9 @@
+import dataclasses
+
 import pytest
 import torch
 from diffusion_people import small_model
-from primdiffusion.diffusion.model import STANDARD_SHAPES, sample, seeded
+from primdiffusion.diffusion.model import STANDARD_SHAPES, WholeSlab, sample, seeded
 from primdiffusion.diffusion.schedule import trailing_steps
 from primdiffusion.primitives.primitives import GRID, K, S
 
@@ -17,14 +19,14 @@ def result(*arguments, **settings):
 
 
 def test_a_seed_gives_one_person_and_another_seed_another(model):
-    first, again, other = result(model, 1, 5), result(model, 1, 5), result(model, 2, 5)
+    first, again, other = result(model, [1], 5), result(model, [1], 5), result(model, [2], 5)
     assert torch.equal(first, again)
     assert (first - other).abs().max() > 0.1
 
 
 @pytest.mark.parametrize("sampler", ["ddim", "ddpm"])
 def test_sampling_yields_every_step_down_to_a_clean_person(model, sampler):
-    steps = list(sample(model, 0, 6, sampler))
+    steps = list(sample(model, [0], 6, sampler))
     assert [(s.index, s.total, s.t) for s in steps] == [(i, 6, t) for i, t in enumerate(trailing_steps(1000, 6))]
     assert torch.equal(steps[-1].x, steps[-1].x0)
     assert steps[-1].x0.isfinite().all()
@@ -33,8 +35,8 @@ def test_sampling_yields_every_step_down_to_a_clean_person(model, sampler):
 def test_a_start_without_the_prior_loses_variety():
     # a few strong components still show at T-1: noise alone stands for a person without them
     model = small_model(scale=300.0)
-    last, generator = 999, seeded(0)
-    start = model.start(400, generator, last)
+    last = 999
+    start = model.start([seeded(seed) for seed in range(400)], last)
     prior = model.denoiser.prior
     y = prior.split(start, torch.tensor(model.schedule.signal(last)))[0]
     expected = model.schedule.signal(last) ** 2 * prior.marginal_variance() + model.schedule.noise(last) ** 2
@@ -53,13 +55,14 @@ def test_decoding_gives_a_valid_payload(model):
 
 
 def test_shapes_follow_the_person_and_the_seed_within_limits(model):
-    x0 = result(model, 3, 3, count=2)
-    betas = model.betas(x0, 7)
+    x0 = result(model, [3, 4], 3)
+    betas = model.betas(x0, [7, 7])
     assert betas.shape == (2, 10)
-    assert torch.equal(betas, model.betas(x0, 7))
-    assert not torch.equal(betas, model.betas(x0, 8))
+    assert torch.equal(betas, model.betas(x0, [7, 7]))
+    assert torch.allclose(betas[1:], model.betas(x0[1:], [7]), atol=1e-5)
+    assert not torch.equal(betas, model.betas(x0, [8, 7]))
     assert betas.abs().max() <= 2.5
-    assert not torch.allclose(betas, model.betas(-x0, 7))
+    assert not torch.allclose(betas, model.betas(-x0, [7, 7]))
 
 
 def test_shapes_without_knowledge_are_standard_normal():
@@ -70,13 +73,13 @@ def test_shapes_without_knowledge_are_standard_normal():
 
 def test_sampling_does_not_disturb_the_global_random_state(model):
     before = torch.get_rng_state()
-    result(model, 1, 2)
+    result(model, [1], 2)
     assert torch.equal(before, torch.get_rng_state())
 
 
 def test_results_are_ordinary_tensors(model):
     # inference tensors would make a user's own optimisation of a person fail
-    x0 = result(model, 1, 2)
+    x0 = result(model, [1], 2)
     assert not model.decode(x0).rgb.is_inference()
 
 
@@ -85,10 +88,55 @@ def test_results_are_ordinary_tensors(model):
 )
 def test_wrong_settings_are_named(model, settings, word):
     with pytest.raises(ValueError, match=word):
-        sample(model, 0, **settings)
+        sample(model, [0], **settings)
 
 
 @pytest.mark.parametrize("seed", [-1, 2**63])
 def test_seeds_out_of_range_are_refused(model, seed):
     with pytest.raises(ValueError, match="seed"):
-        sample(model, seed)
+        sample(model, [seed])
+
+
+@pytest.mark.parametrize("sampler", ["ddim", "ddpm", "dpmpp_2m"])
+def test_people_are_the_same_in_any_company(model, sampler):
+    together = result(model, [5, 6, 7], 4, sampler)
+    assert torch.allclose(together[1:2], result(model, [6], 4, sampler), atol=1e-4)
+
+
+def test_guidance_goes_on_from_anybody_past_the_one_asked_for(model):
+    x, condition = torch.randn(2, 4, GRID, GRID), model.condition({"outfit": "suit"})
+    anybody, asked, guided = (
+        model.denoise(x, 600),
+        model.denoise(x, 600, condition),
+        model.denoise(x, 600, condition, 2.0),
+    )
+    assert (asked - anybody).abs().max() > 0.01
+    assert torch.allclose(guided, 2 * asked - anybody, atol=1e-4)
+    assert torch.allclose(model.denoise(x, 600, condition, 0.0), anybody, atol=1e-5)
+    assert model.condition({}) is None
+
+
+def test_asking_draws_the_start_from_those_who_have_it(model):
+    condition = model.condition({"outfit": "suit"})
+    starts = model.start([seeded(seed) for seed in range(300)], 0, condition)
+    c = model.denoiser.prior.split(starts)[0]
+    assert torch.allclose(c.mean(0), model.denoiser.prior.centre[0, 1], atol=1.0)
+    with pytest.raises(ValueError, match="jeans, suit"):
+        model.condition({"outfit": "robe"})
+
+
+def test_encoding_is_the_inverse_of_decoding(model):
+    x0 = 0.5 * torch.randn(2, 4, GRID, GRID)
+    assert torch.allclose(model.encode(model.decode(x0)), x0, atol=0.05)
+
+
+def test_a_region_s_mask_covers_its_primitives(model):
+    region = torch.zeros(K, dtype=torch.bool)
+    region[[0, 33]] = True
+    assert model.cell_mask(region).nonzero().tolist() == [[0, 0], [1, 1]]
+    slab = dataclasses.replace(model, codec=WholeSlab()).cell_mask(region)
+    assert slab.shape == (GRID * S, GRID * S)
+    assert slab.sum() == 2 * S * S
+    assert slab[8:16, 8:16].all()
+    with pytest.raises(ValueError, match="1024"):
+        model.cell_mask(region[:7])

@@ -52,7 +52,7 @@ def test_step_features_are_cosines_then_sines():
 
 @pytest.fixture
 def prior():
-    return random_prior((CHANNELS, GRID, GRID), COMPONENTS, 2, 0).to(dtype=torch.float32)
+    return random_prior((CHANNELS, GRID, GRID), COMPONENTS, 2, 0, asked=2).to(dtype=torch.float32)
 
 
 @pytest.mark.parametrize("config", [SMALL, DenoiserConfig(None, None), DenoiserConfig(SMALL.person, None)])
@@ -96,6 +96,17 @@ def test_gradients_reach_every_weight(prior):
     denoiser = PersonDenoiser(SMALL, prior, linear())
     for parameter in denoiser.parameters():
         torch.nn.init.normal_(parameter, std=0.2)
-    denoiser(torch.randn(2, CHANNELS, GRID, GRID), torch.tensor([50, 600])).square().sum().backward()
+    denoiser(torch.randn(2, CHANNELS, GRID, GRID), torch.tensor([50, 600]), torch.eye(2)).square().sum().backward()
     idle = [name for name, p in denoiser.named_parameters() if p.grad is None or p.grad.abs().max() == 0]
     assert idle == []
+
+
+def test_asking_for_nothing_is_the_same_as_not_asking(prior):
+    torch.manual_seed(0)
+    denoiser = PersonDenoiser(SMALL, prior, linear()).eval()
+    for parameter in denoiser.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    x, t = torch.randn(2, CHANNELS, GRID, GRID), torch.tensor([50, 600])
+    with torch.no_grad():
+        assert torch.equal(denoiser(x, t), denoiser(x, t, torch.zeros(2, 2)))
+        assert not torch.allclose(denoiser(x, t), denoiser(x, t, torch.eye(2)))

@@ -200,7 +200,7 @@ def test_the_prior_describes_the_people_it_was_fitted_to(prepared_once):
     energy = (z - prepared.prior.mean).square().sum((1, 2, 3)).mean()
     described = prepared.prior.marginal_variance().sum() + prepared.prior.rest_variance.sum()
     assert described.item() == pytest.approx(energy.item(), rel=0.15)
-    assert len(prepared.prior.weight) == 2
+    assert prepared.prior.log_weight.shape == (2, 1)
 
 
 def test_shapes_learn_what_the_person_shows(prepared_once):

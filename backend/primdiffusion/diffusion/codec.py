@@ -1,9 +1,9 @@
 """A frozen orthonormal linear codec per primitive: the first and last layer of slab diffusion, in closed form.
 
-A primitive's 4 x 8^3 values (sRGB-encoded colour, density / full density; the slab's values, SPEC 3) become C numbers
-in one basis that all primitives share. Noise of the slab projected on orthonormal rows is standard normal again, and
-what the basis leaves out never feeds back, so diffusing latents is diffusing the slab with these two layers fixed.
-The delta scales of these people are all 1 and are not diffused.
+A primitive's 4 x 8^3 values (sRGB-encoded colour, density / full density; the slab's values, SPEC 3) and its delta
+scale become C numbers in one basis that all primitives share. Noise of the slab projected on orthonormal rows is
+standard normal again, and what the basis leaves out never feeds back, so diffusing latents is diffusing the slab with
+these two layers fixed. The slab repeats a delta scale over 8^3 voxels; here it is one number of the same energy.
 """
 
 from __future__ import annotations
@@ -17,10 +17,13 @@ from torch import Tensor
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.primitives.primitives import GRID, K, Payload, S
-from primdiffusion.primitives.slab import NETWORK_SCALE
+from primdiffusion.primitives.slab import DELTA_SCALE_UNIT, NETWORK_SCALE
 
-VALUES = 4 * S**3
-"""Values of a primitive: encoded red, green, blue, relative density, each D, H, W."""
+VOXEL_VALUES = 4 * S**3
+VALUES = VOXEL_VALUES + 3
+"""Values of a primitive: encoded red, green, blue, relative density, each D, H, W; delta scale along T, B, N."""
+SCALE_VALUE = S**1.5 * DELTA_SCALE_UNIT / 255
+"""Value of a delta scale of 1: the slab's, times the root of how often the slab repeats it."""
 SLAB_UNIT = 2 * NETWORK_SCALE
 """Network units per value: noise on latents is the noise that the paper puts on the slab."""
 DEAD_ZONE = (0.08, 0.84)
@@ -29,7 +32,7 @@ DEAD_ZONE = (0.08, 0.84)
 
 @dataclasses.dataclass(frozen=True)
 class LinearCodec(TensorRecord):
-    """Cells [*b, 1024, 2048] to latents [*b, C, 32, 32] and back: z = 0.364 basis (v - mean), in the slab's units."""
+    """Cells [*b, 1024, 2051] to latents [*b, C, 32, 32] and back: z = 0.364 basis (v - mean), in the slab's units."""
 
     mean: Float[Tensor, "k v"]
     """Mean values of every primitive; equal to its own mirror image."""
@@ -52,29 +55,41 @@ class LinearCodec(TensorRecord):
         return latents.flip(-1) * self.parity[:, None, None]
 
 
-def cells_from_voxels(voxels: UInt8[Tensor, "*b k 8 8 8 4"]) -> Float[Tensor, "*b k v"]:
-    """Stored voxels (encoded RGB and relative density, 0 ... 255) as cells in [0, 1]."""
-    return voxels.movedim(-1, -4).flatten(-4).float() / 255
+def cells_from_voxels(
+    voxels: UInt8[Tensor, "*b k 8 8 8 4"], delta_scale: Float[Tensor, "*b k 3"] | None = None
+) -> Float[Tensor, "*b k v"]:
+    """Stored voxels (encoded RGB and relative density, 0 ... 255) and delta scales (None: all 1) as cells."""
+    values = voxels.movedim(-1, -4).flatten(-4).float() / 255
+    scale = values.new_ones((*values.shape[:-1], 3)) if delta_scale is None else delta_scale.float()
+    return torch.cat([values, scale * SCALE_VALUE], dim=-1)
 
 
 def cells_from_payload(payload: Payload, full_density: float) -> Float[Tensor, "*b k v"]:
-    """A payload as cells; `full_density` (1/m) is the density that counts as 1, and denser voxels are clamped to it."""
-    density = (payload.density / full_density).clamp(0, 1).unsqueeze(-4)
-    return torch.cat([encode_srgb(payload.rgb), density], dim=-4).flatten(-4)
+    """What `payload_from_cells` makes this payload of; `full_density` (1/m) is the density that counts as 1.
+
+    Denser voxels are clamped to it. The dead zone is undone between empty and full voxels, which stay 0 and 1.
+    """
+    start, width = DEAD_ZONE
+    relative = (payload.density / full_density).clamp(0, 1)
+    density = torch.where((relative > 0) & (relative < 1), relative * width + start, relative).unsqueeze(-4)
+    voxels = torch.cat([encode_srgb(payload.rgb.clamp(0, 1)), density], dim=-4).flatten(-4)
+    return torch.cat([voxels, payload.delta_scale * SCALE_VALUE], dim=-1)
 
 
 def payload_from_cells(cells: Float[Tensor, "*b k v"], full_density: float) -> Payload:
-    """The payload of decoded cells: clamped, with the dead zone on density; delta scales are 1."""
+    """The payload of decoded cells: clamped, with the dead zone on density."""
     start, width = DEAD_ZONE
-    voxels = cells.unflatten(-1, (4, S, S, S))
+    voxels, scale = cells.split((VOXEL_VALUES, 3), dim=-1)
+    voxels = voxels.unflatten(-1, (4, S, S, S))
     density = ((voxels[..., 3, :, :, :] - start) / width).clamp(0, 1) * full_density
-    return Payload(decode_srgb(voxels[..., :3, :, :, :].clamp(0, 1)), density, torch.ones_like(density[..., :3, 0, 0]))
+    return Payload(decode_srgb(voxels[..., :3, :, :, :].clamp(0, 1)), density, (scale / SCALE_VALUE).clamp_min(0))
 
 
 def mirror_cells(cells: Float[Tensor, "*b k v"]) -> Float[Tensor, "*b k v"]:
     """Cells of the mirrored person; what `LinearCodec.mirror` does to latents."""
-    grid = cells.unflatten(-2, (GRID, GRID)).unflatten(-1, (4, S, S, S))
-    return grid.flip(-5).flip(-1).flatten(-4).flatten(-3, -2)
+    voxels, scale = cells.unflatten(-2, (GRID, GRID)).flip(-2).split((VOXEL_VALUES, 3), dim=-1)
+    voxels = voxels.unflatten(-1, (4 * S * S, S)).flip(-1).flatten(-2)
+    return torch.cat([voxels, scale], dim=-1).flatten(-3, -2)
 
 
 def fit_codec(
@@ -90,7 +105,7 @@ def fit_codec(
         )
     mean = cells.mean(0)
     mean = ((mean + mirror_cells(mean)) / 2).half().float()  # stored in half precision: encode with what is stored
-    moments = [torch.zeros(VALUES // 2, VALUES // 2, dtype=torch.float64) for _ in range(2)]
+    moments = [torch.zeros(count, count, dtype=torch.float64) for count in (VOXEL_VALUES // 2 + 3, VOXEL_VALUES // 2)]
     for person in cells:
         chosen = torch.randperm(K, generator=generator)[:cells_each]
         for moment, part in zip(moments, _parity_parts(person[chosen] - mean[chosen]), strict=True):
@@ -107,13 +122,16 @@ def fit_codec(
 
 
 def _parity_parts(values: Float[Tensor, "n v"]) -> tuple[Tensor, Tensor]:
-    """Orthonormal coordinates of the parts that are even and odd along W."""
-    left, right = values.unflatten(-1, (4 * S * S, S)).split(S // 2, dim=-1)
+    """Orthonormal coordinates of the parts that are even and odd along W; delta scales are even."""
+    voxels, scale = values.split((VOXEL_VALUES, 3), dim=-1)
+    left, right = voxels.unflatten(-1, (4 * S * S, S)).split(S // 2, dim=-1)
     right = right.flip(-1)
-    return ((left + right) / 2**0.5).flatten(-2), ((left - right) / 2**0.5).flatten(-2)
+    return torch.cat([((left + right) / 2**0.5).flatten(-2), scale], dim=-1), ((left - right) / 2**0.5).flatten(-2)
 
 
 def _whole(part: Float[Tensor, "n h"], sign: float) -> Float[Tensor, "n v"]:
     """Inverse of one of `_parity_parts`."""
-    left = part.unflatten(-1, (4 * S * S, S // 2)) / 2**0.5
-    return torch.cat([left, sign * left.flip(-1)], dim=-1).flatten(-2)
+    voxels, scale = part[:, : VOXEL_VALUES // 2], part[:, VOXEL_VALUES // 2 :]
+    left = voxels.unflatten(-1, (4 * S * S, S // 2)) / 2**0.5
+    scale = scale if sign > 0 else scale.new_zeros(len(scale), 3)
+    return torch.cat([torch.cat([left, sign * left.flip(-1)], dim=-1).flatten(-2), scale], dim=-1)

@@ -46,8 +46,9 @@ class PersonDenoiser(nn.Module):
         self.register_buffer("component_std", component_std, persistent=False)
         self.register_buffer("picture_std", _picture_std(prior, component_std), persistent=False)
         channels, grid, components = prior.mean.shape[0], prior.mean.shape[-1], prior.basis.shape[0]
-        self.person = PersonNetwork(components, config.person) if config.person else None
-        self.local = LocalUNet(channels, components, grid, config.local) if config.local else None
+        asked = prior.kind.shape[-1]
+        self.person = PersonNetwork(components, asked, config.person) if config.person else None
+        self.local = LocalUNet(channels, components, grid, asked, config.local) if config.local else None
         if self.local is not None:
             self.local = self.local.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
@@ -58,27 +59,37 @@ class PersonDenoiser(nn.Module):
             **{field.name: self.get_buffer(f"prior_{field.name}") for field in dataclasses.fields(PersonPrior)}
         )
 
-    def forward(self, x: Float[Tensor, "b c h w"], t: Int[Tensor, "b"]) -> Float[Tensor, "b c h w"]:
-        """The x0 guess of latents x at steps t."""
+    def forward(
+        self, x: Float[Tensor, "b c h w"], t: Int[Tensor, "b"], condition: Float[Tensor, "b a"] | None = None
+    ) -> Float[Tensor, "b c h w"]:
+        """The x0 guess of latents x at steps t, of people who are what `condition` asks for (None: anybody)."""
         signal, _ = self.schedule.levels(t, x)
         prior = self.prior
         y, rest = prior.split(x, signal)
-        coefficients = self.coefficients(y, t)
-        return prior.join(coefficients, self.rest(rest, coefficients, t))
+        coefficients = self.coefficients(y, t, condition)
+        return prior.join(coefficients, self.rest(rest, coefficients, t, condition))
 
-    def coefficients(self, y: Float[Tensor, "b r"], t: Int[Tensor, "b"]) -> Float[Tensor, "b r"]:
+    def coefficients(
+        self, y: Float[Tensor, "b r"], t: Int[Tensor, "b"], condition: Float[Tensor, "b a"] | None = None
+    ) -> Float[Tensor, "b r"]:
         """The guess of clean person coefficients of noisy ones."""
         signal, noise = self.schedule.levels(t, y)
-        guess = self.prior.denoise_coefficients(y, signal, noise)
+        guess = self.prior.denoise_coefficients(y, signal, noise, condition)
         if self.person is None:
             return guess
         std = self.component_std
         total = (signal**2 * std**2 + noise**2).sqrt()
         with self._precision(y):
-            correction = self.person(y / total, guess / std, t)
+            correction = self.person(y / total, guess / std, t, condition)
         return guess + std * noise / total * correction
 
-    def rest(self, rest: Float[Tensor, "b c h w"], coefficients: Float[Tensor, "b r"], t: Int[Tensor, "b"]) -> Tensor:
+    def rest(
+        self,
+        rest: Float[Tensor, "b c h w"],
+        coefficients: Float[Tensor, "b r"],
+        t: Int[Tensor, "b"],
+        condition: Float[Tensor, "b a"] | None = None,
+    ) -> Float[Tensor, "b c h w"]:
         """The guess of the clean rest of a noisy one, for guessed person coefficients."""
         signal, noise = self.schedule.levels(t, rest)
         prior = self.prior
@@ -88,7 +99,7 @@ class PersonDenoiser(nn.Module):
         total = (signal**2 * prior.rest_variance + noise**2).sqrt()
         picture = (coefficients @ prior.basis).unflatten(1, prior.mean.shape) / self.picture_std[:, None, None]
         with self._precision(rest):
-            correction = self.local(rest / total, picture, coefficients / self.component_std, t)
+            correction = self.local(rest / total, picture, coefficients / self.component_std, t, condition)
         return guess + prior.rest_variance.sqrt() * noise / total * correction
 
     def _precision(self, like: Tensor) -> torch.autocast:

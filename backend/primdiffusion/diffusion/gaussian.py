@@ -2,8 +2,11 @@
 
 A latent is z = mean + sum_i c_i u_i + r with orthonormal person components u and a rest r orthogonal to them. White
 noise splits the same way, so the c and r parts of a noisy person are diffusions of their own, each with its own
-denoiser. For c ~ sum_m weight_m N(centre_m, cov_m) and r of independent entries, the posterior means below are exact
+denoiser. For c ~ sum_k weight_k N(centre_k, cov_g(k)) and r of independent entries, the posterior means below are exact
 up to the projection of r. They are the yardstick a network has to beat and the base it starts from.
+
+Parts k of the mixture are kinds of people (an outfit, a hair style, shoes): many, with few people each. So parts lie in
+groups of one covariance, and what is common to a group is computed once.
 """
 
 from __future__ import annotations
@@ -16,10 +19,13 @@ from torch import Tensor
 
 from primdiffusion.geometry.records import TensorRecord
 
+IMPOSSIBLE = -1e4
+"""Logarithm of the weight of a part that is not what was asked for, or does not exist."""
+
 
 @dataclasses.dataclass(frozen=True)
 class PersonPrior(TensorRecord):
-    """Distribution of latents [C, H, W]; D = C*H*W, R person components, M mixture parts (1: a Gaussian)."""
+    """Distribution of latents [C, H, W]; D = C*H*W, R person components, G groups of M mixture parts."""
 
     mean: Float[Tensor, "c h w"]
     basis: Float[Tensor, "r d"]
@@ -28,13 +34,15 @@ class PersonPrior(TensorRecord):
     """Sign of each component in the mirror image of a person."""
     rest_variance: Float[Tensor, "c h w"]
     """Variance of the entries of r."""
-    weight: Float[Tensor, "m"]
-    """Probability of each part."""
-    centre: Float[Tensor, "m r"]
-    axes: Float[Tensor, "m r r"]
-    """Orthonormal rows: principal axes of each part among the person components."""
-    variance: Float[Tensor, "m r"]
+    log_weight: Float[Tensor, "g m"]
+    """Logarithm of the probability of each part; IMPOSSIBLE where a group has fewer parts."""
+    centre: Float[Tensor, "g m r"]
+    axes: Float[Tensor, "g r r"]
+    """Orthonormal rows: principal axes of each group among the person components."""
+    variance: Float[Tensor, "g r"]
     """Variance along each axis."""
+    kind: Float[Tensor, "g m a"]
+    """What each part is: the condition (`Vocabulary.encode`) that it meets; a may be 0."""
 
     def split(self, z: Float[Tensor, "b c h w"], signal: Tensor | float = 1.0) -> tuple[Tensor, Tensor]:
         """Person coefficients [b, R] and rest [b, C, H, W] of latents whose mean is scaled by `signal` [b, 1, 1, 1]."""
@@ -47,51 +55,88 @@ class PersonPrior(TensorRecord):
         coefficients = coefficients - rest.flatten(1) @ self.basis.T
         return self.mean + rest + (coefficients @ self.basis).unflatten(1, self.mean.shape)
 
-    def denoise_coefficients(self, y: Float[Tensor, "b r"], signal: Tensor, noise: Tensor) -> Float[Tensor, "b r"]:
-        """E[c | y = signal c + noise eps]; `signal` and `noise` are [b, 1]."""
-        in_axes = torch.einsum("mij,bmj->bmi", self.axes, y[:, None] - signal[:, :, None] * self.centre)
-        total = signal[:, :, None] ** 2 * self.variance + noise[:, :, None] ** 2
-        mean = (
-            torch.einsum("mij,bmi->bmj", self.axes, signal[:, :, None] * self.variance / total * in_axes) + self.centre
+    def log_weights(self, condition: Float[Tensor, "b a"] | None) -> Float[Tensor, "b g m"] | Float[Tensor, "1 g m"]:
+        """Logarithms of the parts' weights, those that are not what is asked for made IMPOSSIBLE.
+
+        A category is asked for where its block of the condition is not 0; a part that lacks its value is out. A value
+        that no part has is not held against any.
+        """
+        if condition is None or not condition.shape[-1]:
+            return self.log_weight[None]
+        asked = (condition[:, None, None, :] * self.kind).sum(-1)  # values of the condition that a part has
+        return self.log_weight + IMPOSSIBLE * (asked.amax((1, 2), keepdim=True) - asked)
+
+    def denoise_coefficients(
+        self, y: Float[Tensor, "b r"], signal: Tensor, noise: Tensor, condition: Float[Tensor, "b a"] | None = None
+    ) -> Float[Tensor, "b r"]:
+        """E[c | y = signal c + noise eps]; `signal` and `noise` are [b, 1].
+
+        Computed in float64: distances to centres are squares of numbers up to a hundred over noise down to 0.01.
+        """
+        dtype, (y, signal, noise) = y.dtype, (part.double() for part in (y, signal, noise))
+        axes, variance = self.axes.double(), self.variance.double()
+        centre = torch.einsum("gmr,gir->gmi", self.centre.double(), axes)
+        in_axes = torch.einsum("br,gir->bgi", y, axes)
+        total = signal[:, :, None] ** 2 * variance + noise[:, :, None] ** 2
+        distance = (
+            (in_axes.square() / total).sum(-1)[..., None]
+            - 2 * signal[:, :, None] * torch.einsum("bgi,gmi->bgm", in_axes / total, centre)
+            + signal[:, :, None] ** 2 * torch.einsum("bgi,gmi->bgm", 1 / total, centre.square())
         )
-        log_likelihood = self.weight.log() - 0.5 * (in_axes.square() / total + total.log()).sum(-1)
-        return torch.einsum("bm,bmr->br", log_likelihood.softmax(-1), mean)
+        evidence = self.log_weights(condition).double() - 0.5 * (distance + total.log().sum(-1)[..., None])
+        share = evidence.flatten(1).softmax(-1).view_as(evidence)
+        expected = torch.einsum("bgm,gmi->bgi", share, centre)
+        gain = signal[:, :, None] * variance / total
+        mean = gain * (share.sum(-1)[..., None] * in_axes - signal[:, :, None] * expected) + expected
+        return torch.einsum("bgi,gir->br", mean, axes).to(dtype)
 
     def denoise_rest(self, rest: Float[Tensor, "b c h w"], signal: Tensor, noise: Tensor) -> Float[Tensor, "b c h w"]:
         """E[r | rest = signal r + noise eps]; `signal` and `noise` are [b, 1, 1, 1]."""
         return signal * self.rest_variance / (signal**2 * self.rest_variance + noise**2) * rest
 
-    def denoise(self, x: Float[Tensor, "b c h w"], signal: Tensor, noise: Tensor) -> Float[Tensor, "b c h w"]:
+    def denoise(
+        self, x: Float[Tensor, "b c h w"], signal: Tensor, noise: Tensor, condition: Float[Tensor, "b a"] | None = None
+    ) -> Float[Tensor, "b c h w"]:
         """E[z | x = signal z + noise eps]; `signal` and `noise` are [b, 1, 1, 1]."""
         y, rest = self.split(x, signal)
-        return self.join(
-            self.denoise_coefficients(y, signal[..., 0, 0], noise[..., 0, 0]), self.denoise_rest(rest, signal, noise)
-        )
+        coefficients = self.denoise_coefficients(y, signal[..., 0, 0], noise[..., 0, 0], condition)
+        return self.join(coefficients, self.denoise_rest(rest, signal, noise))
 
     def marginal_variance(self) -> Float[Tensor, "r"]:
         """Variance of each person coefficient over the whole mixture."""
-        second = torch.einsum("mij,mi->mj", self.axes.square(), self.variance) + self.centre.square()
-        return self.weight @ second - (self.weight @ self.centre).square()
+        weight = self.log_weight.exp()
+        within = torch.einsum("g,gij,gi->j", weight.sum(1), self.axes.square(), self.variance)
+        mean = torch.einsum("gm,gmr->r", weight, self.centre)
+        return within + torch.einsum("gm,gmr->r", weight, (self.centre - mean).square())
 
-    def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "count c h w"]:
-        """Random latents of this distribution."""
+    def sample(
+        self, count: int, generator: torch.Generator, condition: Float[Tensor, "1 a"] | None = None
+    ) -> Float[Tensor, "count c h w"]:
+        """Draws from the prior, of what is asked for; on the generator's device, which is the prior's."""
 
         def normal(*shape: int) -> Tensor:
             return torch.randn(shape, generator=generator, dtype=self.mean.dtype, device=self.mean.device)
 
-        part = torch.multinomial(self.weight, count, replacement=True, generator=generator)
-        in_axes = self.variance[part].sqrt() * normal(count, self.basis.shape[0])
-        coefficients = torch.einsum("bij,bi->bj", self.axes[part], in_axes) + self.centre[part]
+        weight = self.log_weights(condition)[0].flatten().softmax(0)
+        part = torch.multinomial(weight, count, replacement=True, generator=generator)
+        group = part // self.log_weight.shape[1]
+        in_axes = self.variance[group].sqrt() * normal(count, self.basis.shape[0])
+        coefficients = torch.einsum("bij,bi->bj", self.axes[group], in_axes) + self.centre.flatten(0, 1)[part]
         return self.join(coefficients, self.rest_variance.sqrt() * normal(count, *self.mean.shape))
 
     def gaussian(self) -> PersonPrior:
-        """The single Gaussian with this mixture's mean and covariance: the yardstick without clusters."""
-        mean = self.weight @ self.centre
-        within = torch.einsum("m,mij,mi,mik->jk", self.weight, self.axes, self.variance, self.axes)
+        """The single Gaussian with this mixture's mean and covariance: the yardstick without kinds of people."""
+        weight = self.log_weight.exp()
+        mean = torch.einsum("gm,gmr->r", weight, self.centre)
+        within = torch.einsum("g,gij,gi,gik->jk", weight.sum(1), self.axes, self.variance, self.axes)
         offset = self.centre - mean
-        covariance = within + torch.einsum("m,mj,mk->jk", self.weight, offset, offset)
+        covariance = within + torch.einsum("gm,gmj,gmk->jk", weight, offset, offset)
         variance, vectors = torch.linalg.eigh(covariance)
-        one = torch.ones_like(self.weight[:1])
         return dataclasses.replace(
-            self, weight=one, centre=mean[None], axes=vectors.T[None], variance=variance.clamp_min(0)[None]
+            self,
+            log_weight=torch.zeros_like(self.log_weight[:1, :1]),
+            centre=mean[None, None],
+            axes=vectors.T[None],
+            variance=variance.clamp_min(0)[None],
+            kind=self.kind[:1, :1] * 0,
         )

@@ -65,18 +65,23 @@ class PersonBlock(nn.Module):
 class PersonNetwork(nn.Module):
     """Correction of the closed-form guess of R person components, all in units of standard deviations; starts at 0."""
 
-    def __init__(self, components: int, config: PersonNetworkConfig):
+    def __init__(self, components: int, condition_width: int, config: PersonNetworkConfig):
         super().__init__()
         self.time = TimeEmbedding(64, 256)
+        self.asked = zeroed(nn.Linear(condition_width, 256, bias=False)) if condition_width else None
         self.inner = nn.Linear(2 * components, config.width)
         self.blocks = nn.ModuleList([PersonBlock(config.width, 256, config.dropout) for _ in range(config.blocks)])
         self.outer = zeroed(nn.Linear(config.width, components))
 
     def forward(
-        self, noisy: Float[Tensor, "b r"], guess: Float[Tensor, "b r"], t: Int[Tensor, "b"]
+        self,
+        noisy: Float[Tensor, "b r"],
+        guess: Float[Tensor, "b r"],
+        t: Int[Tensor, "b"],
+        condition: Float[Tensor, "b a"] | None = None,
     ) -> Float[Tensor, "b r"]:
-        """Correction for noisy components and their closed-form guess at steps t."""
-        condition = functional.silu(self.time(t))
+        """Correction for noisy components and their closed-form guess at steps t; `condition` as of `Vocabulary`."""
+        condition = functional.silu(embedded(self.time(t), self.asked, condition))
         x = self.inner(torch.cat([noisy, guess], dim=-1))
         for block in self.blocks:
             x = block(x, condition)
@@ -135,10 +140,11 @@ class LocalStage(nn.ModuleList):
 class LocalUNet(nn.Module):
     """Correction of the closed-form guess of what person components leave out, in standard deviations; starts at 0."""
 
-    def __init__(self, channels: int, components: int, grid: int, config: LocalUNetConfig):
+    def __init__(self, channels: int, components: int, grid: int, asked_width: int, config: LocalUNetConfig):
         super().__init__()
         widths, condition_width = config.widths, config.condition_width
         self.time = TimeEmbedding(64, condition_width)
+        self.asked = zeroed(nn.Linear(asked_width, condition_width, bias=False)) if asked_width else None
         self.person = nn.Linear(components, condition_width)
         self.position = nn.Parameter(0.5 * torch.randn(config.position_channels, grid, grid))
         self.inner = nn.Conv2d(2 * channels + config.position_channels, widths[0], 3, padding=1)
@@ -163,9 +169,10 @@ class LocalUNet(nn.Module):
         picture: Float[Tensor, "b c h w"],
         person: Float[Tensor, "b r"],
         t: Int[Tensor, "b"],
+        condition: Float[Tensor, "b a"] | None = None,
     ) -> Float[Tensor, "b c h w"]:
         """Correction for a noisy rest, beside the picture that guessed person components draw, and the components."""
-        condition = functional.silu(self.time(t) + self.person(person))
+        condition = functional.silu(embedded(self.time(t), self.asked, condition) + self.person(person))
         position = self.position.expand(len(noisy), -1, -1, -1)
         x = self.inner(torch.cat([noisy, picture, position], dim=1).contiguous(memory_format=torch.channels_last))
         skips = []
@@ -180,3 +187,10 @@ class LocalUNet(nn.Module):
             if level:
                 x = self.grow[level - 1](functional.interpolate(x, scale_factor=2.0, mode="nearest"))
         return self.outer(functional.silu(self.norm(x)))
+
+
+def embedded(
+    time: Float[Tensor, "b e"], asked: nn.Linear | None, condition: Float[Tensor, "b a"] | None
+) -> Float[Tensor, "b e"]:
+    """The embedding of a step and of what is asked for; None asks for nothing, as zeros do."""
+    return time if asked is None or condition is None else time + asked(condition)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import zlib
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -198,3 +199,54 @@ def draw_body(seed: int, femininity: Float[np.ndarray, "10"]) -> tuple[Float[np.
     betas = np.clip(betas, -LARGEST_BETA, LARGEST_BETA)
     betas[0] = STATURE[sex] + STATURE_SPREAD * betas[0]
     return betas.round(BETA_DIGITS), sex
+
+
+WORDS = {
+    "outfit": {
+        "female_casualsuit01": "fitted tee and jeans",
+        "female_casualsuit02": "tee and shorts",
+        "female_elegantsuit01": "blouse and skirt",
+        "female_sportsuit01": "crop top and leggings",
+        "male_casualsuit01": "shirt and trousers",
+        "male_casualsuit02": "sweater and jeans",
+        "male_casualsuit03": "long sleeves and jeans",
+        "male_casualsuit04": "tee and jeans",
+        "male_casualsuit05": "jacket and trousers",
+        "male_casualsuit06": "loose tee and jeans",
+        "male_elegantsuit01": "suit",
+        "male_worksuit01": "dungarees",
+    },
+    "hair": {
+        "none": "bald",
+        "afro01": "afro",
+        "bob01": "bob",
+        "bob02": "long bob",
+        "braid01": "braid",
+        "long01": "long",
+        "ponytail01": "ponytail",
+        "short01": "crew cut",
+        "short02": "short",
+        "short03": "fringe",
+        "short04": "side parting",
+    },
+    "hat": {"fedora": "fedora", "fedora_cocked": "cocked fedora"},
+}
+"""What artists call the meshes of the pack; names that are not here stand for themselves."""
+PLAIN = {"solid", "original"}
+"""Patterns that are none."""
+
+
+def words_of(attributes: Mapping[str, object]) -> dict[str, str]:
+    """What can be asked for of a person with these attributes: sex, outfit, pattern, shoes, hair, hat.
+
+    Attributes are those of `person.Person`; which a person lacks are left out.
+    """
+    words = {
+        name: WORDS.get(name, {}).get(str(attributes[name]), str(attributes[name]))
+        for name in ("sex", "outfit", "shoes", "hair", "hat")
+        if name in attributes
+    }
+    if "pattern" in attributes:
+        patterns = set(str(attributes["pattern"]).split(", "))
+        words["pattern"] = "plain" if patterns <= PLAIN else "patterned"
+    return words

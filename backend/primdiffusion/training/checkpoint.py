@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -14,7 +15,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from primdiffusion.diffusion.codec import LinearCodec
+from primdiffusion.diffusion.codec import SCALE_VALUE, LinearCodec
+from primdiffusion.diffusion.conditioning import NOTHING, Vocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkConfig
@@ -26,8 +28,9 @@ from primdiffusion.training.config import write_atomically
 FORMAT = "primdiffusion-checkpoint"
 ENCODER_FORMAT = "primdiffusion-encoder"
 """Of encoders' files, which `encoder_checkpoint` reads."""
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 _HALVED = ("codec.mean", "denoiser.")
+_WHOLE = ("prior_variance", "prior_log_weight")
 
 
 class CheckpointError(ValueError):
@@ -43,6 +46,7 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
     """Write a model; networks, prior and codec mean in half precision. `schedule` is its schedule's name."""
     tensors: dict[str, Tensor] = {f"denoiser.{key}": value for key, value in model.denoiser.state_dict().items()}
     architecture: dict[str, Any] = {"schedule": schedule, "full_density": model.full_density}
+    architecture |= {"vocabulary": model.vocabulary.to_json()}
     if isinstance(model.codec, CellCodec):
         codec = model.codec.codec
         tensors |= {f"codec.{name}": getattr(codec, name) for name in ("mean", "basis", "parity")}
@@ -56,11 +60,12 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
         raise TypeError(f"checkpoints hold a PersonDenoiser or a SlabUNet, not a {type(model.denoiser).__name__}")
     architecture["config"] = dataclasses.asdict(model.denoiser.config)
     halved = {key: value.half() if _is_halved(key, value) else value for key, value in tensors.items()}
+    card = {key: value for key, value in model.card.items() if key != "sha256"}  # of the file it came from
     metadata = {
         "format": FORMAT,
         "format_version": str(FORMAT_VERSION),
         "architecture": json.dumps(architecture),
-        "card": json.dumps(dict(model.card)),
+        "card": json.dumps(card),
     }
     contents = {key: value.detach().cpu().contiguous().clone() for key, value in halved.items()}
     _check_finite(path, contents)
@@ -79,13 +84,22 @@ def load_checkpoint(path: Path | str | None = None, device: torch.device | str =
     tensors = {key: value.float() for key, value in tensors.items()}
     try:
         architecture = json.loads(metadata["architecture"])
-        model = _build(tensors, architecture, json.loads(metadata["card"]))
+        if metadata["format_version"] == "1":
+            tensors, architecture = _from_version_1(tensors, architecture)
+        card = {**json.loads(metadata["card"]), "sha256": file_hash(path)}
+        model = _build(tensors, architecture, card)
     except (KeyError, TypeError, json.JSONDecodeError, RuntimeError) as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
         raise CheckpointError(
             f"{path} does not match its own description ({reason}): download or train it again"
         ) from error
     return model.to(device)
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file, as hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_card(path: Path | str | None = None) -> dict[str, Any]:
@@ -109,7 +123,8 @@ def _build(tensors: Mapping[str, Tensor], architecture: dict[str, Any], card: di
         shapes = ShapePrior(**_under(tensors, "shapes."))
     denoiser.load_state_dict(weights)
     denoiser.eval().requires_grad_(False)
-    return DiffusionModel(denoiser, schedule, codec, shapes, float(architecture["full_density"]), card)
+    vocabulary = Vocabulary.from_json(architecture["vocabulary"])
+    return DiffusionModel(denoiser, schedule, codec, shapes, float(architecture["full_density"]), card, vocabulary)
 
 
 def denoiser_config(tree: Mapping[str, Any]) -> DenoiserConfig:
@@ -119,6 +134,21 @@ def denoiser_config(tree: Mapping[str, Any]) -> DenoiserConfig:
         person=None if person is None else PersonNetworkConfig(**person),
         local=None if local is None else LocalUNetConfig(**{**local, "widths": tuple(local["widths"])}),
     )
+
+
+def _from_version_1(
+    tensors: Mapping[str, Tensor], architecture: dict[str, Any]
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Groups of one part each, no attributes, no delta scale."""
+    tensors = dict(tensors)
+    if architecture["kind"] == "person":
+        mean, basis = tensors["codec.mean"], tensors["codec.basis"]
+        tensors["codec.mean"] = torch.cat([mean, torch.full((len(mean), 3), SCALE_VALUE)], dim=1)
+        tensors["codec.basis"] = torch.nn.functional.pad(basis, (0, 3))
+        tensors["denoiser.prior_log_weight"] = tensors.pop("denoiser.prior_weight").log()[:, None]
+        tensors["denoiser.prior_centre"] = tensors["denoiser.prior_centre"][:, None]
+        tensors["denoiser.prior_kind"] = torch.zeros(*tensors["denoiser.prior_log_weight"].shape, 0)
+    return tensors, {**architecture, "vocabulary": NOTHING.to_json()}
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -143,6 +173,8 @@ def _read_metadata(path: Path, formats: Sequence[str] = (FORMAT,)) -> dict[str, 
         raise CheckpointError(
             f"{path} is a safetensors file of format {metadata.get('format')!r}, not {FORMAT!r}: choose another file"
         )
+    if metadata.get("format") == FORMAT and metadata.get("format_version") == "1":
+        return metadata
     if metadata.get("format_version") != str(FORMAT_VERSION):
         version = metadata.get("format_version")
         raise CheckpointError(
@@ -158,7 +190,7 @@ def _check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:
 
 
 def _is_halved(key: str, value: Tensor) -> bool:
-    return key.startswith(_HALVED) and value.is_floating_point() and value.ndim > 1 and "prior_variance" not in key
+    return key.startswith(_HALVED) and value.is_floating_point() and value.ndim > 1 and not key.endswith(_WHOLE)
 
 
 def _under(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

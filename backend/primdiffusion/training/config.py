@@ -15,7 +15,7 @@ from primdiffusion.staging import written_whole
 class CodecConfig:
     """The frozen linear codec."""
 
-    channels: int = 64
+    channels: int = 96
     """Latent channels of a primitive."""
     people: int = 160
     """People (geometry and colours) that the basis is fitted to, drawn at random."""
@@ -27,8 +27,10 @@ class PriorConfig:
 
     components: int = 128
     """Person components."""
-    clusters: Literal["outfit", "none"] = "outfit"
-    """What the parts of the mixture are: people of one outfit each, or all in a single Gaussian."""
+    groups: tuple[str, ...] = ("sex", "outfit", "pattern")
+    """Attributes that people of one covariance have in common; those that the people do not have are left out."""
+    features: tuple[tuple[str, ...], ...] = (("sex", "hair", "hat"), ("shoes",))
+    """Attributes that move the mean of a group, each list on its own account; a part for each choice."""
     folds: int = 4
     """Parts of the people, each left out once, to measure how much of a component's variance holds for new people."""
 
@@ -53,6 +55,8 @@ class PhaseConfig:
     """Errors in units of posterior std s are weighted by s^power: 0 whitened, 2 the paper's plain squares."""
     blend: float = 0.3
     """Share of people that are blends of the colour variants of one geometry."""
+    unasked: float = 0.5
+    """Share of people that are learnt without any attribute; the others with some of theirs."""
     evaluate_every: int = 500
     """Steps between evaluations on held-out people."""
     bfloat16: bool = False

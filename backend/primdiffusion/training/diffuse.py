@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from primdiffusion import __version__
 from primdiffusion.diffusion.codec import LinearCodec
+from primdiffusion.diffusion.conditioning import Vocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import CellCodec, DiffusionModel, ShapePrior
@@ -30,7 +31,7 @@ from primdiffusion.training.latents import (
     encode_people,
     find_people,
     fit_codec_to,
-    read_outfits,
+    read_vocabulary,
     split_people,
 )
 from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors
@@ -59,6 +60,7 @@ class Prepared:
     codec: LinearCodec
     prior: PersonPrior
     shapes: ShapePrior
+    vocabulary: Vocabulary
     full_density: float
 
 
@@ -83,12 +85,12 @@ def prepare(config: TrainingConfig) -> Prepared:
     paths = find_people(config.data)
     train_paths, held_paths = split_people(paths, config.holdout, config.seed)
     generator = torch.Generator().manual_seed(config.seed)
-    outfits = read_outfits(paths)
+    vocabulary = read_vocabulary(train_paths)
     codec = fit_codec_to(train_paths, config.codec, generator)
-    train, full_density = encode_people(train_paths, codec, outfits)
-    held, _ = encode_people(held_paths, codec, outfits)
-    prior = fit_prior(train, codec, config.prior)
-    prepared = Prepared(train, held, codec, prior, fit_shapes(train, prior), full_density)
+    train, full_density = encode_people(train_paths, codec, vocabulary)
+    held, _ = encode_people(held_paths, codec, vocabulary)
+    prior = fit_prior(train, codec, vocabulary, config.prior)
+    prepared = Prepared(train, held, codec, prior, fit_shapes(train, prior), vocabulary, full_density)
     _save_prepared(path, prepared)
     write_atomically(
         config.run / "people.json",
@@ -156,6 +158,7 @@ def train(config: TrainingConfig) -> DiffusionModel:
         prepared.shapes,
         prepared.full_density,
         _card(config, prepared, denoiser, steps),
+        prepared.vocabulary,
     )
     save_checkpoint(config.run / "model.safetensors", model, config.schedule)
     return model
@@ -199,11 +202,11 @@ def _train_phase(
 
 def _objective(name: str, phase: PhaseConfig, prepared: Prepared, denoiser: PersonDenoiser) -> Objective:
     if name == "local":
-        return RestObjective(denoiser, prepared.train, prepared.codec, phase)
+        return RestObjective(denoiser, prepared.train, prepared.codec, prepared.vocabulary, phase)
     coefficients = torch.cat([prepared.prior.split(chunk.float())[0] for chunk in prepared.train.latents.split(128)])
     # Components are fitted to these people and vary more over them than over new ones; the prior knows by how much.
     coefficients *= denoiser.component_std / coefficients.square().mean(0).sqrt()
-    return PersonObjective(denoiser, coefficients, prepared.train.geometry, phase)
+    return PersonObjective(denoiser, coefficients, prepared.train, prepared.vocabulary, phase)
 
 
 def _card(
@@ -256,13 +259,14 @@ def _save_prepared(path: Path, prepared: Prepared) -> None:
         for field in dataclasses.fields(record):
             value = getattr(record, field.name)
             tensors[f"{name}.{field.name}"] = value.contiguous()
-    write_atomically(path, save(tensors, metadata={"full_density": repr(prepared.full_density)}))
+    about = {"full_density": repr(prepared.full_density), "vocabulary": json.dumps(prepared.vocabulary.to_json())}
+    write_atomically(path, save(tensors, metadata=about))
 
 
 def _load_prepared(path: Path) -> Prepared:
     with safe_open(path, framework="pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
-        full_density = float(file.metadata()["full_density"])
+        about = file.metadata()
 
     def part(name: str) -> dict[str, Tensor]:
         return {key.removeprefix(f"{name}."): value for key, value in tensors.items() if key.startswith(f"{name}.")}
@@ -273,7 +277,8 @@ def _load_prepared(path: Path) -> Prepared:
         LinearCodec(**part("codec")),
         PersonPrior(**part("prior")),
         ShapePrior(**part("shapes")),
-        full_density,
+        Vocabulary.from_json(json.loads(about["vocabulary"])),
+        float(about["full_density"]),
     )
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from primdiffusion.diffusion.codec import LinearCodec
+from primdiffusion.diffusion.conditioning import Vocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.samplers import gaussian_noise
 from primdiffusion.training.config import PhaseConfig
@@ -34,7 +35,8 @@ class PersonObjective:
 
     denoiser: PersonDenoiser
     coefficients: Float[Tensor, "n r"]
-    geometry: Int[Tensor, "n"]
+    people: LatentSet
+    vocabulary: Vocabulary
     config: PhaseConfig
 
     @property
@@ -44,7 +46,8 @@ class PersonObjective:
 
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted x0 error of a random batch at random levels."""
-        weights, indices = blends(self.geometry, self.config.batch, self.config.blend, generator)
+        weights, indices = blends(self.people.geometry, self.config.batch, self.config.blend, generator)
+        condition = asked_of(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
         c = torch.einsum("bk,bkr->br", weights, self.coefficients[indices])
         flip = torch.rand(len(c), 1, generator=generator) < 0.5
         c = torch.where(flip, c * self.denoiser.prior_parity, c)
@@ -53,7 +56,8 @@ class PersonObjective:
         signal, noise = self.denoiser.schedule.levels(t, c)
         std = self.denoiser.component_std
         std = std * noise / (signal**2 * std**2 + noise**2).sqrt()
-        return weighted_error((self.denoiser.coefficients(y, t) - c) / std, std, self.config.error_power)
+        guess = self.denoiser.coefficients(y, t, condition)
+        return weighted_error((guess - c) / std, std, self.config.error_power)
 
 
 @dataclasses.dataclass
@@ -63,6 +67,7 @@ class RestObjective:
     denoiser: PersonDenoiser
     people: LatentSet
     codec: LinearCodec
+    vocabulary: Vocabulary
     config: PhaseConfig
 
     @property
@@ -73,6 +78,7 @@ class RestObjective:
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted x0 error of a random batch at random levels."""
         weights, indices = blends(self.people.geometry, self.config.batch, self.config.blend, generator)
+        condition = asked_of(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
         z = torch.einsum("bk,bkchw->bchw", weights, self.people.latents[indices].float())
         flip = torch.rand(len(z), 1, 1, 1, generator=generator) < 0.5
         z = torch.where(flip, self.codec.mirror(z), z)
@@ -82,10 +88,10 @@ class RestObjective:
         with torch.no_grad():
             _, clean = self.denoiser.prior.split(z)
             y, rest = self.denoiser.prior.split(x, signal)
-            coefficients = self.denoiser.coefficients(y, t)
+            coefficients = self.denoiser.coefficients(y, t, condition)
         std = self.denoiser.prior_rest_variance.sqrt()
         std = std * noise / (signal**2 * std**2 + noise**2).sqrt()
-        error = (self.denoiser.rest(rest, coefficients, t) - clean) / std
+        error = (self.denoiser.rest(rest, coefficients, t, condition) - clean) / std
         return weighted_error(error.flatten(1), std.flatten(1), self.config.error_power)
 
 
@@ -111,6 +117,20 @@ def blends(
     part = 0.5 + 3**0.5 * (torch.rand(batch, generator=generator) - 0.5)
     part = part * (torch.rand(batch, generator=generator) < share)
     return torch.stack([1 - part, part], dim=1), torch.stack([first, second], dim=1)
+
+
+def asked_of(
+    people: LatentSet,
+    indices: Int[Tensor, "b 2"],
+    weights: Float[Tensor, "b 2"],
+    vocabulary: Vocabulary,
+    unasked: float,
+    generator: torch.Generator,
+) -> Float[Tensor, "b a"]:
+    """What is said of a batch of `blends`: what both people of a blend have, and of that only a part."""
+    first, second = people.condition[indices].unbind(1)
+    same = (first == second) | (weights[:, 1:] == 0)
+    return vocabulary.forget(torch.where(same, first, 0.0), unasked, generator)
 
 
 Guess = Callable[[Tensor, Tensor], Tensor]

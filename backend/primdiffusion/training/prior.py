@@ -7,13 +7,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from primdiffusion.diffusion.codec import LinearCodec
+from primdiffusion.diffusion.conditioning import Vocabulary
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.latents import LatentSet
+from primdiffusion.training.mixture import fit_mixture
 
 
-def fit_prior(people: LatentSet, codec: LinearCodec, config: PriorConfig) -> PersonPrior:
+def fit_prior(people: LatentSet, codec: LinearCodec, vocabulary: Vocabulary, config: PriorConfig) -> PersonPrior:
     """Principal components of people and their mirror images, and a mixture of Gaussians over them.
 
     Components are found from Gram matrices of the even and the odd parts of people, so that each is even or odd under
@@ -28,10 +30,11 @@ def fit_prior(people: LatentSet, codec: LinearCodec, config: PriorConfig) -> Per
         (vector.T @ part) / (variance * len(people)).sqrt()[:, None]
         for (_, part), (variance, vector) in zip(parts, vectors, strict=True)
     ]
+    mean = parts[0][0]
+    del parts
     basis = torch.linalg.qr(torch.cat(rows)[order].T)[0].T.contiguous()
     kept, rest_ratio = _held_out_ratios(grams, people.geometry, config)
     coefficients, rest_energy = [], torch.zeros(basis.shape[1])
-    mean = parts[0][0]
     for chunk in people.latents.split(256):
         centred = (chunk.float() - mean).flatten(1)
         c = centred @ basis.T
@@ -40,12 +43,8 @@ def fit_prior(people: LatentSet, codec: LinearCodec, config: PriorConfig) -> Per
     rest = (rest_energy / len(people)).unflatten(0, mean.shape)
     rest = (rest + codec.mirror(rest).abs()) / 2 * rest_ratio
     c = torch.cat(coefficients) * kept.sqrt()
-    both = torch.cat([c, c * signs])
-    label = (
-        people.label[people.geometry] if config.clusters == "outfit" else torch.zeros(len(people), dtype=torch.int64)
-    )
-    weight, centre, axes, variance = _mixture(both, torch.cat([label, label]))
-    return PersonPrior(mean, basis, signs, rest.clamp_min(1e-6), weight, centre, axes, variance)
+    mixture = fit_mixture(torch.cat([c, c * signs]), people.condition.repeat(2, 1), vocabulary, config)
+    return PersonPrior(mean, basis, signs, rest.clamp_min(1e-6), **mixture._asdict())
 
 
 def _mirror_parts(people: LatentSet, codec: LinearCodec) -> list[tuple[Tensor, Tensor]]:
@@ -102,25 +101,6 @@ def _smooth(values: Float[Tensor, "r"], width: int = 9) -> Float[Tensor, "r"]:
     """Running mean in log space: the ratio of a single component is noisy, its trend is not."""
     padded = torch.nn.functional.pad(values.log()[None, None], (width // 2, width // 2), mode="replicate")
     return torch.nn.functional.avg_pool1d(padded, width, stride=1)[0, 0].exp()
-
-
-def _mixture(
-    c: Float[Tensor, "n r"], label: Int[Tensor, "n"], shrink: float = 1.0
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Weight, centre, axes and variances of each label's Gaussian; small groups lean on the mean covariance."""
-    groups = [c[label == value] for value in label.unique()]
-    within = sum((g - g.mean(0)).T @ (g - g.mean(0)) for g in groups) / len(c)
-    pull = shrink * c.shape[1]
-    centre, axes, variance = [], [], []
-    for group in groups:
-        centred = group - group.mean(0)
-        covariance = (centred.T @ centred + pull * within) / (len(group) + pull)
-        value, vector = torch.linalg.eigh(covariance.double())
-        centre.append(group.mean(0))
-        axes.append(vector.T.float())
-        variance.append(value.clamp_min(float(value.max()) * 1e-7).float())
-    weight = torch.tensor([len(group) / len(c) for group in groups])
-    return weight, torch.stack(centre), torch.stack(axes), torch.stack(variance)
 
 
 def fit_shapes(people: LatentSet, prior: PersonPrior, features: int = 24, ridge: float = 30.0) -> ShapePrior:

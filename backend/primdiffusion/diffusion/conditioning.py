@@ -1,0 +1,112 @@
+"""What a model can be asked for: attributes of a person as numbers that a denoiser understands.
+
+Classifier-free (Ho and Salimans 2022): an attribute that is not asked for is a block of zeros, so one network knows
+people with all, some or no attributes, and the paper's unconditional model is the one that is asked for nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+Attributes = Mapping[str, str | float]
+"""What a person is asked to be: {"sex": "female", "height": 1.7}."""
+FARTHEST = 4.0
+"""Standard deviations from the mean within which a number may be asked for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Vocabulary:
+    """Attributes and their values, as the people had them that a model was trained on."""
+
+    categories: Mapping[str, tuple[str, ...]]
+    """Name -> values to choose from."""
+    scalars: Mapping[str, tuple[float, float]]
+    """Name -> mean and standard deviation."""
+
+    @property
+    def width(self) -> int:
+        """Numbers in a condition: one for each value of a category, two for each scalar."""
+        return sum(map(len, self.categories.values())) + 2 * len(self.scalars)
+
+    def encode(self, attributes: Attributes) -> Float[Tensor, "a"]:
+        """One-hot blocks, then (known, standardised) pairs; attributes that are not given are 0 throughout.
+
+        Raises ValueError for a name or value the model does not know, which says what it knows.
+        """
+        self._check_names(attributes)
+        numbers: list[float] = []
+        for name, values in self.categories.items():
+            wanted = attributes.get(name)
+            if wanted is not None and wanted not in values:
+                raise ValueError(f"there is no {name} {wanted!r}: choose one of {', '.join(values)}")
+            numbers += [float(value == wanted) for value in values]
+        for name in self.scalars:
+            numbers += self._scalar(name, attributes.get(name))
+        return torch.tensor(numbers)
+
+    def blocks(self) -> dict[str, slice]:
+        """Where each category's numbers are in a condition."""
+        places, start = {}, 0
+        for name, values in self.categories.items():
+            places[name] = slice(start, start + len(values))
+            start += len(values)
+        return places
+
+    def forget(self, condition: Float[Tensor, "b a"], share: float, generator: torch.Generator) -> Float[Tensor, "b a"]:
+        """Conditions for training, of which parts are forgotten.
+
+        Of a sample, everything with a chance of `share`; otherwise each attribute with a chance that is drawn for the
+        sample, so that subsets of all sizes are seen.
+        """
+        count = len(self.categories) + len(self.scalars)
+        if not count:
+            return condition
+        draws = torch.rand(len(condition), count + 2, generator=generator)
+        kept = (draws[:, 2:] > draws[:, :1]) & (draws[:, 1:2] >= share)
+        sizes = torch.tensor([*map(len, self.categories.values()), *[2] * len(self.scalars)])
+        return condition * kept.to(condition).repeat_interleave(sizes, dim=1)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, for a checkpoint's description."""
+        return {
+            "categories": {name: list(values) for name, values in self.categories.items()},
+            "scalars": {name: list(values) for name, values in self.scalars.items()},
+        }
+
+    @classmethod
+    def from_json(cls, tree: Mapping[str, Any]) -> Vocabulary:
+        """Inverse of `to_json`; raises KeyError, TypeError or ValueError for anything else."""
+        categories = {name: tuple(map(str, values)) for name, values in tree["categories"].items()}
+        scalars = {name: (float(mean), float(std)) for name, (mean, std) in tree["scalars"].items()}
+        return cls(categories, scalars)
+
+    def _check_names(self, attributes: Attributes) -> None:
+        known = [*self.categories, *self.scalars]
+        for name in attributes:
+            if name not in known:
+                choices = ", ".join(known) or "nothing: it was trained without attributes"
+                raise ValueError(f"this model knows no attribute {name!r}; it knows {choices}")
+
+    def _scalar(self, name: str, value: str | float | None) -> list[float]:
+        if value is None:
+            return [0.0, 0.0]
+        mean, std = self.scalars[name]
+        low, high = mean - FARTHEST * std, mean + FARTHEST * std
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not low <= number <= high:
+            raise ValueError(f"{name} is {value!r}: give a number from {low:.4g} to {high:.4g}")
+        return [1.0, (number - mean) / std]
+
+
+NOTHING = Vocabulary({}, {})
+"""Of models that cannot be asked for anything."""

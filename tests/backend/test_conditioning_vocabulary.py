@@ -1,0 +1,42 @@
+import pytest
+import torch
+from primdiffusion.diffusion.conditioning import NOTHING, Vocabulary
+
+WORDS = Vocabulary({"sex": ("female", "male"), "hair": ("bald", "bob", "long")}, {"height": (1.7, 0.1)})
+
+
+def test_what_is_not_asked_for_is_zero():
+    assert torch.equal(WORDS.encode({}), torch.zeros(7))
+    assert WORDS.encode({"hair": "long"}).tolist() == [0, 0, 0, 0, 1, 0, 0]
+    assert WORDS.encode({"sex": "female", "height": 1.8}).tolist() == pytest.approx([1, 0, 0, 0, 0, 1, 1])
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"hair": "mohawk"}, "mohawk.*bald, bob, long"),
+        ({"beard": "full"}, "beard.*sex, hair, height"),
+        ({"height": 2.5}, r"height is 2.5.*1.3 to 2.1"),
+        ({"height": "tall"}, "height is 'tall'"),
+        ({"height": float("nan")}, "height"),
+    ],
+)
+def test_what_a_model_does_not_know_is_refused_with_what_it_knows(asked, words):
+    with pytest.raises(ValueError, match=words):
+        WORDS.encode(asked)
+    with pytest.raises(ValueError, match="nothing"):
+        NOTHING.encode(asked)
+
+
+def test_a_vocabulary_survives_json():
+    assert Vocabulary.from_json(WORDS.to_json()) == WORDS
+
+
+def test_all_subsets_of_attributes_are_learnt():
+    whole = WORDS.encode({"sex": "male", "hair": "bob", "height": 1.75}).expand(4000, -1)
+    part = WORDS.forget(whole, 0.5, torch.Generator().manual_seed(0))
+    kept = torch.stack([part[:, :2].sum(1), part[:, 2:5].sum(1), part[:, 5]], dim=1)
+    assert set(kept.flatten().tolist()) == {0.0, 1.0}
+    assert len({tuple(row) for row in kept.tolist()}) == 8
+    assert 0.5 < (kept.sum(1) == 0).float().mean() < 0.7
+    assert torch.equal(NOTHING.forget(torch.zeros(3, 0), 0.5, torch.Generator()), torch.zeros(3, 0))
