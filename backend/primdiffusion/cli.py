@@ -205,7 +205,7 @@ class People:
 
 @dataclasses.dataclass(frozen=True)
 class Payloads:
-    """Make such people as primitives, to train the diffusion model on (own --help)."""
+    """Make such people, or captured ones, as primitives to train the diffusion model on; pack them (own --help)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,9 +262,9 @@ def _people(arguments: Sequence[str]) -> None:
 
 
 def _payloads(arguments: Sequence[str]) -> None:
-    from primdiffusion.people.command import PayloadsCommand, run_payloads
+    from primdiffusion.payloads_command import run
 
-    run_payloads(tyro.cli(PayloadsCommand, args=arguments, prog="primdiffusion payloads"))
+    run(arguments)
 
 
 def _captures(arguments: Sequence[str]) -> None:

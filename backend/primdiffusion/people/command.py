@@ -33,7 +33,11 @@ class PeopleCommand:
 
 @dataclasses.dataclass(frozen=True)
 class PayloadsCommand:
-    """Make dressed people as primitives: the training set of the diffusion model."""
+    """Make dressed people as primitives: the training set of the diffusion model.
+
+    `payloads encode` makes it of captures instead; `payloads pack` stores either in few files, which `payloads verify`
+    compares with their checksums (each with its own --help).
+    """
 
     out: Path
     """Folder to write person_NNNNNN.npz into; people that are whole in it are kept."""

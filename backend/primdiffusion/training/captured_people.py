@@ -1,0 +1,171 @@
+"""Captured people as training payloads: what the frozen encoder makes of their pictures, refined where asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from primdiffusion.capture.conditioning import conditioning_views, default_betas, spread_cameras
+from primdiffusion.capture.people_files import find_people
+from primdiffusion.capture.rasterised import Outcome
+from primdiffusion.capture.reader import Captures
+from primdiffusion.encoder.encode import EncoderModel, betas_of_frames
+from primdiffusion.failures import describe
+from primdiffusion.human import Human
+from primdiffusion.people.folder import CARD
+from primdiffusion.people.payloads import store_person, voxels_from_payload
+from primdiffusion.primitives.primitives import Payload
+from primdiffusion.training.refine import RefineSettings, refine
+from primdiffusion.training.stored_people import read_person
+
+
+@dataclasses.dataclass(frozen=True)
+class EncodeSettings:
+    """How captures become payloads."""
+
+    views: int = 8
+    """Pictures that the encoder is given, of one frame, spread around the person; all where there are fewer."""
+    looks: int = 1
+    """Frames, evenly spaced from the first on, of each of which one payload is made."""
+    refine_steps: int = 0
+    """Steps of refinement on all pictures of all frames; 0: as the encoder gives them."""
+    refine_size: int = 256
+    """Pixels a side, at most, of the pictures that are refined on."""
+    seed: int = 0
+    """Of the order of pictures in refining."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for settings that cannot be."""
+        for name, least in (("views", 1), ("looks", 1), ("refine_steps", 0), ("refine_size", 1), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} is {getattr(self, name)}: it must be {least} or more")
+
+
+def encode_people(
+    model: EncoderModel,
+    captures: Captures,
+    out: Path,
+    settings: EncodeSettings = EncodeSettings(),
+    cards: Mapping[str, Mapping[str, Any]] | None = None,
+) -> Iterator[Outcome]:
+    """Write NAME.npz of every captured person into `out`; yields each outcome. One that fails leaves the others alone.
+
+    The files are those of `primdiffusion payloads`, with delta scales and where they come from. A file of the same
+    source is kept ("skipped"). `cards` holds attributes and seeds of people by name (`read_cards`).
+
+    Raises OSError where `out` cannot be written to.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    about = {
+        "captures": {key: value for key, value in captures.about.items() if key != "part_names"},
+        "encoder": {"name": model.card.get("name", "unnamed"), "weights": _digest(model)},
+        **dataclasses.asdict(settings),
+    }
+    for name in captures.subjects:
+        card = (cards or {}).get(name, {})
+        path = out / f"{name}.npz"
+        source = json.dumps({"captured": name, **about}, sort_keys=True)
+        if _is_kept(path, source, card.get("attributes", {})):
+            yield Outcome(name, "skipped")
+            continue
+        try:
+            payloads, betas = looks_of(model, captures, name, settings)
+        except Exception as error:
+            failure = describe(error)
+            if failure is None:
+                raise
+            yield Outcome(name, "failed", str(failure))
+            continue
+        _store(path, payloads, betas, source, card)
+        yield Outcome(name, "done", views=settings.views)
+
+
+def looks_of(
+    model: EncoderModel, captures: Captures, name: str, settings: EncodeSettings
+) -> tuple[list[Payload], Float[Tensor, "10"]]:
+    """A person's payloads, on the CPU, and the betas of the body that their boxes sit on.
+
+    Raises:
+        FileNotFoundError, ConditioningError, CaptureFileError, NpzError, BodyFileError: captures are missing, damaged
+            or of another body.
+        ValueError: the pictures lead to numbers that are not finite.
+    """
+    subject = captures.subject(name)
+    given = default_betas(subject)
+    betas, payloads, pictures = betas_of_frames(model.config, given), [], []
+    if settings.refine_steps:
+        frames = range(subject.frames)
+        pictures = [conditioning_views(captures, name, frame, None, settings.refine_size) for frame in frames]
+    for frame in frames_of_looks(subject.frames, settings.looks):
+        cameras = spread_cameras(subject, frame, settings.views)
+        payload = model.encode(conditioning_views(captures, name, frame, cameras), given).validate()
+        if pictures:
+            human = Human(payload, betas, {}).to(payload.density.device)
+            payload = refine(human, pictures, RefineSettings(settings.refine_steps, seed=settings.seed)).human.payload
+        payloads.append(payload.to("cpu"))
+    return payloads, betas
+
+
+def frames_of_looks(frames: int, looks: int) -> list[int]:
+    """`looks` evenly spaced frames from the first on, fewer where there are fewer."""
+    count = min(frames, looks)
+    return [look * frames // count for look in range(count)]
+
+
+def read_cards(people: Path) -> dict[str, Mapping[str, Any]]:
+    """What `primdiffusion people` noted of everybody in a folder, by name: betas, attributes, seed.
+
+    Raises:
+        FileNotFoundError: there is nobody in it.
+        ValueError: somebody's card is damaged.
+    """
+    cards = {}
+    for name, path in find_people(people).items():
+        card = path.parent / CARD
+        if path.name != f"{name}.glb" and card.is_file():
+            try:
+                cards[name] = dict(json.loads(card.read_text(encoding="utf-8")))
+            except (ValueError, TypeError) as error:
+                raise ValueError(f"{card} is damaged ({error}): make the person again") from error
+    return cards
+
+
+def _digest(model: EncoderModel) -> str:
+    """Of the weights, so that what another encoder made is not taken for this one's."""
+    digest = hashlib.sha256()
+    for value in model.encoder.state_dict().values():
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _store(path: Path, payloads: list[Payload], betas: Tensor, source: str, card: Mapping[str, Any]) -> None:
+    entries: dict[str, np.ndarray | str | int] = {
+        "voxels": np.stack([voxels_from_payload(payload) for payload in payloads]),
+        "delta_scale": torch.stack([payload.delta_scale for payload in payloads]).half().numpy(),
+        "betas": betas.double().numpy(),
+        "attributes": json.dumps(card.get("attributes", {})),
+        "source": source,
+    }
+    store_person(path, entries if card.get("seed") is None else {**entries, "seed": int(card["seed"])})
+
+
+def _is_kept(path: Path, source: str, attributes: Mapping[str, Any]) -> bool:
+    """Whether a file is whole and holds what would be written again; a damaged one is made anew."""
+    try:
+        return dict(read_person(path).attributes) == dict(attributes) and _source(path) == source
+    except (FileNotFoundError, ValueError):
+        return False
+
+
+def _source(path: Path) -> str:
+    with np.load(path, allow_pickle=False) as file:
+        return str(file["source"]) if "source" in file else ""
