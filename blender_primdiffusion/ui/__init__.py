@@ -7,10 +7,15 @@ from bpy.app.handlers import persistent
 
 from ..scene.collect import collect_before_saving
 from . import (
+    attributes,
     capture_command,
     capture_operators,
     capture_panel,
     capture_settings,
+    edit_operators,
+    edit_painting,
+    edit_panel,
+    edit_settings,
     operators,
     panel,
     preferences,
@@ -19,16 +24,26 @@ from . import (
     reconstruct_panel,
     reconstruct_settings,
     render_panels,
+    unused_files,
 )
 from .capture_session import captures
 from .generation import session
 
 CLASSES = (
     preferences.PRIMDIFFUSION_AP_preferences,
+    attributes.PRIMDIFFUSION_PG_attributes,
     properties.PRIMDIFFUSION_PG_settings,
     operators.PRIMDIFFUSION_OT_generate,
     operators.PRIMDIFFUSION_OT_cancel,
     panel.PRIMDIFFUSION_PT_generate,
+    panel.PRIMDIFFUSION_PT_attributes,
+    edit_settings.PRIMDIFFUSION_PG_edit,
+    *edit_operators.EDITS,
+    edit_painting.PRIMDIFFUSION_OT_paint_region,
+    edit_painting.PRIMDIFFUSION_OT_finish_painting,
+    unused_files.PRIMDIFFUSION_OT_remove_unused_files,
+    edit_panel.PRIMDIFFUSION_PT_edit,
+    *edit_panel.SUB_PANELS,
     capture_settings.PRIMDIFFUSION_PG_captures,
     capture_operators.PRIMDIFFUSION_OT_render_captures,
     capture_operators.PRIMDIFFUSION_OT_cancel_captures,
@@ -58,6 +73,7 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion = bpy.props.PointerProperty(type=properties.PRIMDIFFUSION_PG_settings)
+    bpy.types.Scene.primdiffusion_edit = bpy.props.PointerProperty(type=edit_settings.PRIMDIFFUSION_PG_edit)
     bpy.types.Scene.primdiffusion_captures = bpy.props.PointerProperty(type=capture_settings.PRIMDIFFUSION_PG_captures)
     bpy.types.Scene.primdiffusion_reconstruct = bpy.props.PointerProperty(
         type=reconstruct_settings.PRIMDIFFUSION_PG_reconstruct
@@ -82,6 +98,7 @@ def unregister() -> None:
     render_panels.leave_panels()
     del bpy.types.Scene.primdiffusion_reconstruct
     del bpy.types.Scene.primdiffusion_captures
+    del bpy.types.Scene.primdiffusion_edit
     del bpy.types.Scene.primdiffusion
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -1,22 +1,34 @@
-"""The one person that may be in the making, generated or reconstructed, and what becomes of them in the scene."""
+"""The one person in the making - generated, reconstructed, edited - and what becomes of them in the scene."""
 
 from __future__ import annotations
 
 import shutil
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import bpy
+import numpy as np
 
 from ..places import new_backend, preference
-from ..scene.human import build_human, overlap_warning
+from ..scene.edited import replace_person
+from ..scene.human import build_human, overlap_warning, person_file
 from ..scene.human_file import HumanFileError
 from ..scene.volumes import VolumeWriteError
-from ..worker.job import Backend, GenerateJob, PersonJob, ReconstructJob
+from ..worker.job import Backend, EditJob, GenerateJob, PersonJob, ReconstructJob
+from .edit_target import Target
 
 TICK_S = 0.1
-_UNDO_NAMES = {"generate": "Generate Human", "reconstruct": "Human from Captures"}
+_UNDO_NAMES = {
+    "generate": "Generate Human",
+    "reconstruct": "Human from Captures",
+    "vary": "Vary Human",
+    "interpolate": "Blend Humans",
+    "inpaint": "Re-dress Region",
+    "transfer": "Transfer Texture",
+}
 
 
 class Busy(RuntimeError):
@@ -38,7 +50,7 @@ class Session:
         self.notice: str = ""
         """How the last generation ended otherwise."""
         self.kind = ""
-        """The child's method of the job under way, or of the last one: generate or reconstruct."""
+        """The child's method of the job under way, or of the last one: generate, reconstruct or an edit."""
         self.device = ""
         """What the backend computes on, once it has said so."""
         self.seconds: dict[str, float] = {}
@@ -47,16 +59,45 @@ class Session:
         self._backend: Backend | None = None
         self._backend_python = ""
         self._folder: Path | None = None
+        self._target: Target | None = None
 
     @property
     def busy(self) -> bool:
         """A person is being made."""
         return self.job is not None
 
-    def start(self, seed: int, steps: int) -> None:
-        """Begin a generation. Raises Busy, or OSError when there is no folder to work in."""
+    def start(self, seed: int, steps: int, sampler: str = "ddim", asked: Mapping[str, Any] | None = None) -> None:
+        """Begin a generation; `asked` may hold attributes and guidance.
+
+        Raises Busy, or OSError when there is no folder to work in.
+        """
         backend, folder = self._begin("generate")
-        self.job = GenerateJob(backend, seed=seed, steps=steps, out_dir=folder, checkpoint=_checkpoint("checkpoint"))
+        checkpoint = _checkpoint("checkpoint")
+        self.job = GenerateJob(
+            backend, seed=seed, steps=steps, out_dir=folder, sampler=sampler, asked=asked, checkpoint=checkpoint
+        )
+
+    def start_edit(
+        self,
+        person: bpy.types.Collection,
+        method: str,
+        steps: int,
+        asked: Mapping[str, Any],
+    ) -> None:
+        """Begin to edit `person` by a method of the child with these parameters.
+
+        A region that is an array holds painted weights [V], and travels as a file.
+        Raises Busy, ValueError for a person that cannot be edited, FileNotFoundError for one whose file is missing, and
+        OSError when there is no folder to work in.
+        """
+        target, file = Target.of(person), person_file(person)
+        backend, folder = self._begin(method)
+        if isinstance(asked.get("region"), np.ndarray):
+            np.savez(folder / "region.npz", weights=asked["region"])
+            asked = {**asked, "region": {"weights": str(folder / "region.npz")}}
+        self._target = target
+        checkpoint = _checkpoint("checkpoint")
+        self.job = EditJob(backend, method, file, asked, out_dir=folder, steps=steps, checkpoint=checkpoint)
 
     def start_reconstruction(self, capture: Path, subject: str, frame: int, views: int) -> None:
         """Begin to make a person of captures; an empty subject: the only one. Raises as `start` does."""
@@ -103,12 +144,12 @@ class Session:
                 return None
             if job.state == "failed":
                 raise GenerationFailed(str(job.error))
-            return self._build(context, job)
+            return self._replace(context, job) if isinstance(job, EditJob) else self._build(context, job)
         except (GenerationFailed, HumanFileError, VolumeWriteError) as error:
             self.error = _sentence(error)
             raise GenerationFailed(self.error) from error
         except Exception as error:
-            self.error = f"The person could not be built: {_sentence(error)}"
+            self.error = f"The person could not be put into the scene: {_sentence(error)}"
             raise
         finally:
             if folder is not None:
@@ -141,6 +182,27 @@ class Session:
         bpy.ops.ed.undo_push(message=_UNDO_NAMES[job.method])
         return collection
 
+    def _replace(self, context: bpy.types.Context, job: PersonJob) -> bpy.types.Collection:
+        began = time.monotonic()
+        result = job.result or {}
+        try:
+            person = self._target.found()
+            _leave_edit_mode(context)
+            done = replace_person(context, person, Path(result["human"]), Path(result["person"]))
+        except (ValueError, OSError) as error:
+            raise GenerationFailed(str(error)) from error
+        self.seconds = {"generate": began - self._started, "build": time.monotonic() - began}
+        warnings = (*result.get("warnings", ()), done.warning, overlap_warning(person))
+        shape = ", the body's shape too" if done.reshaped else ""
+        self.notice = " ".join(
+            [
+                f"{job.message}; {done.volumes} of {done.of} volumes of {person.name} changed{shape}.",
+                *(_sentence(text) for text in warnings if text),
+            ]
+        )
+        bpy.ops.ed.undo_push(message=_UNDO_NAMES[job.method])
+        return person
+
     def _backend_for(self, python: str) -> Backend:
         """The child of this interpreter; changing the preference ends the former one."""
         if self._backend is not None and python == self._backend_python:
@@ -155,6 +217,12 @@ def _checkpoint(name: str) -> Path | None:
     """The file of a preference; None: the one that comes with the extension."""
     path = preference(name)
     return Path(path) if path else None
+
+
+def _leave_edit_mode(context: bpy.types.Context) -> None:
+    """Undo steps made in an edit mode hold what is being edited alone, not the person."""
+    if context.mode.startswith(("EDIT", "PARTICLE")):
+        bpy.ops.object.mode_set(mode="OBJECT")
 
 
 def _sentence(error: BaseException | str) -> str:

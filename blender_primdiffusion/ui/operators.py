@@ -6,7 +6,9 @@ import time
 
 import bpy
 
+from .attributes import asked, parsed
 from .generation import TICK_S, Busy, GenerationFailed, session
+from .properties import SAMPLERS
 
 _TOLD_S = 1.0
 """Between lines of progress on the console in background mode."""
@@ -21,13 +23,34 @@ class PRIMDIFFUSION_OT_generate(bpy.types.Operator):
 
     seed: bpy.props.IntProperty(name="Seed", default=-1, min=-1, description="-1: the panel's")
     steps: bpy.props.IntProperty(name="Steps", default=0, min=0, description="0: the panel's")
+    sampler: bpy.props.EnumProperty(
+        name="Sampler", items=SAMPLERS, description="Not given: the panel's", options={"SKIP_SAVE"}
+    )
+    guidance: bpy.props.FloatProperty(
+        name="Guidance", min=0.0, max=20.0, description="Not given: the panel's", options={"SKIP_SAVE"}
+    )
+    attributes: bpy.props.StringProperty(
+        name="Attributes",
+        description="Like sex=female, height=1.7; empty: whatever comes. Not given: the panel's",
+        options={"SKIP_SAVE"},
+    )
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Start; with a window a timer follows the job, in background mode this waits for it."""
         settings = context.scene.primdiffusion
+        given = self.properties.is_property_set
+        sampler = self.sampler if given("sampler") else settings.sampler
+        guidance = self.guidance if given("guidance") else settings.guidance
         try:
-            session.start(self.seed if self.seed >= 0 else settings.seed, self.steps or settings.steps)
-        except (Busy, OSError) as error:
+            wanted = parsed(self.attributes) if given("attributes") else asked(settings.attributes)
+            asked_of_the_child = {"attributes": wanted, "guidance": guidance} if wanted else {}
+            session.start(
+                self.seed if self.seed >= 0 else settings.seed,
+                self.steps or settings.steps,
+                sampler,
+                asked_of_the_child,
+            )
+        except (Busy, OSError, ValueError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return see_through(self, context)

@@ -1,4 +1,4 @@
-"""The sidebar panel: 3D View > N > PrimDiffusion."""
+"""The sidebar panel Generate Human: 3D View > N > PrimDiffusion."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import textwrap
 
 import bpy
 
+from .attributes import draw_attributes
 from .generation import session
 
 _LINE = 46
@@ -27,8 +28,29 @@ class PRIMDIFFUSION_PT_generate(bpy.types.Panel):
         column.enabled = not session.busy
         column.prop(settings, "seed")
         column.prop(settings, "steps")
+        column.prop(settings, "sampler")
         layout.label(text=f"Device: {session.device or 'known after the first start'}", icon="MEMORY")
         draw_job(layout, "generate", "primdiffusion.generate", "OUTLINER_OB_ARMATURE")
+
+
+class PRIMDIFFUSION_PT_attributes(bpy.types.Panel):
+    """What the person is asked to be; nothing is asked for unless something is chosen."""
+
+    bl_label = "Attributes"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "PrimDiffusion"
+    bl_parent_id = "PRIMDIFFUSION_PT_generate"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Reads the checkpoint's card; starts nothing."""
+        layout, settings = self.layout, context.scene.primdiffusion
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        layout.enabled = not session.busy
+        draw_attributes(layout, settings.attributes)
+        layout.prop(settings, "guidance")
 
 
 def draw_job(layout: bpy.types.UILayout, kind: str, button: str, icon: str) -> None:

@@ -4,6 +4,14 @@ from __future__ import annotations
 
 import bpy
 
+from .attributes import PRIMDIFFUSION_PG_attributes
+
+SAMPLERS = [
+    ("ddim", "DDIM", "The paper's way to sample: the same steps each time"),
+    ("dpmpp_2m", "DPM-Solver++(2M)", "Good with few steps"),
+    ("ddpm", "DDPM", "Noise is added again at each step; wants many steps"),
+]
+
 
 class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
     """`scene.primdiffusion`."""
@@ -19,3 +27,15 @@ class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
         max=1000,
         soft_max=100,
     )
+    sampler: bpy.props.EnumProperty(name="Sampler", description="How the noise is taken away", items=SAMPLERS)
+    guidance: bpy.props.FloatProperty(
+        name="Guidance",
+        description="How strongly the attributes are followed: 1 as people are, more exaggerates; "
+        "without attributes it does nothing",
+        default=1.5,
+        min=0.0,
+        max=20.0,
+        soft_min=1.0,
+        soft_max=5.0,
+    )
+    attributes: bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_attributes)

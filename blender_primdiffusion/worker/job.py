@@ -7,7 +7,7 @@ import dataclasses
 import shutil
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,6 +26,9 @@ STAGES = {
     "preview": "Drawing the previews",
     "write": "Writing the person",
 }
+
+EDITS = {"vary": "Varied", "interpolate": "Blended", "inpaint": "Re-dressed", "transfer": "Texture transferred"}
+"""Methods of the child that make a person of a person, and what became of them."""
 
 
 class Backend:
@@ -257,8 +260,24 @@ class PersonJob:
         self.state, self.message, self.eta_s = state, message, None
 
 
-class GenerateJob(PersonJob):
-    """A person from noise; progress counts the sampler's steps."""
+class SamplingJob(PersonJob):
+    """A person whom the diffusion model draws; progress counts the sampler's steps."""
+
+    def __init__(
+        self, backend: Backend, params: dict[str, Any], *, out_dir: Path, steps: int, checkpoint: Path | None = None
+    ):
+        if checkpoint is not None:
+            params = {**params, "checkpoint": str(checkpoint)}
+        super().__init__(backend, {**params, "steps": steps}, out_dir, steps)
+
+    def _take_step(self, stage: str, step: int, total: int) -> None:
+        if stage == "sample":
+            super()._take_step(stage, step, total)
+            self.message = f"{self.message}: step {step} of {total}"
+
+
+class GenerateJob(SamplingJob):
+    """A person from noise."""
 
     method = "generate"
     made = "Generated"
@@ -271,17 +290,32 @@ class GenerateJob(PersonJob):
         steps: int,
         out_dir: Path,
         sampler: str = "ddim",
+        asked: Mapping[str, Any] | None = None,
         checkpoint: Path | None = None,
     ):
-        params = {"seed": seed, "steps": steps, "sampler": sampler}
-        if checkpoint is not None:
-            params["checkpoint"] = str(checkpoint)
-        super().__init__(backend, params, out_dir, steps)
+        """`asked` are further parameters: attributes, guidance."""
+        params = {"seed": seed, "sampler": sampler, **(asked or {})}
+        super().__init__(backend, params, out_dir=out_dir, steps=steps, checkpoint=checkpoint)
 
-    def _take_step(self, stage: str, step: int, total: int) -> None:
-        if stage == "sample":
-            super()._take_step(stage, step, total)
-            self.message = f"{self.message}: step {step} of {total}"
+
+class EditJob(SamplingJob):
+    """A person made of one that exists, by one of the child's methods in EDITS."""
+
+    def __init__(
+        self,
+        backend: Backend,
+        method: str,
+        person: Path,
+        asked: Mapping[str, Any],
+        *,
+        out_dir: Path,
+        steps: int,
+        checkpoint: Path | None = None,
+    ):
+        """`person` is the backend's file of whom to edit, `asked` the method's other parameters."""
+        self.method, self.made = method, EDITS[method]
+        params = {**asked, "person": str(person)}
+        super().__init__(backend, params, out_dir=out_dir, steps=steps, checkpoint=checkpoint)
 
 
 class ReconstructJob(PersonJob):

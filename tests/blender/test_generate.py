@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -46,7 +47,9 @@ def test_generate_builds_a_person_and_keeps_the_backends_file_beside_its_volumes
     assert bpy.ops.primdiffusion.generate(seed=7, steps=3) == {"FINISHED"}
     (person,) = humans(addon.scene)
     assert sum(o.type == "VOLUME" for o in person.all_objects) == 8
-    assert (folder_of(person) / "person.human.safetensors").read_bytes() == b"person"
+    sent = json.loads((folder_of(person) / "person.human.safetensors").read_bytes())
+    assert Path(sent.pop("out_dir")).name.startswith("generate_")
+    assert sent == {"seed": 7, "steps": 3, "sampler": "ddim"}
     assert not session.busy
     assert session.error == ""
     assert session.device == "fake device"

@@ -1,4 +1,4 @@
-"""A child that answers generate and reconstruct with FAKE_HUMAN's file and draw with one colour, or misbehaves."""
+"""A child that makes people of FAKE_HUMAN's file, edits them and draws one colour, or misbehaves."""
 
 import json
 import os
@@ -40,11 +40,30 @@ def generate(id: int, params: dict, cancelled: threading.Event) -> None:
     human = out / "human.npz"
     if seed == GIVES_GARBAGE:
         human.write_bytes(b"PK\x03\x04 no more")
+    elif "person" in params:
+        write_edited(human, params)
     else:
         shutil.copyfile(os.environ["FAKE_HUMAN"], human)
-    (out / "person.human.safetensors").write_bytes(b"person")
+    (out / "person.human.safetensors").write_bytes(json.dumps(params).encode())
     person = str(out / "person.human.safetensors")
     say(id=id, result={"human": str(human), "person": person, "seed": seed, "steps": steps, "seconds": 0.1})
+
+
+def write_edited(path: Path, params: dict) -> None:
+    """Another colour for primitives 1 and 2, for all where no region is given; another body for a blend."""
+    with np.load(os.environ["FAKE_HUMAN"]) as archive:
+        arrays = dict(archive)
+    arrays["rgb"] = arrays["rgb"].copy()
+    region = [1, 2] if "region" in params else slice(None)
+    arrays["rgb"][region] = arrays["rgb"][region] * 0.5 + 0.1 * (params["seed"] % 5)
+    if "fraction" in params:
+        arrays["betas"] = arrays["betas"] + 1
+        for name in ("joints", "vertices", "position"):
+            arrays[name] = arrays[name] * 1.1
+    if "weights" in (params.get("region") or ()):
+        with np.load(params["region"]["weights"]) as weights:
+            arrays["meta"] = np.array(json.dumps({"painted": weights["weights"].tolist()}))
+    np.savez(path, **arrays)
 
 
 def reconstruct(id: int, params: dict, cancelled: threading.Event) -> None:
@@ -94,7 +113,12 @@ def draw(id: int, params: dict, cancelled: threading.Event) -> None:
     say(id=id, result={"seconds": 0.0, "seconds_place": 0.0, "seconds_march": 0.0})
 
 
-WORK = {"generate": generate, "reconstruct": reconstruct, "draw": draw}
+def edit(id: int, params: dict, cancelled: threading.Event) -> None:
+    generate(id, {"seed": 0, **params}, cancelled)
+
+
+EDITS = dict.fromkeys(("vary", "interpolate", "inpaint", "transfer"), edit)
+WORK = {**EDITS, "generate": generate, "reconstruct": reconstruct, "draw": draw}
 cancelled = threading.Event()
 for line in sys.stdin:
     request = json.loads(line)

@@ -1,0 +1,116 @@
+"""The sidebar panel Edit Human, below Generate Human: 3D View > N > PrimDiffusion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import bpy
+
+from ..scene.body_mesh import body_of
+from .attributes import draw_attributes
+from .edit_painting import painting
+from .edit_settings import SIDED_PARTS, WHOLE_PARTS
+from .edit_target import selected_person
+from .panel import draw_job
+
+
+class _InSidebar:
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "PrimDiffusion"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+
+class PRIMDIFFUSION_PT_edit(_InSidebar, bpy.types.Panel):
+    """Who would be edited; the edits are sub-panels."""
+
+    bl_label = "Edit Human"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Reads the scene; changes nothing."""
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        try:
+            layout.label(text=selected_person(context).name, icon="OUTLINER_OB_ARMATURE")
+        except ValueError as error:
+            layout.label(text=str(error), icon="INFO")
+        layout.prop(context.scene.primdiffusion_edit, "seed")
+        layout.operator("primdiffusion.remove_unused_files", icon="TRASH")
+
+
+def _sub_panel(name: str, label: str, content: Callable) -> type:
+    class SubPanel(_InSidebar, bpy.types.Panel):
+        bl_idname = f"PRIMDIFFUSION_PT_edit_{name}"
+        bl_label = label
+        bl_parent_id = "PRIMDIFFUSION_PT_edit"
+        __doc__ = content.__doc__
+
+        def draw(self, context: bpy.types.Context) -> None:
+            self.layout.use_property_split = True
+            self.layout.use_property_decorate = False
+            content(self.layout, context.scene.primdiffusion_edit, context)
+
+    SubPanel.__name__ = SubPanel.bl_idname
+    return SubPanel
+
+
+def _draw_vary(layout: bpy.types.UILayout, settings, _context) -> None:
+    """How far, and the button."""
+    layout.prop(settings, "amount")
+    draw_job(layout, "vary", "primdiffusion.vary", "MOD_NOISE")
+
+
+def _draw_redress(layout: bpy.types.UILayout, settings, context) -> None:
+    """Where, into what, and the button."""
+    _draw_region(layout, settings, context)
+    draw_attributes(layout, settings.attributes)
+    draw_job(layout, "inpaint", "primdiffusion.redress", "MATCLOTH")
+
+
+def _draw_transfer(layout: bpy.types.UILayout, settings, context) -> None:
+    """From whom, where, and the button."""
+    layout.prop(settings, "other")
+    _draw_region(layout, settings, context)
+    layout.prop(settings, "harmonise")
+    draw_job(layout, "transfer", "primdiffusion.transfer_texture", "TEXTURE")
+
+
+def _draw_blend(layout: bpy.types.UILayout, settings, _context) -> None:
+    """With whom, how far, and the button."""
+    layout.prop(settings, "other")
+    layout.prop(settings, "fraction")
+    draw_job(layout, "interpolate", "primdiffusion.blend", "ARROW_LEFTRIGHT")
+
+
+def _draw_region(layout: bpy.types.UILayout, settings, context: bpy.types.Context) -> None:
+    layout.row().prop(settings, "region", expand=True)
+    if settings.region == "PARTS":
+        _draw_parts(layout, settings, WHOLE_PARTS, 3)
+        header, body = layout.panel("primdiffusion_sides", default_closed=True)
+        header.label(text="Left and Right")
+        if body is not None:
+            _draw_parts(body, settings, SIDED_PARTS, 2)
+        return
+    try:
+        mesh = body_of(selected_person(context))
+    except ValueError:
+        mesh = None
+    if mesh is not None:
+        layout.prop_search(settings, "vertex_group", mesh, "vertex_groups", text="Group")
+    action = "finish_painting" if painting(context) else "paint_region"
+    layout.operator(f"primdiffusion.{action}", icon="BRUSH_DATA")
+
+
+def _draw_parts(layout: bpy.types.UILayout, settings, parts: tuple[str, ...], columns: int) -> None:
+    grid = layout.grid_flow(row_major=True, columns=columns, even_columns=True, align=True)
+    for part in parts:
+        grid.prop_enum(settings, "parts", part)
+
+
+SUB_PANELS = (
+    _sub_panel("vary", "Vary", _draw_vary),
+    _sub_panel("redress", "Re-dress Region", _draw_redress),
+    _sub_panel("transfer", "Transfer Texture", _draw_transfer),
+    _sub_panel("blend", "Blend", _draw_blend),
+)

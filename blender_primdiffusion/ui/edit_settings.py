@@ -1,0 +1,84 @@
+"""What the panel Edit Human asks for; saved with the scene."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..scene.human import MARK, humans
+from .attributes import PRIMDIFFUSION_PG_attributes, title
+
+WHOLE_PARTS = (
+    "face", "hair", "neck", "torso", "upper_arms", "forearms", "hands", "thighs", "shins", "feet", "hips",
+    "head", "arms", "legs", "top", "bottom", "shoes", "clothes", "skin",
+)  # fmt: skip
+SIDED_PARTS = (
+    "left_upper_arm", "right_upper_arm", "left_forearm", "right_forearm", "left_hand", "right_hand",
+    "left_thigh", "right_thigh", "left_shin", "right_shin", "left_foot", "right_foot",
+)  # fmt: skip
+PARTS = (*WHOLE_PARTS, *SIDED_PARTS)
+"""The backend's names of parts of the body, in its order."""
+PAINTED_GROUP = "PrimDiffusion Region"
+"""Vertex group of the body mesh that Paint Region makes."""
+
+
+def parts_property():
+    """Several parts of the body may be chosen."""
+    return bpy.props.EnumProperty(
+        name="Parts",
+        description="What to change: Shift-click for several. A person's left and right",
+        items=[(name, title(name), "", 1 << i) for i, name in enumerate(PARTS)],
+        options={"ENUM_FLAG", "SKIP_SAVE"},
+        default={"top"},
+    )
+
+
+def _may_be_other(_self: PRIMDIFFUSION_PG_edit, collection: bpy.types.Collection) -> bool:
+    return MARK in collection and collection in humans(bpy.context.scene)
+
+
+class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
+    """`scene.primdiffusion_edit`."""
+
+    seed: bpy.props.IntProperty(
+        name="Seed", description="Another seed is another result; the same seed is the same", default=1, min=0
+    )
+    amount: bpy.props.FloatProperty(
+        name="Amount",
+        description="How far the new person may be from this one: 0 is the same, 1 anybody",
+        default=0.5,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+    )
+    region: bpy.props.EnumProperty(
+        name="Region",
+        description="Where to change the person; everything else stays exactly as it is",
+        items=[
+            ("PARTS", "Parts", "Parts of the body, by name"),
+            ("PAINTED", "Painted", "A vertex group of the body mesh: where its weight is one half or more"),
+        ],
+    )
+    parts: parts_property()
+    vertex_group: bpy.props.StringProperty(
+        name="Vertex Group", description="Of the body mesh of the person", default=PAINTED_GROUP
+    )
+    attributes: bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_attributes)
+    other: bpy.props.PointerProperty(
+        name="Other Person", description="From whom", type=bpy.types.Collection, poll=_may_be_other
+    )
+    harmonise: bpy.props.FloatProperty(
+        name="Harmonise",
+        description="How much the region is denoised once more to fit the rest of the person: 0 copies it exactly",
+        default=0.0,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+    )
+    fraction: bpy.props.FloatProperty(
+        name="Fraction",
+        description="How much of the other person: 0 is this one, 1 the other",
+        default=0.5,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+    )

@@ -1,0 +1,67 @@
+"""Whom an edit is about, from the click until it is done, whatever happens to the scene meanwhile."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import bpy
+
+from ..scene.edited import check_editable
+from ..scene.human import human_of, humans, person_file_name
+
+
+@dataclasses.dataclass(frozen=True)
+class Target:
+    """A person as they were when the edit began. Undo may replace Blender's objects, so none is kept."""
+
+    uid: int
+    """Of the collection, for as long as the file is open."""
+    name: str
+    file: str
+    """Name of the backend's file of the person."""
+
+    @classmethod
+    def of(cls, person: bpy.types.Collection) -> Target:
+        """Raises ValueError for a person that cannot be edited."""
+        check_editable(person)
+        return cls(person.session_uid, person.name, person_file_name(person))
+
+    def found(self) -> bpy.types.Collection:
+        """The person, if still in a scene and the one it was; else ValueError with a sentence."""
+        people = [person for scene in bpy.data.scenes for person in humans(scene)]
+        person = next((person for person in people if person.session_uid == self.uid), None)
+        if person is None or not any(thing.type == "ARMATURE" for thing in person.objects):
+            raise ValueError(
+                f"the person {self.name!r} was removed while the edit was under way; nothing was changed. Undo the "
+                "removal and edit again"
+            )
+        if person_file_name(person) != self.file:
+            raise ValueError(
+                f"the person {person.name!r} became another while the edit was under way (by undo or redo); nothing "
+                "was changed. Edit again"
+            )
+        check_editable(person)
+        return person
+
+
+def selected_person(context: bpy.types.Context) -> bpy.types.Collection:
+    """Whom the active object belongs to; without such an object the only person of the scene. Raises ValueError."""
+    person = human_of(context.view_layer.objects.active, context.scene)
+    if person is not None:
+        return person
+    people = humans(context.scene)
+    if len(people) == 1:
+        return people[0]
+    if not people:
+        raise ValueError("nobody is in the scene: generate a person first")
+    raise ValueError(f"{len(people)} people are in the scene: select a part of the one to edit")
+
+
+def named_person(context: bpy.types.Context, name: str) -> bpy.types.Collection:
+    """The person of the scene whose collection has this name. Raises ValueError, naming who is there."""
+    people = humans(context.scene)
+    for person in people:
+        if person.name == name:
+            return person
+    there = ", ".join(repr(person.name) for person in people) or "nobody"
+    raise ValueError(f"the person {name!r} is not in the scene: choose from {there}")

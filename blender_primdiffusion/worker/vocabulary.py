@@ -1,0 +1,42 @@
+"""What a checkpoint can be asked for, read from its file without torch.
+
+A safetensors file begins with the length of its header (8 bytes, little-endian) and the header itself: JSON, in which
+`__metadata__` holds strings. The backend writes its vocabulary into one of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+_LONGEST_HEADER = 100_000_000
+"""What safetensors itself accepts."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Vocabulary:
+    """Attributes that a model knows; none for one that was trained without."""
+
+    categories: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    """Name -> values to choose from: sex, outfit, hair."""
+    scalars: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    """Name -> mean and standard deviation: height in metres, weight in kilograms."""
+
+
+def read_vocabulary(path: Path) -> Vocabulary:
+    """The vocabulary of a checkpoint; an empty one where the file has none.
+
+    Raises OSError for a file that cannot be read and ValueError for one that is no checkpoint.
+    """
+    with path.open("rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+        header = file.read(length) if length <= _LONGEST_HEADER else b""
+    try:
+        tree = json.loads(json.loads(header)["__metadata__"]["architecture"]).get("vocabulary") or {}
+        categories = {name: tuple(map(str, values)) for name, values in tree.get("categories", {}).items()}
+        scalars = {name: (float(mean), float(std)) for name, (mean, std) in tree.get("scalars", {}).items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged or no checkpoint of a diffusion model: choose another file") from error
+    return Vocabulary(categories, scalars)

@@ -1,0 +1,346 @@
+"""Editing the selected person as the user meets it, with the real client and a child that can be told to misbehave."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import bpy
+import numpy as np
+import pytest
+
+from blender_primdiffusion.scene.body_mesh import body_of
+from blender_primdiffusion.scene.human import armature_of, humans, person_file, remove_human
+from blender_primdiffusion.scene.painted import painted_weights
+from blender_primdiffusion.ui import edit_operators, edit_panel
+from blender_primdiffusion.ui.generation import session
+from blender_primdiffusion.ui.operators import follow
+
+DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
+"""Seeds that the fake child takes as orders."""
+FINE = 8
+ops = bpy.ops.primdiffusion
+
+
+@pytest.fixture
+def person(addon):
+    """Somebody at work on whom there is to edit, and somebody else, in a saved file."""
+    for _ in range(2):
+        ops.generate(seed=7, steps=1)
+    first, _ = humans(addon.scene)
+    addon.view_layer.objects.active = armature_of(first)
+    bpy.ops.ed.undo_push(message="two people")
+    return first
+
+
+def paths(person) -> list[str]:
+    return [thing.data.filepath for thing in sorted(person.all_objects, key=lambda o: o.name) if thing.type == "VOLUME"]
+
+
+def sent(person) -> dict:
+    """What the child was asked, but for the folder of the job."""
+    asked = json.loads(person_file(person).read_bytes())
+    del asked["out_dir"]
+    return asked
+
+
+def drive(seconds: float = 60.0) -> None:
+    """The timer's part, by hand: background mode runs no timers."""
+    end = time.monotonic() + seconds
+    while follow() is not None:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def until_running() -> None:
+    while session.job.state != "running":
+        session.tick()
+        time.sleep(0.01)
+
+
+def start(person, seed: int = FINE, **params) -> None:
+    session.start_edit(person, "vary", 2, {"amount": 0.5, "seed": seed, **params})
+
+
+def texts(panel, context) -> str:
+    layout = MagicMock()
+    layout.panel.return_value = (MagicMock(), None)
+    panel.draw(SimpleNamespace(layout=layout), context)
+    shown = [call.kwargs["text"] for drawn in (layout.label, layout.progress) for call in drawn.call_args_list]
+    return " | ".join([call.args[0] for call in layout.operator.call_args_list] + shown)
+
+
+def test_vary_changes_the_selected_person_in_place_as_one_undo_step(person):
+    first, before = person_file(person), paths(person)
+    armature_of(person).location.x = 3.0
+    bpy.ops.ed.undo_push(message="moved")
+    assert ops.vary(amount=0.25, seed=FINE, steps=3) == {"FINISHED"}
+    assert sent(person) == {"person": str(first), "amount": 0.25, "seed": FINE, "steps": 3}
+    assert not set(before) & set(paths(person))
+    assert armature_of(person).location.x == 3.0
+    assert "8 of 8 volumes of Human changed" in session.notice
+    after = paths(person)
+    bpy.ops.ed.undo()
+    person = humans(bpy.context.scene)[0]
+    assert paths(person) == before
+    assert person_file(person) == first
+    assert armature_of(person).location.x == 3.0
+    bpy.ops.ed.redo()
+    assert paths(humans(bpy.context.scene)[0]) == after
+    assert not list(Path(bpy.app.tempdir).glob("vary_*"))
+
+
+def test_redress_changes_the_volumes_of_the_region_alone(person):
+    before, other = paths(person), paths(humans(bpy.context.scene)[1])
+    assert ops.redress(parts={"top", "left_foot"}, seed=FINE, steps=2, attributes="outfit=dress") == {"FINISHED"}
+    asked = sent(person)
+    assert asked["region"] == ["left_foot", "top"]
+    assert (asked["attributes"], asked["guidance"]) == ({"outfit": "dress"}, 1.5)
+    assert [k for k in range(8) if paths(person)[k] != before[k]] == [1, 2]
+    assert paths(humans(bpy.context.scene)[1]) == other
+
+
+def test_what_a_script_does_not_give_is_the_panels(person):
+    panel = bpy.context.scene.primdiffusion_edit
+    panel.seed, panel.parts, panel.harmonise = FINE, {"hair", "face"}, 0.5
+    panel.other = humans(bpy.context.scene)[1]
+    bpy.context.scene.primdiffusion.steps = 2
+    ops.transfer_texture()
+    source = person_file(panel.other)
+    asked = sent(person)
+    del asked["person"]
+    expected = {"source": str(source), "region": ["face", "hair"], "harmonise": 0.5, "seed": FINE, "steps": 2}
+    assert asked == expected
+
+
+def test_a_blend_moves_the_body_where_the_betas_differ(person):
+    joints = [list(bone.head_local) for bone in armature_of(person).data.bones]
+    assert ops.blend(other="Human.001", fraction=0.75, steps=1) == {"FINISHED"}
+    asked = sent(person)
+    assert (asked["other"], asked["fraction"]) == (str(person_file(humans(bpy.context.scene)[1])), 0.75)
+    moved = [list(bone.head_local) for bone in armature_of(person).data.bones]
+    np.testing.assert_allclose(moved, np.array(joints) * 1.1, atol=1e-5)
+    assert "the body's shape too" in session.notice
+
+
+def test_any_part_of_a_person_selects_it_and_a_script_may_name_it(person):
+    other = humans(bpy.context.scene)[1]
+    before = paths(person)
+    volume = next(thing for thing in other.all_objects if thing.type == "VOLUME")
+    bpy.context.view_layer.objects.active = volume
+    ops.vary(seed=FINE, steps=1)
+    assert paths(person) == before
+    assert sent(other)["seed"] == FINE
+    ops.vary(human="Human", seed=FINE + 1, steps=1)
+    assert sent(person)["seed"] == FINE + 1
+
+
+def test_an_edit_of_an_edit_starts_from_the_edited_person(person):
+    ops.vary(seed=FINE, steps=1)
+    edited = person_file(person)
+    ops.vary(seed=FINE + 1, steps=1)
+    assert sent(person)["person"] == str(edited)
+
+
+def test_a_painted_region_travels_as_weights_of_all_vertices(person):
+    body = body_of(person)
+    assert ops.paint_region() == {"FINISHED"}
+    assert (body.mode, bpy.context.object, body.hide_viewport) == ("WEIGHT_PAINT", body, False)
+    assert bpy.context.scene.primdiffusion_edit.region == "PAINTED"
+    with pytest.raises(RuntimeError, match="nothing is painted in the vertex group 'PrimDiffusion Region'"):
+        ops.redress(seed=FINE, steps=1)
+    body.vertex_groups["PrimDiffusion Region"].add([3, 5], 0.75, "REPLACE")
+    assert ops.redress(seed=FINE, steps=1) == {"FINISHED"}
+    painted = np.array(json.loads(person["primdiffusion_human"])["painted"])
+    assert painted.shape == (len(body.data.vertices),)
+    assert np.flatnonzero(painted).tolist() == [3, 5]
+    assert painted[3] == pytest.approx(0.75)
+    assert body.mode == "WEIGHT_PAINT"
+    assert ops.finish_painting() == {"FINISHED"}
+    assert (body.mode, body.hide_viewport) == ("OBJECT", True)
+    assert not ops.finish_painting.poll()
+
+
+def test_a_vertex_group_that_is_not_there_is_named(person):
+    with pytest.raises(RuntimeError, match="no vertex group 'sleeve'"):
+        ops.redress(vertex_group="sleeve", seed=FINE)
+    with pytest.raises(ValueError, match="no vertex group 'sleeve'"):
+        painted_weights(body_of(person), "sleeve")
+    bpy.data.objects.remove(body_of(person))
+    for edit in (ops.paint_region, lambda: ops.redress(vertex_group="sleeve", seed=FINE)):
+        with pytest.raises(RuntimeError, match="body mesh of 'Human' was deleted"):
+            edit()
+
+
+@pytest.mark.parametrize(
+    ("seed", "sentence"), [(DIES, "ended by itself"), (FAILS, "checkpoint is damaged"), (GIVES_GARBAGE, "is damaged")]
+)
+def test_a_failure_raises_one_sentence_and_leaves_the_person_as_it_was(person, seed, sentence):
+    before, file, files = paths(person), person_file(person), sorted(person_file(person).parent.iterdir())
+    with pytest.raises(RuntimeError, match=sentence) as caught:
+        ops.vary(seed=seed, steps=1)
+    assert str(caught.value).count("Error:") == 1
+    assert (paths(person), person_file(person)) == (before, file)
+    assert sorted(file.parent.iterdir()) == files
+    assert not list(Path(bpy.app.tempdir).glob("vary_*"))
+    assert sentence in texts(edit_panel.SUB_PANELS[0], bpy.context)
+    assert sentence not in texts(edit_panel.SUB_PANELS[1], bpy.context)
+
+
+def test_a_person_removed_while_the_job_runs_is_said_so_and_the_other_is_untouched(person):
+    other = paths(humans(bpy.context.scene)[1])
+    start(person)
+    until_running()
+    remove_human(person)
+    drive()
+    assert "'Human' was removed while the edit was under way" in session.error
+    assert [paths(left) for left in humans(bpy.context.scene)] == [other]
+
+
+def test_objects_deleted_by_hand_while_the_job_runs_count_as_removal(person):
+    start(person)
+    until_running()
+    bpy.data.batch_remove(list(person.all_objects))
+    drive()
+    assert "was removed while the edit was under way" in session.error
+    assert not session.busy
+
+
+def test_undo_of_something_else_during_the_job_does_not_lose_the_person(person):
+    cube = bpy.data.objects.new("cube", None)
+    bpy.context.scene.collection.objects.link(cube)
+    bpy.ops.ed.undo_push(message="cube")
+    before = paths(person)
+    start(person)
+    until_running()
+    bpy.ops.ed.undo()
+    drive()
+    assert session.error == ""
+    assert not set(paths(humans(bpy.context.scene)[0])) & set(before)
+
+
+def test_undo_of_an_earlier_edit_during_the_job_refuses_the_result(person):
+    before = paths(person)
+    ops.vary(seed=FINE, steps=1)
+    start(person, FINE + 1)
+    until_running()
+    bpy.ops.ed.undo()
+    drive()
+    assert "became another while the edit was under way" in session.error
+    assert paths(humans(bpy.context.scene)[0]) == before
+
+
+def test_saving_for_the_first_time_and_renaming_during_the_job_do_not_matter(addon, tmp_path):
+    bpy.ops.wm.read_homefile(use_empty=True)
+    ops.generate(seed=7, steps=1)
+    (person,) = humans(bpy.context.scene)
+    start(person)
+    until_running()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "late.blend"))
+    person.name = "Anna"
+    drive()
+    assert session.error == ""
+    assert all(path.startswith("//late_humans/Human/") for path in paths(person))
+    assert person_file(person).parent == tmp_path / "late_humans" / "Human"
+    assert sent(person)["seed"] == FINE
+
+
+def test_loading_a_file_during_the_job_drops_it(person):
+    start(person, TAKES_LONG)
+    until_running()
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    assert not session.busy
+    assert follow() is None
+    assert len(humans(bpy.context.scene)) == 2
+
+
+@pytest.mark.parametrize("part", ["armature", "body", "cube"])
+def test_a_result_that_comes_in_edit_mode_leaves_it_and_can_be_undone(person, part):
+    cube = bpy.data.objects.new("cube", bpy.data.meshes.new("cube"))
+    bpy.context.scene.collection.objects.link(cube)
+    body_of(person).hide_viewport = False
+    thing = {"armature": armature_of(person), "body": body_of(person), "cube": cube}[part]
+    bpy.context.view_layer.objects.active = thing
+    bpy.ops.ed.undo_push(message="before")
+    before = paths(person)
+    start(person)
+    bpy.ops.object.mode_set(mode="EDIT")
+    drive()
+    assert session.error == ""
+    assert bpy.context.mode == "OBJECT"
+    assert not set(paths(person)) & set(before)
+    bpy.ops.ed.undo()
+    assert paths(humans(bpy.context.scene)[0]) == before
+
+
+def test_locked_hidden_people_are_edited(person):
+    for thing in list(person.all_objects):
+        thing.lock_location = thing.lock_rotation = thing.lock_scale = (True, True, True)
+        thing.hide_select = thing.hide_viewport = True
+    before = paths(person)
+    assert ops.blend(human="Human", other="Human.001", steps=1) == {"FINISHED"}
+    assert not set(paths(person)) & set(before)
+
+
+def test_who_cannot_be_edited_is_said_before_a_job_begins(addon, tmp_path):
+    assert not ops.vary.poll()
+    for _ in range(2):
+        ops.generate(seed=7, steps=1)
+    addon.view_layer.objects.active = None
+    refused = {
+        "select a part of the one to edit": lambda: ops.vary(),
+        "'Eve' is not in the scene: choose from 'Human', 'Human.001'": lambda: ops.vary(human="Eve"),
+        "choose the other person in the panel first": lambda: ops.blend(human="Human"),
+        "'Human' cannot be the other person too": lambda: ops.blend(human="Human", other="Human"),
+        "is no name=value": lambda: ops.vary(human="Human", attributes="tall"),
+        "no part of the body is chosen": lambda: ops.redress(human="Human", parts=set()),
+    }
+    for sentence, edit in refused.items():
+        with pytest.raises(RuntimeError, match=sentence):
+            edit()
+        assert not session.busy
+    person_file(humans(addon.scene)[0]).unlink()
+    with pytest.raises(RuntimeError, match="file of the person 'Human' is missing"):
+        ops.vary(human="Human")
+
+
+def test_one_job_at_a_time(person):
+    start(person, TAKES_LONG)
+    until_running()
+    with pytest.raises(RuntimeError, match="being made; wait for it or press Cancel"):
+        ops.redress(seed=FINE)
+    shown = texts(edit_panel.SUB_PANELS[0], bpy.context)
+    assert "primdiffusion.cancel" in shown
+    assert "step" in shown
+    ops.cancel()
+    drive()
+    assert session.notice == "Cancelled"
+
+
+def test_no_edit_can_be_redone_with_a_slider():
+    for operator in edit_operators.EDITS:
+        assert not {"REGISTER", "UNDO"} & operator.bl_options
+
+
+def test_the_panel_names_who_is_selected_and_offers_all_edits(person):
+    assert "Human" in texts(edit_panel.PRIMDIFFUSION_PT_edit, bpy.context)
+    shown = " ".join(texts(panel, bpy.context) for panel in edit_panel.SUB_PANELS)
+    for name in ("vary", "redress", "transfer_texture", "blend"):
+        assert f"primdiffusion.{name}" in shown
+    bpy.context.scene.primdiffusion_edit.region = "PAINTED"
+    assert "primdiffusion.paint_region" in texts(edit_panel.SUB_PANELS[1], bpy.context)
+    bpy.context.view_layer.objects.active = None
+    assert "select a part" in texts(edit_panel.PRIMDIFFUSION_PT_edit, bpy.context)
+
+
+def test_unused_files_are_removed_and_those_in_use_stay(person):
+    ops.vary(seed=FINE, steps=1)
+    shown = {bpy.path.abspath(path) for human in humans(bpy.context.scene) for path in paths(human)}
+    assert ops.remove_unused_files() == {"FINISHED"}
+    left = {str(path) for path in person_file(person).parent.parent.rglob("*.vdb")}
+    assert left == shown
+    assert person_file(person).is_file()
