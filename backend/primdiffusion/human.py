@@ -37,6 +37,7 @@ from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.rotation import polar
 from primdiffusion.primitives.anchors import Anchors, attach, default_anchors
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.primitives.stand import Stand
 from primdiffusion.render.march import MarchSettings, Rendering, march
 
 DEFAULT_SETTINGS = MarchSettings()
@@ -56,10 +57,12 @@ class Human(TensorRecord):
     payload: Payload
     """Unbatched."""
     betas: Float[Tensor, "n"]
-    """Shape coefficients of the default body."""
+    """Shape coefficients of the body they stand on."""
     provenance: Mapping[str, Any]
     """Where the person comes from; JSON values. Of a generated one: seed, steps, sampler, attributes if any were asked
     for, checkpoint, checkpoint_sha256, full_density, version."""
+    stand: Stand | None = None
+    """Body and anchors that they stand on; None is the default body."""
 
     def validate(self) -> Human:
         """Itself, if it is one whole person with finite values; otherwise ValueError that names what is wrong."""
@@ -116,16 +119,18 @@ def generate_batch(
     people = []
     for index, (seed, betas) in enumerate(zip(seeds, model.betas(final, seeds), strict=True)):
         payload = model.decode(final[index])
-        betas = betas_of_measures(betas.cpu(), model.shapes.scale.cpu(), default_body(), *measures_of(attributes))
-        people.append(Human(payload, betas, {"seed": seed, **made}).to("cpu").validate())
+        body = default_body() if model.stand is None else model.stand.body
+        betas = betas_of_measures(betas.cpu(), model.shapes.scale.cpu(), body, *measures_of(attributes))
+        people.append(Human(payload, betas, {"seed": seed, **made}, model.stand).to("cpu").validate())
     return people
 
 
 def made_by(model: DiffusionModel) -> dict[str, Any]:
     """What a person's provenance says of the model and program that made them."""
+    of_file = {"checkpoint_sha256": model.card["sha256"]} if "sha256" in model.card else {}
     return {
         "checkpoint": model.card.get("name", "unnamed"),
-        "checkpoint_sha256": model.card.get("sha256"),
+        **of_file,
         "full_density": model.full_density,
         "version": __version__,
     }
@@ -146,11 +151,11 @@ def pose_body(betas: Float[Tensor, "n"], pose: BodyPose | None = None, body: Bod
 def place(
     human: Human, pose: BodyPose | None = None, body: BodyModel | None = None, anchors: Anchors | None = None
 ) -> Primitives:
-    """The person's primitives in the world; None stands for the T pose, the default body and its anchors.
+    """The person's primitives in the world; None stands for the T pose, the body they stand on and its anchors.
 
     Anchors belong to a body: give both or neither. Differentiable in the pose and the human.
     """
-    body, anchors = _together(body, anchors)
+    body, anchors = body_of(human, body, anchors)
     frames = attach(anchors, pose_body(human.betas, pose, body).vertices, body.faces)
     return Primitives.place(frames, human.payload)
 
@@ -172,7 +177,7 @@ def place_skinned(
 
     Raises ValueError for matrices with NaN or infinite values, and for a flat object or joint (scaled to zero).
     """
-    body, anchors = _together(body, anchors)
+    body, anchors = body_of(human, body, anchors)
     for name, matrix in (("skinning", skinning), ("object_to_world", object_to_world)):
         if not torch.isfinite(matrix).all():
             raise ValueError(f"{name} holds NaN or infinite values: check the pose and scale of the armature")
@@ -199,11 +204,12 @@ def place_skinned(
     )
 
 
-def _together(body: BodyModel | None, anchors: Anchors | None) -> tuple[BodyModel, Anchors]:
+def body_of(human: Human, body: BodyModel | None = None, anchors: Anchors | None = None) -> tuple[BodyModel, Anchors]:
+    """The body and anchors that are given, or those that the person stands on; ValueError for one without the other."""
     if body is None and anchors is None:
-        return default_body(), default_anchors()
+        return (default_body(), default_anchors()) if human.stand is None else (human.stand.body, human.stand.anchors)
     if body is None or anchors is None:
-        raise ValueError("a body and its anchors go together: give both, or neither for the default body")
+        raise ValueError("a body and its anchors go together: give both, or neither for the person's own")
     return body, anchors
 
 

@@ -8,7 +8,8 @@ A `.human.safetensors` file holds rgb, density, delta_scale and betas as they ar
     version                                         by which PrimDiffusion
     edits                                           what was done to it since, oldest first: objects with a name "edit"
 
-and every other entry is kept as it is.
+and every other entry is kept as it is. A person who stands on a body of the user's files has format version 2, the
+boxes' rest_half_extent, and in the metadata `body`: paths and fingerprints of these files, never what is in them.
 """
 
 from __future__ import annotations
@@ -24,15 +25,18 @@ import safetensors
 import safetensors.torch
 import torch
 
-from primdiffusion.body.model import JOINT_NAMES, default_body
-from primdiffusion.human import Human
-from primdiffusion.primitives.anchors import anchor_skin_weights, attach, default_anchors
+from primdiffusion.body.model import JOINT_NAMES
+from primdiffusion.human import Human, body_of
+from primdiffusion.primitives.anchors import anchor_skin_weights, attach
 from primdiffusion.primitives.primitives import K, Payload, S
+from primdiffusion.primitives.stand import BodyFiles, Stand, StandError, find_stand
 from primdiffusion.staging import written_whole
 
 FORMAT = "primdiffusion.human"
 FORMAT_VERSION = 1
-"""Of both files; readers refuse a higher one."""
+"""Of both files."""
+FORMAT_VERSION_ON_FILES = 2
+"""Of people who stand on a body of the user's files; readers refuse a higher one."""
 LARGEST_BETA = 5.0
 """Standard deviations of body shape; beyond, no body is a person's."""
 SHAPES = {"rgb": (K, 3, S, S, S), "density": (K, S, S, S), "delta_scale": (K, 3), "betas": (10,)}
@@ -58,6 +62,9 @@ def save_human(path: str | Path, human: Human) -> None:
         "format_version": str(FORMAT_VERSION),
         "provenance": json.dumps(dict(human.provenance), allow_nan=False),
     }
+    if human.stand is not None:
+        tensors["rest_half_extent"] = human.stand.anchors.rest_half_extent.detach().cpu().contiguous()
+        metadata |= {"format_version": str(FORMAT_VERSION_ON_FILES), "body": human.stand.files.to_json()}
     with written_whole(path) as unfinished:
         unfinished.write_bytes(safetensors.torch.save(tensors, metadata))
 
@@ -80,8 +87,11 @@ def load_human(path: str | Path) -> Human:
     _check_shapes(path, tensors)
     payload = Payload(tensors["rgb"], tensors["density"], tensors["delta_scale"])
     try:
-        human = Human(payload, tensors["betas"], _provenance(metadata)).validate()
+        stand = _stand(path, metadata, tensors) if "body" in metadata else None
+        human = Human(payload, tensors["betas"], _provenance(metadata), stand).validate()
         _check_betas(human)
+    except StandError as e:
+        raise HumanFileError(f"{path}: {e}") from e
     except ValueError as e:
         raise HumanFileError(f"{path} holds no whole person: {e}") from e
     return human
@@ -93,10 +103,16 @@ def _check_format(path: Path, metadata: Mapping[str, str]) -> None:
     version = metadata.get("format_version", "")
     if not version.isdecimal() or int(version) < 1:
         raise HumanFileError(f"{path} holds no whole person (its format version is {version!r}): generate it again")
-    if int(version) > FORMAT_VERSION:
+    if int(version) > FORMAT_VERSION_ON_FILES:
         raise HumanFileError(
-            f"{path} comes from a newer PrimDiffusion (format {version}, this one reads {FORMAT_VERSION}): update it"
+            f"{path} comes from a newer PrimDiffusion (format {version}, this one reads {FORMAT_VERSION_ON_FILES}): "
+            "update it"
         )
+
+
+def _stand(path: Path, metadata: Mapping[str, str], tensors: Mapping[str, torch.Tensor]) -> Stand:
+    extents = tensors.get("rest_half_extent", torch.empty(0))
+    return find_stand(BodyFiles.from_json(metadata["body"]), extents, [path.parent])
 
 
 def _check_shapes(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
@@ -182,7 +198,7 @@ def export_for_blender(path: str | Path, human: Human) -> None:
     linear and density [K,8,8,8] (1/m, without the window), voxels in the order D, H, W = along N, B, T. meta: JSON.
     """
     human.validate()
-    body, anchors = default_body(), default_anchors()
+    body, anchors = body_of(human)
     shaped = body.shape(human.betas)
     frames = attach(anchors, shaped.vertices, body.faces)
     arrays = {

@@ -96,7 +96,7 @@ def test_a_damaged_file_is_refused_by_name_with_its_damage(human, tmp_path, how,
 
 @pytest.mark.parametrize(
     ("version", "told"),
-    [("2", "newer PrimDiffusion"), ("10", "newer PrimDiffusion"), ("one", "format version is 'one'"), ("0", "'0'")],
+    [("3", "newer PrimDiffusion"), ("10", "newer PrimDiffusion"), ("one", "format version is 'one'"), ("0", "'0'")],
 )
 def test_a_file_of_another_version_is_refused_with_what_to_do(human, tmp_path, version, told):
     path = tmp_path / "other.human.safetensors"
@@ -108,7 +108,7 @@ def test_a_file_of_another_version_is_refused_with_what_to_do(human, tmp_path, v
 
 def test_a_newer_file_is_refused_for_its_version_even_where_its_tensors_are_others(human, tmp_path):
     path = tmp_path / "newer.human.safetensors"
-    safetensors.torch.save_file({"latents": torch.zeros(3)}, path, {**META, "format_version": "2"})
+    safetensors.torch.save_file({"latents": torch.zeros(3)}, path, {**META, "format_version": "3"})
     with pytest.raises(HumanFileError, match="newer PrimDiffusion"):
         load_human(path)
 

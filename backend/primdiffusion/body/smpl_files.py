@@ -34,9 +34,9 @@ def load_body(
 
     Args:
         path: the model. Pickles are read by `smpl_pickle` and cannot run code.
-        uv: texture coordinates: an .obj with the body's vertex numbers, or the pair (vt.npy [T, 2], ft.npy [F, 3]).
-            Without it, "vt" and "ft" of the model file are used, and without those an automatic unwrap (seconds; many
-            small islands).
+        uv: texture coordinates: an .obj with the body's vertex numbers, an .npz that holds vt [T, 2] and ft [F, 3], or
+            the pair (vt.npy, ft.npy). Without it, "vt" and "ft" of the model file are used, and without those an
+            automatic unwrap (seconds; many small islands).
         shape_components: how many leading shape components to keep, at most; files hold 10 to 300.
 
     Raises:
@@ -150,6 +150,9 @@ def _texture_coordinates(
     if isinstance(uv, tuple):
         coordinates, coordinate_faces = (_numpy_file(pathlib.Path(part)) for part in uv)
         source = str(uv[1])
+    elif uv is not None and pathlib.Path(uv).suffix == ".npz":
+        held = _ArrayFile(pathlib.Path(uv))
+        coordinates, coordinate_faces, source = held.raw("vt"), held.raw("ft"), str(uv)
     elif uv is not None:
         coordinates, coordinate_faces = _obj_texture_coordinates(pathlib.Path(uv), faces)
         source = str(uv)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 import torch
@@ -18,6 +18,7 @@ from primdiffusion.diffusion.schedule import Schedule, trailing_steps
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import GRID, K, Payload, S
 from primdiffusion.primitives.slab import CHANNELS_PER_LAYER, pack, unpack
+from primdiffusion.primitives.stand import Stand
 
 BETAS = 10
 DEFAULT_STEPS, DEFAULT_SAMPLER, DEFAULT_GUIDANCE = 30, "ddim", 1.5
@@ -133,6 +134,10 @@ class DiffusionModel:
     """Where the weights come from and what was measured on them."""
     vocabulary: Vocabulary = NOTHING
     """What it can be asked for."""
+    chain: Callable[[int, int], list[int]] = trailing_steps
+    """Descending t that a sampler visits, from the schedule's length and the number of steps."""
+    stand: Stand | None = None
+    """What its people stand on; None is the default body."""
 
     @property
     def device(self) -> torch.device:
@@ -237,7 +242,7 @@ def sample(
         raise ValueError(f"there is no sampler {sampler!r}; choose one of {', '.join(sorted(SAMPLERS))}")
     if not len(seeds):
         raise ValueError("no seeds were given: a person needs one")
-    chain = trailing_steps(model.schedule.length, steps)
+    chain = model.chain(model.schedule.length, steps)
     generators = [seeded(seed, model.device) for seed in seeds]
     start = model.start(generators, chain[0], condition)
 

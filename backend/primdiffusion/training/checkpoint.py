@@ -76,7 +76,8 @@ def load_checkpoint(path: Path | str | None = None, device: torch.device | str =
     """A model ready to sample, in float32; without a path the package's default.
 
     Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
-    format or version, does not match its own architecture or holds values that are not finite.
+    format or version, does not match its own architecture or holds values that are not finite. An imported one
+    (`released`) also raises StandError (a ValueError) where the user's body that it needs is gone or changed.
     """
     path = default_checkpoint() if path is None else Path(path)
     tensors, metadata = _read(path)
@@ -87,6 +88,10 @@ def load_checkpoint(path: Path | str | None = None, device: torch.device | str =
         if metadata["format_version"] == "1":
             tensors, architecture = _from_version_1(tensors, architecture)
         card = {**json.loads(metadata["card"]), "sha256": file_hash(path)}
+        if architecture["kind"] == "released":
+            from primdiffusion.released.imported import released_model  # the top room: pyproject.toml allows this one
+
+            return released_model(tensors, architecture, card, path.parent).to(device)
         model = _build(tensors, architecture, card)
     except (KeyError, TypeError, json.JSONDecodeError, RuntimeError) as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"

@@ -1,0 +1,144 @@
+"""The command `primdiffusion import-released`: the authors' checkpoint and the user's SMPL in, one like ours out."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+from torch import Tensor
+
+from primdiffusion.body.model import BodyModel
+from primdiffusion.capture.smpl_parameters import read_smpl
+from primdiffusion.diffusion.model import BETAS
+from primdiffusion.primitives.primitives import K
+from primdiffusion.primitives.stand import Stand, stand_of_files
+from primdiffusion.released.denoiser import PREFIX
+from primdiffusion.released.imported import Reference, write_imported
+from primdiffusion.released.inventory import Inventory, take_inventory
+from primdiffusion.released.reading import ReleasedFileError, read_weights
+from primdiffusion.released.stage_one import PREFIX as STAGE_ONE
+from primdiffusion.training.config import write_atomically
+
+SMPL_CELLS_OUTSIDE = 214
+"""Of 1024 grid points outside every chart with SMPL's own UV (SPEC 1.2)."""
+SAME_BODY = 1e-4
+"""Metres by which two files of one body may differ."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportReleased:
+    """Turn the authors' primdiffusion.pt into a checkpoint for generate, render, the add-on and everything else.
+
+    Only the denoiser (stage 2) is imported. The new file holds nothing of SMPL: it names your SMPL file and its
+    fingerprint, and needs that file wherever it is used.
+    """
+
+    checkpoint: tyro.conf.Positional[Path]
+    """The authors' file. It is read as tensors only: nothing in it is run."""
+    smpl: Path
+    """Your SMPL_NEUTRAL.pkl, or a body of the same format as .npz."""
+    uv: tuple[Path, ...]
+    """The UV layout it was trained with: SMPL's UV .obj, an .npz with vt and ft, or the pair vt.npy ft.npy."""
+    out: Path
+    """The .safetensors file to write."""
+    reference: Path | None = None
+    """Folder of the dataset's subject seq_000016-rp_alison_rigged_002, whose first frame set the sizes of boxes;
+    without it the mean body in the T pose sets them, which differs by millimetres."""
+    chain: Literal["released", "trailing"] = "released"
+    """Which steps samplers visit: 991, 981, ... 1 as the released code does, or from the schedule's last step on."""
+    report: Path | None = None
+    """A .json to write: what became of every tensor."""
+
+    def run(self) -> None:
+        """Imports, and prints what became of every group of tensors."""
+        weights = read_weights(self.checkpoint)
+        inventory = take_inventory(weights)
+        print(inventory.account.table())
+        if inventory.unet is None:
+            raise ReleasedFileError(
+                f"{self.checkpoint} is a whole checkpoint of stage 1, the encoder, which is not imported; nothing was "
+                "written: give the authors' primdiffusion.pt, which holds the denoiser"
+            )
+        if not 1 <= len(self.uv) <= 2:
+            raise ValueError(f"uv names {len(self.uv)} files: give one .obj or .npz, or the pair vt.npy ft.npy")
+        stand = stand_of_files(self.smpl, self.uv)
+        notes = [*_about_body(weights, stand.body), _about_layout(stand)]
+        denoiser = {key.removeprefix(PREFIX): value for key, value in weights.items() if key.startswith(PREFIX)}
+        card = _card(self.checkpoint, inventory, denoiser, self.reference)
+        write_imported(self.out, denoiser, inventory.unet, stand, _reference(self.reference), self.chain, card)
+        for note in notes:
+            print(note)
+        if self.report is not None:
+            _write_report(self.report, inventory, card, notes, stand)
+        print(self.out)
+
+
+def _reference(folder: Path | None) -> Reference:
+    if folder is None:
+        return Reference.template()
+    parameters = read_smpl(folder)
+    betas = torch.zeros(BETAS)
+    betas[: len(parameters.betas)] = torch.from_numpy(parameters.betas)[:BETAS]
+    return Reference(betas, parameters.pose(0))
+
+
+def _about_body(weights: Mapping[str, Tensor], body: BodyModel) -> list[str]:
+    """Whether the SMPL given is the one that the checkpoint was trained on, which holds a copy of it."""
+    held = [
+        value.reshape(body.template.shape)
+        for key, value in weights.items()
+        if key.startswith(f"{STAGE_ONE}lbs_fn.")
+        and value.is_floating_point()
+        and tuple(value.shape)[-2:] == body.template.shape
+        and value.numel() == body.template.numel()
+    ]
+    if not held:
+        return ["the checkpoint's own body has other vertices, or none: the SMPL file could not be compared with it"]
+    difference = min(float((value.float() - body.template).abs().max()) for value in held)
+    if difference <= SAME_BODY:
+        return ["the SMPL file is the body that the checkpoint was trained on"]
+    return [f"the SMPL file differs from the body the checkpoint was trained on by up to {1000 * difference:.1f} mm"]
+
+
+def _about_layout(stand: Stand) -> str:
+    centred = (stand.anchors.barycentric == 1 / 3).all(-1)  # where the rule puts them, on the last face
+    outside = int((centred & (stand.anchors.face == len(stand.body.faces) - 1)).sum())
+    return f"{outside} of {K} primitives lie outside of the UV charts; with SMPL's own UV {SMPL_CELLS_OUTSIDE} do"
+
+
+def _card(path: Path, inventory: Inventory, denoiser: Mapping[str, Tensor], reference: Path | None) -> dict[str, Any]:
+    with open(path, "rb") as file:
+        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    return {
+        "name": f"released {path.stem}",
+        "source": path.name,
+        "source_sha256": sha256,
+        "source_tensors": len(inventory.account.entries),
+        "parameters": sum(value.numel() for value in denoiser.values()),
+        "sizes_from": "template" if reference is None else reference.name,
+        "licence": "that of the authors' weights, and of SMPL for what is made on its body",
+        "limits": ["needs the SMPL file it was imported with", "encoder (stage 1) not imported"],
+    }
+
+
+def _write_report(path: Path, inventory: Inventory, card: Mapping[str, Any], notes: list[str], stand: Stand) -> None:
+    content = {
+        "card": card,
+        "body": dataclasses.asdict(stand.files),
+        "unet": None if inventory.unet is None else dataclasses.asdict(inventory.unet),
+        "notes": notes,
+        "groups": inventory.account.groups(),
+        "tensors": [dataclasses.asdict(entry) for entry in inventory.account.entries],
+    }
+    write_atomically(path, json.dumps(content, indent=1))
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parses and runs one command line."""
+    tyro.cli(ImportReleased, args=arguments, prog="primdiffusion import-released").run()

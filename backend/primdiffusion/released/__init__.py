@@ -1,0 +1,1 @@
+"""The authors' checkpoints, read, checked and converted at the border (SPEC 1, 3, 6)."""

@@ -1,0 +1,168 @@
+"""The 165 tensors of stage 1 (`bodydecoder.*`): every one is accounted for, none is carried over.
+
+SPEC 6 names groups and how many tensors each has, SPEC 2 the layers. That suffices to tell whether a file is what it
+should be, not to run it: over which axes weights are normalised is told neither there nor by any shape.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+from torch import Tensor
+
+from primdiffusion.released.account import Entry
+from primdiffusion.released.reading import ReleasedFileError
+
+PREFIX = "bodydecoder."
+TENSORS = {
+    "lbs_fn": 7,
+    "geo_fn": 7,
+    "local_pose_conv_block": 9,
+    "joint_conv_block": 9,
+    "embs_encoder": 42,
+    "decoder_motion": 15,
+    "decoder_rgb": 9,
+    "decoder_alpha": 9,
+    "decoder_geom": 12,
+    "transformer": 46,
+}
+"""SPEC 6."""
+NOT_USED = {
+    "lbs_fn": "the licensed SMPL model: yours is read instead",
+    "geo_fn": "the licensed SMPL model's UV: yours is read instead",
+    "decoder_geom": "no part of the released code uses it",
+}
+NOT_CARRIED_OVER = "has the layers of the encoder 'released'; stage 1 is not imported"
+
+
+@dataclasses.dataclass(frozen=True)
+class Layer:
+    """A weight-normalised convolution with a bias for every place: three tensors (SPEC 2)."""
+
+    weight: tuple[int | None, ...]
+    """[out, in, k, k], or [in, out, k, k] of a transposed one; None where SPEC 2 does not say."""
+    bias: tuple[int | None, ...]
+    """[out, side, side]."""
+
+
+def _same(outputs: int, inputs: int, kernel: int | None = None) -> Layer:
+    return Layer((outputs, inputs, kernel, kernel), (outputs, 32, 32))
+
+
+def _up(inputs: int, outputs: int, side: int) -> Layer:
+    return Layer((inputs, outputs, 4, 4), (outputs, side, side))
+
+
+def _up_thrice(outputs: int) -> list[Layer]:
+    return [_up(64, 32, 64), _up(32, 16, 128), _up(16, outputs, 256)]
+
+
+def _of_u_net(side: int) -> Layer:
+    return Layer((None,) * 4, (None, side, side))
+
+
+LAYERS: dict[str, list[Layer]] = {
+    "local_pose_conv_block": [_same(32, 69), _same(32, 32), _same(32, 69)],
+    "joint_conv_block": [_same(64, 96), _same(64, 64), _same(64, 96)],
+    "embs_encoder": [
+        *(Layer((o, i, 4, 4), (o, side, side)) for i, o, side in ((3, 4, 128), (4, 8, 64), (8, 16, 32))),
+        Layer((64, None, 1, 1), (64, 32, 32)),
+        *(_of_u_net(side) for side in (16, 8, 4, 2, 1, 2, 4, 8, 16, 32)),
+    ],
+    "decoder_motion": [_same(o, i, 3) for i, o in ((64, 64), (64, 128), (128, 64), (64, 64), (64, 9))],
+    "decoder_rgb": _up_thrice(3 * 8),
+    "decoder_alpha": _up_thrice(8),
+}
+"""SPEC 2, the most definite first; the small U-Net halves 32 x 32 to 1 x 1 and back, its channels are not told."""
+ATTENTION: list[tuple[int, ...]] = [(256, 96), (96, 256), *[(2048, 256), (256, 1024)] * 2]
+"""Matrices of the transformer that SPEC 2 tells: into 256 channels, back to 96, and two gated feed-forwards."""
+
+
+def account_stage_one(tensors: Mapping[str, Tensor], prefix: str = PREFIX) -> list[Entry]:
+    """Accounts for all of them (names without `prefix`, which errors put back).
+
+    Raises ReleasedFileError that names a tensor which is unknown or does not fit, or a group that is not whole.
+    """
+    groups: dict[str, dict[str, Tensor]] = {group: {} for group in TENSORS}
+    for name, value in tensors.items():
+        group = name.partition(".")[0]
+        if group not in groups:
+            raise ReleasedFileError(
+                f"'{prefix}{name}' {tuple(value.shape)} belongs to no part of a released checkpoint"
+            )
+        groups[group][f"{prefix}{name}"] = value
+    for group, found in groups.items():
+        if group in LAYERS:
+            _check_layers(group, found)
+        if len(found) != TENSORS[group]:
+            names = ", ".join(found) or "none"
+            raise ReleasedFileError(
+                f"'{prefix}{group}' holds {len(found)} tensors, not {TENSORS[group]}: {names}; take the checkpoint "
+                "again whole"
+            )
+    _check_attention(groups["transformer"])
+    return [
+        Entry(
+            f"{prefix}{name}",
+            group := name.partition(".")[0],
+            tuple(value.shape),
+            "dropped" if group in NOT_USED else "checked",
+            NOT_USED.get(group, NOT_CARRIED_OVER),
+        )
+        for name, value in tensors.items()
+    ]
+
+
+def _check_layers(group: str, found: Mapping[str, Tensor]) -> None:
+    modules: dict[str, list[str]] = collections.defaultdict(list)
+    for key in found:
+        modules[key.rpartition(".")[0]].append(key)
+    left = list(LAYERS[group])
+    for module, keys in modules.items():
+        weight, bias = _weight_and_bias(module, {key: found[key] for key in keys})
+        shapes = tuple(found[weight].shape), tuple(found[bias].shape)
+        fitting = [layer for layer in left if _fits(shapes[0], layer.weight) and _fits(shapes[1], layer.bias)]
+        if not fitting:
+            rest = "; ".join(f"{_written(layer.weight)} with {_written(layer.bias)}" for layer in left) or "none"
+            raise ReleasedFileError(
+                f"{weight!r} {shapes[0]} with {bias!r} {shapes[1]} fits no layer of {group}; those still looked for: "
+                f"{rest}"
+            )
+        left.remove(fitting[0])
+
+
+def _weight_and_bias(module: str, found: Mapping[str, Tensor]) -> tuple[str, str]:
+    """The weight's and the bias' names of a convolution's three tensors; the third is the gain of each channel."""
+    weights = [key for key, value in found.items() if value.ndim == 4 and value.numel() > max(value.shape)]
+    biases = [key for key, value in found.items() if value.ndim == 3]
+    gains = [key for key in found if key not in weights + biases]
+    if not len(weights) == len(biases) == len(gains) == 1:
+        given = ", ".join(f"{key!r} {tuple(value.shape)}" for key, value in found.items())
+        raise ReleasedFileError(
+            f"{module!r} is no convolution with weight, gain and bias of every place: it has {given}"
+        )
+    channels = found[biases[0]].shape[0]
+    if found[gains[0]].numel() != channels:
+        raise ReleasedFileError(
+            f"{gains[0]!r} has shape {tuple(found[gains[0]].shape)}, not one number for each channel of {biases[0]!r} "
+            f"{tuple(found[biases[0]].shape)}"
+        )
+    return weights[0], biases[0]
+
+
+def _check_attention(found: Mapping[str, Tensor]) -> None:
+    matrices = [tuple(side for side in value.shape if side != 1) for value in found.values()]
+    for wanted in ATTENTION:
+        if matrices.count(wanted) < ATTENTION.count(wanted):
+            given = ", ".join(f"{key!r} {tuple(value.shape)}" for key, value in found.items() if value.ndim > 1)
+            raise ReleasedFileError(f"the transformer lacks a matrix of shape {wanted}; it has {given}")
+
+
+def _fits(shape: Sequence[int], wanted: Sequence[int | None]) -> bool:
+    return len(shape) == len(wanted) and all(w in (None, s) for s, w in zip(shape, wanted, strict=True))
+
+
+def _written(shape: Sequence[int | None]) -> str:
+    return " x ".join("?" if side is None else str(side) for side in shape)

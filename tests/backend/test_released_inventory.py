@@ -1,0 +1,179 @@
+"""The authors' checkpoints: what a file must hold, tensor by tensor, and what is refused."""
+
+import os
+import pickle
+
+import pytest
+import torch
+from primdiffusion.diffusion.schedule import linear
+from primdiffusion.diffusion.unet import PAPER, PAPER_WITH_ATTENTION, SlabUNet
+from primdiffusion.released.inventory import take_inventory
+from primdiffusion.released.reading import ReleasedFileError, read_weights
+from primdiffusion.released.schedule_buffers import SCHEDULE
+from released_files import SMALL, T, blank, save_released, schedule_buffers, stage_one, state, template
+
+
+def shapes_of(config) -> dict[str, torch.Tensor]:
+    with torch.device("meta"):
+        network = SlabUNet(config)
+    return {name: blank(*value.shape) for name, value in network.state_dict().items()}
+
+
+@pytest.fixture(scope="module")
+def released() -> dict[str, torch.Tensor]:
+    """All names and real shapes, in no memory."""
+    return state(shapes_of(PAPER), template())
+
+
+def test_all_475_tensors_are_accounted_for(released):
+    inventory = take_inventory(released)
+    assert inventory.unet == PAPER
+    assert [entry.key for entry in inventory.account.entries] == list(released)
+    fates = {(row["group"], row["fate"]): row["tensors"] for row in inventory.account.groups()}
+    assert len(released) == sum(fates.values()) == 475
+    assert fates == {
+        ("schedule", "checked"): 12, ("lbs_fn", "dropped"): 7, ("geo_fn", "dropped"): 7,
+        ("local_pose_conv_block", "checked"): 9, ("joint_conv_block", "checked"): 9, ("embs_encoder", "checked"): 42,
+        ("decoder_motion", "checked"): 15, ("decoder_rgb", "checked"): 9, ("decoder_alpha", "checked"): 9,
+        ("decoder_geom", "dropped"): 12, ("transformer", "checked"): 46, ("diffusion", "imported"): 298,
+    }  # fmt: skip
+    imported = [entry for entry in inventory.account.entries if entry.fate == "imported"]
+    assert sum(torch.Size(entry.shape).numel() for entry in imported) == 84_846_776
+
+
+@pytest.mark.parametrize("config", [PAPER_WITH_ATTENTION, SMALL])
+def test_size_and_attention_of_the_denoiser_are_read_off_its_tensors(config):
+    assert take_inventory(state(shapes_of(config), template())).unet == config
+
+
+def test_each_tensor_that_is_taken_away_is_missed_by_name_or_group(released):
+    for key in released:
+        with pytest.raises(ReleasedFileError) as caught:
+            take_inventory({name: value for name, value in released.items() if name != key})
+        prefix, group = [*key.split("."), ""][:2]
+        expected = key if prefix != "bodydecoder" else group
+        assert expected in str(caught.value), f"{key}: {caught.value}"
+
+
+@pytest.mark.parametrize(
+    "key", ["extra", "diffusion.extra.weight", "bodydecoder.extra.weight", "bodydecoder.lbs_fn.extra", "logvar",
+            "bodydecoder.decoder_rgb.0.extra", "diffusion.input_blocks.12.0.op.weight"]
+)  # fmt: skip
+def test_a_tensor_too_many_is_named(released, key):
+    with pytest.raises(ReleasedFileError, match=key):
+        take_inventory({**released, key: blank(3)})
+
+
+def test_each_tensor_of_another_shape_is_named(released):
+    settled = [key for key in released if not any(part in key for part in ("lbs_fn", "geo_fn", "decoder_geom"))]
+    tried = [key for key in settled if "transformer." not in key and "embs_encoder" not in key]
+    tried += ["bodydecoder.embs_encoder.down.0.weight", "bodydecoder.embs_encoder.up.1.bias"]
+    for key in tried:
+        other = blank(*(side + 1 for side in released[key].shape))
+        with pytest.raises(ReleasedFileError) as caught:
+            take_inventory({**released, key: other})
+        assert f"'{key}'" in str(caught.value), str(caught.value)
+        assert str(tuple(other.shape)) in str(caught.value)
+
+
+def test_a_transformer_of_another_width_is_refused(released):
+    key = "bodydecoder.transformer.transformer_blocks.1.ff.net.2.weight"
+    with pytest.raises(ReleasedFileError, match=r"1024\).*ff\.net\.2\.weight' \(256, 512\)"):
+        take_inventory({**released, key: blank(256, 512)})
+
+
+@pytest.mark.parametrize("name", schedule_buffers())
+def test_a_schedule_buffer_that_does_not_follow_from_the_schedule_is_named(released, name):
+    wrong = released[name].clone()
+    wrong[500] *= 1.001
+    with pytest.raises(ReleasedFileError, match=rf"'{name}' is .* at step 500"):
+        take_inventory({**released, name: wrong})
+
+
+def test_the_linear_schedule_is_told_from_the_released_one(released):
+    other = {**released, "alphas_cumprod": linear().alpha_bar.float()}
+    with pytest.raises(ReleasedFileError, match="alphas_cumprod"):
+        take_inventory(other)
+    assert SCHEDULE == "sqrt_linear"
+
+
+def test_both_ways_to_write_the_clipped_logarithm_are_known(released):
+    name = "posterior_log_variance_clipped"
+    other = released[name].clone()
+    other[0] = other[1]
+    assert len(take_inventory({**released, name: other}).account.entries) == 475
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_not_finite_are_named(released, value):
+    key = "diffusion.time_embed.0.bias"
+    with pytest.raises(ReleasedFileError, match=key):
+        take_inventory({**released, key: torch.full_like(released[key], value)})
+
+
+def test_a_stage_1_file_is_accounted_for_with_and_without_its_wrapping(tmp_path):
+    tensors = stage_one(template())
+    for content in (tensors, {"model_state_dict": tensors}):
+        torch.save(content, tmp_path / "stage1.pt")
+        inventory = take_inventory(read_weights(tmp_path / "stage1.pt"))
+        assert inventory.unet is None
+        assert len(inventory.account.entries) == 165
+
+
+def test_reading_gives_the_tensors_without_the_optimiser(tmp_path, released):
+    read = read_weights(save_released(tmp_path / "primdiffusion.pt", released))
+    assert list(read) == list(released)
+    assert torch.equal(read["betas"], released["betas"])
+    assert len(read["betas"]) == T
+
+
+class Hostile:
+    def __reduce__(self):
+        return os.mkdir, (os.environ["HOSTILE"],)
+
+
+def bad_file(path, kind):
+    """Writes a file and returns what the refusal must say."""
+    if kind == "hostile torch file":
+        torch.save({"model_state_dict": {"betas": Hostile()}}, path)
+        return "nothing in it was run"
+    if kind == "hostile pickle":
+        path.write_bytes(pickle.dumps({"model_state_dict": Hostile()}, 2))
+        return "no torch file|nothing in it was run"
+    if kind == "truncated":
+        save_released(path, {"betas": torch.zeros(5000)})
+        path.write_bytes(path.read_bytes()[:-3000])
+        return "truncated"
+    if kind in ("empty", "text"):
+        path.write_text("" if kind == "empty" else "hello world")
+        return "no torch file"
+    contents = {
+        "a list": ([1, 2], "list"),
+        "other keys": ({"epoch": 3, "net": {"a": torch.zeros(1)}}, "'model_state_dict' and 'optimizer'"),
+        "no tensors": ({"model_state_dict": {"betas": 3}}, "'betas'"),
+        "a tensor": (torch.zeros(3), "Tensor"),
+        "another network": ({"model_state_dict": {"conv.weight": torch.zeros(3)}}, "conv.weight"),
+        "nothing": ({}, "none of the 0 tensors"),
+    }
+    content, expected = contents[kind]
+    torch.save(content, path)
+    return expected
+
+
+@pytest.mark.parametrize(
+    "kind", ["hostile torch file", "hostile pickle", "truncated", "empty", "text", "a list", "other keys", "no tensors",
+             "a tensor", "another network", "nothing"]
+)  # fmt: skip
+def test_what_is_no_released_checkpoint_is_refused_in_one_sentence(tmp_path, monkeypatch, kind):
+    monkeypatch.setenv("HOSTILE", str(tmp_path / "ran"))
+    expected = bad_file(tmp_path / "file.pt", kind)
+    with pytest.raises(ReleasedFileError, match=expected) as caught:
+        take_inventory(read_weights(tmp_path / "file.pt"))
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_missing_file_is_said_to_be_missing(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no checkpoint"):
+        read_weights(tmp_path / "none.pt")
