@@ -21,7 +21,7 @@ from primdiffusion.diffusion.unet import TimeEmbedding, zeroed
 class PersonNetworkConfig:
     """Size of the perceptron over person components."""
 
-    width: int = 768
+    width: int = 512
     """Features of the residual stream."""
     blocks: int = 3
     """Residual blocks."""
@@ -33,7 +33,7 @@ class PersonNetworkConfig:
 class LocalUNetConfig:
     """Size of the U-Net over the 32 x 32 grid."""
 
-    widths: tuple[int, ...] = (64, 96, 128)
+    widths: tuple[int, ...] = (64, 128, 192)
     """Channels at 32, 16 and 8 cells a side."""
     blocks: int = 1
     """Residual blocks of a level, down and up."""

@@ -31,6 +31,8 @@ class PriorConfig:
     """Attributes that people of one covariance have in common; those that the people do not have are left out."""
     features: tuple[tuple[str, ...], ...] = (("sex", "hair", "hat"), ("shoes",))
     """Attributes that move the mean of a group, each list on its own account; a part for each choice."""
+    lean: float = 0.1
+    """People of the covariance of all groups, in units of the number of components, that each group's is mixed with."""
     folds: int = 4
     """Parts of the people, each left out once, to measure how much of a component's variance holds for new people."""
 
@@ -87,10 +89,10 @@ class TrainingConfig:
     prior: PriorConfig = dataclasses.field(default_factory=PriorConfig)
     model: DenoiserConfig = dataclasses.field(default_factory=DenoiserConfig)
     person: PhaseConfig = dataclasses.field(
-        default_factory=lambda: PhaseConfig(steps=8000, batch=512, evaluate_every=1000)
+        default_factory=lambda: PhaseConfig(steps=5000, batch=256, evaluate_every=1000)
     )
     local: PhaseConfig = dataclasses.field(
-        default_factory=lambda: PhaseConfig(steps=6000, batch=8, blend=0.2, weight_decay=0.0, bfloat16=True)
+        default_factory=lambda: PhaseConfig(steps=8000, batch=16, blend=0.2, weight_decay=0.0, bfloat16=True)
     )
 
 

@@ -20,8 +20,6 @@ from primdiffusion.diffusion.conditioning import Vocabulary
 from primdiffusion.diffusion.gaussian import IMPOSSIBLE
 from primdiffusion.training.config import PriorConfig
 
-LEAN = 1.0
-"""People of the pooled covariance, in units of the number of components, that every group's own is mixed with."""
 RIDGE = 4.0
 """People without any effect that every effect is estimated with."""
 
@@ -51,7 +49,7 @@ def fit_mixture(
     choices = [sorted(set(row)) for row in rows]
     effects = _effects(c, rows, choices)
     left = c - sum(effects[k][[choices[k].index(v) for v in rows[k]]] for k in range(len(keys)))
-    axes, variance = _covariances(left, rows[0], choices[0])
+    axes, variance = _covariances(left, rows[0], choices[0], config.lean * c.shape[1])
     groups = [_parts(group, keys, rows, choices) for group in choices[0]]
     most = max(map(len, groups))
     log_weight = torch.full((len(groups), most), IMPOSSIBLE)
@@ -89,13 +87,12 @@ def _effects(
 
 
 def _covariances(
-    left: Float[Tensor, "n r"], group: Sequence[Values], groups: Sequence[Values]
+    left: Float[Tensor, "n r"], group: Sequence[Values], groups: Sequence[Values], pull: float
 ) -> tuple[Float[Tensor, "g r r"], Float[Tensor, "g r"]]:
-    """Principal axes and variances of each group, mixed with those of all groups that agree in the last attribute."""
+    """Principal axes and variances of each group's people, and of `pull` of all groups that agree in the last value."""
     of = torch.tensor([groups.index(v) for v in group])
     scatter = [left[of == g].T @ left[of == g] for g in range(len(groups))]
     counts = [int((of == g).sum()) for g in range(len(groups))]
-    pull = LEAN * left.shape[1]
     axes, variances = [], []
     for g, own in enumerate(groups):
         like = [other for other, values in enumerate(groups) if values[-1:] == own[-1:]]
