@@ -56,10 +56,11 @@ def test_the_file_holds_what_the_encoder_makes_of_the_pictures(root, line, tmp_p
     assert (got.delta_scale != 1).all()
     assert (got.density - wanted.density).abs().max() < 0.51 / 255 * 100
     assert torch.equal(stored.betas, person.betas)
-    assert stored.attributes == {"outfit": "suit", "height": 1.8}
     people = PeopleFolder(tmp_path / "out")
     assert list(people.names) == [FIRST, SECOND]
-    assert people.attributes[1] == {}
+    assert people.known(0)[0].keys() == {"outfit", "height", "weight"}
+    assert people.known(0)[0]["outfit"] == "suit"
+    assert people.known(1)[0].keys() == {"height", "weight"}
 
 
 def test_looks_are_frames_from_the_first_to_the_last(root, tmp_path):

@@ -68,9 +68,9 @@ class Vocabulary:
         count = len(self.categories) + len(self.scalars)
         if not count:
             return condition
-        draws = torch.rand(len(condition), count + 2, generator=generator)
+        draws = torch.rand(len(condition), count + 2, generator=generator, device=generator.device)
         kept = (draws[:, 2:] > draws[:, :1]) & (draws[:, 1:2] >= share)
-        sizes = torch.tensor([*map(len, self.categories.values()), *[2] * len(self.scalars)])
+        sizes = torch.tensor([*map(len, self.categories.values()), *[2] * len(self.scalars)], device=kept.device)
         return condition * kept.to(condition).repeat_interleave(sizes, dim=1)
 
     def to_json(self) -> dict[str, Any]:

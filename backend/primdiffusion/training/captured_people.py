@@ -161,11 +161,10 @@ def _store(path: Path, payloads: list[Payload], betas: Tensor, source: str, card
 def _is_kept(path: Path, source: str, attributes: Mapping[str, Any]) -> bool:
     """Whether a file is whole and holds what would be written again; a damaged one is made anew."""
     try:
-        return dict(read_person(path).attributes) == dict(attributes) and _source(path) == source
-    except (FileNotFoundError, ValueError):
+        read_person(path)
+        with np.load(path, allow_pickle=False) as file:
+            return (
+                "source" in file and str(file["source"]) == source and json.loads(str(file["attributes"])) == attributes
+            )
+    except (FileNotFoundError, ValueError, KeyError):
         return False
-
-
-def _source(path: Path) -> str:
-    with np.load(path, allow_pickle=False) as file:
-        return str(file["source"]) if "source" in file else ""

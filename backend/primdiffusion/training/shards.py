@@ -23,10 +23,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.primitives.primitives import K
 from primdiffusion.staging import written_whole
 from primdiffusion.training.config import write_atomically
-from primdiffusion.training.stored_people import People, PeopleFolder, StoredPerson
+from primdiffusion.training.stored_people import People, PeopleFolder, StoredPerson, attributes_of
 
 INDEX, FORMAT, VERSION = "index.json", "primdiffusion-payloads", 1
 PEOPLE_EACH = 32
@@ -66,7 +67,7 @@ def pack_people(folder: Path, out: Path, people_each: int = PEOPLE_EACH) -> Iter
         path = out / f"shard_{number:04d}.safetensors"
         _write_shard(path, [people.person(index) for index in indices])
         about = [
-            {"name": people.names[i], "variants": people.variants[i], "attributes": dict(people.attributes[i])}
+            {"name": people.names[i], "variants": people.variants[i], "attributes": dict(people.outlines[i].stored)}
             for i in indices
         ]
         shards.append({"file": path.name, "sha256": digest_of(path), "people": about})
@@ -83,7 +84,7 @@ def _write_shard(path: Path, people: Sequence[StoredPerson]) -> None:
     }
     scales = torch.cat([person.delta_scale for person in people])
     if (scales != 1).any():
-        tensors["delta_scale"] = scales
+        tensors["delta_scale"] = scales.half()
     with written_whole(path) as unfinished:
         save_file(tensors, unfinished)
 
@@ -118,18 +119,22 @@ class PackedPeople:
             people = [person for shard in index["shards"] for person in shard["people"]]
             self.names: Sequence[str] = [str(person["name"]) for person in people]
             self.variants: Sequence[int] = [int(person["variants"]) for person in people]
-            self.attributes: Sequence[Mapping[str, Any]] = [dict(person["attributes"]) for person in people]
+            self._stored: Sequence[Mapping[str, Any]] = [dict(person["attributes"]) for person in people]
             self._firsts = [0, *itertools.accumulate(len(shard["people"]) for shard in index["shards"])]
         except (KeyError, TypeError, ValueError) as error:
             raise ShardError(f"{folder / INDEX} is damaged ({error}): pack the people again") from error
         self._open: dict[int, Any] = {}
 
+    def known(self, index: int) -> tuple[Attributes, ...]:
+        """What is known of each colouring of one of them. Raises what `person` does."""
+        shard, place, _ = self._rows(index)
+        return attributes_of(self._stored[index], self._slice(shard, "betas")[place], self.variants[index])
+
     def person(self, index: int) -> StoredPerson:
         """One of them. Raises ShardError that names the shard where it is damaged, OSError."""
         shard, place, rows = self._rows(index)
-        scale = self._scale(shard, rows)
-        betas = self._slice(shard, "betas")[place].float()
-        return StoredPerson(self._slice(shard, "voxels")[rows], scale, betas, self.attributes[index], self.full_density)
+        voxels, scale, betas = self._slice(shard, "voxels")[rows], self._scale(shard, rows), self._slice(shard, "betas")
+        return StoredPerson(voxels, scale, betas[place], self.known(index), self.full_density)
 
     def variant(self, index: int, number: int) -> tuple[Tensor, Tensor]:
         """Voxels and delta scales of one colouring; nothing else is read. Raises what `person` does."""
@@ -154,8 +159,8 @@ class PackedPeople:
 
     def _scale(self, shard: int, rows: slice) -> Tensor:
         if "delta_scale" in self._shard(shard).keys():  # noqa: SIM118 - safe_open is no mapping
-            return self._slice(shard, "delta_scale")[rows]
-        return torch.ones(rows.stop - rows.start, K, 3, dtype=torch.float16)
+            return self._slice(shard, "delta_scale")[rows].float()
+        return torch.ones(rows.stop - rows.start, K, 3)
 
     def _slice(self, shard: int, name: str) -> Any:
         return self._shard(shard).get_slice(name)

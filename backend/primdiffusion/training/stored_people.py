@@ -12,10 +12,15 @@ from typing import IO, Any, Protocol
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from numpy.lib.npyio import NpzFile
 from torch import Tensor
 
+from primdiffusion.body.measures import measure
+from primdiffusion.body.model import default_body
+from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.people.wardrobe import words_of
 from primdiffusion.primitives.primitives import K, Payload, S
 
 _DAMAGED = (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile)
@@ -30,9 +35,10 @@ class StoredPerson:
     voxels: UInt8[Tensor, "n k 8 8 8 4"]
     """sRGB-encoded colour and relative density of each colouring."""
     delta_scale: Float[Tensor, "n k 3"]
-    """float16: factors on the anchors' half extents; 1 where the file holds none."""
+    """Factors on the anchors' half extents; 1 where the file holds none."""
     betas: Float[Tensor, "10"]
-    attributes: Mapping[str, Any]
+    attributes: tuple[Attributes, ...]
+    """Of each colouring, in the words of `primdiffusion.people.wardrobe`, and height and weight, which betas tell."""
     full_density: float
     """1/m that 255 stands for."""
 
@@ -55,13 +61,12 @@ class People(Protocol):
         ...
 
     @property
-    def attributes(self) -> Sequence[Mapping[str, Any]]:
-        """What is known of each."""
-        ...
-
-    @property
     def full_density(self) -> float:
         """1/m that 255 stands for, in all of them."""
+        ...
+
+    def known(self, index: int) -> tuple[Attributes, ...]:
+        """`StoredPerson.attributes` of one of them, without reading voxels; raises what `person` does."""
         ...
 
     def person(self, index: int) -> StoredPerson:
@@ -81,27 +86,74 @@ def payload_of_bytes(
     return Payload(decode_srgb(values[..., :3, :, :, :]), values[..., 3, :, :, :] * full_density, delta_scale.float())
 
 
+def attributes_of(stored: Mapping[str, Any], betas: Float[Tensor, "10"], count: int) -> tuple[Attributes, ...]:
+    """What can be said of each of `count` colourings, of what a file says and of the body's shape."""
+    variants = stored.get("variants", [stored] * count)
+    measures = measure(default_body().shape(betas))
+    body = {"height": measures.height, "weight": measures.weight}
+    return tuple({**words_of(variant), **body} for variant in variants)
+
+
 def read_person(path: Path) -> StoredPerson:
     """A person's file; ValueError if it is damaged or of another shape."""
     try:
         with np.load(path, allow_pickle=False) as file:
+            outline = _outline_of(file)
             voxels = torch.from_numpy(file["voxels"])
-            scale = torch.from_numpy(file["delta_scale"]).half() if "delta_scale" in file else None
-            betas = torch.from_numpy(file["betas"]).float()
-            attributes = json.loads(str(file["attributes"]))
-            full_density = float(file["full_density"])
+            scale = torch.from_numpy(file["delta_scale"]).float() if "delta_scale" in file else None
     except _DAMAGED as error:
         raise ValueError(_NO_PERSON.format(path=path, error=error)) from error
     if voxels.dtype != torch.uint8 or tuple(voxels.shape[1:]) != _VOXELS:
         raise ValueError(
             f"{path} holds voxels {voxels.dtype} {tuple(voxels.shape)}; uint8 [n, {K}, {S}, {S}, {S}, 4] is needed"
         )
-    scale = voxels.new_ones((len(voxels), K, 3), dtype=torch.float16) if scale is None else scale
+    scale = torch.ones(len(voxels), K, 3) if scale is None else scale
     if tuple(scale.shape) != (len(voxels), K, 3) or not (torch.isfinite(scale) & (scale > 0)).all():
         raise ValueError(f"{path} holds delta_scale {tuple(scale.shape)}; positive [{len(voxels)}, {K}, 3] is needed")
+    return StoredPerson(voxels, scale, outline.betas, outline.known(), outline.full_density)
+
+
+@dataclasses.dataclass(frozen=True)
+class Outline:
+    """What a person's file holds, but for its voxels."""
+
+    variants: int
+    betas: Float[Tensor, "10"]
+    stored: Mapping[str, Any]
+    """Attributes as they are stored."""
+    full_density: float
+
+    def known(self) -> tuple[Attributes, ...]:
+        """`StoredPerson.attributes`."""
+        return attributes_of(self.stored, self.betas, self.variants)
+
+
+def read_outline(path: Path) -> Outline:
+    """What a person's file holds, but for its voxels; ValueError if it is damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return _outline_of(file)
+    except _DAMAGED as error:
+        raise ValueError(_NO_PERSON.format(path=path, error=error)) from error
+
+
+def _outline_of(file: NpzFile) -> Outline:
+    with file.zip.open("voxels.npy") as member:
+        count = _length(member)
+    betas = torch.from_numpy(file["betas"]).float()
     if tuple(betas.shape) != (BETAS,) or not torch.isfinite(betas).all():
-        raise ValueError(f"{path} holds betas {tuple(betas.shape)}; {BETAS} finite numbers are needed")
-    return StoredPerson(voxels, scale, betas, attributes, full_density)
+        raise ValueError(f"betas of shape {tuple(betas.shape)}, not {BETAS} finite numbers")
+    stored = dict(json.loads(str(file["attributes"])))
+    if len(stored.get("variants", range(count))) != count:
+        raise ValueError(f"attributes of {len(stored['variants'])} colourings, voxels of {count}")
+    return Outline(count, betas, stored, float(file["full_density"]))
+
+
+def _length(member: IO[bytes]) -> int:
+    """First dimension of an array in numpy's format, from its header."""
+    major, _ = np.lib.format.read_magic(member)
+    read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+    return read(member)[0][0]
 
 
 class PeopleFolder:
@@ -115,11 +167,14 @@ class PeopleFolder:
             ValueError: one is damaged, or people have several full densities.
         """
         self.paths = find_people(folder)
-        outlines = [_outline(path) for path in self.paths]
+        self.outlines = [read_outline(path) for path in self.paths]
         self.names = [path.stem for path in self.paths]
-        self.variants = [outline.variants for outline in outlines]
-        self.attributes = [outline.attributes for outline in outlines]
-        self.full_density = one_density([outline.full_density for outline in outlines])
+        self.variants = [outline.variants for outline in self.outlines]
+        self.full_density = one_density([outline.full_density for outline in self.outlines])
+
+    def known(self, index: int) -> tuple[Attributes, ...]:
+        """What is known of each colouring of one of them."""
+        return self.outlines[index].known()
 
     def person(self, index: int) -> StoredPerson:
         """One of them. Raises ValueError where its file is damaged."""
@@ -148,27 +203,3 @@ def one_density(densities: Sequence[float]) -> float:
             f"people with full densities {sorted(found)} cannot be trained together: regenerate them with one"
         )
     return found.pop()
-
-
-@dataclasses.dataclass(frozen=True)
-class _Outline:
-    """What a file holds, but for its voxels."""
-
-    variants: int
-    attributes: Mapping[str, Any]
-    full_density: float
-
-
-def _outline(path: Path) -> _Outline:
-    try:
-        with np.load(path, allow_pickle=False) as file, file.zip.open("voxels.npy") as member:
-            return _Outline(_length(member), json.loads(str(file["attributes"])), float(file["full_density"]))
-    except _DAMAGED as error:
-        raise ValueError(_NO_PERSON.format(path=path, error=error)) from error
-
-
-def _length(member: IO[bytes]) -> int:
-    """First dimension of an array in numpy's format, from its header."""
-    major, _ = np.lib.format.read_magic(member)
-    read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
-    return read(member)[0][0]
