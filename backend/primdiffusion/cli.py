@@ -47,41 +47,57 @@ class Generate:
     """Which person: the same seed gives the same one."""
     steps: int = 30
     """Sampler steps, 1 to 1000."""
-    sampler: Literal["ddim", "ddpm"] = "ddim"
-    """ddim: few steps; ddpm: the paper's, wants hundreds."""
+    sampler: Literal["ddim", "dpmpp_2m", "ddpm"] = "ddim"
+    """ddim: few steps; dpmpp_2m: fewer still; ddpm: the paper's, wants hundreds."""
+    attributes: tuple[str, ...] = ()
+    """What the people shall be, NAME=VALUE: sex=female "outfit=blouse and skirt" height=1.7; by default anybody. `info`
+    lists the names and values that a checkpoint knows."""
+    guidance: float = 1.5
+    """How strongly attributes are insisted on: 1 plainly, more at the cost of variety."""
     checkpoint: Path | None = None
     """Trained model (.safetensors); without it the one that comes with the package."""
     count: int = 1
     """How many people, with seeds following on each other."""
+    batch: int = 1
+    """People that are sampled at once: faster, most of all on a graphics card, and takes more memory. Numbers then
+    differ in the last digits from those of people made alone."""
     size: int = 512
     """Pixels a side of the pictures."""
 
     def run(self) -> None:
         """Generates, and prints the folder of each person."""
-        if self.count < 1:
-            raise ValueError(f"count is {self.count}: ask for one person or more")
+        for name in ("count", "batch"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}: ask for one person or more")
         from tqdm import tqdm
 
-        from primdiffusion.human import generate
+        from primdiffusion.diffusion.conditioning import read_attributes
+        from primdiffusion.human import generate_batch
         from primdiffusion.machine import best_device
         from primdiffusion.person_folder import write_person
         from primdiffusion.staging import staged
         from primdiffusion.training.checkpoint import load_checkpoint
 
-        model = None
-        for seed in range(self.seed, self.seed + self.count):
-            began = time.perf_counter()
-            folder = self.out if self.count == 1 else self.out / f"seed_{seed:06d}"
-            with staged(folder) as unfinished:
+        model, attributes = None, read_attributes(self.attributes)
+        end = self.seed + self.count
+        for first in range(self.seed, end, self.batch):
+            began, seeds = time.perf_counter(), range(first, min(first + self.batch, end))
+            folders = [self.out if self.count == 1 else self.out / f"seed_{seed:06d}" for seed in seeds]
+            with contextlib.ExitStack() as files:  # all people of a batch or none
+                unfinished = [files.enter_context(staged(folder)) for folder in folders]
                 model = load_checkpoint(self.checkpoint, best_device()) if model is None else model
-                with tqdm(total=self.steps, desc=f"seed {seed}", unit="step", disable=None) as bar:
+                label = ", ".join(map(str, seeds))
+                with tqdm(total=self.steps, desc=f"seed {label}", unit="step", disable=None) as bar:
 
                     def on_step(step: Step, bar: tqdm = bar) -> None:
                         bar.update()
 
-                    human = generate(model, seed, self.steps, self.sampler, on_step)
-                write_person(unfinished, human, self.size)
-            print(f"{folder}  seed {seed}, {self.steps} steps, {time.perf_counter() - began:.1f} s")
+                    people = generate_batch(model, seeds, self.steps, self.sampler, on_step, attributes, self.guidance)
+                for folder, human in zip(unfinished, people, strict=True):
+                    write_person(folder, human, self.size)
+            seconds = (time.perf_counter() - began) / len(seeds)
+            for folder, seed in zip(folders, seeds, strict=True):
+                print(f"{folder}  seed {seed}, {self.steps} steps, {seconds:.1f} s")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,20 +135,20 @@ class Render:
 
         from primdiffusion.drawing.draw import draw
         from primdiffusion.drawing.scene import Look, Scene
-        from primdiffusion.human import framing, place
+        from primdiffusion.human import body_of, framing, place
         from primdiffusion.human_file import load_human
         from primdiffusion.pose_file import read_pose
-        from primdiffusion.primitives.anchors import default_anchors
         from primdiffusion.render.image import depth_to_png, rgba_to_png
         from primdiffusion.render.march import MarchSettings, march
         from primdiffusion.staging import written_whole
 
         self._check()
         look = Look(self.view, settings=MarchSettings(step=self.step))
-        primitives = place(load_human(self.human), None if self.pose is None else read_pose(self.pose, self.frame))
+        human = load_human(self.human)
+        primitives = place(human, None if self.pose is None else read_pose(self.pose, self.frame))
         width, height = (self.size if side is None else side for side in (self.width, self.height))
         camera = framing(primitives, math.radians(self.yaw), width, height)
-        picture = draw(Scene(primitives, chart=default_anchors().chart), camera, look)
+        picture = draw(Scene(primitives, chart=body_of(human)[1].chart), camera, look)
         with contextlib.ExitStack() as files:  # both pictures or none
             rgba_to_png(
                 files.enter_context(written_whole(self.out)),
@@ -224,6 +240,11 @@ class Train:
 
 
 @dataclasses.dataclass(frozen=True)
+class ImportReleased:
+    """Turn the authors' primdiffusion.pt and your SMPL file into a checkpoint for generate (own --help)."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Evaluate:
     """Measure how good trained models are: reconstruction (own --help)."""
 
@@ -240,6 +261,7 @@ Command = (
     | Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[ImportReleased, tyro.conf.subcommand("import-released")]
 )
 
 
@@ -289,6 +311,12 @@ def _train(arguments: Sequence[str]) -> None:
     train(tyro.cli(TrainingConfig, args=arguments, prog="primdiffusion train"))
 
 
+def _import_released(arguments: Sequence[str]) -> None:
+    from primdiffusion.import_released_command import run
+
+    run(arguments)
+
+
 def _evaluate(arguments: Sequence[str]) -> None:
     from primdiffusion.evaluation.command import TrainedReconstructor, run
 
@@ -310,6 +338,7 @@ FORWARDED = {
     "fit": _fit,
     "train": _train,
     "evaluate": _evaluate,
+    "import-released": _import_released,
 }
 """Commands whose parameters their own modules state; importing these takes a second, so only when asked for."""
 

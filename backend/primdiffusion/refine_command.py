@@ -114,6 +114,11 @@ class Refine:
             human = meshed_person(self.start)
         else:
             human = load_human(self.start)
+        if human.stand is not None:
+            raise ValueError(
+                f"{self.start} stands on the body {human.stand.files.smpl.path}; captures are fitted to the default "
+                "body: start from a person on that, or from the encoder"
+            )
         return dataclasses.replace(human, betas=betas, provenance={**human.provenance, "refined_from": name})
 
     def _encoded(self, captures: Captures, name: str, betas: Tensor, given: Sequence[int]) -> Human:

@@ -87,8 +87,8 @@ class FrameDrawer:
         solids = None if params.solids is None else self._solids(_stamp(params.solids))
         if not people:
             return Scene(None, solids)
-        chart = default_anchors().chart.repeat(len(people)) if params.view == "boxes" else None
-        return Scene(self._everybody(people), solids, chart)
+        chart = torch.cat([self._stand(person[0])[1].chart for person in people]) if params.view == "boxes" else None
+        return Scene(self._everybody(people), solids, None if chart is None else chart.cpu())
 
     def _together(self, people: tuple[Numbers, ...]) -> Primitives:
         placed = [self._placed(*person) for person in people]
@@ -97,13 +97,17 @@ class FrameDrawer:
     def _place(self, file: Stamp, matrix: Numbers, joints: Numbers, betas: Numbers | None) -> Primitives:
         skinning, object_to_world = self._tensor(joints), self._tensor(matrix)
         shape = None if betas is None else self._tensor(betas)
-        return place_skinned(self._human(file), skinning, object_to_world, shape, *self._rig())
+        return place_skinned(self._human(file), skinning, object_to_world, shape, *self._stand(file))
 
     def _tensor(self, numbers: Numbers) -> torch.Tensor:
         return torch.tensor(numbers, dtype=torch.float32, device=self._device)
 
     def _body(self) -> tuple[BodyModel, Anchors]:
         return default_body().to(self._device), default_anchors().to(self._device)
+
+    def _stand(self, file: Stamp) -> tuple[BodyModel, Anchors]:
+        stand = self._human(file).stand
+        return self._rig() if stand is None else (stand.body, stand.anchors)
 
     def _load(self, file: Stamp) -> Human:
         return load_human(file[0]).to(self._device)
