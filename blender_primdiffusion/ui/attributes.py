@@ -13,7 +13,8 @@ from ..places import backend_module_path, preference
 from ..worker.vocabulary import Vocabulary, read_vocabulary
 
 ANY = "ANY"
-CATEGORIES = ("sex", "outfit", "hair")
+CATEGORIES = ("sex", "outfit", "pattern", "shoes", "hair", "hat")
+"""Those that have a menu; scripts may ask for whatever else a checkpoint knows."""
 SCALARS = {"height": "m", "weight": "kg"}
 _DEFAULT_CHECKPOINT = Path("primdiffusion", "weights", "default.safetensors")
 
@@ -49,7 +50,9 @@ def menu(name: str) -> list[Item]:
     checkpoint that knows the same value shows it."""
     values = known().categories.get(name, ())
     if values not in _items:
-        numbered = [(value, title(value), "", zlib.crc32(value.encode()) & 0x7FFFFFFF or 1) for value in values]
+        numbered = [
+            (value, value[:1].upper() + value[1:], "", zlib.crc32(value.encode()) & 0x7FFFFFFF or 1) for value in values
+        ]
         _items[values] = [(ANY, "Any", "Whatever comes", 0), *numbered]
     return _items[values]
 
@@ -69,7 +72,10 @@ class PRIMDIFFUSION_PG_attributes(bpy.types.PropertyGroup):
 
     sex: _menu_property("sex")
     outfit: _menu_property("outfit")
+    pattern: _menu_property("pattern")
+    shoes: _menu_property("shoes")
     hair: _menu_property("hair")
+    hat: _menu_property("hat")
     use_height: bpy.props.BoolProperty(name="Ask for a Height")
     height: bpy.props.FloatProperty(name="Height", description="Metres", default=1.7, min=0.5, max=2.5, step=1)
     use_weight: bpy.props.BoolProperty(name="Ask for a Weight")

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import bpy
 
 from ..scene.body_mesh import body_of
+from ..worker.names import SIDED_PARTS, WHOLE_PARTS
 from .attributes import draw_attributes
 from .edit_painting import painting
-from .edit_settings import SIDED_PARTS, WHOLE_PARTS
 from .edit_target import selected_person
 from .panel import draw_job
 

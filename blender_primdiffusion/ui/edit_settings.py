@@ -5,18 +5,9 @@ from __future__ import annotations
 import bpy
 
 from ..scene.human import MARK, humans
+from ..worker.names import PARTS
 from .attributes import PRIMDIFFUSION_PG_attributes, title
 
-WHOLE_PARTS = (
-    "face", "hair", "neck", "torso", "upper_arms", "forearms", "hands", "thighs", "shins", "feet", "hips",
-    "head", "arms", "legs", "top", "bottom", "shoes", "clothes", "skin",
-)  # fmt: skip
-SIDED_PARTS = (
-    "left_upper_arm", "right_upper_arm", "left_forearm", "right_forearm", "left_hand", "right_hand",
-    "left_thigh", "right_thigh", "left_shin", "right_shin", "left_foot", "right_foot",
-)  # fmt: skip
-PARTS = (*WHOLE_PARTS, *SIDED_PARTS)
-"""The backend's names of parts of the body, in its order."""
 PAINTED_GROUP = "PrimDiffusion Region"
 """Vertex group of the body mesh that Paint Region makes."""
 

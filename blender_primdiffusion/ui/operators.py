@@ -8,7 +8,7 @@ import bpy
 
 from .attributes import asked, parsed
 from .generation import TICK_S, Busy, GenerationFailed, session
-from .properties import SAMPLERS
+from .properties import SAMPLER_ITEMS
 
 _TOLD_S = 1.0
 """Between lines of progress on the console in background mode."""
@@ -24,7 +24,7 @@ class PRIMDIFFUSION_OT_generate(bpy.types.Operator):
     seed: bpy.props.IntProperty(name="Seed", default=-1, min=-1, description="-1: the panel's")
     steps: bpy.props.IntProperty(name="Steps", default=0, min=0, description="0: the panel's")
     sampler: bpy.props.EnumProperty(
-        name="Sampler", items=SAMPLERS, description="Not given: the panel's", options={"SKIP_SAVE"}
+        name="Sampler", items=SAMPLER_ITEMS, description="Not given: the panel's", options={"SKIP_SAVE"}
     )
     guidance: bpy.props.FloatProperty(
         name="Guidance", min=0.0, max=20.0, description="Not given: the panel's", options={"SKIP_SAVE"}

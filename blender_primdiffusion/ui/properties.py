@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import bpy
 
+from ..worker.names import SAMPLERS
 from .attributes import PRIMDIFFUSION_PG_attributes
 
-SAMPLERS = [
-    ("ddim", "DDIM", "The paper's way to sample: the same steps each time"),
-    ("dpmpp_2m", "DPM-Solver++(2M)", "Good with few steps"),
-    ("ddpm", "DDPM", "Noise is added again at each step; wants many steps"),
-]
+_SAMPLERS = {
+    "ddim": ("DDIM", "The noise of the seed alone: as the paper samples"),
+    "dpmpp_2m": ("DPM-Solver++(2M)", "Two steps are looked at together: does well with few"),
+    "ddpm": ("DDPM", "New noise at each step: wants many"),
+}
+SAMPLER_ITEMS = [(name, *_SAMPLERS[name]) for name in SAMPLERS]
 
 
 class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
@@ -27,7 +29,7 @@ class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
         max=1000,
         soft_max=100,
     )
-    sampler: bpy.props.EnumProperty(name="Sampler", description="How the noise is taken away", items=SAMPLERS)
+    sampler: bpy.props.EnumProperty(name="Sampler", description="How the noise is taken away", items=SAMPLER_ITEMS)
     guidance: bpy.props.FloatProperty(
         name="Guidance",
         description="How strongly the attributes are followed: 1 as people are, more exaggerates; "

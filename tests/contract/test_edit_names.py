@@ -1,0 +1,44 @@
+"""What the extension offers to ask for is what the backend knows; the card of a checkpoint is read without torch."""
+
+from pathlib import Path
+
+import pytest
+import tiny_model
+from primdiffusion.diffusion.samplers import SAMPLERS as BACKENDS_SAMPLERS
+from primdiffusion.editing.regions import PARTS as BACKENDS_PARTS
+from primdiffusion.editing.regions import region_of
+from primdiffusion.training.checkpoint import default_checkpoint, load_checkpoint
+from worker.names import PARTS, SAMPLERS
+from worker.vocabulary import read_vocabulary
+
+
+def test_parts_of_the_body_are_the_backends_in_its_order():
+    assert PARTS == BACKENDS_PARTS
+    assert len(PARTS) <= 32, "Blender's menu of several choices holds 32 bits"
+    assert all(region_of([part]).any() for part in PARTS)
+
+
+def test_samplers_are_the_backends():
+    assert set(SAMPLERS) == set(BACKENDS_SAMPLERS)
+
+
+def test_the_card_of_a_checkpoint_tells_what_its_model_knows(checkpoint):
+    read = read_vocabulary(checkpoint)
+    assert (read.categories, read.scalars) == (tiny_model.VOCABULARY.categories, tiny_model.VOCABULARY.scalars)
+
+
+def test_the_default_checkpoint_is_read_as_the_backend_reads_it():
+    model = load_checkpoint()
+    read = read_vocabulary(Path(default_checkpoint()))
+    assert (read.categories, read.scalars) == (model.vocabulary.categories, model.vocabulary.scalars)
+
+
+DAMAGED = [b"", b"PK\x03\x04", b"\xff" * 64, b"\x02" + bytes(7) + b"{}", b"\x09" + bytes(7) + b"{"]
+
+
+@pytest.mark.parametrize("contents", DAMAGED)
+def test_a_file_that_is_no_checkpoint_is_refused_with_its_path(tmp_path, contents):
+    path = tmp_path / "broken.safetensors"
+    path.write_bytes(contents)
+    with pytest.raises(ValueError, match=r"broken\.safetensors is damaged or no checkpoint"):
+        read_vocabulary(path)
