@@ -114,7 +114,8 @@ def generate_batch(
             on_step(step)
         final = step.x0
     assert final is not None, "a sampler yields at least one step"
-    asked = {"attributes": dict(attributes), "guidance": guidance} if attributes else {}
+    numbers = {name: float(attributes[name]) for name in model.vocabulary.scalars if name in attributes}
+    asked = {"attributes": {**attributes, **numbers}, "guidance": guidance} if attributes else {}
     made = {"steps": steps, "sampler": sampler, **asked, **made_by(model)}
     people = []
     for index, (seed, betas) in enumerate(zip(seeds, model.betas(final, seeds), strict=True)):
@@ -138,7 +139,7 @@ def made_by(model: DiffusionModel) -> dict[str, Any]:
 
 def measures_of(attributes: Attributes) -> tuple[float | None, float | None]:
     """Height (m) and weight (kg) that are asked for; None where they are not."""
-    height, weight = (attributes.get(name) for name in ("height", "weight"))
+    height, weight = (attributes.get(name) for name in ("height", "weight"))  # numbers: the vocabulary has read them
     return None if height is None else float(height), None if weight is None else float(weight)
 
 

@@ -3,7 +3,7 @@ import json
 
 import pytest
 import torch
-from diffusion_people import small_model
+from diffusion_people import VOCABULARY, small_model
 from primdiffusion.diffusion.model import DiffusionModel, WholeSlab, sample
 from primdiffusion.diffusion.schedule import linear
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
@@ -40,7 +40,7 @@ def test_a_saved_model_generates_the_same_people(path):
     assert torch.allclose(loaded.denoise(x, t), model.denoise(x, t), atol=0.02)
     assert loaded.full_density == 100.0
     card = {"name": "small", "licence": "CC0-1.0"}
-    assert read_card(path) == card
+    assert read_card(path) == {**card, "attributes": VOCABULARY.to_json()}
     assert loaded.card == {**card, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
     again = path.with_name("again.safetensors")
     save_checkpoint(again, loaded, "linear")

@@ -108,9 +108,14 @@ def file_hash(path: Path) -> str:
 
 
 def read_card(path: Path | str | None = None) -> dict[str, Any]:
-    """The card of a checkpoint or an encoder, without its weights; errors as in `load_checkpoint`."""
+    """The card of a checkpoint or an encoder, without its weights; errors as in `load_checkpoint`.
+
+    A checkpoint's says under "attributes" what its model can be asked for, as `Vocabulary.to_json`.
+    """
     path = default_checkpoint() if path is None else Path(path)
-    return json.loads(_read_metadata(path, (FORMAT, ENCODER_FORMAT))["card"])
+    metadata = _read_metadata(path, (FORMAT, ENCODER_FORMAT))
+    known = json.loads(metadata.get("architecture", "{}")).get("vocabulary")
+    return json.loads(metadata["card"]) | ({"attributes": known} if known else {})
 
 
 def _build(tensors: Mapping[str, Tensor], architecture: dict[str, Any], card: dict[str, Any]) -> DiffusionModel:
