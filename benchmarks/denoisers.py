@@ -28,7 +28,7 @@ def median_seconds(model: DiffusionModel, repeats: int) -> float:
     times = []
     for seed in range(repeats + 1):
         begin = time.perf_counter()
-        for _ in sample(model, seed, STEPS):
+        for _ in sample(model, [seed], STEPS):
             pass
         times.append(time.perf_counter() - begin)
     return sorted(times[1:])[repeats // 2]
@@ -36,7 +36,7 @@ def median_seconds(model: DiffusionModel, repeats: int) -> float:
 
 def spread(model: DiffusionModel, count: int) -> float:
     """Root mean square distance of generated people from their mean, over that of the prior fitted to the data."""
-    people = torch.cat([list(sample(model, seed, STEPS))[-1].x0 for seed in range(count)]).flatten(1)
+    people = torch.cat([list(sample(model, [seed], STEPS))[-1].x0 for seed in range(count)]).flatten(1)
     generated = people.var(0).sum().sqrt()
     if not isinstance(model.denoiser, PersonDenoiser):
         raise TypeError("variety is measured against a prior, which only the default architecture has")
