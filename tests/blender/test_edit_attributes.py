@@ -1,4 +1,4 @@
-"""Asking for attributes: menus of what the checkpoint knows, read from its header; nothing unless something is chosen."""
+"""Asking for attributes: menus of what the checkpoint knows, from its header; nothing is asked for unless chosen."""
 
 from __future__ import annotations
 
