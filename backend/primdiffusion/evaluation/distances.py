@@ -1,0 +1,107 @@
+"""How far two sets of people are apart, by features [n, d] of each: pure functions, float64, as accurate as the sets.
+
+All are of samples, so two sets of one distribution are apart too: state the distance of two real sets beside them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+NEIGHBOURS = 3
+"""k of precision and recall (Kynkäänniemi et al. 2019)."""
+ROWS_AT_ONCE = 512
+"""Bounds the memory of tables of distances; no effect on the result."""
+
+
+def frechet_distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -> float:
+    """|m1 - m2|^2 + tr(C1 + C2 - 2 (C1 C2)^1/2) of Gaussians fitted to both (Heusel et al. 2017).
+
+    Covariances are unbiased; the distance is not: it falls with the number of samples, so compare sets of equal size.
+    Raises ValueError for fewer than two samples or features of another width.
+    """
+    _check(first, second)
+    means, roots = [], []
+    for features in (first.double(), second.double()):
+        means.append(features.mean(0))
+        roots.append((features - means[-1]) / (len(features) - 1) ** 0.5)
+    # tr (C1 C2)^1/2 is the nuclear norm of A1 A2^T, where C = A^T A: no square root of a singular matrix is needed.
+    overlap = torch.linalg.svdvals(roots[0] @ roots[1].T).sum()
+    spread = sum(root.square().sum() for root in roots)
+    return float((means[0] - means[1]).square().sum() + spread - 2 * overlap)
+
+
+def kernel_distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -> float:
+    """Squared maximum mean discrepancy by the kernel (x.y / d + 1)^3 (KID, Binkowski et al. 2018).
+
+    Unbiased, of all samples at once: 0 on average, and now and then below, for two sets of one distribution. Raises
+    ValueError as `frechet_distance`.
+    """
+    _check(first, second)
+    first, second = first.double(), second.double()
+
+    def kernel(a: Tensor, b: Tensor) -> Tensor:
+        return (a @ b.T / a.shape[1] + 1) ** 3
+
+    within = 0.0
+    for features in (first, second):
+        table = kernel(features, features)
+        within += float((table.sum() - table.trace()) / (len(features) * (len(features) - 1)))
+    return within - 2 * float(kernel(first, second).mean())
+
+
+class PrecisionRecall(NamedTuple):
+    """Shares of samples; both 1 for sets that cover each other."""
+
+    precision: float
+    """Of made people that lie among real ones."""
+    recall: float
+    """Of real people that lie among made ones."""
+
+
+def precision_recall(
+    made: Float[Tensor, "n d"], real: Float[Tensor, "m d"], neighbours: int = NEIGHBOURS
+) -> PrecisionRecall:
+    """Shares of each set within the reach of some of the other's samples (Kynkäänniemi et al. 2019, eq. 1-2).
+
+    A sample reaches as far as its k-th nearest neighbour in its own set. Raises ValueError for sets of k or fewer.
+    """
+    _check(made, real)
+    if min(len(made), len(real)) <= neighbours:
+        raise ValueError(
+            f"sets of {len(made)} and {len(real)} people have no {neighbours} neighbours: give more people"
+        )
+
+    def covered(points: Tensor, centres: Tensor) -> float:
+        own = torch.cdist(centres, centres).kthvalue(neighbours + 1, dim=1).values  # the nearest is the sample itself
+        return float((torch.cdist(points, centres) <= own).any(1).double().mean())
+
+    made, real = made.double(), real.double()
+    return PrecisionRecall(covered(made, real), covered(real, made))
+
+
+class Nearest(NamedTuple):
+    """The nearest of a set to each of some samples."""
+
+    distance: Float[Tensor, "q"]
+    index: Int[Tensor, "q"]
+
+
+def nearest(queries: Float[Tensor, "q d"], among: Float[Tensor, "n d"]) -> Nearest:
+    """Euclidean; ValueError for an empty set or features of another width."""
+    if queries.shape[-1] != among.shape[-1] or not len(among):
+        raise ValueError(
+            f"features {tuple(queries.shape)} have no nearest among {tuple(among.shape)}: same width, n > 0"
+        )
+    found = [torch.cdist(part.double(), among.double()).min(1) for part in queries.split(ROWS_AT_ONCE)]
+    return Nearest(torch.cat([part.values for part in found]), torch.cat([part.indices for part in found]))
+
+
+def _check(first: Tensor, second: Tensor) -> None:
+    if first.ndim != 2 or second.ndim != 2 or first.shape[1] != second.shape[1] or min(len(first), len(second)) < 2:
+        raise ValueError(
+            f"features of shapes {tuple(first.shape)} and {tuple(second.shape)}: give two or more rows, of one width"
+        )

@@ -1,0 +1,52 @@
+"""The nearest training person of each generated one in what is diffused, read from disk person by person."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from primdiffusion.evaluation.gallery import ReadPerson, Report, payload_of, silent
+from primdiffusion.primitives.primitives import Payload
+
+Encode = Callable[[Payload], Tensor]
+"""A payload's clean sample: `DiffusionModel.encode`."""
+
+
+class NearestStored(NamedTuple):
+    """The nearest of the people on disk to each query."""
+
+    distance: Float[Tensor, "q"]
+    """Root mean square difference of the numbers that are diffused."""
+    file: Int[Tensor, "q"]
+    """Place in the paths."""
+    colouring: Int[Tensor, "q"]
+
+
+def nearest_stored(
+    queries: Float[Tensor, "q d"], paths: Sequence[Path], read: ReadPerson, encode: Encode, report: Report = silent
+) -> NearestStored:
+    """Compares flattened samples with all colourings of all people. Raises ValueError for no paths."""
+    if not paths:
+        raise ValueError("there are no people to find the nearest of: name a folder of payloads")
+    best = torch.full((len(queries),), torch.inf)
+    file, colouring = (torch.zeros(len(queries), dtype=torch.int64) for _ in range(2))
+    for number, path in enumerate(paths):
+        encoded = encoded_person(path, read, encode)
+        found = torch.cdist(queries, encoded).min(1)
+        nearer = found.values < best
+        best = torch.where(nearer, found.values, best)
+        file[nearer] = number
+        colouring = torch.where(nearer, found.indices, colouring)
+        report(number + 1, len(paths))
+    return NearestStored(best / queries.shape[1] ** 0.5, file, colouring)
+
+
+def encoded_person(path: Path, read: ReadPerson, encode: Encode) -> Float[Tensor, "n d"]:
+    """Flattened samples of all colourings of a person."""
+    person = read(path)
+    return torch.stack([encode(payload_of(person, one)).flatten().cpu() for one in range(len(person.voxels))])

@@ -1,0 +1,273 @@
+"""The paper's Table 2 baseline: the same diffusion on 64^3 voxels in place of primitives.
+
+As in our default model, cells (here blocks of 4^3 voxels) pass a frozen orthonormal linear codec, and a closed-form
+person prior is corrected by a network for the whole person and a U-Net for its cells (here in three dimensions).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+from torch.nn import functional
+
+from primdiffusion.diffusion.codec import DEAD_ZONE, SLAB_UNIT
+from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
+from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.diffusion.local_unet import PersonNetworkConfig
+from primdiffusion.diffusion.samplers import SAMPLERS
+from primdiffusion.diffusion.schedule import SCHEDULES, trailing_steps
+from primdiffusion.diffusion.unet import TimeEmbedding, zeroed
+from primdiffusion.evaluation.voxel_grid import SIDE, primitives_of
+from primdiffusion.geometry.records import TensorRecord
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.staging import written_whole
+
+BLOCK = 4
+"""Voxels along a side of a cell."""
+BLOCKS = SIDE // BLOCK
+VALUES = 4 * BLOCK**3
+CELLS_EACH = 256
+"""Cells of each person that the components are fitted to."""
+SCHEDULE = "linear"
+
+
+@dataclasses.dataclass(frozen=True)
+class VoxelCodec(TensorRecord):
+    """Grids to latents [*b, C, n, 1] of the n cells where anybody ever is, and back; as `LinearCodec`."""
+
+    cells: Int[Tensor, "n"]
+    """Which of the 16^3 cells (z, y, x), ascending; the others are empty in everybody."""
+    mirrored: Int[Tensor, "n"]
+    """Place in `cells` of each cell's mirror image."""
+    mean: Float[Tensor, "n v"]
+    basis: Float[Tensor, "c v"]
+    """Orthonormal rows, each even or odd in x."""
+    parity: Float[Tensor, "c"]
+
+    def encode(self, grids: UInt8[Tensor, "*b 64 64 64 4"]) -> Float[Tensor, "*b c n 1"]:
+        """Latents of stored grids."""
+        values = blocks_of(grids)[..., self.cells, :].float() / 255
+        return ((values - self.mean) @ self.basis.T * SLAB_UNIT).mT[..., None]
+
+    def decode(self, latents: Float[Tensor, "*b c n 1"]) -> Float[Tensor, "*b 64 64 64 4"]:
+        """Grids in [0, 1] of latents, with the dead zone of primitives on density."""
+        values = latents[..., 0].mT @ self.basis / SLAB_UNIT + self.mean
+        blocks = values.new_zeros((*values.shape[:-2], BLOCKS**3, VALUES))
+        blocks[..., self.cells, :] = values
+        grid = blocks.unflatten(-1, (BLOCK, BLOCK, BLOCK, 4)).unflatten(-5, (BLOCKS, BLOCKS, BLOCKS))
+        grid = grid.movedim((-4, -3, -2), (-6, -4, -2)).flatten(-3, -2).flatten(-4, -3).flatten(-5, -4)
+        start, width = DEAD_ZONE
+        return torch.cat([grid[..., :3], (grid[..., 3:] - start) / width], dim=-1).clamp(0, 1)
+
+    def mirror(self, latents: Float[Tensor, "*b c n 1"]) -> Float[Tensor, "*b c n 1"]:
+        """The person seen in a mirror."""
+        return latents[..., self.mirrored, :] * self.parity[:, None, None]
+
+
+def blocks_of(grids: Tensor) -> Tensor:
+    """Grids [*b, 64, 64, 64, 4] as cells [*b, 16^3, 256]: z, y, x and channel of a block's voxels."""
+    split = grids.unflatten(-2, (BLOCKS, BLOCK)).unflatten(-4, (BLOCKS, BLOCK)).unflatten(-6, (BLOCKS, BLOCK))
+    return split.movedim((-6, -4, -2), (-4, -3, -2)).flatten(-4).flatten(-4, -2)
+
+
+def fit_voxel_codec(people: Callable[[], Iterable[UInt8[Tensor, "n 64 64 64 4"]]], channels: int) -> VoxelCodec:
+    """Cells, their means, and the principal components that all share, from everybody and their mirror images.
+
+    `people` is called twice, once for the means.
+    """
+    count, total = 0, torch.zeros(BLOCKS**3, VALUES)
+    occupied = torch.zeros(BLOCKS**3, dtype=torch.bool)
+    for grids in people():
+        values = blocks_of(torch.cat([grids, grids.flip(-2)])).float() / 255
+        occupied |= (values[..., 3::4] > 0).any(-1).any(0)
+        total += values.sum(0)
+        count += len(values)
+    cells = occupied.nonzero()[:, 0]
+    mean = total[cells] / count
+    place = torch.full((BLOCKS**3,), -1)
+    place[cells] = torch.arange(len(cells))
+    moment, generator = torch.zeros(VALUES, VALUES, dtype=torch.float64), torch.Generator().manual_seed(0)
+    for grids in people():
+        chosen = torch.randperm(len(cells), generator=generator)[:CELLS_EACH]
+        part = (blocks_of(grids)[:, cells[chosen]].float() / 255 - mean[chosen]).flatten(0, 1)
+        moment += (part.T @ part).double()
+    basis, parity = _components(moment, channels)
+    mirrored = place[(cells - cells % BLOCKS) + (BLOCKS - 1 - cells % BLOCKS)]
+    return VoxelCodec(cells, mirrored, mean, basis, parity)
+
+
+def _components(moment: Float[Tensor, "v v"], channels: int) -> tuple[Tensor, Tensor]:
+    """Principal components among the even and among the odd cells, the largest first, and their parity."""
+    signs, sides = torch.linalg.eigh(_flipped(torch.eye(VALUES, dtype=moment.dtype)))  # -1 for odd, 1 for even
+    variances, rows, parity = [], [], []
+    for sign in (-1.0, 1.0):
+        side = sides[:, signs * sign > 0]
+        value, vector = torch.linalg.eigh(side.T @ moment @ side)
+        variances.append(value)
+        rows.append((side @ vector).T)
+        parity.append(torch.full_like(value, sign))
+    order = torch.cat(variances).argsort(descending=True)[:channels]
+    return torch.cat(rows)[order].float().contiguous(), torch.cat(parity)[order].float()
+
+
+def _flipped(values: Float[Tensor, "n 256"]) -> Float[Tensor, "n 256"]:
+    """Cells whose voxels are reversed in x."""
+    return values.unflatten(-1, (BLOCK**2, BLOCK, 4)).flip(-2).flatten(-3)
+
+
+class VoxelBlock(nn.Module):
+    """GroupNorm - SiLU - conv, modulated by the condition, SiLU - conv, plus the input; in three dimensions."""
+
+    def __init__(self, channels: int, out_channels: int, condition_width: int):
+        super().__init__()
+        self.norm1, self.conv1 = nn.GroupNorm(8, channels), nn.Conv3d(channels, out_channels, 3, padding=1)
+        self.norm2 = nn.GroupNorm(8, out_channels)
+        self.conv2 = nn.Conv3d(out_channels, out_channels, 3, padding=1)
+        for parameter in self.conv2.parameters():
+            nn.init.zeros_(parameter)
+        self.film = nn.Linear(condition_width, 2 * out_channels)
+        self.skip = nn.Identity() if channels == out_channels else nn.Conv3d(channels, out_channels, 1)
+
+    def forward(self, x: Float[Tensor, "b c d h w"], condition: Float[Tensor, "b e"]) -> Float[Tensor, "b o d h w"]:
+        """The block's output."""
+        scale, shift = self.film(condition)[:, :, None, None, None].chunk(2, dim=1)
+        h = self.norm2(self.conv1(functional.silu(self.norm1(x)))) * (1 + scale) + shift
+        return self.skip(x) + self.conv2(functional.silu(h))
+
+
+@dataclasses.dataclass(frozen=True)
+class VoxelUNetConfig:
+    """Size of the U-Net."""
+
+    widths: tuple[int, ...] = (32, 64, 128)
+    """Channels at 16, 8 and 4 cells a side."""
+    condition_width: int = 192
+
+
+class VoxelUNet(nn.Module):
+    """As `LocalUNet`, on the cells of a grid; between a linear layer for each cell's latents and back."""
+
+    cells: Tensor
+
+    def __init__(self, channels: int, components: int, cells: Int[Tensor, "n"], config: VoxelUNetConfig):
+        super().__init__()
+        widths, condition_width = config.widths, config.condition_width
+        self.register_buffer("cells", cells, persistent=False)
+        self.time, self.person = TimeEmbedding(64, condition_width), nn.Linear(components, condition_width)
+        self.inner = nn.Linear(2 * channels, widths[0])
+        self.position = nn.Parameter(0.5 * torch.randn(len(cells), widths[0]))
+        pairs = list(pairwise(widths))
+        self.down = nn.ModuleList(VoxelBlock(width, width, condition_width) for width in widths)
+        self.up = nn.ModuleList(VoxelBlock(2 * width, width, condition_width) for width in widths)
+        self.shrink = nn.ModuleList(nn.Conv3d(width, wider, 2, stride=2) for width, wider in pairs)
+        self.grow = nn.ModuleList(nn.Conv3d(wider, width, 1) for width, wider in pairs)
+        self.norm, self.outer = nn.LayerNorm(widths[0]), zeroed(nn.Linear(widths[0], channels))
+
+    def forward(
+        self,
+        noisy: Float[Tensor, "b c n 1"],
+        picture: Float[Tensor, "b c n 1"],
+        person: Float[Tensor, "b r"],
+        t: Int[Tensor, "b"],
+        condition: None = None,
+    ) -> Float[Tensor, "b c n 1"]:
+        """Correction for a noisy rest, beside the picture that guessed person components draw; takes no condition."""
+        modulation = functional.silu(self.time(t) + self.person(person))
+        tokens = self.inner(torch.cat([noisy, picture], dim=1)[..., 0].mT) + self.position
+        grid = tokens.new_zeros((len(tokens), BLOCKS**3, tokens.shape[-1]))
+        grid = grid.index_copy(1, self.cells, tokens).mT.unflatten(-1, (BLOCKS, BLOCKS, BLOCKS))
+        x, skips = grid.contiguous(memory_format=torch.channels_last_3d), []
+        for level, block in enumerate(self.down):
+            x = block(x, modulation)
+            skips.append(x)
+            if level < len(self.shrink):
+                x = self.shrink[level](x)
+        for level in reversed(range(len(self.up))):
+            x = self.up[level](torch.cat([x, skips.pop()], dim=1), modulation)
+            if level:
+                x = self.grow[level - 1](functional.interpolate(x, scale_factor=2.0, mode="nearest"))
+        return self.outer(self.norm(x.flatten(2).mT[:, self.cells])).mT[..., None]
+
+
+@dataclasses.dataclass(frozen=True)
+class VoxelModel:
+    """A trained baseline."""
+
+    denoiser: PersonDenoiser
+    codec: VoxelCodec
+    full_density: float
+    """1/m that a stored density of 1 stands for."""
+    card: dict[str, object]
+    """What it was trained on, and how long."""
+
+    def sample(self, seeds: Sequence[int], steps: int = 30) -> Iterator[Float[Tensor, "64 64 64 4"]]:
+        """One grid for each seed, by DDIM from the start that `DiffusionModel.start` states."""
+        schedule, prior = self.denoiser.schedule, self.denoiser.prior
+        chain = trailing_steps(schedule.length, steps)
+
+        def denoise(x: Tensor, t: int) -> Tensor:
+            with torch.inference_mode():
+                return self.denoiser(x, torch.full((len(x),), t))
+
+        for seed in seeds:
+            generator = torch.Generator().manual_seed(seed)
+            noise = torch.randn((1, *prior.mean.shape), generator=generator)
+            x = schedule.noise(chain[0]) * noise + schedule.signal(chain[0]) * prior.sample(1, generator)
+            for step in SAMPLERS["ddim"](denoise, schedule, x, chain, [generator]):
+                x = step.x0
+            yield self.codec.decode(x.clone())[0]
+
+    def primitives(self, grid: Float[Tensor, "64 64 64 4"]) -> Primitives:
+        """What the marcher draws."""
+        return primitives_of(grid, self.full_density)
+
+
+def voxel_denoiser(
+    prior: PersonPrior, codec: VoxelCodec, config: VoxelUNetConfig = VoxelUNetConfig(), blocks: int = 3
+) -> PersonDenoiser:
+    """An untrained one: as our default's, but for the network of cells."""
+    person = PersonNetworkConfig(blocks=blocks)
+    denoiser = PersonDenoiser(DenoiserConfig(person=person, local=None), prior, SCHEDULES[SCHEDULE]())
+    denoiser.local = VoxelUNet(len(codec.basis), len(prior.basis), codec.cells, config)
+    return denoiser.eval().requires_grad_(False)
+
+
+def save_voxel_model(path: Path, model: VoxelModel) -> None:
+    """Writes it, whole or not at all."""
+    tensors = {f"denoiser.{name}": value for name, value in model.denoiser.state_dict().items()}
+    tensors |= {f"codec.{field.name}": getattr(model.codec, field.name) for field in dataclasses.fields(VoxelCodec)}
+    about = {"full_density": model.full_density, "card": model.card}
+    with written_whole(path) as unfinished:
+        contents = {name: value.detach().contiguous() for name, value in tensors.items()}
+        unfinished.write_bytes(save(contents, metadata={"about": json.dumps(about)}))
+
+
+def load_voxel_model(path: Path) -> VoxelModel:
+    """What `save_voxel_model` wrote. Raises FileNotFoundError, and ValueError for another file."""
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no voxel baseline {path}: train one with benchmarks/diffusion_voxel.py")
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = json.loads(file.metadata()["about"])
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
+        codec = VoxelCodec(**_under(tensors, "codec."))
+        weights = _under(tensors, "denoiser.")
+        denoiser = voxel_denoiser(PersonPrior(**_under(weights, "prior_")), codec)
+        denoiser.load_state_dict(weights)
+    except (SafetensorError, KeyError, TypeError, RuntimeError, OSError, ValueError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"{path} is no voxel baseline of this version ({reason}): train it again") from error
+    return VoxelModel(denoiser, codec, about["full_density"], about["card"])
+
+
+def _under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}

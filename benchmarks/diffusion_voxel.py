@@ -1,0 +1,228 @@
+"""Trains the paper's Table 2 baseline, diffusion on 64^3 voxels, on the people and for the time of our model.
+
+`python benchmarks/diffusion_voxel.py --people DIR --out DIR --minutes 45` makes the grids of the people that
+`primdiffusion train` trains on (with its holdout and seed) into DIR/grids, fits codec and closed-form prior, and trains
+the person network for a fifth of the time and the U-Net for the rest. Minutes are of training, as of ours: what is made
+before counts for neither. The same line goes on where it stopped; DIR/voxel.safetensors is what diffusion.py takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import statistics
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from primdiffusion.diffusion.conditioning import Vocabulary
+from primdiffusion.diffusion.denoiser import PersonDenoiser
+from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.evaluation.voxel_baseline import (
+    SCHEDULE,
+    VoxelCodec,
+    VoxelModel,
+    fit_voxel_codec,
+    save_voxel_model,
+    voxel_denoiser,
+)
+from primdiffusion.evaluation.voxel_grid import voxelise
+from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.people.payloads import rest_frames
+from primdiffusion.staging import written_whole
+from primdiffusion.training.config import PhaseConfig, PriorConfig
+from primdiffusion.training.latents import LatentSet, find_people, read_person, read_vocabulary, split_people
+from primdiffusion.training.losses import PersonObjective, RestObjective
+from primdiffusion.training.prior import fit_prior
+from primdiffusion.training.state import TrainingState
+from safetensors.torch import load_file, save
+from torch import Tensor
+
+CHANNELS = 64
+"""Numbers of a cell, as many as a primitive has in our codec."""
+PERSON_SHARE = 0.2
+PERSON = PhaseConfig(steps=1, batch=128)
+LOCAL = PhaseConfig(steps=1, batch=8, blend=0.2, weight_decay=0.0, bfloat16=True)
+"""Our model's phases; steps follow from the time."""
+SAVE_EVERY = 60.0
+
+
+def main() -> None:
+    """Prepares and trains as far as the time allows."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--people", type=Path, required=True, help="folder of payloads")
+    parser.add_argument("--out", type=Path, required=True, help="folder for grids, states and model")
+    parser.add_argument("--holdout", type=float, default=0.08)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--minutes", type=float, default=45.0)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--grids-only", action="store_true", help="make the grids, train nothing")
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    paths = find_people(arguments.people)
+    make_grids(paths, arguments.out / "grids")
+    if arguments.grids_only:
+        return
+    train_paths, _ = split_people(paths, arguments.holdout, arguments.seed)
+    vocabulary = read_vocabulary(train_paths)
+    codec, people, prior = prepared(train_paths, vocabulary, arguments.out)
+    run = Run(people, codec, vocabulary, arguments.out, arguments.seed)
+    torch.manual_seed(arguments.seed)
+    denoiser = voxel_denoiser(prior, codec)
+    steps = {}
+    for name, share in (("person", PERSON_SHARE), ("local", 1 - PERSON_SHARE)):
+        steps[name] = trained(denoiser, name, run, 60 * arguments.minutes * share)
+    card = {
+        "people": len(people),
+        "geometries": len(people.betas),
+        "minutes": arguments.minutes,
+        "threads": arguments.threads,
+        "steps": steps,
+        "schedule": SCHEDULE,
+    }
+    model = VoxelModel(denoiser, codec, read_person(train_paths[0]).full_density, card)
+    save_voxel_model(arguments.out / "voxel.safetensors", model)
+    print("trained", json.dumps(card), flush=True)
+
+
+def make_grids(paths: Sequence[Path], folder: Path) -> None:
+    """The grids of everybody that are not there yet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    missing = [path for path in paths if not (folder / path.name).is_file()]
+    for number, path in enumerate(missing):
+        person = read_person(path)
+        voxels = person.voxels.movedim(-1, -4).float() / 255
+        rgb, density = decode_srgb(voxels[:, :, :3]), voxels[0, :, 3] * person.full_density
+        grids = voxelise(rest_frames(person.betas.numpy()), rgb, density, person.full_density)
+        with written_whole(folder / path.name) as unfinished, unfinished.open("wb") as file:
+            np.savez_compressed(file, grids=grids.numpy())
+        if number % 50 == 0:
+            print("grids", number, "of", len(missing), flush=True)
+
+
+def read_betas(path: Path) -> np.ndarray:
+    """A stored person's shape, without its voxels."""
+    with np.load(path, allow_pickle=False) as file:
+        return file["betas"]
+
+
+def prepared(paths: Sequence[Path], vocabulary: Vocabulary, folder: Path) -> tuple[VoxelCodec, LatentSet, PersonPrior]:
+    """Codec, latents and prior; read back from the folder when they are there."""
+
+    def grids() -> Iterator[Tensor]:
+        for path in paths:
+            with np.load(folder / "grids" / path.name) as file:
+                yield torch.from_numpy(file["grids"])
+
+    stored = folder / "prepared.safetensors"
+    if stored.is_file():
+        parts = {"codec": {}, "people": {}, "prior": {}}
+        for key, value in load_file(stored).items():
+            part, name = key.split(".")
+            parts[part][name] = value
+        return VoxelCodec(**parts["codec"]), LatentSet(**parts["people"]), PersonPrior(**parts["prior"])
+    codec = fit_voxel_codec(grids, CHANNELS)
+    print("codec of", len(codec.cells), "cells", flush=True)
+    people = encoded(paths, vocabulary, codec, grids())
+    print("latents", tuple(people.latents.shape), flush=True)
+    prior = fit_prior(people, codec, vocabulary, PriorConfig())  # pyright: ignore[reportArgumentType] - mirrors alike
+    records = {"codec": codec, "people": people, "prior": prior}
+    contents = {
+        f"{part}.{name}": value.contiguous() for part, one in records.items() for name, value in vars(one).items()
+    }
+    with written_whole(stored) as unfinished:
+        unfinished.write_bytes(save(contents))
+    return codec, people, prior
+
+
+def encoded(paths: Sequence[Path], vocabulary: Vocabulary, codec: VoxelCodec, grids: Iterator[Tensor]) -> LatentSet:
+    """Everybody's latents and what is said of them, as of primitives."""
+    latents, conditions, betas = [], [], []
+    for path, one in zip(paths, grids, strict=True):
+        person = read_person(path)
+        latents.append(codec.encode(one).half())
+        conditions += [vocabulary.encode(attributes) for attributes in person.attributes]
+        betas.append(person.betas)
+    geometry = torch.arange(len(paths)).repeat_interleave(torch.tensor([len(one) for one in latents]))
+    return LatentSet(torch.cat(latents), geometry, torch.stack(betas), torch.stack(conditions))
+
+
+class Run(NamedTuple):
+    """What both networks are trained with."""
+
+    people: LatentSet
+    codec: VoxelCodec
+    vocabulary: Vocabulary
+    folder: Path
+    seed: int
+
+
+def trained(denoiser: PersonDenoiser, name: str, run: Run, seconds: float) -> int:
+    """Trains one network for so many seconds, interruptions not counted, and leaves its average; returns its steps."""
+    network = getattr(denoiser, name).requires_grad_(True)
+    plan, stored = run.folder / f"{name}.json", run.folder / f"{name}.state.safetensors"
+    if not plan.is_file():
+        plan.write_text(json.dumps(planned_steps(denoiser, name, run, seconds)))
+    config = phase(name, json.loads(plan.read_text()))
+    state = TrainingState(network, config, run.seed + 1)
+    if stored.is_file():
+        state.load(stored)
+    objective = objective_of(denoiser, name, run, config)
+    denoiser.network_dtype = torch.bfloat16 if config.bfloat16 else torch.float32
+    network.train()
+    mean, saved = 0.0, time.monotonic()
+    while state.step < config.steps and state.seconds < seconds:
+        began = time.monotonic()
+        loss = objective.loss(state.generator)
+        state.update(loss)
+        mean += (float(loss.detach()) - mean) / min(state.step, 200)
+        state.seconds += time.monotonic() - began
+        if time.monotonic() - saved > SAVE_EVERY:
+            saved = time.monotonic()
+            state.save(stored)
+            print(name, state.step, "of", config.steps, f"{state.seconds:.0f} s, loss {mean:.4f}", flush=True)
+    state.save(stored)
+    setattr(denoiser, name, state.average)
+    denoiser.network_dtype = torch.float32
+    return state.step
+
+
+def planned_steps(denoiser: PersonDenoiser, name: str, run: Run, seconds: float) -> int:
+    """How many steps fit into the time, by a few of a network that is thrown away: the rate falls over as many."""
+    config = phase(name, 1000)
+    network = getattr(denoiser, name)
+    weights = {key: value.clone() for key, value in network.state_dict().items()}
+    state = TrainingState(network, config, 0)
+    objective = objective_of(denoiser, name, run, config)
+    denoiser.network_dtype = torch.bfloat16 if config.bfloat16 else torch.float32
+    times = []
+    for _ in range(9):
+        began = time.monotonic()
+        state.update(objective.loss(state.generator))
+        times.append(time.monotonic() - began)
+    network.load_state_dict(weights)
+    return max(1, round(seconds / statistics.median(times)))
+
+
+def phase(name: str, steps: int) -> PhaseConfig:
+    """The settings of a phase of so many steps."""
+    return dataclasses.replace(PERSON if name == "person" else LOCAL, steps=steps)
+
+
+def objective_of(denoiser: PersonDenoiser, name: str, run: Run, config: PhaseConfig) -> PersonObjective | RestObjective:
+    """The losses that our model is trained by."""
+    if name == "local":
+        return RestObjective(denoiser, run.people, run.codec, run.vocabulary, config)  # pyright: ignore[reportArgumentType]
+    coefficients = torch.cat([denoiser.prior.split(chunk.float())[0] for chunk in run.people.latents.split(128)])
+    # As in `training.diffuse`: components vary more over the people they are fitted to than over new ones.
+    coefficients *= denoiser.component_std / coefficients.square().mean(0).sqrt()
+    return PersonObjective(denoiser, coefficients, run.people, run.vocabulary, config)
+
+
+if __name__ == "__main__":
+    main()

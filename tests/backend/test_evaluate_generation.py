@@ -1,0 +1,160 @@
+"""Distances of sets of people, the feature space they are taken in, and the nearest training people."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.linalg
+import torch
+from primdiffusion.evaluation.attribute_network import (
+    UNKNOWN,
+    accuracies,
+    answers_of,
+    category,
+    features_of,
+    fit_attribute_network,
+    load_attribute_network,
+    save_attribute_network,
+)
+from primdiffusion.evaluation.distances import frechet_distance, kernel_distance, nearest, precision_recall
+from primdiffusion.evaluation.generation import nearest_other
+from torchmetrics.image.kid import poly_mmd
+
+
+def draws(count: int, width: int, seed: int, shift: float = 0.0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    mixed = torch.randn(width, width, generator=torch.Generator().manual_seed(9))
+    return torch.randn(count, width, generator=generator) @ mixed + shift
+
+
+def test_frechet_distance_is_the_formula_with_scipys_matrix_root():
+    first, second = draws(60, 8, 0), draws(50, 8, 1, shift=0.7)
+    one, two = (np.cov(part.double().numpy(), rowvar=False) for part in (first, second))
+    apart = first.double().mean(0) - second.double().mean(0)
+    root = np.real(scipy.linalg.sqrtm(one @ two))
+    expected = float(apart.square().sum()) + np.trace(one + two - 2 * root)
+    assert frechet_distance(first, second) == pytest.approx(expected, rel=1e-9)
+
+
+def test_frechet_distance_of_a_moved_set_is_the_square_of_the_move():
+    people = draws(40, 5, 0)
+    assert frechet_distance(people, people + 2.0) == pytest.approx(5 * 2.0**2, rel=1e-5)
+    assert frechet_distance(people, people) == pytest.approx(0, abs=1e-9)
+
+
+def test_frechet_distance_needs_no_more_samples_than_features():
+    few = draws(4, 20, 0)
+    assert frechet_distance(few, few.flip(0)) == pytest.approx(0, abs=1e-9)
+
+
+def test_kernel_distance_is_torchmetrics():
+    first, second = draws(30, 6, 0).double(), draws(30, 6, 1, shift=0.5).double()
+    assert kernel_distance(first, second) == pytest.approx(float(poly_mmd(first, second)), rel=1e-9)
+
+
+def test_kernel_distance_has_no_bias_and_frechet_distance_has():
+    pairs = [(draws(12, 4, 2 * i), draws(12, 4, 2 * i + 1)) for i in range(200)]
+    kernel = torch.tensor([kernel_distance(*pair) for pair in pairs])
+    assert abs(float(kernel.mean())) < 3 * float(kernel.std()) / math.sqrt(len(pairs))
+    assert min(frechet_distance(*pair) for pair in pairs) > 0
+
+
+def test_precision_and_recall_tell_lost_variety_from_lost_quality():
+    real = draws(200, 3, 0)
+    centre = precision_recall(0.05 * draws(200, 3, 1), real)
+    assert centre.precision > 0.95
+    assert centre.recall < 0.2
+    wide = precision_recall(torch.cat([draws(100, 3, 2), draws(100, 3, 3) + 100.0]), real)
+    assert wide.precision == pytest.approx(0.5, abs=0.1)
+    assert wide.recall > 0.8
+
+
+def test_nearest_is_found_by_hand():
+    found = nearest(torch.tensor([[0.0, 0.0], [5.0, 5.0]]), torch.tensor([[3.0, 4.0], [5.0, 6.0], [-1.0, 0.0]]))
+    assert found.index.tolist() == [2, 1]
+    assert found.distance.tolist() == [1.0, 1.0]
+
+
+def test_nearest_other_is_of_another_geometry():
+    features = torch.tensor([[0.0], [0.1], [5.0], [5.2]])
+    found = nearest_other(features, torch.tensor([0, 0, 1, 1]))
+    assert found.index.tolist() == [2, 2, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [((1, 3), (4, 3)), ((4, 3), (4, 2)), ((4,), (4,))], ids=["one row", "widths", "flat"]
+)
+def test_sets_that_cannot_be_compared_are_named(first, second):
+    for distance in (frechet_distance, kernel_distance):
+        with pytest.raises(ValueError, match="two or more rows"):
+            distance(torch.zeros(first), torch.zeros(second))
+
+
+def test_precision_needs_more_people_than_neighbours():
+    with pytest.raises(ValueError, match="no 3 neighbours"):
+        precision_recall(draws(3, 2, 0), draws(9, 2, 1))
+
+
+def test_categories_are_what_can_be_seen():
+    person = {"pattern": "solid, bands", "hair": "none", "hair_colour": "red", "sex": "female"}
+    assert category(person, "pattern") == "bands"
+    assert category({"pattern": "solid"}, "pattern") == "solid"
+    assert category(person, "hair_colour") is None
+    assert category(person, "shoes") is None
+
+
+def test_values_that_no_training_person_has_are_unknown():
+    answers = answers_of([{"sex": "male", "height": 1.6}, {"sex": "female", "height": 1.8}])
+    labels = answers.labels([{"sex": "other", "height": 1.9}, {"sex": "female"}])
+    assert labels["sex"].tolist() == [UNKNOWN, answers.categories["sex"].index("female")]
+    assert float(labels["height"][0]) == pytest.approx(2.0, rel=1e-5)
+    assert labels["height"][1].isnan()
+
+
+def painted(count: int, seed: int) -> tuple[torch.Tensor, list[dict[str, object]]]:
+    """Pictures that are red or blue, as bright as the person is tall."""
+    generator = torch.Generator().manual_seed(seed)
+    sex, height = torch.randint(2, (count,), generator=generator), 1.5 + 0.5 * torch.rand(count, generator=generator)
+    pictures = torch.zeros(count, 4, 32, 32, 4, dtype=torch.uint8)
+    for number in range(count):
+        pictures[number, :, 8:24, 8:24, 2 * int(sex[number])] = round(255 * (float(height[number]) - 1.3))
+    people = [{"sex": "fm"[int(s)], "height": float(h)} for s, h in zip(sex, height, strict=True)]
+    return pictures, people
+
+
+@pytest.fixture(scope="module")
+def trained():
+    pictures, people = painted(64, 0)
+    return fit_attribute_network(pictures, people, epochs=20, batch=16)
+
+
+def test_network_learns_what_can_be_seen(trained):
+    pictures, people = painted(32, 1)
+    right = accuracies(trained, features_of(trained, pictures), people)
+    assert right["sex"] == 1.0
+    assert right["height"] > 0.5
+
+
+def test_network_is_the_same_for_a_seed_and_leaves_torchs_random_state():
+    pictures, people = painted(16, 0)
+    before = torch.get_rng_state()
+    first, second = (fit_attribute_network(pictures, people, epochs=1, batch=8) for _ in range(2))
+    assert torch.equal(before, torch.get_rng_state())
+    assert torch.equal(features_of(first, pictures), features_of(second, pictures))
+
+
+def test_network_is_stored_with_its_answers(trained, tmp_path):
+    save_attribute_network(tmp_path / "new" / "features.safetensors", trained)
+    again = load_attribute_network(tmp_path / "new" / "features.safetensors")
+    assert again.answers == trained.answers
+    pictures, _ = painted(4, 2)
+    near = features_of(trained, pictures)
+    assert torch.allclose(features_of(again, pictures), near, atol=2e-2 * float(near.abs().max()))
+
+
+def test_another_file_is_no_network(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no feature network"):
+        load_attribute_network(tmp_path / "none.safetensors")
+    (tmp_path / "other.safetensors").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match="remove it"):
+        load_attribute_network(tmp_path / "other.safetensors")
