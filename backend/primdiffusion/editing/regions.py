@@ -1,6 +1,6 @@
 """Regions of a person: sets of primitives, named as an artist names them or painted on the body.
 
-A part is a set of the default body's primitives: those whose anchor follows a certain joint most, cut where cloth and
+A part is a set of primitives: those whose anchor follows a certain joint most, cut where cloth and
 hair are rather than where bones end. The cuts were chosen by looking at which rows of the grid have the colour of the
 shirt, of the face, of the hair on the people that the default checkpoint learnt from; docs/editing.md shows them.
 """
@@ -14,19 +14,19 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from primdiffusion.body.model import JOINT_NAMES, default_body
+from primdiffusion.body.model import JOINT_NAMES, BodyModel, default_body
 from primdiffusion.geometry.surface import surface_points
-from primdiffusion.primitives.anchors import anchor_skin_weights, attach, default_anchors, default_texels
+from primdiffusion.primitives.anchors import Anchors, anchor_skin_weights, attach, default_anchors, default_texels
 from primdiffusion.primitives.primitives import GRID, K, S
+from primdiffusion.primitives.stand import Stand
 
-HEM = -0.248
-"""Metres up on the rest body (whose chest is near 0): where most shirts end, down to which the torso reaches."""
-SEAT = -0.345
-"""Metres up on the rest body: between the hips and the thighs."""
-COLLAR_HEIGHT, COLLAR_SLOPE = 0.353, -0.42
-"""The plane y = height + slope * z (metres): below it a neck wears a shirt, above it skin."""
-NAPE_HEIGHT, NAPE_DEPTH, HAIRLINE_SLOPE = 0.45, 0.023, 1.4
-"""The plane z = depth + slope * (y - height): behind it, from the nape over the ears to the hairline, grows hair."""
+HEM, SEAT = -0.028, -0.125
+"""Metres above the rest body's pelvis: where most shirts end, and where hips become thighs."""
+COLLAR_HEIGHT, COLLAR_SLOPE = 0.007, -0.42
+"""The plane y = height + slope * z, metres from the neck's joint: below it a neck wears a shirt, above it skin."""
+NAPE_DEPTH, HAIRLINE_SLOPE = -0.052, 1.4
+"""The plane z = depth + slope * y, metres from the head's joint: behind it, from the nape over the ears to the
+hairline, grows hair."""
 
 _TRUNK = ("pelvis", "spine1", "spine2", "spine3", "left_collar", "right_collar")
 _SIDED = {
@@ -65,25 +65,32 @@ PARTS = ("face", "hair", "neck", "torso", *_SIDED, "hips", *_UNIONS, *SIDES)
 """All names that `region_of` knows."""
 
 
-def region_of(names: Sequence[str]) -> Bool[Tensor, "k"]:
-    """The primitives of the parts with these names, together. Raises ValueError for no name or an unknown one."""
+def region_of(names: Sequence[str], stand: Stand | None = None) -> Bool[Tensor, "k"]:
+    """The primitives of the parts with these names, together, of people who stand on `stand` (None: the default body).
+
+    Raises ValueError for no name or an unknown one.
+    """
     if not names:
         raise ValueError(f"the region names no part of the body: choose one or more of {', '.join(PARTS)}")
-    parts = _parts()
+    parts = parts_of(stand)
     for name in names:
         if name not in parts:
             raise ValueError(f"there is no part of the body {name!r}: choose from {', '.join(PARTS)}")
     return torch.stack([parts[name] for name in names]).any(0)
 
 
-def region_from_weights(weights: Float[Tensor, "v"], threshold: float = 0.5) -> Bool[Tensor, "k"]:
+def region_from_weights(
+    weights: Float[Tensor, "v"], threshold: float = 0.5, stand: Stand | None = None
+) -> Bool[Tensor, "k"]:
     """The primitives under paint: those on whose patch of skin the weight is at least `threshold` on average.
 
-    `weights` hold a number from 0 to 1 for each vertex of the default body, in the order of `human.npz` (a vertex group
-    in Blender). A patch is the primitive's 8 x 8 texels. Raises ValueError for another number of vertices, values that
-    are not finite, a threshold outside 0 ... 1 and paint that covers no primitive.
+    `weights` hold a number from 0 to 1 for each vertex of the body, in the order of `human.npz` (a vertex group in
+    Blender). A patch is the primitive's 8 x 8 texels; on another body than the default one, its anchor.
+
+    Raises ValueError for another number of vertices, values that are not finite, a threshold that is not in 0 ... 1 or
+    is 0, and paint that covers no primitive.
     """
-    body = default_body()
+    body = default_body() if stand is None else stand.body
     if tuple(weights.shape) != (len(body.template),):
         given, wanted = tuple(weights.shape), len(body.template)
         raise ValueError(
@@ -93,9 +100,7 @@ def region_from_weights(weights: Float[Tensor, "v"], threshold: float = 0.5) -> 
         raise ValueError("the painted weights hold NaN or infinite values: paint them again")
     if not 0 < threshold <= 1:
         raise ValueError(f"the threshold of painted weights is {threshold}: choose one above 0, at most 1")
-    face, barycentric = default_texels()
-    texels = surface_points(weights.float()[:, None].cpu(), body.faces, face.flatten(), barycentric.flatten(0, 1))
-    covered = texels.reshape(GRID, S, GRID, S).mean((1, 3)).flatten()
+    covered = _covered(weights.float().cpu(), stand)
     # Weights of exactly the threshold, as from a brush of that strength, come back a rounding error below it.
     region = covered >= threshold - 1e-6
     if not region.any():
@@ -116,31 +121,56 @@ def check_region(region: Tensor) -> Bool[Tensor, "k"]:
     return region.cpu()
 
 
-def name_region(region: Bool[Tensor, "k"]) -> list[str] | str:
+def name_region(region: Bool[Tensor, "k"], stand: Stand | None = None) -> list[str] | str:
     """How files tell a region: the names of its parts, or 1024 bits in hexadecimal, primitive 0 first, for paint."""
-    parts = _parts()
+    parts = parts_of(stand)
     for name in PARTS:
         if torch.equal(parts[name], region):
             return [name]
     inside = [name for name in DISJOINT if bool(region[parts[name]].all())]
-    if inside and torch.equal(region_of(inside), region):
+    if inside and torch.equal(region_of(inside, stand), region):
         return inside
     return int("".join("1" if chosen else "0" for chosen in region.tolist()), 2).to_bytes(K // 8, "big").hex()
 
 
+def parts_of(stand: Stand | None = None) -> Mapping[str, Bool[Tensor, "k"]]:
+    """The primitives of every part in PARTS."""
+    return _default_parts() if stand is None else _parts(stand.body, stand.anchors)
+
+
 @functools.lru_cache(maxsize=1)
-def _parts() -> Mapping[str, Bool[Tensor, "k"]]:
-    body, anchors = default_body(), default_anchors()
+def _default_parts() -> Mapping[str, Bool[Tensor, "k"]]:
+    return _parts(default_body(), default_anchors())
+
+
+def _covered(weights: Float[Tensor, "v"], stand: Stand | None) -> Float[Tensor, "k"]:
+    """Mean weight under each primitive."""
+    if stand is not None:
+        face, barycentric = stand.anchors.face, stand.anchors.barycentric
+        return surface_points(weights[:, None], stand.body.faces, face, barycentric)[:, 0]
+    face, barycentric = default_texels()
+    texels = surface_points(weights[:, None], default_body().faces, face.flatten(), barycentric.flatten(0, 1))
+    return texels.reshape(GRID, S, GRID, S).mean((1, 3)).flatten()
+
+
+def _parts(body: BodyModel, anchors: Anchors) -> Mapping[str, Bool[Tensor, "k"]]:
     rest = attach(anchors, body.template, body.faces).position
+    joints = body.shape(torch.zeros_like(body.shape_basis[0, 0])).joints
+
+    def from_joint(name: str) -> tuple[Tensor, Tensor]:
+        """Metres up and forward."""
+        up, forward = (rest - joints[JOINT_NAMES.index(name)])[:, 1:].unbind(-1)
+        return up, forward
+
+    (up, _), (up_neck, forward_neck), (up_head, forward_head) = map(from_joint, ("pelvis", "neck", "head"))
     joint = anchor_skin_weights(anchors, body).argmax(-1)
     by_joint = {name: joint == i for i, name in enumerate(JOINT_NAMES)}
-    _, height, depth = rest.unbind(-1)
     neck_or_head = by_joint["neck"] | by_joint["head"]
-    collar = by_joint["neck"] & (height < COLLAR_HEIGHT + COLLAR_SLOPE * depth)
-    hair = neck_or_head & (depth < NAPE_DEPTH + HAIRLINE_SLOPE * (height - NAPE_HEIGHT))
+    collar = by_joint["neck"] & (up_neck < COLLAR_HEIGHT + COLLAR_SLOPE * forward_neck)
+    hair = neck_or_head & (forward_head < NAPE_DEPTH + HAIRLINE_SLOPE * up_head)
     trunk = torch.stack([by_joint[name] for name in _TRUNK]).any(0)
     to_the_knees = trunk | by_joint["left_hip"] | by_joint["right_hip"]
-    above_hem, above_seat = to_the_knees & (height > HEM), to_the_knees & (height > SEAT)
+    above_hem, above_seat = to_the_knees & (up > HEM), to_the_knees & (up > SEAT)
     parts = {
         "face": by_joint["head"] & ~hair,
         "hair": hair,

@@ -1,0 +1,100 @@
+"""Sampling a part: the rest at its own noise level at every step, and a part that fits the rest."""
+
+import pytest
+import torch
+from primdiffusion.diffusion.schedule import CLEAN, linear, trailing_steps
+from primdiffusion.editing.repaint import noised, renoised, repaint, resampling_path
+
+SCHEDULE = linear()
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_the_path_goes_down_with_every_stretch_sampled_again():
+    assert resampling_path(4, 2, 2) == [0, 1, 2, 0, 1, 2, 3, 4]
+    assert resampling_path(5, 2, 3) == [0, 1, 2, 0, 1, 2, 0, 1, 2, 3, 4, 2, 3, 4, 2, 3, 4, 5]
+    assert resampling_path(3, 5, 2) == [0, 1, 2, 3]
+    assert resampling_path(3, 1, 1) == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(("jump", "resamples"), [(0, 2), (2, 0)])
+def test_a_path_of_no_steps_is_refused(jump, resamples):
+    with pytest.raises(ValueError, match="choose 1 or more"):
+        resampling_path(4, jump, resamples)
+
+
+@pytest.mark.parametrize("resamples", [1, 2])
+def test_the_denoiser_always_sees_the_outside_with_the_noise_of_the_step_it_is_asked_about(resamples):
+    known = 3 + 2 * torch.randn(1, 4, 64, 64, generator=generator(1))
+    inside = torch.zeros(64, 64, dtype=torch.bool)
+    inside[:, 40:] = True
+    seen = []
+
+    def denoise(x, t):
+        noise = ((x - SCHEDULE.signal(t) * known) / SCHEDULE.noise(t))[..., ~inside]
+        seen.append((t, float(noise.mean()), float(noise.std())))
+        return torch.zeros_like(x)
+
+    chain = trailing_steps(SCHEDULE.length, 12)
+    start = torch.randn(known.shape, generator=generator(2))
+    steps = list(repaint(denoise, SCHEDULE, start, known, inside, chain, generator(3), 4, resamples))
+    assert {t for t, _, _ in seen} == set(chain)
+    assert len(seen) == len(steps) == steps[0].total
+    for t, mean, std in seen:
+        assert abs(mean) < 0.05, t
+        assert abs(std - 1) < 0.03, t
+
+
+def test_what_a_step_leaves_outside_has_the_noise_of_the_level_it_leads_to():
+    known = torch.randn(1, 4, 64, 64, generator=generator(1))
+    inside = torch.zeros(64, 64, dtype=torch.bool)
+    inside[0, 0] = True
+    chain = trailing_steps(SCHEDULE.length, 5)
+    steps = list(repaint(lambda x, t: x, SCHEDULE, known, known, inside, chain, generator(), 5, 1))
+    for step, t_next in zip(steps, [*chain[1:], CLEAN], strict=True):
+        left = (step.x - SCHEDULE.signal(t_next) * known)[..., ~inside]
+        assert float(left.std()) == pytest.approx(SCHEDULE.noise(t_next), rel=0.03)
+    assert torch.equal(steps[-1].x0[..., ~inside], known[..., ~inside])
+
+
+def test_noise_added_on_the_way_up_makes_a_sample_of_the_upper_level():
+    known = torch.full((1, 8, 64, 64), 2.0)
+    x = renoised(SCHEDULE, noised(SCHEDULE, known, 200, generator(1)), 200, 700, generator(2))
+    assert float(x.mean()) == pytest.approx(2 * SCHEDULE.signal(700), abs=0.02)
+    assert float(x.std()) == pytest.approx(SCHEDULE.noise(700), rel=0.01)
+
+
+def correlated(covariance: torch.Tensor):
+    """The exact denoiser of pairs of numbers that are normal with this covariance."""
+
+    def denoise(x, t):
+        signal, noise = SCHEDULE.signal(t), SCHEDULE.noise(t)
+        gain = signal * covariance @ torch.linalg.inv(signal**2 * covariance + noise**2 * torch.eye(2))
+        return x @ gain.T
+
+    return denoise
+
+
+def inside_mean(jump: int, resamples: int) -> float:
+    """Mean of one of a pair when the other is known to be 1.5; their correlation is 0.9."""
+    covariance = torch.tensor([[1.0, 0.9], [0.9, 1.0]])
+    known = torch.tensor([1.5, 0.0]).expand(20000, 1, 1, 2)
+    inside = torch.tensor([[False, True]])
+    start, chain = torch.randn(known.shape, generator=generator(4)), trailing_steps(SCHEDULE.length, 30)
+    denoise = correlated(covariance)
+    *_, step = repaint(denoise, SCHEDULE, start, known, inside, chain, generator(5), jump, resamples)
+    return float(step.x0[..., 1].mean())
+
+
+def test_the_more_often_steps_are_sampled_the_better_the_inside_fits_the_outside():
+    fits = 0.9 * 1.5
+    misses = [fits - inside_mean(1, resamples) for resamples in (1, 2, 5)]
+    assert misses[0] > misses[1] > misses[2] > 0
+    assert misses[2] < 0.35 * misses[0]
+
+
+def test_short_jumps_fit_better_than_long_ones_with_as_many_calls():
+    """30 steps: jumps of 1 sampled twice are 59 calls, of 5 sampled three times 80."""
+    assert inside_mean(1, 2) > inside_mean(5, 3) + 0.05
