@@ -14,8 +14,8 @@ from torch import Tensor
 T = 1000
 SMALL = UNetConfig(width=32)
 """298 tensors as released, at a quarter of the width."""
-TINY = UNetConfig(width=32, multipliers=(1, 1), blocks=1)
-"""Fewer levels too, for whole slabs in a second."""
+TINY = UNetConfig(width=32, multipliers=(1, 1, 1, 1), blocks=1)
+"""Thinner still, for whole slabs in seconds."""
 SEGMENTS, RINGS, HEIGHT, RADIUS = 24, 13, 1.6, 0.2
 PARENTS = [2**32 - 1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21]
 

@@ -1,0 +1,255 @@
+"""An imported checkpoint is used like our own, on the user's SMPL body, of which no file of ours holds anything."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors
+import safetensors.torch
+import torch
+from primdiffusion import cli
+from primdiffusion.body.smpl_files import load_body
+from primdiffusion.human import generate, place, place_skinned
+from primdiffusion.human_file import HumanFileError, load_human, save_human
+from primdiffusion.primitives.anchors import build_anchors
+from primdiffusion.primitives.primitives import K
+from primdiffusion.primitives.stand import StandError, stand_of_files
+from primdiffusion.released.conventions import ReleasedSlab, released_steps
+from primdiffusion.training.checkpoint import CheckpointError, load_checkpoint, read_card
+from released_files import TINY, body_arrays, random_network, save_body, save_released, stage_one, state, template
+
+
+def line(folder: Path, *more: str) -> list[str]:
+    return [
+        "import-released", str(folder / "primdiffusion.pt"), "--smpl", str(folder / "SMPL_NEUTRAL.pkl"),
+        "--uv", str(folder / "smpl_uv.obj"), "--out", str(folder / "imported.safetensors"), *more,
+    ]  # fmt: skip
+
+
+def prepared(folder: Path) -> Path:
+    """A folder with the authors' file and the user's SMPL."""
+    save_body(folder)
+    save_released(folder / "primdiffusion.pt", state(random_network(TINY).state_dict(), template()))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    folder = prepared(tmp_path_factory.mktemp("released"))
+    cli.run(line(folder, "--report", str(folder / "report.json")))
+    return folder
+
+
+@pytest.fixture
+def copied(folder, tmp_path) -> Path:
+    """The same in a folder of its own, imported there."""
+    for name in ("primdiffusion.pt", "SMPL_NEUTRAL.pkl", "smpl_uv.obj"):
+        shutil.copy(folder / name, tmp_path)
+    cli.run(line(tmp_path))
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def person(folder) -> Path:
+    out = folder / "person"
+    checkpoint = str(folder / "imported.safetensors")
+    cli.run(["generate", "--checkpoint", checkpoint, "--out", str(out), "--seed", "3", "--steps", "1", "--size", "32"])
+    return out
+
+
+def test_the_imported_denoiser_gives_what_the_source_weights_give(folder):
+    model = load_checkpoint(folder / "imported.safetensors")
+    x = torch.randn(1, 56, 32, 32, generator=torch.Generator().manual_seed(1))
+    with torch.inference_mode():
+        expected = random_network(TINY)(x, torch.tensor([431]))
+    assert torch.equal(model.denoise(x, 431), expected)
+    assert isinstance(model.codec, ReleasedSlab)
+    assert model.chain is released_steps
+    assert model.full_density == 25.5
+    assert model.schedule.alpha_bar[-1].item() == pytest.approx(np.prod(1 - np.linspace(0.01, 0.02**0.5, 1000) ** 2))
+
+
+def test_generate_makes_people_on_the_users_body(person, folder):
+    files = sorted(path.name for path in person.iterdir())
+    assert files == ["depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"]
+    body = load_body(folder / "SMPL_NEUTRAL.pkl", uv=folder / "smpl_uv.obj")
+    with np.load(person / "human.npz") as human:
+        np.testing.assert_allclose(human["vertices"], body.template, atol=1e-6)
+        np.testing.assert_array_equal(human["faces"], body.faces)
+        np.testing.assert_allclose(np.linalg.det(human["rotation"]), 1, atol=1e-4)
+        assert human["primitive_weights"].shape == (K, 24)
+        assert json.loads(str(human["meta"]))["seed"] == 3
+
+
+def test_a_saved_person_comes_back_on_the_same_body(person, folder):
+    human = load_human(person / "person.human.safetensors")
+    again = generate(load_checkpoint(folder / "imported.safetensors"), 3, steps=1)
+    first, second = place(human), place(again)
+    for name, value in vars(first).items():
+        torch.testing.assert_close(value, getattr(second, name), msg=name)
+    rest = torch.eye(4)[:3].expand(24, 3, 4)
+    skinned = place_skinned(human, rest, torch.eye(4)[:3])
+    torch.testing.assert_close(skinned.position, first.position, atol=1e-5, rtol=0)
+    picture = person / "again.png"
+    cli.run(["render", str(person / "person.human.safetensors"), "--out", str(picture), "--size", "32"])
+    assert picture.read_bytes() == (person / "front.png").read_bytes()
+    picture.unlink()
+
+
+def test_no_file_of_ours_holds_any_of_smpl(person, folder):
+    """Neither places of vertices nor which of them make faces; only how boxes lie on numbered faces."""
+    vertices = len(body_arrays()["v_template"])
+    faces = len(body_arrays()["f"])
+    for path, held in ((folder / "imported.safetensors", {"face", "barycentric", "rest_half_extent", "betas"}),
+                       (person / "person.human.safetensors", {"rest_half_extent"})):  # fmt: skip
+        with safetensors.safe_open(path, framework="pt") as file:
+            shapes = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
+            text = json.dumps(file.metadata())
+        assert not any(vertices in shape or faces in shape for shape in shapes.values())
+        assert held <= {name.removeprefix("stand.") for name in shapes}
+        assert "SMPL_NEUTRAL.pkl" in text
+        assert "v_template" not in text
+
+
+def test_the_report_accounts_for_every_tensor(folder):
+    report = json.loads((folder / "report.json").read_text())
+    keys = list(torch.load(folder / "primdiffusion.pt", weights_only=True)["model_state_dict"])
+    assert [tensor["key"] for tensor in report["tensors"]] == keys
+    assert {tensor["fate"] for tensor in report["tensors"]} == {"imported", "checked", "dropped"}
+    assert sum(group["tensors"] for group in report["groups"]) == len(keys)
+    assert report["unet"]["attention_levels"] == []
+    assert report["notes"][0] == "the SMPL file is the body that the checkpoint was trained on"
+    assert report["body"]["smpl"]["path"] == str(folder / "SMPL_NEUTRAL.pkl")
+    assert read_card(folder / "imported.safetensors")["parameters"] == report["card"]["parameters"] > 0
+
+
+def test_the_table_is_printed(tmp_path, capsys):
+    cli.run(line(prepared(tmp_path)))
+    out = capsys.readouterr().out.splitlines()
+    assert out[0].split() == ["group", "fate", "tensors", "values", "note"]
+    assert any(row.startswith("decoder_geom") and "dropped" in row for row in out)
+    assert out[-1] == str(tmp_path / "imported.safetensors")
+
+
+def test_a_body_that_is_gone_changed_or_moved(copied):
+    checkpoint, smpl = copied / "imported.safetensors", copied / "SMPL_NEUTRAL.pkl"
+    content = smpl.read_bytes()
+    smpl.unlink()
+    with pytest.raises(StandError, match=r"SMPL_NEUTRAL\.pkl is not there any more: put it back"):
+        load_checkpoint(checkpoint)
+    smpl.write_bytes(content[:-1] + b"!")
+    with pytest.raises(StandError, match=r"SMPL_NEUTRAL\.pkl is not the body file it was"):
+        load_checkpoint(checkpoint)
+    smpl.unlink()
+    elsewhere = copied / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / smpl.name).write_bytes(content)
+    shutil.copy(checkpoint, elsewhere)
+    assert load_checkpoint(elsewhere / checkpoint.name).stand is not None
+
+
+def test_a_person_whose_body_is_gone_is_told_by_its_file(copied, person):
+    saved = copied / "person.human.safetensors"
+    human = load_human(person / "person.human.safetensors")
+    save_human(saved, human)
+    with safetensors.safe_open(saved, framework="pt") as file:
+        metadata = file.metadata()
+    body = json.loads(metadata["body"])
+    body["smpl"]["sha256"] = "0" * 64
+    tensors = safetensors.torch.load_file(saved)
+    safetensors.torch.save_file(tensors, saved, {**metadata, "body": json.dumps(body)})
+    with pytest.raises(HumanFileError, match=r"person\.human.*is not the body file it was"):
+        load_human(saved)
+    safetensors.torch.save_file(tensors, saved, {**metadata, "body": "{}"})
+    with pytest.raises(HumanFileError, match="which body it needs"):
+        load_human(saved)
+    del tensors["rest_half_extent"]
+    safetensors.torch.save_file(tensors, saved, metadata)
+    with pytest.raises(HumanFileError, match="rest extents"):
+        load_human(saved)
+
+
+def test_an_imported_file_that_contradicts_itself_is_refused(copied):
+    path = copied / "imported.safetensors"
+    with safetensors.safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    tensors = safetensors.torch.load_file(path)
+    moved = {**tensors, "stand.face": tensors["stand.face"].flip(0).contiguous()}
+    safetensors.torch.save_file(moved, path, metadata)
+    with pytest.raises(StandError, match="import it again"):
+        load_checkpoint(path)
+    del tensors["denoiser.time_embed.0.bias"]
+    safetensors.torch.save_file(tensors, path, metadata)
+    with pytest.raises(CheckpointError, match=r"time_embed\.0\.bias"):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("truncated", "truncated"),
+        ("stage 1", "stage 1, the encoder, which is not imported"),
+        ("no smpl", "SMPL_NEUTRAL.pkl: no such file"),
+        ("another smpl", "SMPL_NEUTRAL.pkl"),
+        ("another uv", "smpl_uv.obj"),
+        ("no uv", "smpl_uv.obj: no such file"),
+        ("unknown tensor", "'diffusion.label_emb.weight'"),
+    ],
+)
+def test_what_cannot_be_imported_is_refused_in_a_sentence_and_nothing_written(tmp_path, capsys, change, told):
+    prepared(tmp_path)
+    weights, smpl, uv = (tmp_path / name for name in ("primdiffusion.pt", "SMPL_NEUTRAL.pkl", "smpl_uv.obj"))
+    if change == "truncated":
+        weights.write_bytes(weights.read_bytes()[:-500])
+    elif change == "stage 1":
+        save_released(weights, stage_one(template()))
+    elif change == "unknown tensor":
+        tensors = torch.load(weights, weights_only=True)["model_state_dict"]
+        save_released(weights, {**tensors, "diffusion.label_emb.weight": torch.zeros(3, 4)})
+    elif change.startswith("another"):
+        (smpl if "smpl" in change else uv).write_bytes(b"hello")
+    else:
+        (smpl if "smpl" in change else uv).unlink()
+    with pytest.raises(SystemExit) as end:
+        cli.main(line(tmp_path))
+    error = capsys.readouterr().err.strip()
+    assert end.value.code == 1
+    assert told in error
+    assert "\n" not in error
+    assert not (tmp_path / "imported.safetensors").exists()
+
+
+def test_uv_files_of_every_kind_give_the_same_anchors(folder, tmp_path):
+    smpl, obj = folder / "SMPL_NEUTRAL.pkl", folder / "smpl_uv.obj"
+    body = load_body(smpl, uv=obj)
+    np.savez(tmp_path / "uv.npz", vt=body.uv, ft=body.uv_faces)
+    np.save(tmp_path / "vt.npy", body.uv)
+    np.save(tmp_path / "ft.npy", body.uv_faces)
+    expected = build_anchors(body, "released")
+    for uv in ((tmp_path / "uv.npz",), (tmp_path / "vt.npy", tmp_path / "ft.npy"), (obj,)):
+        anchors = stand_of_files(smpl, uv).anchors
+        assert torch.equal(anchors.face, expected.face)
+        torch.testing.assert_close(anchors.barycentric, expected.barycentric)
+
+
+def test_the_reference_subject_sets_sizes_and_shape(folder, tmp_path):
+    subject = tmp_path / "seq_000016-rp_alison_rigged_002"
+    (subject / "outputs_re_fitting").mkdir(parents=True)
+    betas = np.zeros((1, 10), np.float32)
+    betas[0, 0] = -9
+    parameters = {
+        "global_orient": np.zeros((2, 3)), "body_pose": np.zeros((2, 69)), "betas": betas, "transl": np.ones((2, 3)),
+    }  # fmt: skip
+    np.savez(subject / "outputs_re_fitting" / "refit_smpl_2nd.npz", smpl=np.array(parameters, dtype=object))
+    arguments = line(folder, "--reference", str(subject), "--chain", "trailing")
+    out = tmp_path / "imported.safetensors"
+    arguments[arguments.index(str(folder / "imported.safetensors"))] = str(out)
+    cli.run(arguments)
+    model, plain = load_checkpoint(out), load_checkpoint(folder / "imported.safetensors")
+    assert (model.stand.anchors.rest_half_extent < 0.7 * plain.stand.anchors.rest_half_extent).any()
+    assert model.chain(1000, 10)[0] == 999
+    shapes = model.betas(torch.zeros(2, 1, 1, 1), [1, 2])
+    assert shapes.tolist() == [[-5.0] + [0.0] * 9] * 2, "betas beyond what people files hold are limited"
+    assert plain.betas(torch.zeros(1, 1, 1, 1), [1]).abs().max() == 0
