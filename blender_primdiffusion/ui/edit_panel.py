@@ -36,7 +36,6 @@ class PRIMDIFFUSION_PT_edit(_InSidebar, bpy.types.Panel):
         except ValueError as error:
             layout.label(text=str(error), icon="INFO")
         layout.prop(context.scene.primdiffusion_edit, "seed")
-        layout.operator("primdiffusion.remove_unused_files", icon="TRASH")
 
 
 def _sub_panel(name: str, label: str, content: Callable) -> type:
@@ -83,6 +82,11 @@ def _draw_blend(layout: bpy.types.UILayout, settings, _context) -> None:
     draw_job(layout, "interpolate", "primdiffusion.blend", "ARROW_LEFTRIGHT")
 
 
+def _draw_files(layout: bpy.types.UILayout, _settings, _context) -> None:
+    """What edits have left on disk."""
+    layout.operator("primdiffusion.remove_unused_files", icon="TRASH")
+
+
 def _draw_region(layout: bpy.types.UILayout, settings, context: bpy.types.Context) -> None:
     layout.row().prop(settings, "region", expand=True)
     if settings.region == "PARTS":
@@ -104,6 +108,7 @@ def _draw_region(layout: bpy.types.UILayout, settings, context: bpy.types.Contex
 
 def _draw_parts(layout: bpy.types.UILayout, settings, parts: tuple[str, ...], columns: int) -> None:
     grid = layout.grid_flow(row_major=True, columns=columns, even_columns=True, align=True)
+    grid.use_property_split = False
     for part in parts:
         grid.prop_enum(settings, "parts", part)
 
@@ -113,4 +118,5 @@ SUB_PANELS = (
     _sub_panel("redress", "Re-dress Region", _draw_redress),
     _sub_panel("transfer", "Transfer Texture", _draw_transfer),
     _sub_panel("blend", "Blend", _draw_blend),
+    _sub_panel("files", "Files", _draw_files),
 )
