@@ -18,7 +18,8 @@ from primdiffusion.failures import describe
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.training import fit_pictures, fit_record
 from primdiffusion.training.fit_config import FitConfig
-from primdiffusion.training.fit_folder import METRICS, MODEL, STATE
+from primdiffusion.training.fit_folder import MODEL, STATE
+from primdiffusion.training.run_folder import METRICS
 from safetensors.torch import load_file
 from tiny_encoder import TINY
 

@@ -19,15 +19,17 @@ from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.training import fit as fit_module
-from primdiffusion.training import fit_folder, fit_record
+from primdiffusion.training import recorder as recorder_module
+from primdiffusion.training import run_folder
 from primdiffusion.training.encoder_checkpoint import load_encoder
 from primdiffusion.training.fit import fit
 from primdiffusion.training.fit_command import run
 from primdiffusion.training.fit_config import FitConfig, LossConfig
 from primdiffusion.training.fit_data import fit_batches, fit_dataset
-from primdiffusion.training.fit_folder import METRICS, MODEL, PICTURES, STATE
+from primdiffusion.training.fit_folder import MODEL, STATE
 from primdiffusion.training.fit_losses import volume_loss
 from primdiffusion.training.fit_state import FitState
+from primdiffusion.training.run_folder import METRICS, PICTURES
 from safetensors.torch import load_file
 
 ROOT = Path(__file__).parents[2]
@@ -91,7 +93,7 @@ def test_ctrl_c_stops_after_the_step_and_saves(captures, tmp_path, monkeypatch):
         if progress.step == 2:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(fit_record.Recorder, "__call__", press)
+    monkeypatch.setattr(recorder_module.Recorder, "__call__", press)
     model = fit(settings(captures, tmp_path / "run"))
     assert model.card["steps"] == 2
     assert load_encoder(tmp_path / "run" / MODEL).card["steps"] == 2
@@ -229,7 +231,7 @@ def test_metrics_that_find_no_room_name_their_file(captures, tmp_path):
     config = settings(captures, tmp_path / "run")
     (config.run / METRICS).mkdir(parents=True)
     with pytest.raises(OSError) as error:
-        fit_folder.append_metrics(config, {"step": 1})
+        run_folder.append_metrics(config.run, {"step": 1})
     assert str(config.run / METRICS) in sentence(error.value)
 
 
@@ -246,7 +248,7 @@ def test_held_boxes_are_drawn_as_large_as_they_start_and_then_learn(captures, tm
         sample, _ = next(fit_batches(dataset, config, FIRST, ALONE))
         with torch.no_grad():
             state.network.scale_out.bias.fill_(30.0)  # as if boxes had learned to be larger
-        clock = fit_record.Clock(torch.device("cpu"))
+        clock = recorder_module.Clock(torch.device("cpu"))
         terms[hold_scale] = fit_module.objective(config, state, sample, MarchSettings(step=0.02), clock)
         start = sample.frames.half_extent * torch.tensor(PRESETS["default"].extent)
     assert torch.allclose(terms[1]["volume"], config.loss.volume * volume_loss(start))

@@ -18,9 +18,10 @@ from primdiffusion.training import interrupt as interrupt_module
 from primdiffusion.training.encoder_checkpoint import load_encoder
 from primdiffusion.training.fit import fit
 from primdiffusion.training.fit_config import LossConfig
-from primdiffusion.training.fit_folder import CONFIG, METRICS, MODEL, RUN, STATE
+from primdiffusion.training.fit_folder import MODEL, STATE
 from primdiffusion.training.fit_state import FitState
 from primdiffusion.training.interrupt import Interrupt
+from primdiffusion.training.run_folder import CONFIG, METRICS, RUN
 from primdiffusion.training.state import TrainingState
 from safetensors import safe_open
 from tiny_encoder import TINY

@@ -1,5 +1,4 @@
 import dataclasses
-import json
 import os
 import signal
 import threading
@@ -7,21 +6,18 @@ import threading
 import numpy as np
 import pytest
 import torch
-from diffusion_people import SMALL, write_people
+from diffuse_runs import settings
+from diffusion_people import write_people
 from primdiffusion.diffusion.codec import mirror_cells
-from primdiffusion.training.checkpoint import load_checkpoint, model_card
-from primdiffusion.training.config import (
-    CodecConfig,
-    PhaseConfig,
-    PriorConfig,
-    TrainingConfig,
-    check_resumable,
-    to_json,
-)
-from primdiffusion.training.diffuse import Interrupt, prepare, train
-from primdiffusion.training.latents import find_people, read_person, split_people
-from primdiffusion.training.losses import LEVELS, blends, closed_form, weighted_error, x0_errors
+from primdiffusion.diffusion.schedule import linear, sqrt_linear
+from primdiffusion.training.cells import CellTrainee, prepare
+from primdiffusion.training.config import PhaseConfig, PriorConfig, check_resumable, to_json
+from primdiffusion.training.interrupt import Interrupt
+from primdiffusion.training.latents import split_people
+from primdiffusion.training.losses import blends, closed_form, level_weight, objective, weighted_error, x0_errors
+from primdiffusion.training.shards import open_people
 from primdiffusion.training.state import TrainingState, learning_rate_factor
+from primdiffusion.training.stored_people import find_people, read_person
 
 
 @pytest.fixture(scope="module")
@@ -33,50 +29,8 @@ def people(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def prepared_once(people, tmp_path_factory):
-    config = settings(people, tmp_path_factory.mktemp("prepared"))
-    return config, prepare(config)
-
-
-def settings(people, run, **changes):
-    config = TrainingConfig(
-        data=people,
-        run=run,
-        holdout=0.2,
-        codec=CodecConfig(channels=4, people=8),
-        prior=PriorConfig(components=6),
-        model=SMALL,
-        person=PhaseConfig(steps=6, batch=16, evaluate_every=6),
-        local=PhaseConfig(steps=4, batch=4, evaluate_every=4),
-    )
-    return dataclasses.replace(config, **changes)
-
-
-@pytest.fixture
-def run(prepared_once, tmp_path):
-    """A run folder in which the closed-form part is done already."""
-    config, _ = prepared_once
-    folder = tmp_path / "run"
-    folder.mkdir()
-    for name in ("prepared.safetensors", "people.json"):
-        os.link(config.run / name, folder / name)
-    return folder
-
-
-def weights(run):
-    return {key: value for key, value in load_checkpoint(run / "model.safetensors").denoiser.state_dict().items()}
-
-
-def test_a_resumed_run_is_bit_identical_to_an_uninterrupted_one(people, run, tmp_path):
-    whole, parts = run, tmp_path / "parts"
-    parts.mkdir()
-    os.link(run / "prepared.safetensors", parts / "prepared.safetensors")
-    train(settings(people, whole))
-    for minutes in (0.0, 0.004, 0.004, None):  # stops before, within and between phases
-        train(settings(people, parts, minutes=minutes))
-    states = [sorted(folder.glob("*.state.safetensors")) for folder in (whole, parts)]
-    assert [path.name for path in states[0]] == ["local.state.safetensors", "person.state.safetensors"]
-    expected, got = weights(whole), weights(parts)
-    assert all(torch.equal(expected[key], got[key]) for key in expected)
+    config, found = settings(people, tmp_path_factory.mktemp("prepared")), open_people(people)
+    return config, prepare(config, found, *split_people(range(16), config.holdout, config.seed))
 
 
 def state_of_a_line(seed=0):
@@ -161,19 +115,6 @@ def test_other_settings_are_refused_and_other_limits_are_not(people, tmp_path):
         check_resumable(saved, settings(people, tmp_path, prior=PriorConfig(components=7)))
 
 
-def test_a_run_leaves_metrics_a_configuration_and_a_card(people, run):
-    model = train(settings(people, run))
-    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    assert [(row["phase"], row["step"]) for row in rows] == [("person", 6), ("local", 4)]
-    assert all(np.isfinite(row["rms_500"]) for row in rows)
-    assert json.loads((run / "config.json").read_text())["person"]["steps"] == 6
-    errors = model.card["held_out_rms_x0_error"]
-    assert errors.keys() == {"gaussian", "mixture", "denoiser"}
-    assert {int(level) for level in errors["gaussian"]} == set(LEVELS)
-    page = model_card(model.card)
-    assert f"{errors['gaussian']['500']:.4f}" in page
-
-
 def test_held_out_geometries_are_never_trained_on(people):
     paths = find_people(people)
     train_paths, held = split_people(paths, 0.2, seed=0)
@@ -216,7 +157,6 @@ def test_shapes_learn_what_the_person_shows(prepared_once):
 
 def test_a_network_that_knows_more_has_less_error(prepared_once):
     from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
-    from primdiffusion.diffusion.schedule import linear
 
     _, prepared = prepared_once
     denoiser = PersonDenoiser(DenoiserConfig(None, None), prepared.prior, linear())
@@ -225,7 +165,7 @@ def test_a_network_that_knows_more_has_less_error(prepared_once):
         "gaussian": closed_form(denoiser, single=True),
         "truth": lambda x, t: prepared.held.latents.float(),
     }
-    errors = x0_errors(guesses, denoiser, prepared.held.latents[:16], levels=(300, 900))
+    errors = x0_errors(guesses, denoiser.schedule, prepared.held.latents[:16], levels=(300, 900))
     for level in (300, 900):
         assert errors["gaussian"][level] < errors["nothing"][level]
     assert errors["gaussian"][300] < errors["gaussian"][900]
@@ -247,6 +187,48 @@ def test_error_weights_have_mean_one_at_every_level():
         assert weighted_error(error, std, power).item() == pytest.approx(1.0, abs=1e-5)
     wide = torch.tensor([[1.0, 3.0]])
     assert weighted_error(torch.tensor([[0.0, 1.0]]), wide, 2.0).item() == pytest.approx(0.9, abs=1e-6)
+
+
+@pytest.mark.parametrize("schedule", [linear(), sqrt_linear()])
+def test_min_snr_weights_are_those_of_the_paper(schedule):
+    # Hang et al. 2023, table 1: min(SNR, gamma) for a network that predicts x0
+    config = PhaseConfig(steps=1, batch=1, weighting="min_snr", min_snr_gamma=5.0)
+    signal, noise = schedule.levels(torch.tensor([0, 300, 999]), torch.zeros(3, 1))
+    weight = level_weight(signal, noise, config)[:, 0]
+    snr = schedule.alpha_bar / (1 - schedule.alpha_bar)
+    assert weight.tolist() == pytest.approx([min(float(snr[t]), 5.0) for t in (0, 300, 999)], rel=1e-5)
+    assert weight[0] == 5
+    assert torch.equal(level_weight(signal, noise, PhaseConfig(steps=1, batch=1, weighting="plain")), torch.ones(3, 1))
+
+
+def test_weightings_weight_what_they_say():
+    error, std = torch.tensor([[1.0, 2.0], [3.0, 0.0]]), torch.tensor([[1.0, 2.0], [0.5, 1.0]])
+    signal, noise = torch.tensor([[0.8], [0.1]]), torch.tensor([[0.6], [0.995]])
+    losses = {
+        name: objective(
+            error, std, signal, noise, PhaseConfig(steps=1, batch=1, weighting=name, error_power=0.0)
+        ).item()
+        for name in ("whitened", "plain", "min_snr")
+    }
+    assert losses["whitened"] == pytest.approx((1 + 1 + 36 + 0) / 4)
+    assert losses["plain"] == pytest.approx((1 + 4 + 9) / 4)
+    assert losses["min_snr"] == pytest.approx(((0.8 / 0.6) ** 2 * 5 + (0.1 / 0.995) ** 2 * 9) / 4)
+
+
+@pytest.mark.parametrize("name", ["person", "local"])
+def test_every_weighting_trains_both_networks(prepared_once, name):
+    config, prepared = prepared_once
+    losses = []
+    for weighting in ("whitened", "plain", "min_snr"):
+        phases = {key: dataclasses.replace(getattr(config, key), weighting=weighting) for key in ("person", "local")}
+        trainee = CellTrainee(dataclasses.replace(config, **phases), prepared, torch.device("cpu"))
+        trainee.network(name).requires_grad_(True)
+        loss = trainee.loss(name, torch.Generator().manual_seed(0))
+        loss.backward()
+        losses.append(loss.item())
+        assert trainee.network(name).outer.weight.grad.abs().max() > 0
+    assert len(set(losses)) == 3
+    assert np.isfinite(losses).all()
 
 
 def test_a_damaged_person_is_named(tmp_path, people):

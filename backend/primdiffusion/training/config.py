@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from primdiffusion.diffusion.denoiser import DenoiserConfig
+from primdiffusion.diffusion.unet import PAPER, UNetConfig
 from primdiffusion.staging import written_whole
+
+Weighting = Literal["whitened", "plain", "min_snr"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,26 +57,48 @@ class PhaseConfig:
     """Largest norm of a step's gradient."""
     ema: float = 0.999
     """Decay of the average of weights that is evaluated and shipped."""
+    weighting: Weighting = "whitened"
+    """Of x0 errors: whitened, in units of the closed form's posterior std; plain, as the paper; min_snr, plain times
+    min(SNR of the level, gamma) (Hang et al. 2023)."""
     error_power: float = 1.0
-    """Errors in units of posterior std s are weighted by s^power: 0 whitened, 2 the paper's plain squares."""
+    """Whitened errors, in units of posterior std s, are weighted by s^power: 2 is the paper's error on one level."""
+    min_snr_gamma: float = 5.0
+    """Largest weight of a level with min_snr."""
     blend: float = 0.3
-    """Share of people that are blends of the colour variants of one geometry."""
+    """Share of people that are blends of the colour variants of one geometry. Default preset only."""
     unasked: float = 0.5
-    """Share of people that are learnt without any attribute; the others with some of theirs."""
+    """Share of people that are learnt without any attribute; the others with some of theirs. Default preset only."""
     evaluate_every: int = 500
     """Steps between evaluations on held-out people."""
     bfloat16: bool = False
-    """Forward and backward in bfloat16, where the processor multiplies it faster."""
+    """Forward and backward of the network in bfloat16, where the device multiplies it faster."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for settings that cannot be."""
+        for name in ("steps", "batch", "evaluate_every"):
+            _check(name, getattr(self, name), getattr(self, name) >= 1, "1 or more")
+        for name in ("learning_rate", "gradient_clip", "min_snr_gamma"):
+            _check(name, getattr(self, name), 0 < getattr(self, name) < math.inf, "above 0")
+        for name in ("weight_decay", "error_power"):
+            _check(name, getattr(self, name), 0 <= getattr(self, name) < math.inf, "0 or more")
+        for name in ("blend", "unasked"):
+            _check(name, getattr(self, name), 0 <= getattr(self, name) <= 1, "from 0 to 1")
+        _check("ema", self.ema, 0 <= self.ema < 1, "0 or more, and below 1")
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainingConfig:
-    """A run of `python -m primdiffusion.training.diffuse`."""
+    """A run of `primdiffusion train`."""
 
     data: Path
-    """Folder of people: one .npz each, as `people` writes them."""
+    """People of `primdiffusion payloads`: a folder of files, or of the shards that `payloads pack` makes of them."""
     run: Path
-    """Folder for weights, metrics and this configuration; an unfinished run in it is resumed."""
+    """Folder for weights, metrics, pictures and this configuration; an unfinished run in it is resumed."""
+    preset: Literal["default", "paper"] = "default"
+    """default: a light network on latents; paper: the paper's U-Net on whole slabs, for graphics cards."""
+    made_of: Literal["makehuman", "own"] = "own"
+    """What the card says of the people: makehuman, those of `payloads` from MakeHuman's CC0 assets, with their licence
+    and limits; own, nothing."""
     minutes: float | None = None
     """Stop after this time, to be resumed; None trains to the end."""
     seed: int = 0
@@ -82,18 +108,50 @@ class TrainingConfig:
     holdout: float = 0.05
     """Share of geometries, with all their colour variants, that is evaluated on and never trained on."""
     save_every: float = 60.0
-    """Seconds between checkpoints."""
+    """Seconds between saved states: what a kill can lose. 0 saves after every step."""
     threads: int | None = None
     """Processor threads; None leaves torch's choice."""
+    log_every: int = 50
+    """Steps between lines of metrics.jsonl; what they hold are running means."""
+    pictures_every: int = 1000
+    """Steps between pictures of a few people that the averaged weights generate."""
     codec: CodecConfig = dataclasses.field(default_factory=CodecConfig)
     prior: PriorConfig = dataclasses.field(default_factory=PriorConfig)
     model: DenoiserConfig = dataclasses.field(default_factory=DenoiserConfig)
     person: PhaseConfig = dataclasses.field(
         default_factory=lambda: PhaseConfig(steps=5000, batch=256, evaluate_every=1000)
     )
+    """The default preset's network over person components, trained first."""
     local: PhaseConfig = dataclasses.field(
         default_factory=lambda: PhaseConfig(steps=8000, batch=16, blend=0.2, weight_decay=0.0, bfloat16=True)
     )
+    """The default preset's network over the grid."""
+    unet: UNetConfig = PAPER
+    """Size of the paper preset's network."""
+    slab: PhaseConfig = dataclasses.field(
+        default_factory=lambda: PhaseConfig(
+            steps=200_000, batch=8, learning_rate=1e-5, weight_decay=0.0, ema=0.9999, weighting="plain",
+            evaluate_every=5000, bfloat16=True,
+        )
+    )  # fmt: skip
+    """The paper preset's only phase; the batch is that of each process."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for settings that cannot be."""
+        for name in ("log_every", "pictures_every", "threads"):
+            value = getattr(self, name)
+            _check(name, value, value is None or value >= 1, "1 or more")
+        for name in ("minutes", "save_every"):
+            value = getattr(self, name)
+            _check(name, value, value is None or value >= 0, "0 or more")
+        _check("holdout", self.holdout, 0 < self.holdout < 1, "between 0 and 1")
+        if self.preset == "paper" and self.slab.weighting == "whitened":
+            raise ValueError("slab.weighting is whitened, for which slabs have no closed form: choose plain or min_snr")
+
+
+def _check(name: str, value: object, fits: bool, wanted: str) -> None:
+    if not fits:
+        raise ValueError(f"{name} is {value}: it must be {wanted}")
 
 
 def to_json(config: Any) -> str:
@@ -106,6 +164,7 @@ MAY_CHANGE = frozenset(
         "run",
         "data",
         "held",
+        "made_of",
         "minutes",
         "save_every",
         "threads",
@@ -122,10 +181,12 @@ left of the learning rate's cosine."""
 
 
 class RunConfig(Protocol):
-    """Any run's settings: a dataclass that says where its folder is."""
+    """Any run's settings: a dataclass that says where its folder and its data are."""
 
     @property
     def run(self) -> Path: ...  # noqa: D102
+    @property
+    def data(self) -> Path: ...  # noqa: D102
 
 
 def check_resumable(saved: str, config: RunConfig) -> None:

@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator
 
 import torch
-from accelerate import Accelerator
 from accelerate.utils import set_seed
 from torch import Tensor
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -24,14 +23,17 @@ from primdiffusion.failures import out_of_memory
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
+from primdiffusion.training.accelerated import accelerator_of, agreed
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.fit_data import FitDataset, FitSample, betas_of, fit_batches, fit_dataset
 from primdiffusion.training.fit_folder import STATE, begin, save
 from primdiffusion.training.fit_losses import Features, loss_terms
 from primdiffusion.training.fit_perceptual import load_perceptual
-from primdiffusion.training.fit_record import Clock, Progress, Recorder
-from primdiffusion.training.fit_state import FitState, versions
+from primdiffusion.training.fit_record import FitRecorder
+from primdiffusion.training.fit_state import FitState
 from primdiffusion.training.interrupt import Interrupt
+from primdiffusion.training.recorder import Clock, Progress
+from primdiffusion.training.run_folder import versions
 from primdiffusion.training.state import NotFiniteError
 
 
@@ -50,7 +52,7 @@ def fit(config: FitConfig) -> EncoderModel:
     """
     if config.threads:
         torch.set_num_threads(config.threads)
-    accelerator = Accelerator(mixed_precision=config.mixed_precision, cpu=not torch.cuda.is_available())
+    accelerator = accelerator_of(config.mixed_precision)
     perceptual = _features(config, accelerator.device)
     captures = open_captures(config.data)
     held = None if config.held is None else open_captures(config.held)
@@ -67,14 +69,14 @@ def fit(config: FitConfig) -> EncoderModel:
         state = FitState(Encoder(PRESETS[config.encoder]), config, accelerator)
         if (config.run / STATE).exists():
             state.load(config.run / STATE)
-    recorder = Recorder(config, captures, held, state) if accelerator.is_main_process else None
+    recorder = FitRecorder(config, captures, held, state) if accelerator.is_main_process else None
     _run(config, state, dataset, recorder, perceptual)
     accelerator.end_training()
     return model_of(config, state, captures)
 
 
 def _run(
-    config: FitConfig, state: FitState, dataset: FitDataset, recorder: Recorder | None, perceptual: Features | None
+    config: FitConfig, state: FitState, dataset: FitDataset, recorder: FitRecorder | None, perceptual: Features | None
 ) -> None:
     """Steps until the last one or an interrupt, saved now and then."""
     captures = dataset.samples.captures
@@ -89,7 +91,7 @@ def _run(
             state.seconds = before + time.monotonic() - began
             if recorder is not None:
                 recorder(progress)
-            stop = _agreed(state.accelerator, interrupt.due()) or progress.step >= config.steps
+            stop = agreed(state.accelerator, interrupt.due()) or progress.step >= config.steps
             if recorder is not None and (stop or time.monotonic() - saved > config.save_every):
                 save(config, state, model_of(config, state, captures))
                 saved = time.monotonic()
@@ -205,11 +207,3 @@ def _memory_named(config: FitConfig) -> Iterator[None]:
             f"memory does not hold {config.batch} people with {config.targets} targets of {config.size} x "
             f"{config.size} pixels each: try {remedy} in a new run folder"
         ) from error
-
-
-def _agreed(accelerator: Accelerator, stop: bool) -> bool:
-    """Whether any process wants to stop: all must leave the loop after the same step."""
-    if accelerator.num_processes == 1:
-        return stop
-    wishes = accelerator.gather(torch.tensor([stop], device=accelerator.device))
-    return bool(torch.as_tensor(wishes).any())

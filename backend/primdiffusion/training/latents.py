@@ -3,43 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import random
-import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from primdiffusion.body.measures import measure
-from primdiffusion.body.model import default_body
 from primdiffusion.diffusion.codec import LinearCodec, cells_from_voxels, fit_codec
 from primdiffusion.diffusion.conditioning import Attributes, Vocabulary
 from primdiffusion.geometry.records import TensorRecord
-from primdiffusion.people.wardrobe import words_of
-from primdiffusion.primitives.primitives import K, S
 from primdiffusion.training.config import CodecConfig
+from primdiffusion.training.stored_people import People, find_people, read_outline, read_person
 
-_DAMAGED = (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile)
-_NO_PERSON = "{path} is no person's payload ({error}): make it again with `primdiffusion payloads`"
+__all__ = ["LatentSet", "encode_people", "find_people", "fit_codec_to", "read_person", "read_vocabulary",
+           "split_people", "vocabulary_of"]  # fmt: skip
 
-
-@dataclasses.dataclass(frozen=True)
-class StoredPerson:
-    """One geometry with several colourings, as `people` writes it."""
-
-    voxels: UInt8[Tensor, "n k 8 8 8 4"]
-    """sRGB-encoded colour and relative density of each colouring."""
-    delta_scale: Float[Tensor, "n k 3"]
-    betas: Float[Tensor, "10"]
-    attributes: tuple[Attributes, ...]
-    """Of each colouring, in the words of `primdiffusion.people.wardrobe`; none where nothing is known."""
-    full_density: float
-    """1/m that 255 stands for."""
+Item = TypeVar("Item", int, Path)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,80 +41,38 @@ class LatentSet(TensorRecord):
         return len(self.latents)
 
 
-def read_person(path: Path) -> StoredPerson:
-    """A person's file; ValueError if it is damaged or of another shape."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            voxels = torch.from_numpy(file["voxels"])
-            betas = torch.from_numpy(file["betas"]).float()
-            attributes = json.loads(str(file["attributes"]))
-            full_density = float(file["full_density"])
-            delta_scale = torch.from_numpy(file["delta_scale"]).float() if "delta_scale" in file else None
-    except _DAMAGED as error:
-        raise ValueError(_NO_PERSON.format(path=path, error=error)) from error
-    if voxels.dtype != torch.uint8 or tuple(voxels.shape[1:]) != (K, S, S, S, 4):
-        raise ValueError(
-            f"{path} holds voxels {voxels.dtype} {tuple(voxels.shape)}; uint8 [n, {K}, {S}, {S}, {S}, 4] is needed"
-        )
-    delta_scale = torch.ones(len(voxels), K, 3) if delta_scale is None else delta_scale
-    if tuple(delta_scale.shape) != (len(voxels), K, 3):
-        raise ValueError(f"{path} holds delta_scale {tuple(delta_scale.shape)}; [{len(voxels)}, {K}, 3] is needed")
-    return StoredPerson(voxels, delta_scale, betas, _attributes_of(attributes, betas, len(voxels)), full_density)
-
-
-def _attributes_of(stored: dict[str, Any], betas: Float[Tensor, "10"], count: int) -> tuple[Attributes, ...]:
-    variants = stored.get("variants", [stored] * count)
-    measures = measure(default_body().shape(betas))
-    body = {"height": measures.height, "weight": measures.weight}
-    return tuple({**words_of(variant), **body} for variant in variants)
-
-
-def find_people(folder: Path) -> list[Path]:
-    """The people's files in a folder, sorted; FileNotFoundError if there are fewer than two."""
-    paths = sorted(folder.glob("*.npz"))
-    if len(paths) < 2:
-        raise FileNotFoundError(
-            f"{folder} holds {len(paths)} people (*.npz): make some with `primdiffusion payloads --out {folder}`"
-        )
-    return paths
-
-
-def split_people(paths: Sequence[Path], holdout: float, seed: int) -> tuple[list[Path], list[Path]]:
-    """Geometries to train on and to hold out (at least one each), the same for the same files and seed."""
-    shuffled = random.Random(seed).sample(list(paths), len(paths))
-    held = min(max(1, round(holdout * len(paths))), len(paths) - 1)
+def split_people(people: Sequence[Item], holdout: float, seed: int) -> tuple[list[Item], list[Item]]:
+    """Geometries to train on and to hold out (at least one each), the same for the same number and seed."""
+    shuffled = random.Random(seed).sample(list(people), len(people))
+    held = min(max(1, round(holdout * len(people))), len(people) - 1)
     return sorted(shuffled[held:]), sorted(shuffled[:held])
 
 
-def fit_codec_to(paths: Sequence[Path], config: CodecConfig, generator: torch.Generator) -> LinearCodec:
-    """The codec of `config.people` random people, one colouring each."""
-    chosen = torch.randint(len(paths), (config.people,), generator=generator).tolist()
-    if config.people <= len(paths):
-        chosen = torch.randperm(len(paths), generator=generator)[: config.people].tolist()
+def fit_codec_to(
+    people: People, indices: Sequence[int], config: CodecConfig, generator: torch.Generator
+) -> LinearCodec:
+    """The codec of `config.people` random people among those of `indices`, one colouring each."""
+    chosen = torch.randint(len(indices), (config.people,), generator=generator).tolist()
+    if config.people <= len(indices):
+        chosen = torch.randperm(len(indices), generator=generator)[: config.people].tolist()
     cells = []
-    for index in chosen:
-        person = read_person(paths[index])
-        one = int(torch.randint(len(person.voxels), (), generator=generator))
-        cells.append(cells_from_voxels(person.voxels[one], person.delta_scale[one]))
+    for place in chosen:
+        index = indices[place]
+        number = int(torch.randint(people.variants[index], (), generator=generator))
+        cells.append(cells_from_voxels(*people.variant(index, number)))
     return fit_codec(torch.stack(cells), config.channels, generator)
 
 
-def encode_people(paths: Sequence[Path], codec: LinearCodec, vocabulary: Vocabulary) -> tuple[LatentSet, float]:
-    """Latents of every colouring of every person, and their common full density (1/m)."""
-    latents, geometry, betas, conditions, densities = [], [], [], [], set()
-    for index, path in enumerate(paths):
-        person = read_person(path)
+def encode_people(people: People, indices: Sequence[int], codec: LinearCodec, vocabulary: Vocabulary) -> LatentSet:
+    """Latents of every colouring of the people of `indices`."""
+    latents, geometry, betas, conditions = [], [], [], []
+    for place, index in enumerate(indices):
+        person = people.person(index)
         latents.append(codec.encode(cells_from_voxels(person.voxels, person.delta_scale)).half())
-        geometry.append(torch.full((len(person.voxels),), index))
+        geometry.append(torch.full((len(person.voxels),), place))
         betas.append(person.betas)
         conditions += [vocabulary.encode(_known(each, vocabulary)) for each in person.attributes]
-        densities.add(person.full_density)
-    if len(densities) != 1:
-        raise ValueError(
-            f"people with full densities {sorted(densities)} cannot be trained together: regenerate them with one"
-        )
-    people = LatentSet(torch.cat(latents), torch.cat(geometry), torch.stack(betas), torch.stack(conditions))
-    return people, densities.pop()
+    return LatentSet(torch.cat(latents), torch.cat(geometry), torch.stack(betas), torch.stack(conditions))
 
 
 def _known(attributes: Attributes, vocabulary: Vocabulary) -> Attributes:
@@ -144,21 +85,20 @@ def _known(attributes: Attributes, vocabulary: Vocabulary) -> Attributes:
 
 
 def read_vocabulary(paths: Sequence[Path]) -> Vocabulary:
-    """What can be said of the people in these files; does not read their voxels."""
+    """What can be said of the people in these files; does not read their voxels. Raises what `read_outline` does."""
+    return vocabulary_of(each for path in paths for each in read_outline(path).known())
+
+
+def vocabulary_of(people: Iterable[Attributes]) -> Vocabulary:
+    """What can be said of these people: all words that are, and mean and spread of all numbers."""
     words: dict[str, set[str]] = {}
     numbers: dict[str, list[float]] = {}
-    for path in paths:
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                stored, betas = json.loads(str(file["attributes"])), torch.from_numpy(file["betas"]).float()
-        except _DAMAGED as error:
-            raise ValueError(_NO_PERSON.format(path=path, error=error)) from error
-        for attributes in _attributes_of(stored, betas, 1):
-            for name, value in attributes.items():
-                if isinstance(value, str):
-                    words.setdefault(name, set()).add(value)
-                else:
-                    numbers.setdefault(name, []).append(value)
+    for attributes in people:
+        for name, value in attributes.items():
+            if isinstance(value, str):
+                words.setdefault(name, set()).add(value)
+            else:
+                numbers.setdefault(name, []).append(value)
     categories = {name: tuple(sorted(values)) for name, values in words.items()}
     spread = {name: (float(np.mean(values)), float(max(np.std(values), 1e-3))) for name, values in numbers.items()}
     return Vocabulary(categories, spread)

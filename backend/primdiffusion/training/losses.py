@@ -1,9 +1,12 @@
-"""Objectives of the denoiser's two networks, and the error they are judged by."""
+"""Objectives of the default denoiser's two networks, weightings of errors, and the error that denoisers are judged by.
+
+All random numbers are drawn where their generator lives, which must be where the people are.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from jaxtyping import Float, Int
@@ -13,6 +16,7 @@ from primdiffusion.diffusion.codec import LinearCodec
 from primdiffusion.diffusion.conditioning import Vocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.samplers import gaussian_noise
+from primdiffusion.diffusion.schedule import Schedule
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.latents import LatentSet
 
@@ -27,6 +31,26 @@ def weighted_error(error: Float[Tensor, "b n"], std: Float[Tensor, "b n"], power
     """
     weight = std**power
     return (weight / weight.mean(1, keepdim=True) * error.square()).mean()
+
+
+def level_weight(signal: Tensor, noise: Tensor, config: PhaseConfig) -> Tensor:
+    """Weight of the plain x0 error at a level: 1, or with min_snr min(SNR, gamma) (Hang et al. 2023, for x0)."""
+    if config.weighting == "min_snr":
+        return (signal / noise).square().clamp(max=config.min_snr_gamma)
+    return torch.ones_like(signal)
+
+
+def objective(
+    error: Float[Tensor, "b *s"],
+    std: Float[Tensor, "b *s"],
+    signal: Float[Tensor, "b *1"],
+    noise: Float[Tensor, "b *1"],
+    config: PhaseConfig,
+) -> Tensor:
+    """Mean of x0 errors as the settings weight them; `std` is the closed form's posterior standard deviation."""
+    if config.weighting == "whitened":
+        return weighted_error((error / std).flatten(1), std.flatten(1), config.error_power)
+    return (level_weight(signal, noise, config) * error.square()).mean()
 
 
 @dataclasses.dataclass
@@ -49,15 +73,14 @@ class PersonObjective:
         weights, indices = blends(self.people.geometry, self.config.batch, self.config.blend, generator)
         condition = asked_of(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
         c = torch.einsum("bk,bkr->br", weights, self.coefficients[indices])
-        flip = torch.rand(len(c), 1, generator=generator) < 0.5
+        flip = torch.rand(len(c), 1, generator=generator, device=generator.device) < 0.5
         c = torch.where(flip, c * self.denoiser.prior_parity, c)
-        t = torch.randint(self.denoiser.schedule.length, (len(c),), generator=generator)
+        t = random_steps(self.denoiser.schedule, len(c), generator)
         y = self.denoiser.schedule.q_sample(c, t, gaussian_noise(c, generator))
         signal, noise = self.denoiser.schedule.levels(t, c)
         std = self.denoiser.component_std
         std = std * noise / (signal**2 * std**2 + noise**2).sqrt()
-        guess = self.denoiser.coefficients(y, t, condition)
-        return weighted_error((guess - c) / std, std, self.config.error_power)
+        return objective(self.denoiser.coefficients(y, t, condition) - c, std, signal, noise, self.config)
 
 
 @dataclasses.dataclass
@@ -80,9 +103,9 @@ class RestObjective:
         weights, indices = blends(self.people.geometry, self.config.batch, self.config.blend, generator)
         condition = asked_of(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
         z = torch.einsum("bk,bkchw->bchw", weights, self.people.latents[indices].float())
-        flip = torch.rand(len(z), 1, 1, 1, generator=generator) < 0.5
+        flip = torch.rand(len(z), 1, 1, 1, generator=generator, device=generator.device) < 0.5
         z = torch.where(flip, self.codec.mirror(z), z)
-        t = torch.randint(self.denoiser.schedule.length, (len(z),), generator=generator)
+        t = random_steps(self.denoiser.schedule, len(z), generator)
         x = self.denoiser.schedule.q_sample(z, t, gaussian_noise(z, generator))
         signal, noise = self.denoiser.schedule.levels(t, z)
         with torch.no_grad():
@@ -91,8 +114,13 @@ class RestObjective:
             coefficients = self.denoiser.coefficients(y, t, condition)
         std = self.denoiser.prior_rest_variance.sqrt()
         std = std * noise / (signal**2 * std**2 + noise**2).sqrt()
-        error = (self.denoiser.rest(rest, coefficients, t, condition) - clean) / std
-        return weighted_error(error.flatten(1), std.flatten(1), self.config.error_power)
+        error = self.denoiser.rest(rest, coefficients, t, condition) - clean
+        return objective(error, std, signal, noise, self.config)
+
+
+def random_steps(schedule: Schedule, count: int, generator: torch.Generator) -> Int[Tensor, "b"]:
+    """Uniform steps (paper eq. 9)."""
+    return torch.randint(schedule.length, (count,), generator=generator, device=generator.device)
 
 
 def _present(network: nn.Module | None) -> nn.Module:
@@ -109,13 +137,13 @@ def blends(
     Colour variants of one geometry have the same density, so their mixture is a person again, of mixed colours. Weights
     reach beyond 0 ... 1 so far that mixing keeps the variance of colours: E[p^2 + (1-p)^2] = 1.
     """
-    first = torch.randint(len(geometry), (batch,), generator=generator)
+    first = torch.randint(len(geometry), (batch,), generator=generator, device=generator.device)
+    which, mixed, chosen = torch.rand(3, batch, generator=generator, device=generator.device)
     counts = torch.bincount(geometry)
     starts = counts.cumsum(0) - counts
     own = geometry[first]
-    second = starts[own] + (torch.rand(batch, generator=generator) * counts[own]).long()
-    part = 0.5 + 3**0.5 * (torch.rand(batch, generator=generator) - 0.5)
-    part = part * (torch.rand(batch, generator=generator) < share)
+    second = starts[own] + (which * counts[own]).long()
+    part = (0.5 + 3**0.5 * (mixed - 0.5)) * (chosen < share)
     return torch.stack([1 - part, part], dim=1), torch.stack([first, second], dim=1)
 
 
@@ -137,23 +165,24 @@ Guess = Callable[[Tensor, Tensor], Tensor]
 
 
 def x0_errors(
-    guesses: dict[str, Guess],
-    denoiser: PersonDenoiser,
-    latents: Float[Tensor, "n c h w"],
+    guesses: Mapping[str, Guess],
+    schedule: Schedule,
+    samples: Float[Tensor, "n c h w"],
     levels: Sequence[int] = LEVELS,
+    batch: int = 16,
 ) -> dict[str, dict[int, float]]:
-    """Root mean square x0 error of each guess at each level, all on the same noise; in units of latents."""
+    """Root mean square x0 error of each guess at each level, all on the same noise; in units of the samples."""
     errors = {name: dict.fromkeys(levels, 0.0) for name in guesses}
-    generator = torch.Generator().manual_seed(20_231)
+    generator = torch.Generator(samples.device).manual_seed(20_231)
     with torch.inference_mode():
         for level in levels:
-            for chunk in latents.split(16):
+            for chunk in samples.split(batch):
                 z = chunk.float()
-                t = torch.full((len(z),), level)
-                x = denoiser.schedule.q_sample(z, t, gaussian_noise(z, generator))
+                t = torch.full((len(z),), level, device=z.device)
+                x = schedule.q_sample(z, t, gaussian_noise(z, generator))
                 for name, guess in guesses.items():
                     errors[name][level] += float((guess(x, t) - z).square().sum())
-    return {name: {level: (e / latents.numel()) ** 0.5 for level, e in by.items()} for name, by in errors.items()}
+    return {name: {level: (e / samples.numel()) ** 0.5 for level, e in by.items()} for name, by in errors.items()}
 
 
 def closed_form(denoiser: PersonDenoiser, single: bool) -> Guess:

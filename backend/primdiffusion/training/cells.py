@@ -1,0 +1,154 @@
+"""The preset `default`: a closed-form person prior on latents of cells, corrected by two light networks."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from primdiffusion.diffusion.codec import LinearCodec
+from primdiffusion.diffusion.conditioning import Vocabulary
+from primdiffusion.diffusion.denoiser import PersonDenoiser
+from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.diffusion.model import CellCodec, DiffusionModel, ShapePrior
+from primdiffusion.diffusion.schedule import SCHEDULES
+from primdiffusion.training.config import PhaseConfig, TrainingConfig, write_atomically
+from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
+from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors
+from primdiffusion.training.prior import fit_prior, fit_shapes
+from primdiffusion.training.stored_people import People
+
+PREPARED = "prepared.safetensors"
+
+
+@dataclasses.dataclass(frozen=True)
+class Prepared:
+    """Everything a run computes in closed form before it trains."""
+
+    train: LatentSet
+    held: LatentSet
+    codec: LinearCodec
+    prior: PersonPrior
+    shapes: ShapePrior
+    vocabulary: Vocabulary
+    full_density: float
+
+
+def prepare(config: TrainingConfig, people: People, train: Sequence[int], held: Sequence[int]) -> Prepared:
+    """Codec, latents, prior and body shapes of the run's people; read back from the run folder when they are there.
+
+    Raises ValueError for a person's file, or prepared ones, that are damaged; OSError.
+    """
+    path = config.run / PREPARED
+    if path.exists():
+        return _load_prepared(path)
+    generator = torch.Generator().manual_seed(config.seed)
+    vocabulary = vocabulary_of(each for index in train for each in people.known(index))
+    codec = fit_codec_to(people, train, config.codec, generator)
+    latents, unseen = (encode_people(people, indices, codec, vocabulary) for indices in (train, held))
+    prior = fit_prior(latents, codec, vocabulary, config.prior)
+    shapes = fit_shapes(latents, prior)
+    prepared = Prepared(latents, unseen, codec, prior, shapes, vocabulary, people.full_density)
+    _save_prepared(path, prepared)
+    return prepared
+
+
+class CellTrainee:
+    """A `PersonDenoiser`: its network over person components, then the one over the grid."""
+
+    def __init__(self, config: TrainingConfig, prepared: Prepared, device: torch.device) -> None:
+        torch.manual_seed(config.seed)
+        self.config, self.device = config, device
+        self.codec, self.shapes = prepared.codec.to(device), prepared.shapes.to(device)
+        self.train, self.held = prepared.train.to(device), prepared.held.to(device)
+        self.vocabulary, self.full_density = prepared.vocabulary, prepared.full_density
+        self.denoiser = PersonDenoiser(config.model, prepared.prior, SCHEDULES[config.schedule]())
+        self.denoiser.eval().requires_grad_(False).to(device)
+        phases = {"person": config.person, "local": config.local}
+        self.phases: Mapping[str, PhaseConfig] = {
+            name: phase for name, phase in phases.items() if getattr(self.denoiser, name) is not None
+        }
+        self._objectives: dict[str, PersonObjective | RestObjective] = {}
+
+    def network(self, name: str) -> nn.Module:
+        """The one over components ("person") or over the grid ("local")."""
+        return getattr(self.denoiser, name)
+
+    def put(self, name: str, network: nn.Module) -> None:
+        """Lets it compute, in its phase's precision."""
+        setattr(self.denoiser, name, network)
+        self.denoiser.network_dtype = torch.bfloat16 if self.phases[name].bfloat16 else torch.float32
+
+    def loss(self, name: str, generator: torch.Generator) -> Tensor:
+        """Weighted x0 error of a random batch at random levels."""
+        if name not in self._objectives:
+            self._objectives[name] = self._objective(name)
+        return self._objectives[name].loss(generator)
+
+    def errors(self) -> Mapping[int, float]:
+        """On everybody held out, in units of latents."""
+        return x0_errors({"rms": self.denoiser}, self.denoiser.schedule, self.held.latents)["rms"]
+
+    def errors_beside_closed_forms(self) -> dict[str, dict[int, float]]:
+        """Likewise, with those of the prior as one Gaussian and as the mixture that it is, on the same noise."""
+        guesses = {
+            "gaussian": closed_form(self.denoiser, single=True),
+            "mixture": closed_form(self.denoiser, single=False),
+            "denoiser": self.denoiser,
+        }
+        return x0_errors(guesses, self.denoiser.schedule, self.held.latents)
+
+    def model(self) -> DiffusionModel:
+        """What is in place, without a card."""
+        codec, denoiser = CellCodec(self.codec), self.denoiser
+        return DiffusionModel(denoiser, denoiser.schedule, codec, self.shapes, self.full_density, {}, self.vocabulary)
+
+    def _objective(self, name: str) -> PersonObjective | RestObjective:
+        denoiser, phase = self.denoiser, self.phases[name]
+        if name == "local":
+            return RestObjective(denoiser, self.train, self.codec, self.vocabulary, phase)
+        prior = denoiser.prior
+        coefficients = torch.cat([prior.split(chunk.float())[0] for chunk in self.train.latents.split(128)])
+        # Components are fitted to these people and vary more over them than over new ones; the prior knows by how much.
+        coefficients *= denoiser.component_std / coefficients.square().mean(0).sqrt()
+        return PersonObjective(denoiser, coefficients, self.train, self.vocabulary, phase)
+
+
+def _save_prepared(path: Path, prepared: Prepared) -> None:
+    tensors = {}
+    for name in ("train", "held", "codec", "prior", "shapes"):
+        record = getattr(prepared, name)
+        for field in dataclasses.fields(record):
+            value = getattr(record, field.name)
+            tensors[f"{name}.{field.name}"] = value.contiguous()
+    about = {"full_density": repr(prepared.full_density), "vocabulary": json.dumps(prepared.vocabulary.to_json())}
+    write_atomically(path, save(tensors, metadata=about))
+
+
+def _load_prepared(path: Path) -> Prepared:
+    try:
+        with safe_open(path, framework="pt") as file:
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
+            about: dict[str, Any] = file.metadata()
+
+        def part(name: str) -> dict[str, Tensor]:
+            return {key.removeprefix(f"{name}."): value for key, value in tensors.items() if key.startswith(f"{name}.")}
+
+        return Prepared(
+            LatentSet(**part("train")),
+            LatentSet(**part("held")),
+            LinearCodec(**part("codec")),
+            PersonPrior(**part("prior")),
+            ShapePrior(**part("shapes")),
+            Vocabulary.from_json(json.loads(about["vocabulary"])),
+            float(about["full_density"]),
+        )
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is damaged ({error}): remove it, then it is made again") from error

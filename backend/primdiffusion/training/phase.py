@@ -1,0 +1,176 @@
+"""Training one network of a diffusion model, from where it stopped to its last step; whatever the preset."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import math
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Protocol
+
+import torch
+from accelerate import Accelerator
+from torch import Tensor, nn
+from tqdm.contrib.logging import logging_redirect_tqdm
+
+from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.failures import out_of_memory
+from primdiffusion.training.accelerated import AcceleratedState, agreed
+from primdiffusion.training.config import PhaseConfig, TrainingConfig
+from primdiffusion.training.diffuse_pictures import write_samples
+from primdiffusion.training.interrupt import Interrupt
+from primdiffusion.training.recorder import Clock, Progress, Recorder
+from primdiffusion.training.run_folder import PICTURES, append_metrics
+from primdiffusion.training.state import NotFiniteError
+
+
+class Trainee(Protocol):
+    """A preset's model in the making."""
+
+    @property
+    def phases(self) -> Mapping[str, PhaseConfig]:
+        """Its networks by name, in the order in which they are trained."""
+        ...
+
+    def network(self, name: str) -> nn.Module:
+        """One of them as it begins."""
+        ...
+
+    def put(self, name: str, network: nn.Module) -> None:
+        """Lets a network compute in its place: as it is called in training, or its average."""
+        ...
+
+    def loss(self, name: str, generator: torch.Generator) -> Tensor:
+        """Of a random batch, for the network of this name."""
+        ...
+
+    def errors(self) -> Mapping[int, float]:
+        """Root mean square x0 error on held-out people, by level, of what is in place."""
+        ...
+
+    def model(self) -> DiffusionModel:
+        """What is in place, without a card."""
+        ...
+
+
+def train_phase(
+    config: TrainingConfig, trainee: Trainee, name: str, accelerator: Accelerator, interrupt: Interrupt
+) -> AcceleratedState:
+    """Train one network until its last step or an interrupt, and leave its average in place.
+
+    Raises:
+        ValueError: loss or gradient are not finite (NotFiniteError); too little memory (says what to try); the saved
+            state is damaged or of another network.
+        OSError: there is no room; the last whole state remains.
+    """
+    phase, path = trainee.phases[name], state_path(config, name)
+    state = AcceleratedState(trainee.network(name).requires_grad_(True), phase, config.seed, accelerator)
+    if path.exists():
+        state.load(path)
+    recorder = PhaseRecorder(config, trainee, name, state) if accelerator.is_main_process else None
+    trainee.put(name, state.prepared)
+    began = saved = time.monotonic()
+    before, first = state.seconds, state.step
+    with contextlib.ExitStack() as stack:
+        if recorder is not None:
+            stack.enter_context(logging_redirect_tqdm())
+            stack.enter_context(recorder)
+        while state.step < phase.steps and not agreed(accelerator, interrupt.due()):
+            progress = step(config, trainee, name, state)
+            state.seconds = before + time.monotonic() - began
+            if recorder is not None:
+                recorder(progress)
+                if time.monotonic() - saved >= config.save_every:
+                    state.save(path)
+                    saved = time.monotonic()
+    if recorder is not None and state.step > first:
+        state.save(path)
+    accelerator.wait_for_everyone()
+    trainee.put(name, state.average)
+    return state
+
+
+def step(config: TrainingConfig, trainee: Trainee, name: str, state: AcceleratedState) -> Progress:
+    """One optimiser step. What it draws and drops follows from seed, phase, step and process alone."""
+    device, phase = state.accelerator.device, trainee.phases[name]
+    seed = step_seed(config.seed, name, state.step, state.accelerator.process_index)
+    torch.manual_seed(seed)
+    clock = Clock(device)
+    state.prepared.train()
+    with _memory_named(name, phase):
+        loss = trainee.loss(name, torch.Generator(device).manual_seed(seed))
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise NotFiniteError(
+                f"the loss of {name!r} at step {state.step} is not finite: lower --{name}.learning-rate in a new run "
+                "folder"
+            )
+        clock.lap("forward")
+        gradient = state.update(loss)
+    clock.lap("backward")
+    return Progress(state.step, {"loss": value}, gradient, clock.seconds)
+
+
+def step_seed(seed: int, phase: str, step: int, process: int) -> int:
+    """The seed of one step's random numbers on one process, 0 ... 2^63 - 1."""
+    digest = hashlib.sha256(f"{seed}/{phase}/{step}/{process}".encode()).digest()
+    return int.from_bytes(digest[:8], "big") >> 1
+
+
+def state_path(config: TrainingConfig, name: str) -> Path:
+    """Where the state of a phase lies."""
+    return config.run / f"{name}.state.safetensors"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Every:
+    log_every: int
+    evaluate_every: int
+    pictures_every: int
+
+
+class PhaseRecorder(Recorder):
+    """Of a phase: held-out error, and people that the averaged weights generate."""
+
+    def __init__(self, config: TrainingConfig, trainee: Trainee, name: str, state: AcceleratedState) -> None:
+        phase = trainee.phases[name]
+        every = _Every(config.log_every, phase.evaluate_every, config.pictures_every)
+        super().__init__(phase.steps, every, state, name)
+        self.run, self.trainee, self.phase, self.prepared = config.run, trainee, name, state.prepared
+
+    def measured(self) -> dict[str, float]:
+        """RMS x0 error at each level."""
+        with self._averaged():
+            return {f"rms_{level}": error for level, error in self.trainee.errors().items()}
+
+    def draw(self) -> None:
+        """A few people side by side."""
+        with self._averaged():
+            write_samples(self.run / PICTURES / f"{self.phase}_{self.state.step:07d}.png", self.trainee.model())
+
+    def append(self, row: Mapping[str, float]) -> None:
+        """A line of metrics.jsonl, with the phase."""
+        append_metrics(self.run, {"phase": self.phase, **row})
+
+    @contextlib.contextmanager
+    def _averaged(self) -> Iterator[None]:
+        self.trainee.put(self.phase, self.state.average)
+        try:
+            yield
+        finally:
+            self.trainee.put(self.phase, self.prepared)
+
+
+@contextlib.contextmanager
+def _memory_named(name: str, phase: PhaseConfig) -> Iterator[None]:
+    """ValueError that says what to try, where memory runs out."""
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if not out_of_memory(error):
+            raise
+        remedy = f"--{name}.batch {phase.batch // 2}" if phase.batch > 1 else "a smaller network, or another device"
+        raise ValueError(f"memory does not hold a batch of {phase.batch}: try {remedy} in a new run folder") from error

@@ -1,0 +1,118 @@
+"""What is seen of a run as it goes: lines of metrics, pictures, a bar."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Protocol
+
+import torch
+from tqdm import tqdm
+
+from primdiffusion.training.state import TrainingState
+
+log = logging.getLogger(__name__)
+
+MEMORY = 25
+"""Steps over which the means of metrics.jsonl reach, about."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """One optimiser step."""
+
+    step: int
+    terms: dict[str, float]
+    """The objective's terms, weighted; of this process' people."""
+    gradient: float
+    """Norm, before clipping."""
+    seconds: dict[str, float]
+    """Of the step's parts, the last of which includes the update."""
+
+
+class Clock:
+    """Seconds between laps, with the device's work waited for."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device, self.seconds = device, {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        """Ends a lap."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        now = time.perf_counter()
+        self.seconds[name] = now - self._last
+        self._last = now
+
+
+class Every(Protocol):
+    """When a run is to be seen, in steps."""
+
+    @property
+    def log_every(self) -> int: ...  # noqa: D102
+    @property
+    def evaluate_every(self) -> int: ...  # noqa: D102
+    @property
+    def pictures_every(self) -> int: ...  # noqa: D102
+
+
+class Recorder(ABC):
+    """metrics.jsonl, pictures and the bar; of the main process.
+
+    Running means are part of the state's place, so that a resumed run writes the lines of one that never stopped.
+    """
+
+    def __init__(self, steps: int, every: Every, state: TrainingState, name: str | None = None) -> None:
+        self.steps, self.every, self.state, self.name = steps, every, state, name
+        self.means: dict[str, float] = json.loads(state.place.get("means", "{}"))
+
+    def __enter__(self) -> Recorder:
+        self.bar = tqdm(total=self.steps, initial=self.state.step, desc=self.name, unit="step", disable=None)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.close()
+
+    def __call__(self, progress: Progress) -> None:
+        """Takes note of a step. Raises OSError where there is no room."""
+        row = {**progress.terms, "gradient": progress.gradient}
+        row |= {f"seconds_{name}": value for name, value in progress.seconds.items()}
+        for name, value in row.items():
+            before = self.means.get(name, value)
+            self.means[name] = before + (value - before) / min(progress.step, MEMORY)
+        self.state.place["means"] = json.dumps(self.means)
+        self.bar.update()
+        if self._due(progress.step, self.every.log_every):
+            self._write(self.means)
+        if self._due(progress.step, self.every.evaluate_every):
+            self._write(self.measured())
+        if self._due(progress.step, self.every.pictures_every):
+            self.draw()
+
+    @abstractmethod
+    def measured(self) -> dict[str, float]:
+        """How good the averaged weights are now."""
+
+    @abstractmethod
+    def draw(self) -> None:
+        """Pictures of what they do."""
+
+    @abstractmethod
+    def append(self, row: Mapping[str, float]) -> None:
+        """A line of metrics.jsonl."""
+
+    def _due(self, step: int, every: int) -> bool:
+        return step % every == 0 or step == self.steps
+
+    def _write(self, values: Mapping[str, float]) -> None:
+        step = self.state.step
+        left = (self.steps - step) * sum(value for name, value in self.means.items() if name.startswith("seconds_"))
+        shown = " ".join(f"{name}={value:.4g}" for name, value in values.items())
+        of = f"{self.name}, " if self.name else ""
+        log.info("%sstep %d of %d, %s left: %s", of, step, self.steps, tqdm.format_interval(left), shown)
+        self.append({"step": step, "seconds": self.state.seconds, **values})

@@ -1,0 +1,130 @@
+"""The folder of a run, of either stage: how a run begins or goes on in it, and what it notes of itself.
+
+config.json      the settings
+run.json         the people; of every start its step, processes, versions and commit
+metrics.jsonl    a line now and then
+pictures/        what it looks like as it goes
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import platform
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import accelerate
+import psutil
+import torch
+
+from primdiffusion import __version__
+from primdiffusion.training.config import RunConfig, check_resumable, to_json, write_atomically
+
+log = logging.getLogger(__name__)
+
+CONFIG, RUN, METRICS, PICTURES = "config.json", "run.json", "metrics.jsonl", "pictures"
+
+
+def begin(
+    config: RunConfig,
+    people: Sequence[str],
+    about: Mapping[str, Any],
+    start: Mapping[str, Any],
+    is_kept: Callable[[Mapping[str, Any]], bool],
+) -> None:
+    """Settings, versions and whom it is trained on; or, in a run's folder, the proof that these are as before.
+
+    `about` is noted beside the people; `start` says of this start where it begins and on how many "processes". Lines
+    of metrics.jsonl for which `is_kept` is false belong to steps that a kill undid: they will be written again.
+
+    Raises:
+        ValueError: other settings or other people than those with which the run began, or damaged files.
+        OSError: the folder cannot be written to.
+    """
+    saved, noted = config.run / CONFIG, config.run / RUN
+    started = {"people": list(people), **about, "starts": []}
+    if saved.exists():
+        check_resumable(saved.read_text(encoding="utf-8"), config)
+        if noted.exists():
+            started["starts"] = _earlier(config, people, noted.read_text(encoding="utf-8"), start["processes"])
+        _cut_metrics(config.run / METRICS, is_kept)
+        _remove_leftovers(config.run)
+    now = {**start, "primdiffusion": __version__, **versions()}
+    write_atomically(saved, to_json(config))
+    write_atomically(noted, json.dumps({**started, "starts": [*started["starts"], now]}, indent=1))
+
+
+def append_metrics(run: Path, row: Mapping[str, Any]) -> None:
+    """One line of metrics.jsonl. Raises OSError, which names the file."""
+    path = run / METRICS
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(path)) from error
+
+
+def versions() -> dict[str, str]:
+    """What ran: Python, torch, accelerate, and of a checkout its commit, "-dirty" where files differ from it."""
+    found = {
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "accelerate": accelerate.__version__,
+        "machine": platform.machine(),
+    }
+    here = Path(__file__)
+    try:
+        _git(here.parent, "ls-files", "--error-unmatch", here.name)  # an environment may lie in another checkout
+        return {**found, "commit": _git(here.parent, "describe", "--always", "--dirty", "--exclude", "*")}
+    except (OSError, subprocess.SubprocessError):
+        return found
+
+
+def _earlier(config: RunConfig, people: Sequence[str], saved: str, processes: int) -> list[Mapping[str, Any]]:
+    """Earlier starts of the run, which must have been with the same people."""
+    try:
+        before = json.loads(saved)
+        known, starts = before["people"], before.get("starts", [])
+        were = starts[-1]["processes"] if starts else processes
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise ValueError(f"{config.run / RUN} is damaged ({error}): give a new folder") from error
+    if known != list(people):
+        raise ValueError(
+            f"the run in {config.run} was begun with other people than those of {config.data} ({len(known)} and "
+            f"{len(people)} of them): give the same data, or a new folder"
+        )
+    if were != processes:
+        log.warning("%d processes, before %d: other batches follow", processes, were)
+    return starts
+
+
+def _cut_metrics(path: Path, is_kept: Callable[[Mapping[str, Any]], bool]) -> None:
+    if path.exists():
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        write_atomically(path, "".join(line + "\n" for line in lines if _is_kept(line, is_kept)))
+
+
+def _is_kept(line: str, is_kept: Callable[[Mapping[str, Any]], bool]) -> bool:
+    """False also for a line that a kill cut short."""
+    try:
+        return is_kept(json.loads(line))
+    except (ValueError, KeyError, TypeError):
+        return False
+
+
+def _remove_leftovers(run: Path) -> None:
+    """What a process that was killed while it wrote left: `.NAME.PID.partial`."""
+    for path in run.glob(".*.partial"):
+        process = path.name.split(".")[-2]
+        if process.isdecimal() and not psutil.pid_exists(int(process)):
+            path.unlink(missing_ok=True)
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    done = subprocess.run(
+        ["git", *arguments], cwd=folder, capture_output=True, text=True, timeout=10, check=True
+    )  # fmt: skip
+    return done.stdout.strip()

@@ -1,0 +1,80 @@
+"""The preset `paper`: the paper's U-Net on whole slabs (paper sec. 3.3, SPEC 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel, WholeSlab
+from primdiffusion.diffusion.samplers import gaussian_noise
+from primdiffusion.diffusion.schedule import SCHEDULES
+from primdiffusion.diffusion.unet import SlabUNet
+from primdiffusion.primitives.slab import pack
+from primdiffusion.training.config import PhaseConfig, TrainingConfig
+from primdiffusion.training.losses import level_weight, random_steps, x0_errors
+from primdiffusion.training.stored_people import People, payload_of_bytes
+
+NETWORK = "slab"
+MEASURED = 4
+"""Held-out people on which the error is measured, one colouring each: a slab takes 15 MB, a guess as long as a step."""
+
+
+class SlabTrainee:
+    """A `SlabUNet` and the people it learns: unweighted x0 error at uniform levels, as in the paper."""
+
+    def __init__(
+        self, config: TrainingConfig, people: People, train: Sequence[int], held: Sequence[int], device: torch.device
+    ) -> None:
+        torch.manual_seed(config.seed)
+        self.schedule = SCHEDULES[config.schedule]()
+        self.config, self.people, self.held, self.device = config.slab, people, held[:MEASURED], device
+        self.places = [(index, number) for index in train for number in range(people.variants[index])]
+        self.denoiser: nn.Module = SlabUNet(config.unet).to(device)
+        self.began = self.denoiser
+
+    @property
+    def phases(self) -> Mapping[str, PhaseConfig]:
+        """One."""
+        return {NETWORK: self.config}
+
+    def network(self, name: str) -> nn.Module:
+        """The U-Net."""
+        return self.began
+
+    def put(self, name: str, network: nn.Module) -> None:
+        """Lets it compute."""
+        self.denoiser = network
+
+    def slabs(self, places: Sequence[tuple[int, int]]) -> Float[Tensor, "b 56 256 256"]:
+        """People as the network sees them. Raises ValueError that names a damaged file, OSError."""
+        voxels, scales = zip(*(self.people.variant(*place) for place in places), strict=True)
+        density = self.people.full_density
+        payload = payload_of_bytes(torch.stack(voxels).to(self.device), torch.stack(scales).to(self.device), density)
+        return pack(payload, density)
+
+    def loss(self, name: str, generator: torch.Generator) -> Tensor:
+        """x0 error of a random batch at random levels (paper eq. 9)."""
+        chosen = torch.randint(
+            len(self.places), (self.config.batch,), generator=generator, device=generator.device
+        ).tolist()
+        slab = self.slabs([self.places[index] for index in chosen])
+        t = random_steps(self.schedule, len(slab), generator)
+        x = self.schedule.q_sample(slab, t, gaussian_noise(slab, generator))
+        error = self._guess(x, t) - slab
+        return (level_weight(*self.schedule.levels(t, slab), self.config) * error.square()).mean()
+
+    def errors(self) -> Mapping[int, float]:
+        """On the first colourings of a few who are held out, in the slab's units."""
+        held = self.slabs([(index, 0) for index in self.held])
+        return x0_errors({"rms": self._guess}, self.schedule, held, batch=1)["rms"]
+
+    def model(self) -> DiffusionModel:
+        """What is in place, without a card; it knows nothing of bodies' shapes."""
+        return DiffusionModel(self.denoiser, self.schedule, WholeSlab(), STANDARD_SHAPES, self.people.full_density, {})
+
+    def _guess(self, x: Float[Tensor, "b 56 256 256"], t: Tensor) -> Float[Tensor, "b 56 256 256"]:
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.config.bfloat16):
+            return self.denoiser(x, t).float()

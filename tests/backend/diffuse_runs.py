@@ -1,0 +1,70 @@
+"""Runs of stage 2 that take seconds: few small people, few channels, small pictures."""
+
+import functools
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+from accelerate.state import AcceleratorState
+from diffusion_people import SMALL
+from primdiffusion.diffusion.unet import UNetConfig
+from primdiffusion.training import diffuse_pictures, phase
+from primdiffusion.training.config import CodecConfig, PhaseConfig, PriorConfig, TrainingConfig
+from primdiffusion.training.diffuse import train
+from primdiffusion.training.run_folder import METRICS
+
+TINY_UNET = UNetConfig(width=32, multipliers=(1, 1, 1, 1, 1), blocks=1, heads=2)
+DEFAULT_FILES = {"config.json", "run.json", "metrics.jsonl", "pictures", "model.safetensors", "prepared.safetensors",
+                 "person.state.safetensors", "local.state.safetensors"}  # fmt: skip
+
+
+def make_small(patch: pytest.MonkeyPatch) -> None:
+    """Pictures of one person, of few pixels and steps; accelerate forgets earlier runs of this process."""
+    patch.setattr(diffuse_pictures, "WIDTH", 24)
+    patch.setattr(diffuse_pictures, "HEIGHT", 40)
+    patch.setattr(diffuse_pictures, "STEP", 0.03)
+    patch.setattr(phase, "write_samples", functools.partial(diffuse_pictures.write_samples, seeds=(0,), steps=1))
+    AcceleratorState._reset_state(reset_partial_state=True)
+
+
+def settings(people: Path, run: Path, **changes) -> TrainingConfig:
+    """Six steps of the person network and four of the local one, or three of the paper's."""
+    quick = {
+        "holdout": 0.2,
+        "codec": CodecConfig(channels=4, people=8),
+        "prior": PriorConfig(components=6),
+        "model": SMALL,
+        "person": PhaseConfig(steps=6, batch=16, evaluate_every=6),
+        "local": PhaseConfig(steps=4, batch=4, evaluate_every=4),
+        "unet": TINY_UNET,
+        "slab": PhaseConfig(steps=3, batch=1, learning_rate=1e-3, weighting="plain", evaluate_every=3),
+        "log_every": 1,
+        "threads": 1,
+    }
+    return TrainingConfig(data=people, run=run, **{**quick, **changes})
+
+
+def rows(run: Path) -> list[dict]:
+    """Of metrics.jsonl."""
+    return [json.loads(line) for line in (run / METRICS).read_text().splitlines()]
+
+
+def logged(run: Path) -> list[tuple[str, int]]:
+    """Phases and steps of the lines that tell the loss."""
+    return [(row["phase"], row["step"]) for row in rows(run) if "loss" in row]
+
+
+def child_environment() -> dict[str, str]:
+    """For processes that import this file."""
+    folder = Path(__file__).parent
+    paths = (folder, folder.parent, os.environ.get("PYTHONPATH", ""))
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths)), "OMP_NUM_THREADS": "1"}
+
+
+if __name__ == "__main__":  # a run in a process of its own
+    make_small(pytest.MonkeyPatch())
+    data, folder, person, local = sys.argv[1:]
+    phases = {"person": PhaseConfig(**json.loads(person)), "local": PhaseConfig(**json.loads(local))}
+    train(settings(Path(data), Path(folder), **phases))

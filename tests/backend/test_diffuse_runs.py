@@ -1,0 +1,343 @@
+"""Runs of stage 2: what they leave, how they go on, and what they refuse; both presets."""
+
+import dataclasses
+import itertools
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from diffuse_runs import DEFAULT_FILES, TINY_UNET, child_environment, logged, make_small, rows, settings
+from diffusion_people import write_people
+from PIL import Image
+from primdiffusion.failures import describe
+from primdiffusion.human import generate
+from primdiffusion.training import phase
+from primdiffusion.training.cells import CellTrainee
+from primdiffusion.training.checkpoint import load_checkpoint, model_card
+from primdiffusion.training.config import PhaseConfig, TrainingConfig
+from primdiffusion.training.diffuse import MODEL, train
+from primdiffusion.training.losses import LEVELS
+from primdiffusion.training.phase import step_seed
+from primdiffusion.training.shards import INDEX, pack_people
+from primdiffusion.training.slabs import SlabTrainee
+from primdiffusion.training.stored_people import PeopleFolder
+from safetensors.torch import load_file
+
+DIES_IN_THE_FIFTH_SAVE = """
+import os, signal, sys
+from pathlib import Path
+import pytest
+from diffuse_runs import make_small, settings
+from primdiffusion.training.diffuse import train
+
+make_small(pytest.MonkeyPatch())
+whole, saves = Path.write_bytes, []
+
+def write(path, content):
+    if ".state" in path.name:
+        saves.append(path)
+        if len(saves) == 5:
+            whole(path, content[: len(content) // 2])
+            os.kill(os.getpid(), signal.SIGKILL)
+    return whole(path, content)
+
+Path.write_bytes = write
+train(settings(Path(sys.argv[1]), Path(sys.argv[2]), save_every=0.0))
+"""
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("people")
+    write_people(folder, geometries=16, variants=3)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory):
+    """For the paper's preset."""
+    folder = tmp_path_factory.mktemp("few")
+    write_people(folder, geometries=3, variants=2)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(people, tmp_path_factory):
+    """A run that nothing disturbed."""
+    with pytest.MonkeyPatch.context() as patch:
+        make_small(patch)
+        config = settings(people, tmp_path_factory.mktemp("whole") / "run", made_of="makehuman")
+        train(config)
+        return config.run
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    make_small(monkeypatch)
+
+
+@pytest.fixture
+def run(whole, tmp_path):
+    """A run's folder in which the closed-form part is done already."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    os.link(whole / "prepared.safetensors", folder / "prepared.safetensors")
+    return folder
+
+
+def timeless(run):
+    """Lines of metrics.jsonl without what a clock says."""
+    return [{name: value for name, value in row.items() if not name.startswith("seconds")} for row in rows(run)]
+
+
+def after(steps):
+    """An interrupt that comes after so many steps."""
+    asked = []
+    return lambda self: asked.append(0) or len(asked) > steps
+
+
+def same_tensors(one, other):
+    a, b = load_file(one), load_file(other)
+    return a.keys() == b.keys() and all(torch.equal(a[key], b[key]) for key in a)
+
+
+def sentence(error):
+    failure = describe(error)
+    assert failure is not None
+    assert "\n" not in str(failure)
+    return str(failure)
+
+
+def test_a_run_leaves_settings_people_metrics_pictures_states_and_a_model(people, whole):
+    assert {path.name for path in whole.iterdir()} == DEFAULT_FILES
+    assert json.loads((whole / "config.json").read_text())["person"]["steps"] == 6
+    about = json.loads((whole / "run.json").read_text())
+    assert about["people"] == [path.stem for path in sorted(people.iterdir())]
+    assert len(about["held"]) == 3
+    (start,) = about["starts"]
+    assert (start["steps"], start["processes"]) == ({}, 1)
+    assert start.keys() >= {"torch", "accelerate", "python", "primdiffusion"}
+    assert logged(whole) == [("person", step) for step in range(1, 7)] + [("local", step) for step in range(1, 5)]
+    measured = [row for row in rows(whole) if "rms_500" in row]
+    assert [(row["phase"], row["step"]) for row in measured] == [("person", 6), ("local", 4)]
+    assert all(np.isfinite(row["rms_500"]) for row in measured)
+    pictures = sorted(path.name for path in (whole / "pictures").iterdir())
+    assert pictures == ["local_0000004.png", "person_0000006.png"]
+    assert Image.open(whole / "pictures" / pictures[0]).size == (24, 40)
+
+
+def test_the_card_tells_data_settings_and_errors(whole):
+    card = load_checkpoint(whole / MODEL).card
+    errors = card["held_out_rms_x0_error"]
+    assert errors.keys() == {"gaussian", "mixture", "denoiser"}
+    assert {int(level) for level in errors["gaussian"]} == set(LEVELS)
+    assert card["steps"] == {"person": 6, "local": 4}
+    assert (card["geometries"], card["people"], card["held_out_geometries"]) == (13, 39, 3)
+    assert card["licence"] == "CC0-1.0"
+    assert "4 of 2051 numbers" in " ".join(card["limits"])
+    assert f"{errors['gaussian']['500']:.4f}" in model_card(card)
+
+
+def test_a_card_claims_nothing_of_people_it_does_not_know(people, run):
+    card = train(settings(people, run, minutes=0.0)).card
+    assert not card.keys() & {"licence", "data", "limits"}
+    assert card["steps"] == {"person": 0, "local": 0}
+
+
+def test_a_run_in_parts_is_bit_identical_to_one_in_one_go(people, whole, run, monkeypatch):
+    due = phase.Interrupt.due
+    for last in (2, 3, 4, 1):  # steps done before it is asked to stop: within, between and before phases
+        asked = []
+        monkeypatch.setattr(
+            phase.Interrupt, "due", lambda self, last=last, asked=asked: asked.append(0) or len(asked) > last
+        )
+        train(settings(people, run))
+        torch.randn(3)  # whatever else is drawn in between does not matter
+    monkeypatch.setattr(phase.Interrupt, "due", due)
+    train(settings(people, run))
+    for name in ("person.state.safetensors", "local.state.safetensors", MODEL):
+        assert same_tensors(run / name, whole / name), name
+    assert timeless(run) == timeless(whole)
+    starts = [start["steps"] for start in json.loads((run / "run.json").read_text())["starts"]]
+    assert starts[:2] == [{}, {"person": 2}]
+
+
+def test_a_kill_in_the_middle_of_a_save_loses_one_interval(people, whole, run):
+    died = subprocess.run(
+        [sys.executable, "-c", DIES_IN_THE_FIFTH_SAVE, str(people), str(run)],
+        env=child_environment(), capture_output=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert died.returncode == -signal.SIGKILL
+    assert logged(run) == [("person", step) for step in range(1, 6)]
+    assert len(list(run.glob(".*.partial"))) == 1
+    with (run / "metrics.jsonl").open("a") as file:
+        file.write('{"phase": "person", "step": 6, "lo')
+    train(settings(people, run))
+    assert {path.name for path in run.iterdir()} == DEFAULT_FILES
+    assert same_tensors(run / MODEL, whole / MODEL)
+    assert same_tensors(run / "person.state.safetensors", whole / "person.state.safetensors")
+    assert timeless(run) == timeless(whole)
+
+
+def test_shards_train_as_the_files_they_were_made_of(people, whole, tmp_path):
+    list(pack_people(people, tmp_path / "packed", people_each=5))
+    train(settings(tmp_path / "packed", tmp_path / "run"))
+    assert same_tensors(tmp_path / "run" / MODEL, whole / MODEL)
+
+
+def test_a_damaged_shard_ends_the_run_and_is_named(people, tmp_path):
+    list(pack_people(people, tmp_path / "packed", people_each=5))
+    path = tmp_path / "packed" / "shard_0002.safetensors"
+    path.write_bytes(path.read_bytes()[:-1])
+    assert (tmp_path / "packed" / INDEX).exists()
+    with pytest.raises(ValueError, match="shard_0002") as error:
+        train(settings(tmp_path / "packed", tmp_path / "run"))
+    sentence(error.value)
+    assert not (tmp_path / "run" / "prepared.safetensors").exists()
+
+
+def test_other_people_or_settings_in_the_same_folder_are_refused(people, few, run):
+    train(settings(people, run, minutes=0.0))
+    with pytest.raises(ValueError, match=r"other people .*\(16 and 3 of them\)"):
+        train(settings(few, run))
+    with pytest.raises(ValueError, match=r"preset \(default, not paper\)"):
+        train(settings(people, run, preset="paper"))
+    slower = PhaseConfig(steps=6, batch=16, learning_rate=1e-5)
+    with pytest.raises(ValueError, match=r"person\.learning_rate"):
+        train(settings(people, run, person=slower))
+
+
+@pytest.mark.parametrize("name", ["config.json", "run.json", "prepared.safetensors", "person.state.safetensors"])
+def test_a_damaged_file_of_the_run_is_named(people, whole, tmp_path, name):
+    shutil.copytree(whole, tmp_path / "run")
+    path = tmp_path / "run" / name
+    path.write_bytes(path.read_bytes()[:30])
+    with pytest.raises(ValueError, match="damaged") as error:
+        train(settings(people, tmp_path / "run"))
+    assert str(tmp_path / "run") in sentence(error.value)
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_with_a_sentence(people, run, monkeypatch):
+    monkeypatch.setattr(CellTrainee, "loss", lambda self, name, generator: self.denoiser.person.outer.weight.sum() / 0)
+    with pytest.raises(ValueError, match=r"loss of 'person' at step 0 .*--person\.learning-rate") as error:
+        train(settings(people, run))
+    sentence(error.value)
+    assert not (run / "person.state.safetensors").exists()
+    assert not (run / MODEL).exists()
+
+
+def test_memory_that_runs_out_names_a_batch_to_try(people, run, monkeypatch):
+    def greedy(self, name, generator):
+        raise RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 99 bytes")
+
+    monkeypatch.setattr(CellTrainee, "loss", greedy)
+    with pytest.raises(ValueError, match=r"batch of 16: try --person\.batch 8"):
+        train(settings(people, run))
+
+
+def test_steps_draw_other_numbers_on_every_process_and_in_every_phase():
+    places = itertools.product((0, 1), ("person", "slab"), range(50), range(3))
+    seeds = {step_seed(*place) for place in places}
+    assert len(seeds) == 600
+    assert all(0 <= seed < 2**63 for seed in seeds)
+
+
+@pytest.fixture(scope="module")
+def paper(few, tmp_path_factory):
+    """A run of the paper's preset with a small network, in which the second of three steps ended it once."""
+    with pytest.MonkeyPatch.context() as patch:
+        make_small(patch)
+        config = settings(few, tmp_path_factory.mktemp("paper") / "run", preset="paper")
+        due = phase.Interrupt.due
+        patch.setattr(phase.Interrupt, "due", after(2))
+        train(config)
+        patch.setattr(phase.Interrupt, "due", due)
+        train(config)
+        return config.run
+
+
+def test_the_paper_preset_trains_saves_loads_and_generates(paper):
+    assert logged(paper) == [("slab", 1), ("slab", 2), ("slab", 3)]
+    assert [path.name for path in (paper / "pictures").iterdir()] == ["slab_0000003.png"]
+    model = load_checkpoint(paper / MODEL)
+    assert model.denoiser.config == TINY_UNET
+    assert model.card["preset"] == "paper"
+    assert model.card["people"] == 4
+    assert model.card["weighting"] == {"slab": "plain"}
+    assert np.isfinite(list(model.card["held_out_rms_x0_error"]["denoiser"].values())).all()
+    human = generate(model, 3, steps=2)
+    assert torch.equal(human.payload.rgb, generate(model, 3, steps=2).payload.rgb)
+
+
+def test_the_paper_preset_goes_on_bit_for_bit(few, paper, tmp_path):
+    train(settings(few, tmp_path / "run", preset="paper"))
+    for name in ("slab.state.safetensors", MODEL):
+        assert same_tensors(tmp_path / "run" / name, paper / name)
+
+
+def test_the_paper_preset_learns_slabs_of_the_people(few):
+    config = settings(few, Path("unused"), preset="paper")
+    trainee = SlabTrainee(config, PeopleFolder(few), [0, 2], [1], torch.device("cpu"))
+    assert trainee.places == [(0, 0), (0, 1), (2, 0), (2, 1)]
+    (slab,) = trainee.slabs([(2, 1)])
+    payload = trainee.model().decode(slab)
+    stored = PeopleFolder(few).person(2).payload(1)
+    for name in ("rgb", "density", "delta_scale"):
+        assert torch.allclose(getattr(payload, name), getattr(stored, name), atol=1e-4), name
+
+
+def test_an_untrained_paper_network_has_the_loss_of_guessing_nothing(few):
+    # it starts at 0, so the plain error is the mean square of the slabs themselves, at any level
+    config = settings(few, Path("unused"), preset="paper", slab=PhaseConfig(steps=1, batch=2, weighting="plain"))
+    trainee = SlabTrainee(config, PeopleFolder(few), [0], [1], torch.device("cpu"))
+    energy = trainee.slabs([(0, 0)]).square().mean().item(), trainee.slabs([(0, 1)]).square().mean().item()
+    loss = trainee.loss("slab", torch.Generator().manual_seed(0)).item()
+    assert min(energy) - 1e-6 <= loss <= max(energy) + 1e-6
+
+
+def test_bfloat16_computes_the_network_in_it_and_nothing_else(few):
+    config = settings(
+        few, Path("unused"), preset="paper", slab=PhaseConfig(steps=1, batch=1, weighting="plain", bfloat16=True)
+    )
+    trainee = SlabTrainee(config, PeopleFolder(few), [0], [1], torch.device("cpu"))
+    seen = []
+    trainee.denoiser.input_blocks[0][0].register_forward_hook(lambda module, given, out: seen.append(out.dtype))
+    loss = trainee.loss("slab", torch.Generator().manual_seed(0))
+    assert seen == [torch.bfloat16]
+    assert loss.dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("settings_of", "changes", "word"),
+    [
+        (PhaseConfig, {"steps": 0}, "steps is 0"),
+        (PhaseConfig, {"batch": 0}, "batch is 0"),
+        (PhaseConfig, {"learning_rate": 0.0}, "learning_rate"),
+        (PhaseConfig, {"ema": 1.0}, "ema"),
+        (PhaseConfig, {"blend": 1.5}, "blend"),
+        (PhaseConfig, {"min_snr_gamma": 0.0}, "min_snr_gamma"),
+        (TrainingConfig, {"holdout": 1.0}, "holdout"),
+        (TrainingConfig, {"minutes": -1.0}, "minutes"),
+        (TrainingConfig, {"log_every": 0}, "log_every"),
+        (TrainingConfig, {"preset": "paper", "slab": PhaseConfig(steps=1, batch=1)}, "whitened"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(settings_of, changes, word):
+    given = {"steps": 1, "batch": 1} if settings_of is PhaseConfig else {"data": Path("a"), "run": Path("b")}
+    with pytest.raises(ValueError, match=word):
+        settings_of(**{**given, **changes})
+
+
+def test_more_steps_go_on_from_a_finished_run(people, whole, tmp_path):
+    shutil.copytree(whole, tmp_path / "run")
+    config = settings(people, tmp_path / "run")
+    longer = dataclasses.replace(config, local=dataclasses.replace(config.local, steps=5))
+    assert train(longer).card["steps"] == {"person": 6, "local": 5}
+    assert logged(tmp_path / "run")[-1] == ("local", 5)
