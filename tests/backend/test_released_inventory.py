@@ -149,7 +149,8 @@ def bad_file(path, kind):
         return "no torch file"
     contents = {
         "a list": ([1, 2], "list"),
-        "other keys": ({"epoch": 3, "net": {"a": torch.zeros(1)}}, "'model_state_dict' and 'optimizer'"),
+        "other keys": ({"epoch": 3, "net": {"a": torch.zeros(1)}}, "'epoch' is a int.*'model_state_dict'"),
+        "a sparse tensor": ({"model_state_dict": {"betas": torch.eye(3).to_sparse()}}, "'betas'"),
         "no tensors": ({"model_state_dict": {"betas": 3}}, "'betas'"),
         "a tensor": (torch.zeros(3), "Tensor"),
         "another network": ({"model_state_dict": {"conv.weight": torch.zeros(3)}}, "conv.weight"),
@@ -161,8 +162,8 @@ def bad_file(path, kind):
 
 
 @pytest.mark.parametrize(
-    "kind", ["hostile torch file", "hostile pickle", "truncated", "empty", "text", "a list", "other keys", "no tensors",
-             "a tensor", "another network", "nothing"]
+    "kind", ["hostile torch file", "hostile pickle", "truncated", "empty", "text", "a list", "a sparse tensor",
+             "other keys", "no tensors", "a tensor", "another network", "nothing"]
 )  # fmt: skip
 def test_what_is_no_released_checkpoint_is_refused_in_one_sentence(tmp_path, monkeypatch, kind):
     monkeypatch.setenv("HOSTILE", str(tmp_path / "ran"))

@@ -42,13 +42,10 @@ def read_weights(path: Path) -> dict[str, Tensor]:
             f"{path} holds a {type(state).__name__} where {STATE!r} belongs: give the authors' primdiffusion.pt"
         )
     for key, value in state.items():
-        if not isinstance(key, str) or not isinstance(value, Tensor):
+        if not isinstance(key, str) or not isinstance(value, Tensor) or value.layout != torch.strided:
             raise ReleasedFileError(
-                f"{path} has no {STATE!r} and {key!r} in it is a {type(value).__name__}, not a tensor: "
-                "give the authors' primdiffusion.pt, whose top-level keys are 'model_state_dict' and 'optimizer'"
-                if state is content
-                else f"{path}: {key!r} in {STATE!r} is a {type(value).__name__}, not a tensor: take the file from its "
-                "publisher again"
+                f"{path}: {key!r} is a {type(value).__name__}, not an ordinary tensor: give the authors' "
+                f"primdiffusion.pt, whose top-level keys are {STATE!r}, a dictionary of tensors, and 'optimizer'"
             )
     return dict(state)
 
