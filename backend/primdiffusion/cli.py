@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
 import math
 import sys
@@ -181,7 +182,7 @@ class Info:
         """Prints one JSON object."""
         import torch
 
-        from primdiffusion.human_file import HumanFileError, load_human
+        from primdiffusion.human_file import NoPersonError, format_version, load_human
         from primdiffusion.machine import best_device, device_info, memory
         from primdiffusion.training.checkpoint import default_checkpoint, read_card
         from primdiffusion.training.encoder_checkpoint import default_encoder
@@ -196,12 +197,33 @@ class Info:
             return
         try:
             human = load_human(self.file)
-        except HumanFileError:
+        except NoPersonError:
             print(json.dumps(dict(read_card(self.file)), indent=2))
         else:
-            print(
-                json.dumps({**human.provenance, "betas": [round(beta, 4) for beta in human.betas.tolist()]}, indent=2)
-            )
+            betas = [round(beta, 4) for beta in human.betas.tolist()]
+            body = "default" if human.stand is None else dataclasses.asdict(human.stand.files)
+            about = {"format_version": format_version(human), **human.provenance, "betas": betas, "body": body}
+            print(json.dumps(about, indent=2))
+
+
+@dataclasses.dataclass(frozen=True)
+class Vary:
+    """Make a neighbour of a person (own --help)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Interpolate:
+    """Make a person between two (own --help)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Inpaint:
+    """Make a region of a person anew: re-dress them (own --help)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Transfer:
+    """Give a region of a person the looks of another one (own --help)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -251,6 +273,10 @@ class Evaluate:
 
 Command = (
     Annotated[Generate, tyro.conf.subcommand("generate")]
+    | Annotated[Vary, tyro.conf.subcommand("vary")]
+    | Annotated[Interpolate, tyro.conf.subcommand("interpolate")]
+    | Annotated[Inpaint, tyro.conf.subcommand("inpaint")]
+    | Annotated[Transfer, tyro.conf.subcommand("transfer")]
     | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
     | Annotated[Refine, tyro.conf.subcommand("refine")]
     | Annotated[Render, tyro.conf.subcommand("render")]
@@ -263,6 +289,12 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[ImportReleased, tyro.conf.subcommand("import-released")]
 )
+
+
+def _edit(name: str, arguments: Sequence[str]) -> None:
+    from primdiffusion.edit_command import run
+
+    run(name, arguments)
 
 
 def _reconstruct(arguments: Sequence[str]) -> None:
@@ -302,13 +334,9 @@ def _fit(arguments: Sequence[str]) -> None:
 
 
 def _train(arguments: Sequence[str]) -> None:
-    import logging
+    from primdiffusion.training.diffuse import run
 
-    from primdiffusion.training.config import TrainingConfig
-    from primdiffusion.training.diffuse import train
-
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    train(tyro.cli(TrainingConfig, args=arguments, prog="primdiffusion train"))
+    run(arguments)
 
 
 def _import_released(arguments: Sequence[str]) -> None:
@@ -330,6 +358,7 @@ def _evaluate(arguments: Sequence[str]) -> None:
 
 
 FORWARDED = {
+    **{name: functools.partial(_edit, name) for name in ("vary", "interpolate", "inpaint", "transfer")},
     "reconstruct": _reconstruct,
     "refine": _refine,
     "people": _people,

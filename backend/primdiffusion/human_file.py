@@ -47,6 +47,10 @@ class HumanFileError(ValueError):
     """A file that holds no person this version can read."""
 
 
+class NoPersonError(HumanFileError):
+    """A safetensors file of another kind."""
+
+
 def save_human(path: str | Path, human: Human) -> None:
     """Writes the person whole or not at all, every bit as it is in memory.
 
@@ -59,14 +63,19 @@ def save_human(path: str | Path, human: Human) -> None:
     tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     metadata = {
         "format": FORMAT,
-        "format_version": str(FORMAT_VERSION),
+        "format_version": str(format_version(human)),
         "provenance": json.dumps(dict(human.provenance), allow_nan=False),
     }
     if human.stand is not None:
         tensors["rest_half_extent"] = human.stand.anchors.rest_half_extent.detach().cpu().contiguous()
-        metadata |= {"format_version": str(FORMAT_VERSION_ON_FILES), "body": human.stand.files.to_json()}
+        metadata |= {"body": human.stand.files.to_json()}
     with written_whole(path) as unfinished:
         unfinished.write_bytes(safetensors.torch.save(tensors, metadata))
+
+
+def format_version(human: Human) -> int:
+    """The version of the file that this person is written to: the lowest that can hold them."""
+    return FORMAT_VERSION if human.stand is None else FORMAT_VERSION_ON_FILES
 
 
 def load_human(path: str | Path) -> Human:
@@ -99,7 +108,7 @@ def load_human(path: str | Path) -> Human:
 
 def _check_format(path: Path, metadata: Mapping[str, str]) -> None:
     if metadata.get("format") != FORMAT:
-        raise HumanFileError(f"{path} is a safetensors file but holds no person: choose a .human.safetensors file")
+        raise NoPersonError(f"{path} is a safetensors file but holds no person: choose a .human.safetensors file")
     version = metadata.get("format_version", "")
     if not version.isdecimal() or int(version) < 1:
         raise HumanFileError(f"{path} holds no whole person (its format version is {version!r}): generate it again")

@@ -22,6 +22,11 @@ class PersonFiles:
     side: str = "side.png"
     depth: str = "depth.png"
 
+    def in_folder(self, folder: Path) -> dict[str, str]:
+        """Their paths, by the names that results of jobs have for them."""
+        names = {"human": self.blender, "person": self.human, "preview": self.front, "side": self.side}
+        return {name: str(folder / file) for name, file in {**names, "depth": self.depth}.items()}
+
 
 FILES = PersonFiles()
 

@@ -1,4 +1,4 @@
-"""The work of the child: generate, reconstruct, render, draw. Imports torch, so the server loads it in its own time."""
+"""The work of the child: generate, edit, reconstruct, render, draw. It imports torch, so the server loads it late."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from primdiffusion.diffusion.conditioning import NOTHING
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import Step
 from primdiffusion.human import framing, generate, place
@@ -19,9 +20,11 @@ from primdiffusion.render.image import depth_to_png, to_png
 from primdiffusion.render.march import march
 from primdiffusion.serve.draw_params import DrawParams
 from primdiffusion.serve.drawing import FrameDrawer, Report
-from primdiffusion.serve.params import GenerateParams, ReconstructParams, RenderParams
+from primdiffusion.serve.edit_params import InpaintParams, InterpolateParams, TransferParams, VaryParams
+from primdiffusion.serve.editing import Editor
+from primdiffusion.serve.params import AttributesParams, GenerateParams, ReconstructParams, RenderParams
 from primdiffusion.staging import staged, written_whole
-from primdiffusion.training.checkpoint import load_checkpoint
+from primdiffusion.training.checkpoint import load_checkpoint, read_card
 
 if TYPE_CHECKING:
     from primdiffusion.serve.reconstruction import Reconstructor
@@ -35,6 +38,7 @@ class Jobs:
         self._loaded: tuple[str | None, DiffusionModel] | None = None
         self._reconstructor: Reconstructor | None = None
         self._drawer = FrameDrawer(self._device)
+        self._editor = Editor(self._model, _step_reporter)
 
     def device_info(self) -> dict[str, Any]:
         """As `ready` and `hello` state it."""
@@ -51,23 +55,45 @@ class Jobs:
             report("load", 0, params.steps, None)
             model = self._model(params.checkpoint)
             report("sample", 0, params.steps, None)
-            human = generate(model, params.seed, params.steps, params.sampler, _step_reporter(report))
+            on_step = _step_reporter(report)
+            human = generate(
+                model, params.seed, params.steps, params.sampler, on_step, params.attributes, params.guidance
+            )
             sampled = time.perf_counter()
             report("write", params.steps, params.steps, None)
             write_person(folder, human, params.size)
             report("write", params.steps, params.steps, 0.0)  # the last chance to cancel
         return {
-            "human": str(out / FILES.blender),
-            "person": str(out / FILES.human),
-            "preview": str(out / FILES.front),
-            "side": str(out / FILES.side),
-            "depth": str(out / FILES.depth),
+            **FILES.in_folder(out),
             "seed": params.seed,
             "steps": params.steps,
             "seconds": round(time.perf_counter() - began, 3),
             "seconds_sampling": round(sampled - began, 3),
             "peak_gb": round(peak_memory_gb(), 3),
         }
+
+    def attributes(self, params: AttributesParams, report: Report) -> dict[str, Any]:
+        """What a checkpoint can be asked for: values of categories, mean and standard deviation of scalars.
+
+        Raises what read_card does.
+        """
+        return read_card(params.checkpoint).get("attributes", NOTHING.to_json())
+
+    def vary(self, params: VaryParams, report: Report) -> dict[str, Any]:
+        """Makes a neighbour of a person (see `Editor`, also for the next three)."""
+        return self._editor.vary(params, report)
+
+    def interpolate(self, params: InterpolateParams, report: Report) -> dict[str, Any]:
+        """Makes a person between two."""
+        return self._editor.interpolate(params, report)
+
+    def inpaint(self, params: InpaintParams, report: Report) -> dict[str, Any]:
+        """Makes a region of a person anew."""
+        return self._editor.inpaint(params, report)
+
+    def transfer(self, params: TransferParams, report: Report) -> dict[str, Any]:
+        """Gives a person another one's looks in a region."""
+        return self._editor.transfer(params, report)
 
     def reconstruct(self, params: ReconstructParams, report: Report) -> dict[str, Any]:
         """Makes a person of captures (see `Reconstructor.reconstruct`)."""

@@ -23,16 +23,26 @@ class GenerateParams:
     """A .safetensors file; None for the one that ships with the package."""
     size: int = 512
     """Pixels a side of the pictures."""
+    attributes: dict = dataclasses.field(default_factory=dict)
+    """What the person shall be: texts and numbers by name, of those that `attributes` tells."""
+    guidance: float = 1.5
+    """How strongly attributes are insisted on: 1 plainly, more at the cost of variety."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.seed <= LARGEST_SEED:
-            raise ValueError(f"seed {self.seed} is outside 0 ... 2^63-1")
-        if not 1 <= self.steps <= STEP_LIMIT:
-            raise ValueError(f"{self.steps} steps were asked for: choose 1 to {STEP_LIMIT}")
-        if self.size < 1:
-            raise ValueError(f"pictures of {self.size} pixels a side: choose 1 or more")
+        check_seed(self.seed)
+        check_steps(self.steps)
+        check_size(self.size)
+        check_attributes(self.attributes, self.guidance)
         if not self.out_dir:
             raise ValueError("out_dir is empty: name a folder")
+
+
+@dataclasses.dataclass(frozen=True)
+class AttributesParams:
+    """Parameters of attributes."""
+
+    checkpoint: str | None = None
+    """A .safetensors file; None for the one that ships with the package."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,8 +68,7 @@ class ReconstructParams:
             raise ValueError(f"frame {self.frame}: they are counted from 0")
         if self.views < 1:
             raise ValueError(f"{self.views} views were asked for: the encoder needs one or more")
-        if self.size < 1:
-            raise ValueError(f"pictures of {self.size} pixels a side: choose 1 or more")
+        check_size(self.size)
         for name in ("capture", "out_dir"):
             if not getattr(self, name):
                 raise ValueError(f"{name} is empty: name a folder")
@@ -87,3 +96,31 @@ class RenderParams:
             raise ValueError(f"a picture of {self.width} x {self.height} pixels: choose sides of 1 or more")
         if not math.isfinite(self.yaw):
             raise ValueError(f"yaw is {self.yaw}: give an angle in radians")
+
+
+def check_seed(seed: int) -> None:
+    """ValueError outside 0 ... 2^63-1."""
+    if not 0 <= seed <= LARGEST_SEED:
+        raise ValueError(f"seed {seed} is outside 0 ... 2^63-1")
+
+
+def check_steps(steps: int) -> None:
+    """ValueError outside 1 ... STEP_LIMIT."""
+    if not 1 <= steps <= STEP_LIMIT:
+        raise ValueError(f"{steps} steps were asked for: choose 1 to {STEP_LIMIT}")
+
+
+def check_size(size: int) -> None:
+    """ValueError for a picture without pixels."""
+    if size < 1:
+        raise ValueError(f"pictures of {size} pixels a side: choose 1 or more")
+
+
+def check_attributes(attributes: dict, guidance: float) -> None:
+    """ValueError unless the values are texts and finite numbers; which ones there are, the checkpoint knows."""
+    for name, value in attributes.items():
+        number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        if not (isinstance(value, str) or number):
+            raise ValueError(f"the attribute {name!r} is {value!r:.40}: give a text or a number")
+    if not math.isfinite(guidance):
+        raise ValueError(f"guidance is {guidance}: give a number, 1 for none")

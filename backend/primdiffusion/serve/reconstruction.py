@@ -49,7 +49,7 @@ class Reconstructor:
             write_person(folder, human, params.size)
             report("write", STEPS, STEPS, 0.0)  # the last chance to cancel
         return {
-            **{name: str(out / file) for name, file in _RESULTS.items()},
+            **FILES.in_folder(out),
             "subject": person.subject,
             "frame": person.frame,
             "views": list(person.cameras),
@@ -65,12 +65,3 @@ class Reconstructor:
             path = None if checkpoint is None else Path(checkpoint)
             self._loaded = (checkpoint, load_encoder(path, self._device))
         return self._loaded[1]
-
-
-_RESULTS = {
-    "human": FILES.blender,
-    "person": FILES.human,
-    "preview": FILES.front,
-    "side": FILES.side,
-    "depth": FILES.depth,
-}

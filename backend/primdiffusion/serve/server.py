@@ -1,7 +1,7 @@
 """The child's side of the conversation: JSON-RPC 2.0 on stdin and stdout, a message a line (docs/protocol.md).
 
     reader thread     parses lines; answers hello, cancel and shutdown itself, so they work while a person is sampled
-    main thread       loads torch, then runs one job at a time (generate, reconstruct, render, draw)
+    main thread       loads torch, then runs one job at a time (generate, edits, reconstruct, render, draw)
     heartbeat thread  a notification every 0.5 s, so that the other side can tell busy from hung
 
 `hello` answers before torch is loaded: `device` is null until a `ready` notification brings it (or `problem`, a
@@ -25,7 +25,8 @@ from primdiffusion import __version__
 from primdiffusion.failures import Failure, describe
 from primdiffusion.machine import memory, share_processors
 from primdiffusion.serve.draw_params import DrawParams
-from primdiffusion.serve.params import GenerateParams, ReconstructParams, RenderParams
+from primdiffusion.serve.edit_params import InpaintParams, InterpolateParams, TransferParams, VaryParams
+from primdiffusion.serve.params import AttributesParams, GenerateParams, ReconstructParams, RenderParams
 from primdiffusion.serve.rpc import (
     CANCELLED,
     DOMAIN_ERROR,
@@ -44,7 +45,17 @@ if TYPE_CHECKING:
 
 PROTOCOL = 1
 HEARTBEAT_S = 0.5
-JOBS = {"generate": GenerateParams, "reconstruct": ReconstructParams, "render": RenderParams, "draw": DrawParams}
+JOBS = {
+    "generate": GenerateParams,
+    "attributes": AttributesParams,
+    "vary": VaryParams,
+    "interpolate": InterpolateParams,
+    "inpaint": InpaintParams,
+    "transfer": TransferParams,
+    "reconstruct": ReconstructParams,
+    "render": RenderParams,
+    "draw": DrawParams,
+}
 """Methods of `Jobs`, which run on the main thread one at a time, and their parameters."""
 GRACE_S = 3.0
 """After the parent is gone a job has this long to reach its next step and tidy up; then the process ends anyway."""

@@ -1,0 +1,192 @@
+"""Edits of people with the real child: as the protocol promises them to anyone."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conversation import BUSY_STEPS, Conversation
+from editing_people import anybody
+from primdiffusion.editing.regions import region_from_weights, region_of
+from primdiffusion.human_file import load_human, save_human
+from tiny_model import VOCABULARY
+
+CANCELLED, DOMAIN_ERROR, INVALID_PARAMS = -32001, -32002, -32602
+RESULTS = ("human", "person", "preview", "side", "depth")
+
+
+@pytest.fixture(scope="module")
+def child():
+    child = Conversation()
+    yield child
+    child.close()
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory) -> dict[str, str]:
+    folder = tmp_path_factory.mktemp("people")
+    paths = {name: str(folder / f"{name}.human.safetensors") for name in ("ann", "bob")}
+    for seed, path in enumerate(paths.values(), 1):
+        save_human(path, anybody(seed))
+    return paths
+
+
+@pytest.fixture
+def asked(people, checkpoint, tmp_path) -> dict:
+    """Parameters that all edits take."""
+    out = str(tmp_path / "new" / "person ü")
+    return {"person": people["ann"], "out_dir": out, "steps": 3, "checkpoint": str(checkpoint), "size": 32}
+
+
+EDITS = {
+    "vary": {"amount": 0.4, "seed": 7},
+    "interpolate": {"other": "bob", "fraction": 0.25},
+    "inpaint": {"region": ["top"], "seed": 7, "attributes": {"outfit": "suit"}, "guidance": 2.0},
+    "transfer": {"source": "bob", "region": ["top", "left_foot"], "harmonise": 0.4, "seed": 7},
+}
+
+
+def parameters(method, people) -> dict:
+    return {
+        name: people.get(value, value) if isinstance(value, str) else value for name, value in EDITS[method].items()
+    }
+
+
+def outside(path, other, region) -> bool:
+    one, two = (load_human(file).payload for file in (path, other))
+    return all(torch.equal(getattr(one, name)[~region], getattr(two, name)[~region]) for name in ("rgb", "density"))
+
+
+@pytest.mark.parametrize("method", EDITS)
+def test_an_edit_reports_its_steps_and_leaves_whole_files(child, people, asked, method):
+    child.send(1, method, **asked, **parameters(method, people))
+    told = []
+    while "method" in (message := child.until(lambda m: m.get("method") == "progress" or m.get("id") == 1)):
+        told.append(message["params"])
+    assert [stage["stage"] for stage in told if stage["stage"] != "sample"] == ["load", "write", "write"]
+    sampled = [(stage["step"], stage["total"]) for stage in told if stage["stage"] == "sample"]
+    assert [step for step, _ in sampled] == list(range(len(sampled)))
+    assert sampled[-1][0] == sampled[-1][1], "the last step is the total"
+    result = message["result"]
+    for name in RESULTS:
+        assert Path(result[name]).parent == Path(asked["out_dir"])
+        assert Path(result[name]).stat().st_size > 0
+    assert result["steps"] == 3
+    assert result.get("seed") == EDITS[method].get("seed")
+    assert result["seconds"] >= result["seconds_sampling"] > 0
+    edits = load_human(result["person"]).provenance["edits"]
+    assert edits[0]["edit"].startswith(method)
+    with np.load(result["human"]) as human:
+        assert json.loads(str(human["meta"]))["edits"] == edits
+    assert not list(Path(asked["out_dir"]).glob(".*"))
+
+
+def test_outside_the_region_the_files_hold_the_same_bits(child, people, asked):
+    for method in ("inpaint", "transfer"):
+        result = child.ask(2, method, **asked, **parameters(method, people))["result"]
+        assert outside(result["person"], people["ann"], region_of(EDITS[method]["region"]))
+
+
+def test_a_region_may_be_painted(child, people, asked, tmp_path):
+    weights = np.zeros(12196, np.float32)
+    weights[:6000] = 1
+    np.savez(tmp_path / "painted.npz", weights=weights)
+    result = child.ask(3, "inpaint", **asked, region={"weights": str(tmp_path / "painted.npz")})["result"]
+    assert outside(result["person"], people["ann"], region_from_weights(torch.from_numpy(weights)))
+
+
+def test_a_plain_transfer_is_exact_and_needs_no_checkpoint(child, people, asked):
+    take = {**asked, "source": people["bob"], "region": ["top"], "checkpoint": "/nowhere.safetensors"}
+    top = region_of(["top"])
+    texture = load_human(child.ask(4, "transfer", **take)["result"]["person"])
+    garment = load_human(child.ask(5, "transfer", **take, what="garment")["result"]["person"])
+    ann, bob = load_human(people["ann"]), load_human(people["bob"])
+    assert torch.equal(texture.payload.rgb[top], bob.payload.rgb[top])
+    assert torch.equal(texture.payload.density, ann.payload.density)
+    assert torch.equal(garment.payload.density[top], bob.payload.density[top])
+
+
+def test_attributes_tells_what_generate_can_be_asked_for(child, checkpoint, asked):
+    known = child.ask(6, "attributes", checkpoint=str(checkpoint))["result"]
+    assert known == VOCABULARY.to_json()
+    (name, values), *_ = known["categories"].items()
+    made = {}
+    for value in values[:2]:
+        out = Path(asked["out_dir"]) / value
+        wanted = {"out_dir": str(out), "checkpoint": str(checkpoint), "steps": 2, "size": 32}
+        child.ask(7, "generate", seed=1, attributes={name: value}, guidance=3.0, **wanted)
+        made[value] = load_human(out / "person.human.safetensors")
+        assert made[value].provenance["attributes"] == {name: value}
+    first, second = made.values()
+    assert not torch.equal(first.payload.rgb, second.payload.rgb)
+
+
+@pytest.mark.parametrize("method", EDITS)
+def test_a_cancel_ends_an_edit_within_a_step_and_leaves_nothing(child, people, asked, method):
+    child.send(8, method, **{**asked, **parameters(method, people), "steps": BUSY_STEPS})
+    child.until(
+        lambda m: m.get("method") == "progress" and m["params"]["stage"] == "sample" and m["params"]["step"] > 1
+    )
+    child.send(9, "cancel", id=8)
+    assert child.answer(9)["result"] == {"cancelled": True}
+    steps = []
+
+    def ended(message):
+        if message.get("method") == "progress":
+            steps.append(message["params"]["step"])
+        return message.get("id") == 8
+
+    assert child.until(ended)["error"]["code"] == CANCELLED
+    assert len(steps) <= 1
+    assert not Path(asked["out_dir"]).parent.exists()
+
+
+@pytest.mark.parametrize(
+    ("method", "wrong", "code", "kind", "told"),
+    [
+        ("vary", {"person": "/nobody.human.safetensors"}, DOMAIN_ERROR, "missing_file", "there is no person in"),
+        ("vary", {"attributes": {"species": "cat"}}, DOMAIN_ERROR, "bad_input", "knows no attribute 'species'"),
+        ("vary", {"attributes": {"outfit": None}}, INVALID_PARAMS, None, "the attribute 'outfit' is None"),
+        ("vary", {"attributes": ["outfit"]}, INVALID_PARAMS, None, "'attributes' of 'vary' must be dict"),
+        ("vary", {"amount": 1.5}, INVALID_PARAMS, None, "amount is 1.5"),
+        ("vary", {"seed": "seven"}, INVALID_PARAMS, None, "'seed' of 'vary' must be int: 'seven' was given"),
+        ("vary", {"seed": 2**63}, INVALID_PARAMS, None, "outside 0 ... 2^63-1"),
+        ("vary", {"steps": 0}, INVALID_PARAMS, None, "0 steps"),
+        ("vary", {"steps": 1001}, INVALID_PARAMS, None, "1001 steps"),
+        ("vary", {"out_dir": ""}, INVALID_PARAMS, None, "out_dir is empty"),
+        ("vary", {"checkpoint": "/nowhere.safetensors"}, DOMAIN_ERROR, "missing_file", "no checkpoint at"),
+        ("interpolate", {"steps": 1}, INVALID_PARAMS, None, "2 or more"),
+        ("interpolate", {"fraction": -1}, INVALID_PARAMS, None, "fraction is -1"),
+        ("inpaint", {"region": []}, INVALID_PARAMS, None, "give a list of names of parts"),
+        ("inpaint", {"region": [1]}, INVALID_PARAMS, None, "give a list of names of parts"),
+        ("inpaint", {"region": {"vertices": "x"}}, INVALID_PARAMS, None, "give a list of names of parts"),
+        ("inpaint", {"region": "top"}, INVALID_PARAMS, None, "must be list"),
+        ("inpaint", {"region": ["hat"]}, DOMAIN_ERROR, "bad_input", "no part of the body 'hat'"),
+        ("inpaint", {"region": ["clothes", "skin", "hair"]}, DOMAIN_ERROR, "bad_input", "the whole person"),
+        ("inpaint", {"region": {"weights": "/no.npz"}}, DOMAIN_ERROR, "missing_file", "no painted weights in"),
+        ("transfer", {"what": "soul"}, INVALID_PARAMS, None, "choose from texture, garment"),
+        ("transfer", {"source": "/nobody.human.safetensors"}, DOMAIN_ERROR, "missing_file", "there is no person in"),
+    ],
+)
+def test_a_refusal_names_what_was_wrong_and_leaves_nothing(child, people, asked, method, wrong, code, kind, told):
+    error = child.ask(10, method, **{**asked, **parameters(method, people), **wrong})["error"]
+    assert error["code"] == code
+    assert told in error["message"]
+    assert "\n" not in error["message"]
+    assert (error.get("data") or {}).get("kind") == kind
+    assert not Path(asked["out_dir"]).parent.exists()
+
+
+def test_a_missing_parameter_is_named(child, people):
+    error = child.ask(11, "interpolate", person=people["ann"], out_dir="x")["error"]
+    assert (error["code"], "'other'" in error["message"]) == (INVALID_PARAMS, True)
+
+
+def test_painted_weights_of_another_body_are_refused(child, asked, tmp_path):
+    np.savez(tmp_path / "smpl.npz", weights=np.ones(6890))
+    error = child.ask(12, "inpaint", **asked, region={"weights": str(tmp_path / "smpl.npz")})["error"]
+    assert "each of the body's 12196 vertices" in error["message"]
+    np.savez(tmp_path / "none.npz", weights=np.zeros(12196))
+    error = child.ask(13, "inpaint", **asked, region={"weights": str(tmp_path / "none.npz")})["error"]
+    assert "covers no primitive" in error["message"]
