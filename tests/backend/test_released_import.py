@@ -1,5 +1,6 @@
 """An imported checkpoint is used like our own, on the user's SMPL body, of which no file of ours holds anything."""
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -11,12 +12,16 @@ import safetensors.torch
 import torch
 from primdiffusion import cli
 from primdiffusion.body.smpl_files import load_body
-from primdiffusion.human import generate, place, place_skinned
+from primdiffusion.drawing.draw import draw
+from primdiffusion.drawing.scene import Look, Scene
+from primdiffusion.human import framing, generate, place, place_skinned
 from primdiffusion.human_file import HumanFileError, load_human, save_human
 from primdiffusion.primitives.anchors import build_anchors
-from primdiffusion.primitives.primitives import K
+from primdiffusion.primitives.primitives import K, Payload
 from primdiffusion.primitives.stand import StandError, stand_of_files
 from primdiffusion.released.conventions import ReleasedSlab, released_steps
+from primdiffusion.serve.draw_params import DrawParams, PersonParams
+from primdiffusion.serve.drawing import FrameDrawer, map_frame
 from primdiffusion.training.checkpoint import CheckpointError, load_checkpoint, read_card
 from released_files import TINY, body_arrays, random_network, save_body, save_released, stage_one, state, template
 
@@ -96,6 +101,28 @@ def test_a_saved_person_comes_back_on_the_same_body(person, folder):
     cli.run(["render", str(person / "person.human.safetensors"), "--out", str(picture), "--size", "32"])
     assert picture.read_bytes() == (person / "front.png").read_bytes()
     picture.unlink()
+
+
+def test_the_engines_frames_and_boxes_show_people_on_the_users_body(person, tmp_path):
+    human = load_human(person / "person.human.safetensors")
+    generator = torch.Generator().manual_seed(0)
+    payload = Payload(torch.rand(K, 3, 8, 8, 8, generator=generator), torch.full((K, 8, 8, 8), 90.0), torch.ones(K, 3))
+    human = dataclasses.replace(human, payload=payload)
+    save_human(tmp_path / "a.human.safetensors", human)
+    primitives, still = place(human), torch.eye(3, 4).tolist()
+    camera = framing(primitives, 0.4, 40, 56)
+    for view, chart in (("colour", None), ("boxes", human.stand.anchors.chart)):
+        np.full(40 * 56 * 5, np.nan, np.float32).tofile(tmp_path / "frame")
+        params = DrawParams(
+            frame=str(tmp_path / "frame"), width=40, height=56, view=view, intrinsics=camera.intrinsics.tolist(),
+            world_to_camera=camera.world_to_camera.tolist(),
+            people=[PersonParams(str(tmp_path / "a.human.safetensors"), still, [still] * 24)],
+        )  # fmt: skip
+        FrameDrawer(torch.device("cpu")).draw(params, lambda *_: None)
+        want = draw(Scene(primitives, chart=chart), camera, Look(view, clip=(0.0, 1e10)))
+        found = map_frame(params.frame, 40, 56).combined
+        assert (want.combined[..., 3] > 0.5).mean() > 0.2
+        assert np.abs(found - want.combined).mean() < 2e-3
 
 
 def test_no_file_of_ours_holds_any_of_smpl(person, folder):

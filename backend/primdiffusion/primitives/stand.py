@@ -10,7 +10,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Iterable
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 from jaxtyping import Float
 from torch import Tensor
@@ -98,7 +98,8 @@ def find_stand(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], beside:
 
 
 def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> _Stamp:
-    paths = [Path(file.path), *(folder / Path(file.path).name for folder in folders)]
+    name = PureWindowsPath(file.path).name  # of paths of any system
+    paths = [Path(file.path), *(folder / name for folder in folders)]
     there = [path for path in paths if path.is_file()]
     for path in there:
         stamp = _Stamp.of(path)
