@@ -137,8 +137,9 @@ def humans(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
 def human_of(thing: bpy.types.Object | None, scene: bpy.types.Scene) -> bpy.types.Collection | None:
     """The person that an object is a part of, hangs on (a hat parented to a bone), or instances; None for others."""
     while thing is not None:
+        around = set(thing.users_collection)
         for collection in humans(scene):
-            if collection.all_objects.get(thing.name) == thing:
+            if not around.isdisjoint([collection, *collection.children_recursive]):
                 return collection
         if thing.instance_collection is not None and MARK in thing.instance_collection:
             return thing.instance_collection

@@ -15,7 +15,7 @@ from ..scene.body_mesh import body_of
 from ..scene.human import humans, person_file
 from ..scene.painted import painted_weights
 from .attributes import asked, parsed
-from .edit_settings import parts_property
+from .edit_settings import TRANSFER_ITEMS, parts_property
 from .edit_target import named_person, selected_person
 from .generation import Busy, session
 from .operators import see_through
@@ -95,13 +95,16 @@ class PRIMDIFFUSION_OT_vary(_Edit, bpy.types.Operator):
     attributes: bpy.props.StringProperty(
         name="Attributes", description="Like sex=female, height=1.7; empty: whatever comes", options=_SKIP
     )
+    guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=_PANELS, options=_SKIP)
 
     def params(self, context: bpy.types.Context, _person: bpy.types.Collection) -> dict[str, Any]:
         """Of the child's method vary."""
         settings = context.scene.primdiffusion_edit
         params = {"amount": self.chosen("amount", settings), "seed": self.chosen("seed", settings)}
         wanted = parsed(self.attributes)
-        return {**params, "attributes": wanted} if wanted else params
+        if wanted:
+            params |= {"attributes": wanted, "guidance": self.chosen("guidance", context.scene.primdiffusion)}
+        return params
 
 
 class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
@@ -126,13 +129,14 @@ class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
-    """Give a region of the selected person the looks of another one"""
+    """Give a region of the selected person the texture of another one, or the garment"""
 
     bl_idname = "primdiffusion.transfer_texture"
     bl_label = "Transfer Texture"
     method = "transfer"
 
     source: bpy.props.StringProperty(name="Source", description=f"Name of the other person. {_PANELS}", options=_SKIP)
+    what: bpy.props.EnumProperty(name="Transfer", items=TRANSFER_ITEMS, description=_PANELS, options=_SKIP)
     harmonise: bpy.props.FloatProperty(name="Harmonise", min=0.0, max=1.0, description=_PANELS, options=_SKIP)
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
@@ -141,6 +145,7 @@ class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
         return {
             "source": _other(context, person, self.source),
             "region": self.region(settings, person),
+            "what": self.chosen("what", settings),
             "harmonise": self.chosen("harmonise", settings),
             "seed": self.chosen("seed", settings),
         }

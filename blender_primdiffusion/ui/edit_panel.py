@@ -71,6 +71,7 @@ def _draw_transfer(layout: bpy.types.UILayout, settings, context) -> None:
     """From whom, where, and the button."""
     layout.prop(settings, "other")
     _draw_region(layout, settings, context)
+    layout.row().prop(settings, "what", expand=True)
     layout.prop(settings, "harmonise")
     draw_job(layout, "transfer", "primdiffusion.transfer_texture", "TEXTURE")
 

@@ -5,11 +5,17 @@ from __future__ import annotations
 import bpy
 
 from ..scene.human import MARK, humans
-from ..worker.names import PARTS
+from ..worker.names import PARTS, TRANSFERS
 from .attributes import PRIMDIFFUSION_PG_attributes, title
 
 PAINTED_GROUP = "PrimDiffusion Region"
 """Vertex group of the body mesh that Paint Region makes."""
+
+_TRANSFERS = {
+    "texture": ("Texture", "Colours alone, on the person's own shape"),
+    "garment": ("Garment", "Colours and shape: what the other person wears there"),
+}
+TRANSFER_ITEMS = [(name, *_TRANSFERS[name]) for name in TRANSFERS]
 
 
 def parts_property():
@@ -57,6 +63,7 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
     other: bpy.props.PointerProperty(
         name="Other Person", description="From whom", type=bpy.types.Collection, poll=_may_be_other
     )
+    what: bpy.props.EnumProperty(name="Transfer", description="What the person gets", items=TRANSFER_ITEMS)
     harmonise: bpy.props.FloatProperty(
         name="Harmonise",
         description="How much the region is denoised once more to fit the rest of the person: 0 copies it exactly",

@@ -27,6 +27,7 @@ STAGES = {
     "write": "Writing the person",
 }
 
+_PICTURE_PX = 16
 EDITS = {"vary": "Varied", "interpolate": "Blended", "inpaint": "Re-dressed", "transfer": "Texture transferred"}
 """Methods of the child that make a person of a person, and what became of them."""
 
@@ -261,14 +262,14 @@ class PersonJob:
 
 
 class SamplingJob(PersonJob):
-    """A person whom the diffusion model draws; progress counts the sampler's steps."""
+    """A person whom the diffusion model draws; progress counts the sampler's steps. Its pictures are of no use here."""
 
     def __init__(
         self, backend: Backend, params: dict[str, Any], *, out_dir: Path, steps: int, checkpoint: Path | None = None
     ):
         if checkpoint is not None:
             params = {**params, "checkpoint": str(checkpoint)}
-        super().__init__(backend, {**params, "steps": steps}, out_dir, steps)
+        super().__init__(backend, {**params, "steps": steps, "size": _PICTURE_PX}, out_dir, steps)
 
     def _take_step(self, stage: str, step: int, total: int) -> None:
         if stage == "sample":

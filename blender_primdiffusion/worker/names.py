@@ -4,6 +4,8 @@ from __future__ import annotations
 
 SAMPLERS = ("ddim", "dpmpp_2m", "ddpm")
 """How noise can be taken away; the first is the default."""
+TRANSFERS = ("texture", "garment")
+"""What one person can get from another; the first is the default."""
 WHOLE_PARTS = (
     "face", "hair", "neck", "torso", "upper_arms", "forearms", "hands", "thighs", "shins", "feet", "hips",
     "head", "arms", "legs", "top", "bottom", "shoes", "clothes", "skin",

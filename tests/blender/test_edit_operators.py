@@ -43,7 +43,7 @@ def paths(person) -> list[str]:
 def sent(person) -> dict:
     """What the child was asked, but for the folder of the job."""
     asked = json.loads(person_file(person).read_bytes())
-    del asked["out_dir"]
+    del asked["out_dir"], asked["size"]
     return asked
 
 
@@ -106,14 +106,14 @@ def test_redress_changes_the_volumes_of_the_region_alone(person):
 def test_what_a_script_does_not_give_is_the_panels(person):
     panel = bpy.context.scene.primdiffusion_edit
     panel.seed, panel.parts, panel.harmonise = FINE, {"hair", "face"}, 0.5
-    panel.other = humans(bpy.context.scene)[1]
+    panel.what, panel.other = "garment", humans(bpy.context.scene)[1]
     bpy.context.scene.primdiffusion.steps = 2
     ops.transfer_texture()
     source = person_file(panel.other)
     asked = sent(person)
     del asked["person"]
-    expected = {"source": str(source), "region": ["face", "hair"], "harmonise": 0.5, "seed": FINE, "steps": 2}
-    assert asked == expected
+    where = {"source": str(source), "region": ["face", "hair"], "what": "garment"}
+    assert asked == {**where, "harmonise": 0.5, "seed": FINE, "steps": 2}
 
 
 def test_a_blend_moves_the_body_where_the_betas_differ(person):

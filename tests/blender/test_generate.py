@@ -49,7 +49,7 @@ def test_generate_builds_a_person_and_keeps_the_backends_file_beside_its_volumes
     assert sum(o.type == "VOLUME" for o in person.all_objects) == 8
     sent = json.loads((folder_of(person) / "person.human.safetensors").read_bytes())
     assert Path(sent.pop("out_dir")).name.startswith("generate_")
-    assert sent == {"seed": 7, "steps": 3, "sampler": "ddim"}
+    assert sent == {"seed": 7, "steps": 3, "sampler": "ddim", "size": 16}
     assert not session.busy
     assert session.error == ""
     assert session.device == "fake device"
