@@ -29,6 +29,7 @@ FORMAT = "primdiffusion-checkpoint"
 ENCODER_FORMAT = "primdiffusion-encoder"
 """Of encoders' files, which `encoder_checkpoint` reads."""
 FORMAT_VERSION = 2
+_READABLE = {FORMAT: ("1", str(FORMAT_VERSION)), ENCODER_FORMAT: ("1",)}
 _HALVED = ("codec.mean", "denoiser.")
 _WHOLE = ("prior_variance", "prior_log_weight")
 
@@ -183,9 +184,7 @@ def _read_metadata(path: Path, formats: Sequence[str] = (FORMAT,)) -> dict[str, 
         raise CheckpointError(
             f"{path} is a safetensors file of format {metadata.get('format')!r}, not {FORMAT!r}: choose another file"
         )
-    if metadata.get("format") == FORMAT and metadata.get("format_version") == "1":
-        return metadata
-    if metadata.get("format_version") != str(FORMAT_VERSION):
+    if metadata.get("format_version") not in _READABLE[metadata["format"]]:
         version = metadata.get("format_version")
         raise CheckpointError(
             f"{path} has format version {version}, this program reads {FORMAT_VERSION}: use the matching release"
