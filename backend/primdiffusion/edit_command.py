@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from primdiffusion.editing.shares import check_share
+
 if TYPE_CHECKING:
     from jaxtyping import Bool
     from torch import Tensor
@@ -161,8 +163,7 @@ class Transfer(EditRegion):
         from primdiffusion.editing.transfer import transfer_garment, transfer_texture
         from primdiffusion.human_file import load_human
 
-        if not 0 <= self.harmonise <= 1:
-            raise ValueError(f"harmonise is {self.harmonise}: choose a number from 0 to 1")
+        check_share("harmonise", self.harmonise)
         region, source = self.chosen(human), load_human(self.source)
         edited = (transfer_garment if self.what == "garment" else transfer_texture)(source, human, region)
         if not self.harmonise:

@@ -115,11 +115,11 @@ def test_edits_go_down_from_the_level_of_their_amount():
 @pytest.mark.parametrize("name", EDITS)
 def test_steps_and_seeds_out_of_range_are_refused_before_any_work(human, name, wrong, told):
     with pytest.raises(ValueError, match=told):
-        EDITS[name](None_that_works(), human, **wrong)
+        EDITS[name](model_that_must_not_work(), human, **wrong)
 
 
-def None_that_works():
-    """A model whose denoiser must not be reached."""
+def model_that_must_not_work():
+    """Its denoiser must not be reached."""
     model = small_model()
 
     def denoise(*_):
@@ -132,9 +132,9 @@ def None_that_works():
 @pytest.mark.parametrize("amount", [-0.1, 1.1, float("nan")])
 def test_an_amount_that_is_no_share_is_refused(human, amount):
     with pytest.raises(ValueError, match="choose a number from 0 to 1"):
-        vary(None_that_works(), human, amount)
+        vary(model_that_must_not_work(), human, amount)
     with pytest.raises(ValueError, match="choose a number from 0 to 1"):
-        harmonise(None_that_works(), human, TOP, amount)
+        harmonise(model_that_must_not_work(), human, TOP, amount)
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_an_amount_that_is_no_share_is_refused(human, amount):
 )
 def test_a_region_that_cannot_be_made_anew_is_refused(human, region, told):
     with pytest.raises(ValueError, match=told):
-        inpaint(None_that_works(), human, region)
+        inpaint(model_that_must_not_work(), human, region)
 
 
 @pytest.mark.parametrize("edit", ["vary", "inpaint"])
@@ -287,7 +287,7 @@ def test_the_arc_keeps_the_distance_from_the_middle():
 )
 def test_an_interpolation_out_of_range_is_refused(human, other, wrong, told):
     with pytest.raises(ValueError, match=told):
-        interpolate(None_that_works(), human, other, **wrong)
+        interpolate(model_that_must_not_work(), human, other, **wrong)
 
 
 def test_people_of_different_density_scales_are_not_interpolated(human, other):

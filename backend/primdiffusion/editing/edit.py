@@ -14,6 +14,7 @@ from torch import Tensor
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import Denoise, Step
 from primdiffusion.diffusion.schedule import Schedule, trailing_steps
+from primdiffusion.editing.shares import check_share
 from primdiffusion.human import Human
 from primdiffusion.primitives.primitives import Payload
 from primdiffusion.primitives.stand import Stand
@@ -62,12 +63,6 @@ def asked(model: DiffusionModel, attributes: Mapping[str, str | float], guidance
         return model.denoise(x, t, condition, guidance)
 
     return denoise
-
-
-def check_share(name: str, value: float) -> None:
-    """ValueError unless `value` lies in 0 ... 1."""
-    if not 0 <= value <= 1:
-        raise ValueError(f"{name} is {value}: choose a number from 0 to 1")
 
 
 def chain_down(schedule: Schedule, amount: float, steps: int) -> list[int]:

@@ -17,7 +17,6 @@ from primdiffusion.diffusion.schedule import Schedule
 from primdiffusion.editing.edit import (
     OnStep,
     added,
-    check_share,
     decoded,
     difference,
     encoded,
@@ -25,6 +24,7 @@ from primdiffusion.editing.edit import (
     last,
     with_edit,
 )
+from primdiffusion.editing.shares import check_share
 from primdiffusion.human import Human, made_by
 from primdiffusion.primitives.primitives import Payload
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from primdiffusion.editing.shares import check_share
 from primdiffusion.serve.params import check_attributes, check_seed, check_size, check_steps
 
 TRANSFERS = ("texture", "garment")
@@ -100,12 +101,6 @@ class TransferParams(EditParams):
         check_seed(self.seed)
         if self.what not in TRANSFERS:
             raise ValueError(f"there is no transfer of {self.what!r}: choose from {', '.join(TRANSFERS)}")
-
-
-def check_share(name: str, value: float) -> None:
-    """ValueError unless `value` lies in 0 ... 1."""
-    if not 0 <= value <= 1:
-        raise ValueError(f"{name} is {value}: choose a number from 0 to 1")
 
 
 def check_region(region: list | dict) -> None:
