@@ -346,7 +346,7 @@ def _import_released(arguments: Sequence[str]) -> None:
 
 
 def _evaluate(arguments: Sequence[str]) -> None:
-    from primdiffusion.evaluation.command import TrainedReconstructor, run
+    from primdiffusion.evaluation.command import StageTwo, TrainedReconstructor, run
 
     def load(path: Path | None) -> TrainedReconstructor:
         from primdiffusion.machine import best_device
@@ -354,7 +354,14 @@ def _evaluate(arguments: Sequence[str]) -> None:
 
         return load_encoder(path, best_device())
 
-    run(arguments, load)
+    def stage_two() -> StageTwo:
+        from primdiffusion.machine import best_device
+        from primdiffusion.training.checkpoint import load_checkpoint
+        from primdiffusion.training.latents import find_people, read_person, split_people
+
+        return StageTwo(lambda path: load_checkpoint(path, best_device()), find_people, split_people, read_person)
+
+    run(arguments, load, stage_two)
 
 
 FORWARDED = {

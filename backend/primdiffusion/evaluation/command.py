@@ -6,13 +6,17 @@ import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import tyro
 from tqdm import tqdm
 
 from primdiffusion import __version__
 from primdiffusion.evaluation.reconstruction import Reconstructor
+
+if TYPE_CHECKING:
+    from primdiffusion.diffusion.model import DiffusionModel
+    from primdiffusion.evaluation.gallery import ReadPerson
 
 DESCRIPTION = "How good trained models are."
 
@@ -89,6 +93,82 @@ class EvaluateReconstruction:
         print(table(means))
 
 
+@dataclasses.dataclass(frozen=True)
+class StageTwo:
+    """What of training the evaluation of generated people needs; given by its caller, as `LoadEncoder` is."""
+
+    load_model: Callable[[Path | None], DiffusionModel]
+    """Reads a checkpoint, None: the package's own."""
+    find_people: Callable[[Path], Sequence[Path]]
+    split_people: Callable[[Sequence[Path], float, int], tuple[list[Path], list[Path]]]
+    """By the share that is held out and a seed."""
+    read_person: ReadPerson
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateGeneration:
+    """Compare generated people with people the model was not trained on, in a feature space of their attributes.
+
+    Also tells whether they are copies: how far they are from training people, beside how far new people are.
+    """
+
+    people: Path
+    """Folder of the payloads that the model was trained on, those held out among them."""
+    judge: Path
+    """Folder for portraits and feature network; what is not there is made, which takes minutes."""
+    checkpoint: Path | None = None
+    """Model (.safetensors); without it the one that comes with the package."""
+    count: int = 256
+    """People to generate, of successive seeds."""
+    first_seed: int = 0
+    """The first of them."""
+    steps: int = 30
+    """Sampling steps."""
+    holdout: float = 0.05
+    """Share of people that was held out in training."""
+    seed: int = 0
+    """Seed of the training run."""
+    json: Path | None = None
+    """File for the figures."""
+
+    def run(self, stage_two: StageTwo) -> None:
+        """Evaluates, and prints a table.
+
+        Raises:
+            ValueError, FileNotFoundError: people or checkpoint are missing, damaged or too few.
+        """
+        from primdiffusion.evaluation.attribute_network import features_of
+        from primdiffusion.evaluation.distances import NEIGHBOURS
+        from primdiffusion.evaluation.gallery import made_gallery
+        from primdiffusion.evaluation.generation import floor, liken, open_judge, table
+        from primdiffusion.human import generate, place
+
+        if self.count <= NEIGHBOURS:
+            raise ValueError(
+                f"count is {self.count}: ask for more than {NEIGHBOURS} people, or nothing can be compared"
+            )
+        train, held = stage_two.split_people(stage_two.find_people(self.people), self.holdout, self.seed)
+        model = stage_two.load_model(self.checkpoint)
+        with tqdm(unit="person", disable=None) as bar:
+
+            def report(done: int, total: int) -> None:
+                bar.update(1)
+
+            judge = open_judge(train, held, self.judge, stage_two.read_person, report)
+        with tqdm(range(self.first_seed, self.first_seed + self.count), unit="person", disable=None) as seeds:
+            made = made_gallery(place(generate(model, seed, self.steps)) for seed in seeds)
+        rows = {"generated": liken(judge, features_of(judge.network, made)), "trained on": floor(judge, self.count)}
+        if self.json is not None:
+            record = {
+                "version": __version__,
+                "checkpoint": dict(model.card),
+                "people": {name: dataclasses.asdict(row) for name, row in rows.items()},
+                "feature_accuracy": judge.held_accuracies,
+            }
+            _write(self.json, record)
+        print(table(rows))
+
+
 def _write(path: Path, record: Mapping[str, Any]) -> None:
     from primdiffusion.staging import written_whole
 
@@ -97,10 +177,15 @@ def _write(path: Path, record: Mapping[str, Any]) -> None:
         unfinished.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
 
-def run(arguments: Sequence[str], load_encoder: LoadEncoder) -> None:
-    """Parses and runs one line."""
-    commands = {"reconstruction": EvaluateReconstruction}
+def run(arguments: Sequence[str], load_encoder: LoadEncoder, stage_two: Callable[[], StageTwo] | None = None) -> None:
+    """Parses and runs one line; without `stage_two` only reconstructions can be evaluated."""
+    commands: dict[str, Any] = {"reconstruction": EvaluateReconstruction}
+    if stage_two is not None:
+        commands["generation"] = EvaluateGeneration
     command = tyro.extras.subcommand_cli_from_dict(
         commands, prog="primdiffusion evaluate", description=DESCRIPTION, args=arguments or ["--help"]
     )
-    command.run(load_encoder)
+    if stage_two is not None and isinstance(command, EvaluateGeneration):
+        command.run(stage_two())
+    else:
+        command.run(load_encoder)

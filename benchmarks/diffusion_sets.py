@@ -1,0 +1,76 @@
+"""The sets of people that benchmarks/diffusion.py compares: all in T pose, made one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import torch
+from primdiffusion.diffusion.denoiser import PersonDenoiser
+from primdiffusion.diffusion.model import DiffusionModel, seeded
+from primdiffusion.evaluation.gallery import payload_of
+from primdiffusion.evaluation.voxel_baseline import VoxelModel
+from primdiffusion.evaluation.voxel_grid import primitives_of, voxelise_payload
+from primdiffusion.human import Human, generate_batch, place
+from primdiffusion.people.payloads import rest_frames
+from primdiffusion.primitives.primitives import Payload, Primitives
+from primdiffusion.training.latents import read_person
+
+TOGETHER = 8
+"""People that are sampled at once."""
+
+
+def generated(model: DiffusionModel, seeds: Sequence[int]) -> Iterator[Human]:
+    """Ours, by the default sampler and steps."""
+    for first in range(0, len(seeds), TOGETHER):
+        yield from generate_batch(model, seeds[first : first + TOGETHER])
+
+
+def gaussian(model: DiffusionModel, seeds: Sequence[int]) -> Iterator[Human]:
+    """Draws of the Gaussian with the mean and covariance of the training people, by the same codec and body shapes."""
+    if not isinstance(model.denoiser, PersonDenoiser):
+        raise TypeError("only the default architecture holds a Gaussian of its training people")
+    prior = model.denoiser.prior.gaussian()
+    for seed in seeds:
+        x0 = prior.sample(1, seeded(seed, model.device))
+        yield Human(model.decode(x0[0]), model.betas(x0, [seed])[0], {"seed": seed}).to("cpu")
+
+
+def placed(people: Iterator[Human]) -> Iterator[Primitives]:
+    """In T pose."""
+    return (place(human) for human in people)
+
+
+def voxels(model: VoxelModel, seeds: Sequence[int]) -> Iterator[Primitives]:
+    """The baseline's."""
+    return (model.primitives(grid) for grid in model.sample(seeds))
+
+
+def decoded(model: DiffusionModel, paths: Sequence[Path]) -> Iterator[Primitives]:
+    """Stored people after the codec alone: what a perfect denoiser could at best make."""
+    for path in paths:
+        person = read_person(path)
+        frames = rest_frames(person.betas.numpy())
+        for number in range(len(person.voxels)):
+            yield Primitives.place(frames, plain(model.decode(model.encode(payload_of(person, number)))))
+
+
+def plain(payload: Payload) -> Payload:
+    """On the CPU, fit for the marcher."""
+    return payload.to("cpu").map(lambda tensor: tensor.clone())
+
+
+def stored_voxels(paths: Sequence[Path], model: VoxelModel | None = None) -> Iterator[Primitives]:
+    """Stored people as grids of 64^3 voxels: what that representation can at best show; of a model after its codec."""
+    for path in paths:
+        person = read_person(path)
+        frames = rest_frames(person.betas.numpy())
+        for number in range(len(person.voxels)):
+            grid = voxelise_payload(frames, payload_of(person, number), person.full_density)
+            shown = grid.float() / 255 if model is None else model.codec.decode(model.codec.encode(grid))
+            yield primitives_of(shown, person.full_density)
+
+
+def seeds_of(count: int, first: int = 0) -> list[int]:
+    """Successive seeds; nobody is picked."""
+    return torch.arange(first, first + count).tolist()

@@ -1,0 +1,156 @@
+"""Generated people before the judge: stored people's portraits, copies told from new people, the command."""
+
+import json
+
+import pytest
+import torch
+from diffusion_people import write_people
+from primdiffusion.evaluation import command
+from primdiffusion.evaluation.attribute_network import features_of
+from primdiffusion.evaluation.gallery import made_gallery, payload_of, read_attributes, stored_gallery
+from primdiffusion.evaluation.generation import COLUMNS, floor, liken, open_judge, table
+from primdiffusion.evaluation.neighbours import nearest_stored
+from primdiffusion.evaluation.portraits import PORTRAITS, SIDE, camera_of
+from primdiffusion.people.payloads import rest_frames
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.training.latents import find_people, read_person, split_people
+from tiny_model import tiny_model
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("people")
+    write_people(folder, 6)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def judge_folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("judge")
+
+
+@pytest.fixture(scope="module")
+def judge(people, judge_folder):
+    train, held = split_people(find_people(people), 0.34, 0)
+    return open_judge(train, held, judge_folder, read_person)
+
+
+def test_cameras_see_the_parts_they_are_named_for():
+    head = camera_of(PORTRAITS[-1])
+    for portrait in PORTRAITS[:3]:
+        pixels, _ = camera_of(portrait).project(torch.tensor([[0.0, 0.72, 0.1], [0.0, -1.3, 0.1]]))
+        assert 0 < float(pixels.min()) < float(pixels.max()) < SIDE
+    pixels, _ = head.project(torch.tensor([[0.0, 0.55, 0.1], [0.0, -0.2, 0.1]]))
+    assert 0 < float(pixels[0].min()) < float(pixels[0].max()) < SIDE
+    assert float(pixels[1, 1]) > SIDE
+    left, _ = camera_of(PORTRAITS[2]).project(torch.tensor([[0.0, 0.0, 0.3]]))
+    assert float(left[0, 0]) < SIDE / 2
+
+
+def test_portraits_of_stored_people_are_kept_and_not_drawn_again(people, tmp_path):
+    paths = find_people(people)[:2]
+    first = stored_gallery(paths, tmp_path, read_person)
+
+    def unread(path):
+        raise AssertionError(path)
+
+    again = stored_gallery(paths, tmp_path, unread)
+    assert torch.equal(first.pictures, again.pictures)
+    assert first.geometry.tolist() == [0, 0, 1, 1]
+    assert again.attributes[2] == {"outfit": "outfit1"}
+
+
+def test_damaged_portraits_are_drawn_again(people, tmp_path):
+    paths = find_people(people)[:1]
+    first = stored_gallery(paths, tmp_path, read_person)
+    (tmp_path / paths[0].name).write_bytes(b"half a file")
+    assert torch.equal(stored_gallery(paths, tmp_path, read_person).pictures, first.pictures)
+
+
+def test_stored_portraits_are_of_the_stored_payload(people, tmp_path):
+    path = find_people(people)[3]
+    person = read_person(path)
+    drawn = made_gallery([Primitives.place(rest_frames(person.betas.numpy()), payload_of(person, 1))])
+    assert torch.equal(stored_gallery([path], tmp_path, read_person).pictures[1], drawn[0])
+    assert int((drawn[..., 3] > 128).sum()) > 500
+
+
+def test_a_file_without_attributes_is_named(tmp_path):
+    (tmp_path / "person.npz").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match=r"person\.npz is no person's payload"):
+        read_attributes(tmp_path / "person.npz", 1)
+
+
+def test_copies_of_training_people_are_told_from_new_people(judge):
+    copies = liken(judge, judge.train_features)
+    assert copies.nearest_ratio == pytest.approx(0, abs=1e-6)
+    assert liken(judge, judge.held_features).nearest_ratio == pytest.approx(1)
+    assert floor(judge, 8).nearest_ratio > 0.05
+
+
+def test_people_far_from_all_real_ones_are_far_and_not_precise(judge):
+    real = floor(judge, 8)
+    strange = liken(judge, judge.held_features + 100 * judge.train_features.std())
+    assert strange.frechet > 10 * real.frechet
+    assert strange.kernel > real.kernel
+    assert strange.precision == 0
+
+
+def test_judge_is_read_back_from_its_folder(people, judge, judge_folder):
+    def unread(path):
+        raise AssertionError(path)
+
+    train, held = split_people(find_people(people), 0.34, 0)
+    again = open_judge(train, held, judge_folder, unread)
+    assert torch.equal(judge.held_features, again.held_features)
+    assert torch.equal(features_of(again.network, again.train.pictures), again.train_features)
+
+
+def test_table_has_a_row_for_each_set(judge):
+    lines = table({"one": liken(judge, judge.held_features)}).splitlines()
+    assert len({line.count("|") for line in lines}) == 1
+    assert lines[0].count("|") == len(COLUMNS) + 2
+    assert lines[2].startswith("| one | 4 |")
+
+
+def test_nearest_stored_person_of_a_stored_person_is_that_person(people):
+    paths, model = find_people(people), tiny_model()
+    queries = torch.stack([model.encode(payload_of(read_person(paths[number]), 1)).flatten() for number in (4, 2)])
+    found = nearest_stored(queries, paths, read_person, model.encode)
+    assert found.file.tolist() == [4, 2]
+    assert found.colouring.tolist() == [1, 1]
+    assert float(found.distance.max()) == pytest.approx(0, abs=1e-3)
+    without = nearest_stored(queries, [*paths[:2], paths[3], paths[5]], read_person, model.encode)
+    assert float(without.distance.min()) > 1e-3
+    with pytest.raises(ValueError, match="no people"):
+        nearest_stored(queries, [], read_person, model.encode)
+
+
+def stage_two():
+    return command.StageTwo(lambda path: tiny_model(), find_people, split_people, read_person)
+
+
+def test_command_compares_generated_people_and_writes_figures(people, judge, judge_folder, tmp_path, capsys):
+    line = ["generation", "--people", str(people), "--judge", str(judge_folder), "--holdout", "0.34"]
+    line += ["--count", "5", "--steps", "2", "--json", str(tmp_path / "new" / "figures.json")]
+    command.run(line, lambda path: None, stage_two)
+    assert "| generated | 5 |" in capsys.readouterr().out
+    figures = json.loads((tmp_path / "new" / "figures.json").read_text())
+    assert set(figures["people"]) == {"generated", "trained on"}
+    assert set(figures["people"]["generated"]) == set(COLUMNS)
+    assert figures["feature_accuracy"] == judge.held_accuracies
+
+
+def test_command_refuses_too_few_people_before_it_works(people, tmp_path):
+    line = ["generation", "--people", str(people), "--judge", str(tmp_path / "judge"), "--count", "3"]
+    with pytest.raises(ValueError, match="more than 3"):
+        command.run(line, lambda path: None, stage_two)
+    assert not (tmp_path / "judge").exists()
