@@ -10,7 +10,7 @@ import pytest
 from accelerate.state import AcceleratorState
 from diffusion_people import SMALL
 from primdiffusion.diffusion.unet import UNetConfig
-from primdiffusion.training import diffuse_pictures, phase
+from primdiffusion.training import diffuse_pictures, losses, phase, slabs
 from primdiffusion.training.config import CodecConfig, PhaseConfig, PriorConfig, TrainingConfig
 from primdiffusion.training.diffuse import train
 from primdiffusion.training.run_folder import METRICS
@@ -21,16 +21,17 @@ DEFAULT_FILES = {"config.json", "run.json", "metrics.jsonl", "pictures", "model.
 
 
 def make_small(patch: pytest.MonkeyPatch) -> None:
-    """Pictures of one person, of few pixels and steps; accelerate forgets earlier runs of this process."""
+    """Pictures of one person, of few pixels and steps, slabs judged at one level; accelerate forgets earlier runs."""
     patch.setattr(diffuse_pictures, "WIDTH", 24)
     patch.setattr(diffuse_pictures, "HEIGHT", 40)
     patch.setattr(diffuse_pictures, "STEP", 0.03)
+    patch.setattr(slabs, "x0_errors", functools.partial(losses.x0_errors, levels=(500,)))
     patch.setattr(phase, "write_samples", functools.partial(diffuse_pictures.write_samples, seeds=(0,), steps=1))
     AcceleratorState._reset_state(reset_partial_state=True)
 
 
 def settings(people: Path, run: Path, **changes) -> TrainingConfig:
-    """Six steps of the person network and four of the local one, or three of the paper's."""
+    """Six steps of the person network and four of the local one, or two of the paper's."""
     quick = {
         "holdout": 0.2,
         "codec": CodecConfig(channels=4, people=8),
@@ -39,7 +40,7 @@ def settings(people: Path, run: Path, **changes) -> TrainingConfig:
         "person": PhaseConfig(steps=6, batch=16, evaluate_every=6),
         "local": PhaseConfig(steps=4, batch=4, evaluate_every=4),
         "unet": TINY_UNET,
-        "slab": PhaseConfig(steps=3, batch=1, learning_rate=1e-3, weighting="plain", evaluate_every=3),
+        "slab": PhaseConfig(steps=2, batch=1, learning_rate=1e-3, weighting="plain", evaluate_every=2),
         "log_every": 1,
         "threads": 1,
     }

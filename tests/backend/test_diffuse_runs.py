@@ -251,32 +251,32 @@ def test_steps_draw_other_numbers_on_every_process_and_in_every_phase():
 
 @pytest.fixture(scope="module")
 def paper(few, tmp_path_factory):
-    """A run of the paper's preset with a small network, in which the second of three steps ended it once."""
+    """A run of the paper's preset with a small network."""
     with pytest.MonkeyPatch.context() as patch:
         make_small(patch)
         config = settings(few, tmp_path_factory.mktemp("paper") / "run", preset="paper")
-        due = phase.Interrupt.due
-        patch.setattr(phase.Interrupt, "due", after(2))
-        train(config)
-        patch.setattr(phase.Interrupt, "due", due)
         train(config)
         return config.run
 
 
 def test_the_paper_preset_trains_saves_loads_and_generates(paper):
-    assert logged(paper) == [("slab", 1), ("slab", 2), ("slab", 3)]
-    assert [path.name for path in (paper / "pictures").iterdir()] == ["slab_0000003.png"]
+    assert logged(paper) == [("slab", 1), ("slab", 2)]
+    assert [path.name for path in (paper / "pictures").iterdir()] == ["slab_0000002.png"]
     model = load_checkpoint(paper / MODEL)
     assert model.denoiser.config == TINY_UNET
     assert model.card["preset"] == "paper"
     assert model.card["people"] == 4
     assert model.card["weighting"] == {"slab": "plain"}
     assert np.isfinite(list(model.card["held_out_rms_x0_error"]["denoiser"].values())).all()
-    human = generate(model, 3, steps=2)
-    assert torch.equal(human.payload.rgb, generate(model, 3, steps=2).payload.rgb)
+    human = generate(model, 3, steps=1)
+    assert human.payload.validate().density.shape == (1024, 8, 8, 8)
 
 
-def test_the_paper_preset_goes_on_bit_for_bit(few, paper, tmp_path):
+@pytest.mark.slow
+def test_the_paper_preset_goes_on_bit_for_bit(few, paper, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(phase.Interrupt, "due", after(1))
+        train(settings(few, tmp_path / "run", preset="paper"))
     train(settings(few, tmp_path / "run", preset="paper"))
     for name in ("slab.state.safetensors", MODEL):
         assert same_tensors(tmp_path / "run" / name, paper / name)

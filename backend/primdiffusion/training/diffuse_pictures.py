@@ -16,7 +16,7 @@ from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.staging import written_whole
 
 SEEDS = (0, 1, 2, 3)
-WIDTH, HEIGHT = 192, 320
+WIDTH, HEIGHT = 256, 256
 YAW = 0.4
 """Radians."""
 STEP = 0.006
