@@ -32,7 +32,7 @@ class EncodePayloads:
     views: int = 8
     """Pictures that the encoder is given, spread around the person; all where there are fewer."""
     looks: int = 1
-    """Frames of each person, evenly spaced, of each of which a payload is made; the first, near the T pose, hides least."""
+    """Frames of each person, evenly spaced, of each of which a payload is made; the first, near T, hides least."""
     refine_steps: int = 0
     """Steps of refinement on all pictures of the person, which show what the encoder blurs; 300 do well. 0: none."""
     refine_size: int = 256
