@@ -88,7 +88,7 @@ class PhaseConfig:
 
 @dataclasses.dataclass(frozen=True)
 class TrainingConfig:
-    """A run of `primdiffusion train`."""
+    """Train a diffusion model on people as primitives; the same line goes on where it stopped (docs/training.md)."""
 
     data: Path
     """People of `primdiffusion payloads`: a folder of files, or of the shards that `payloads pack` makes of them."""
