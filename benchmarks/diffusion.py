@@ -15,12 +15,15 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import torch
-from diffusion_sets import decoded, gaussian, generated, placed, seeds_of, stored_voxels, voxels
+from diffusion_sets import decoded, front, gaussian, generated, placed, seeds_of, stored, stored_voxels, voxels
 from march import from_script
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.attribute_network import features_of
+from primdiffusion.evaluation.clip_vision import load_clip_vision
+from primdiffusion.evaluation.distances import frechet_distance, kernel_distance
 from primdiffusion.evaluation.gallery import made_gallery, payload_of
 from primdiffusion.evaluation.generation import Judge, Likeness, floor, liken, open_judge, table
+from primdiffusion.evaluation.inception import load_inception
 from primdiffusion.evaluation.neighbours import nearest_stored
 from primdiffusion.evaluation.voxel_baseline import load_voxel_model
 from primdiffusion.primitives.primitives import Primitives
@@ -71,6 +74,7 @@ def main() -> None:
         train, held = split_people(find_people(arguments.people), arguments.holdout, arguments.seed)
         judge = open_judge(train, held, arguments.judge, read_person, progress("portraits"), epoch)
         rows = likenesses(judge, model, held, arguments)
+        figures |= photograph_figures(model, held, arguments)
         figures["nearest_neighbour_ratio_latent"] = None if arguments.quick else latent_ratio(model, train, held)
     figures |= quality_figures(rows, judge)
     tell(figures, arguments.json)
@@ -89,6 +93,8 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--judge", type=Path, default=Path("runs/judge"), help="folder for portraits and features")
     parser.add_argument("--checkpoint", type=Path, help="without it the package's default")
     parser.add_argument("--voxel", type=Path, help="baseline of diffusion_voxel.py")
+    parser.add_argument("--inception", type=Path, help="weights for FID: pt_inception-2015-12-05-6726825d.pth")
+    parser.add_argument("--clip", type=Path, help="weights for FID_CLIP: ViT-B/32 as .safetensors")
     parser.add_argument("--count", type=int, default=256, help="people of each set")
     parser.add_argument("--quick", action="store_true", help="16 people of each set, no search among latents")
     parser.add_argument("--json", type=Path, help="file for the figures")
@@ -116,6 +122,29 @@ def likenesses(
         rows[name] = liken(judge, features_of(judge.network, made_gallery(make())))
         print(name, rows[name], flush=True)
     return {name: rows[name] for name in SETS if name in rows}
+
+
+def photograph_figures(model: DiffusionModel, held: list[Path], arguments: argparse.Namespace) -> Figures:
+    """FID, KID * 100 and FID_CLIP of pictures from the front, by networks for photographs; None without their weights.
+
+    Few pictures: their values are far above those of tens of thousands, and only sets of equal size compare.
+    """
+    figures: Figures = dict.fromkeys(("fid_ours", "kid_100_ours", "fid_clip_ours"))
+    networks = {"inception": (arguments.inception, load_inception), "clip": (arguments.clip, load_clip_vision)}
+    features: dict[str, list[Tensor]] = {}
+    for name, (path, load) in networks.items():
+        if path is not None:
+            network = load(path)
+            made = placed(generated(model, seeds_of(arguments.count)))
+            features[name] = [
+                torch.cat([network(front(one)[None]) for one in people]) for people in (made, stored(held))
+            ]
+    if "inception" in features:
+        figures["fid_ours"] = frechet_distance(*features["inception"])
+        figures["kid_100_ours"] = 100 * kernel_distance(*features["inception"])
+    if "clip" in features:
+        figures["fid_clip_ours"] = frechet_distance(*features["clip"])
+    return figures
 
 
 def latent_ratio(model: DiffusionModel, train: list[Path], held: list[Path]) -> float:

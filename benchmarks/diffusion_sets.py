@@ -9,12 +9,16 @@ import torch
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, seeded
 from primdiffusion.evaluation.gallery import payload_of
+from primdiffusion.evaluation.portraits import PORTRAITS, camera_of
 from primdiffusion.evaluation.voxel_baseline import VoxelModel
 from primdiffusion.evaluation.voxel_grid import primitives_of, voxelise_payload
+from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, generate_batch, place
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.primitives.primitives import Payload, Primitives
+from primdiffusion.render.march import march
 from primdiffusion.training.latents import read_person
+from torch import Tensor
 
 TOGETHER = 8
 """People that are sampled at once."""
@@ -60,6 +64,15 @@ def plain(payload: Payload) -> Payload:
     return payload.to("cpu").map(lambda tensor: tensor.clone())
 
 
+def stored(paths: Sequence[Path]) -> Iterator[Primitives]:
+    """People on disk in all colourings."""
+    for path in paths:
+        person = read_person(path)
+        frames = rest_frames(person.betas.numpy())
+        for number in range(len(person.voxels)):
+            yield Primitives.place(frames, payload_of(person, number))
+
+
 def stored_voxels(paths: Sequence[Path], model: VoxelModel | None = None) -> Iterator[Primitives]:
     """Stored people as grids of 64^3 voxels: what that representation can at best show; of a model after its codec."""
     for path in paths:
@@ -69,6 +82,12 @@ def stored_voxels(paths: Sequence[Path], model: VoxelModel | None = None) -> Ite
             grid = voxelise_payload(frames, payload_of(person, number), person.full_density)
             shown = grid.float() / 255 if model is None else model.codec.decode(model.codec.encode(grid))
             yield primitives_of(shown, person.full_density)
+
+
+def front(primitives: Primitives) -> Tensor:
+    """An sRGB picture from the front over white, 299 x 299, as networks for photographs take it."""
+    view = march(primitives, camera_of(PORTRAITS[0], 299), background=(1.0, 1.0, 1.0))
+    return encode_srgb(view.rgb.clamp(0, 1))
 
 
 def seeds_of(count: int, first: int = 0) -> list[int]:
