@@ -1,0 +1,137 @@
+"""The edits from the operator to the volumes, with the real child and a small model."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+import blender_primdiffusion
+from blender_primdiffusion import places
+from blender_primdiffusion.scene.body_mesh import body_of
+from blender_primdiffusion.scene.human import MARK, armature_of, humans, person_file
+from blender_primdiffusion.scene.human_file import JOINT_NAMES
+from blender_primdiffusion.ui import generation
+from blender_primdiffusion.worker.client import BackendClient
+from blender_primdiffusion.worker.environment import BackendPython
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+ops = bpy.ops.primdiffusion
+
+
+@pytest.fixture
+def people(saved_scene, tmp_path, monkeypatch):
+    """Two people of a small model."""
+    from tiny_model import save_tiny_checkpoint
+
+    checkpoint = save_tiny_checkpoint(tmp_path / "tiny.safetensors")
+    python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
+    monkeypatch.setattr(places, "find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr(generation, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
+    # With a cache in Blender's temporary folder the child would compile its marcher anew for each test.
+    monkeypatch.setattr(places, "BackendClient", lambda python, module, cache_dir: BackendClient(python, module))
+    blender_primdiffusion.register()
+    try:
+        ops.generate(seed=1, steps=2, attributes="outfit=suit", sampler="dpmpp_2m")
+        ops.generate(seed=2, steps=2)
+        yield humans(saved_scene.scene)
+    finally:
+        blender_primdiffusion.unregister()
+
+
+def files(person) -> dict[int, str]:
+    paths = [Path(thing.data.filepath).name for thing in person.all_objects if thing.type == "VOLUME"]
+    return {int(name[5:9]): name for name in paths}
+
+
+def changed(before: dict[int, str], after: dict[int, str]) -> set[int]:
+    return {k for k in before if before[k] != after[k]}
+
+
+def region(*parts: str) -> set[int]:
+    from primdiffusion.editing.regions import region_of
+
+    return set(np.flatnonzero(region_of(parts).numpy()).tolist())
+
+
+def payload(path: Path) -> dict[str, np.ndarray]:
+    from safetensors.numpy import load_file
+
+    return load_file(path)
+
+
+def test_redressing_leaves_everything_outside_the_region_as_it_is(people):
+    anna, berta = people
+    before, others, first = files(anna), files(berta), payload(person_file(anna))
+    assert json.loads(anna[MARK])["attributes"] == {"outfit": "suit"}
+    given = {"human": "Human", "seed": 5, "steps": 3}
+    assert ops.redress(parts={"hair", "shoes"}, attributes="outfit=jeans", **given) == {"FINISHED"}
+    inside = region("hair", "shoes")
+    differ = changed(before, files(anna))
+    assert differ
+    assert differ <= inside
+    assert files(berta) == others
+    second = payload(person_file(anna))
+    outside = sorted(set(before) - inside)
+    assert all(np.array_equal(first[name][outside], second[name][outside]) for name in ("rgb", "density"))
+    assert np.array_equal(first["betas"], second["betas"])
+
+
+def test_a_painted_head_is_all_that_changes(people):
+    anna, _ = people
+    body = body_of(anna)
+    before = files(anna)
+    head = body.vertex_groups[JOINT_NAMES.index("head")]
+    bpy.context.view_layer.objects.active = armature_of(anna)
+    ops.paint_region()
+    painted = body.vertex_groups["PrimDiffusion Region"]
+    for vertex in body.data.vertices:
+        if any(element.group == head.index and element.weight > 0.5 for element in vertex.groups):
+            painted.add([vertex.index], 1.0, "REPLACE")
+    assert ops.redress(seed=5, steps=3) == {"FINISHED"}
+    differ = changed(before, files(anna))
+    assert differ
+    assert differ <= region("head")
+    ops.finish_painting()
+
+
+def test_vary_transfer_and_blend_follow_one_another_and_undo_goes_back_through_them(people):
+    anna, berta = people
+    bpy.ops.ed.undo_push(message="two people")
+    states = [files(anna)]
+    assert ops.vary(human="Human", amount=0.5, seed=3, steps=4) == {"FINISHED"}
+    states.append(files(anna))
+    assert ops.transfer_texture(human="Human", source="Human.001", parts={"top"}, steps=2) == {"FINISHED"}
+    states.append(files(anna))
+    assert changed(states[1], states[2]) <= region("top")
+    assert ops.transfer_texture(
+        human="Human", source="Human.001", parts={"top"}, what="garment", harmonise=0.5, steps=2
+    ) == {"FINISHED"}
+    states.append(files(anna))
+    assert ops.blend(human="Human", other="Human.001", fraction=1.0, steps=4) == {"FINISHED"}
+    ours, theirs = (json.loads(person[MARK])["betas"] for person in (anna, berta))
+    np.testing.assert_allclose(ours, theirs, atol=1e-4)
+    for state in reversed(states):
+        bpy.ops.ed.undo()
+        anna = humans(bpy.context.scene)[0]
+        assert files(anna) == state
+        assert all(Path(bpy.path.abspath(volume.filepath)).is_file() for volume in bpy.data.volumes)
+
+
+def test_what_the_child_refuses_is_one_sentence(people):
+    refused = {
+        "1 steps were asked for": lambda: ops.blend(human="Human", other="Human.001", steps=1),
+        "knows no attribute 'wings'": lambda: ops.redress(human="Human", attributes="wings=two", steps=2),
+    }
+    before = files(people[0])
+    for sentence, edit in refused.items():
+        with pytest.raises(RuntimeError, match=sentence):
+            edit()
+    bpy.context.scene.objects["Human_body"].vertex_groups.new(name="dot").add([0], 0.1, "REPLACE")
+    with pytest.raises(RuntimeError, match="paint a larger area, or more strongly"):
+        ops.redress(human="Human", vertex_group="dot", steps=2)
+    assert files(people[0]) == before
