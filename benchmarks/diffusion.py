@@ -37,6 +37,8 @@ SPEED_FIGURES = (
     "threads", "import_seconds", "load_seconds", "step_seconds_cpu", "generate_seconds_cpu",
     "generate_first_seconds_cpu", "generate_processor_seconds", "generate_seconds_a_person_of_8", "peak_gb",
 )  # fmt: skip
+NEED_MORE = ("nearest_neighbour_ratio_latent", "fid_ours", "kid_100_ours", "fid_clip_ours")
+"""Figures that stay null without people or weights."""
 SETS = ("ours", "gaussian", "voxel", "floor", "codec", "voxel_people", "voxel_codec")
 TITLES = {
     "ours": "ours",
@@ -64,6 +66,7 @@ def main() -> None:
     figures: Figures = {
         "checkpoint_mb": round(path.stat().st_size / 1e6, 2),
         "parameters": sum(p.numel() for p in model.denoiser.parameters()),
+        **dict.fromkeys(NEED_MORE),
     }
     given = () if arguments.checkpoint is None else ("--checkpoint", str(arguments.checkpoint))
     repeats = "2" if arguments.quick else "5"
@@ -129,7 +132,7 @@ def photograph_figures(model: DiffusionModel, held: list[Path], arguments: argpa
 
     Few pictures: their values are far above those of tens of thousands, and only sets of equal size compare.
     """
-    figures: Figures = dict.fromkeys(("fid_ours", "kid_100_ours", "fid_clip_ours"))
+    figures: Figures = {}
     networks = {"inception": (arguments.inception, load_inception), "clip": (arguments.clip, load_clip_vision)}
     features: dict[str, list[Tensor]] = {}
     for name, (path, load) in networks.items():

@@ -135,6 +135,11 @@ def test_network_learns_what_can_be_seen(trained):
     assert right["height"] > 0.5
 
 
+def test_features_vary_by_one_over_the_people_they_were_trained_on(trained):
+    pictures, _ = painted(64, 0)
+    assert float(features_of(trained, pictures).std(0).median()) == pytest.approx(1, abs=0.3)
+
+
 def test_network_is_the_same_for_a_seed_and_leaves_torchs_random_state():
     pictures, people = painted(16, 0)
     before = torch.get_rng_state()

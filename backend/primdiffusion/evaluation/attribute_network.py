@@ -88,7 +88,12 @@ class AttributeNetwork(nn.Module):
             layers += [nn.Conv2d(before, width, 3, stride=2, padding=1), nn.BatchNorm2d(width), nn.ReLU()]
             before = width
         self.trunk = nn.Sequential(*layers, nn.AdaptiveAvgPool2d(POOLED))
-        self.features = nn.Sequential(nn.Dropout(0.2), nn.Linear(len(PORTRAITS) * before * POOLED**2, FEATURES))
+        # Normalised: every feature varies by 1 over the training people, so distances are in such units.
+        self.features = nn.Sequential(
+            nn.Dropout(0.2),
+            nn.Linear(len(PORTRAITS) * before * POOLED**2, FEATURES),
+            nn.BatchNorm1d(FEATURES, affine=False),
+        )
         sizes = {name: len(values) for name, values in answers.categories.items()} | dict.fromkeys(answers.scalars, 1)
         self.heads = nn.ModuleDict({name: nn.Linear(FEATURES, size) for name, size in sizes.items()})
 
@@ -113,7 +118,7 @@ def fit_attribute_network(
     pictures: UInt8[Tensor, "n v h w 4"],
     people: Sequence[Mapping[str, Any]],
     *,
-    epochs: int = 10,
+    epochs: int = 20,
     batch: int = 64,
     learning_rate: float = 2e-3,
     seed: int = 0,
