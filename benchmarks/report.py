@@ -20,6 +20,11 @@ SOURCES = {
         "benchmarks/encoder.py --train DIR --heldout DIR --models DIR --json docs/results/encoder.json "
         "--table docs/results/encoder_table.md",
     ),
+    "diffusion": (
+        "Generated people",
+        "benchmarks/diffusion.py --people DIR --judge DIR --voxel FILE --json docs/results/diffusion.json "
+        "--table docs/results/diffusion_table.md",
+    ),
     "layout": ("The grid on the default body", "scripts/bake_layout"),
 }  # fmt: skip
 ABOUT = ("device", "cores", "memory_gb", "python", "commit", "date")
