@@ -112,7 +112,7 @@ class Studio:
         yield "texture of the top", self.took("transfer", lambda: transfer_texture(source, target, top))
         garment = self.took("transfer", lambda: transfer_garment(source, target, top))
         yield "garment: top", garment
-        yield "harmonised 0.5", self._harmonised(garment, top, 0.5)
+        yield "harmonised 0.3", self._harmonised(garment, top, 0.3)
         yield "texture of all clothes", transfer_texture(source, target, region_of(["clothes"]))
 
     def harmonised(self) -> Iterator[Shown]:

@@ -1,6 +1,7 @@
 """Edits of people: what they change, what they leave as it is to the last bit, what they say of themselves."""
 
 import dataclasses
+import functools
 import itertools
 import json
 
@@ -8,13 +9,15 @@ import pytest
 import torch
 from diffusion_people import small_model
 from editing_people import anybody, slab_model
+from primdiffusion.diffusion.model import seeded
 from primdiffusion.diffusion.schedule import linear
-from primdiffusion.editing.edit import chain_down
+from primdiffusion.editing.edit import chain_down, edit_generator
 from primdiffusion.editing.inpaint import harmonise, inpaint
 from primdiffusion.editing.interpolate import interpolate, inversion_steps, inverted, slerp
 from primdiffusion.editing.regions import region_of
 from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
+from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
 from primdiffusion.primitives.primitives import K
 from primdiffusion.primitives.stand import BodyFiles, FileFingerprint, Stand
@@ -69,6 +72,15 @@ def test_an_edit_is_its_seeds_own(human, name):
     first = EDITS[name](model, human, seed=3)
     assert same(first, EDITS[name](model, human, seed=3))
     assert not same(first, EDITS[name](model, human, seed=4))
+
+
+def test_the_seed_that_made_a_person_does_not_lead_an_edit_back_to_them():
+    model = tiny_model()
+    person = generate(model, 5, steps=4)
+    moved = [distance(vary(model, person, 1.0, seed, steps=4), person) for seed in (5, 6, 7)]
+    assert moved[0] > 0.3 * max(moved)
+    noises = [torch.randn(4, generator=make(5)) for make in (seeded, functools.partial(edit_generator, model))]
+    assert not torch.isclose(*noises).any()
 
 
 @pytest.mark.parametrize("name", EDITS)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.diffusion.model import DiffusionModel, seeded
 from primdiffusion.diffusion.samplers import Denoise, Step
 from primdiffusion.diffusion.schedule import Schedule, trailing_steps
 from primdiffusion.editing.shares import check_share
@@ -20,6 +20,8 @@ from primdiffusion.primitives.primitives import Payload
 from primdiffusion.primitives.stand import Stand
 
 EVENNESS = 0.7
+EDITING = 0x6ED1F7A9C35B2D84
+"""Tells seeds of edits from those of generating: with a person's own noise, an edit would lead back to them."""
 OnStep = Callable[[Step], None]
 """Sees each step after it is done; an exception it raises ends the work (that is how cancelling works)."""
 
@@ -51,6 +53,12 @@ def check_correspondence(name: str, stand: Stand | None, other_name: str, other:
 def encoded(model: DiffusionModel, human: Human) -> Float[Tensor, "1 c h w"]:
     """The person as a clean sample of a `fitted` model; what its codec leaves out is lost."""
     return model.encode(human.payload.map(lambda values: values[None]))
+
+
+def edit_generator(model: DiffusionModel, seed: int) -> torch.Generator:
+    """The noise of an edit, on the model's device; ValueError for a seed outside 0 ... 2^63-1."""
+    seeded(seed)
+    return seeded(seed ^ EDITING, model.device)
 
 
 def asked(model: DiffusionModel, attributes: Mapping[str, str | float], guidance: float) -> Denoise:

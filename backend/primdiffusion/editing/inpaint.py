@@ -8,8 +8,19 @@ from types import MappingProxyType
 from jaxtyping import Bool
 from torch import Tensor
 
-from primdiffusion.diffusion.model import DEFAULT_GUIDANCE, DEFAULT_STEPS, DiffusionModel, seeded
-from primdiffusion.editing.edit import OnStep, asked, chain_down, combined, decoded, encoded, fitted, last, with_edit
+from primdiffusion.diffusion.model import DEFAULT_GUIDANCE, DEFAULT_STEPS, DiffusionModel
+from primdiffusion.editing.edit import (
+    OnStep,
+    asked,
+    chain_down,
+    combined,
+    decoded,
+    edit_generator,
+    encoded,
+    fitted,
+    last,
+    with_edit,
+)
 from primdiffusion.editing.regions import check_region, name_region
 from primdiffusion.editing.repaint import noised, repaint
 from primdiffusion.human import Human, made_by
@@ -38,7 +49,7 @@ def inpaint(
     region = check_region(region)
     if region.all():
         raise ValueError("the region is the whole person: generate a new one, or vary this one")
-    generator = seeded(seed, model.device)
+    generator = edit_generator(model, seed)
     chain = model.chain(model.schedule.length, steps)
     model = fitted(model, human)
     denoise = asked(model, attributes, guidance)
@@ -67,7 +78,7 @@ def harmonise(
     does, and for an amount outside 0 ... 1.
     """
     region = check_region(region)
-    generator = seeded(seed, model.device)
+    generator = edit_generator(model, seed)
     model = fitted(model, human)
     chain = chain_down(model.schedule, amount, steps)
     payload = human.payload

@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import torch
 
-from primdiffusion.diffusion.model import DEFAULT_GUIDANCE, DEFAULT_STEPS, DiffusionModel, seeded
+from primdiffusion.diffusion.model import DEFAULT_GUIDANCE, DEFAULT_STEPS, DiffusionModel
 from primdiffusion.diffusion.samplers import ddim, gaussian_noise
 from primdiffusion.editing.edit import (
     OnStep,
@@ -16,6 +16,7 @@ from primdiffusion.editing.edit import (
     chain_down,
     decoded,
     difference,
+    edit_generator,
     encoded,
     fitted,
     last,
@@ -44,7 +45,7 @@ def vary(
     Raises ValueError for an amount outside 0 ... 1, steps outside 1 ... T, a seed outside 0 ... 2^63-1 and attributes
     that the model does not know.
     """
-    generator = seeded(seed, model.device)
+    generator = edit_generator(model, seed)
     model = fitted(model, human)
     denoise = asked(model, attributes, guidance)
     chain = chain_down(model.schedule, amount, steps)
