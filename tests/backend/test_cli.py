@@ -200,7 +200,7 @@ def test_an_interrupt_is_130_without_a_traceback_and_leaves_nothing(monkeypatch,
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("primdiffusion.human.generate", interrupted)
+    monkeypatch.setattr("primdiffusion.human.generate_batch", interrupted)
     code, stderr = fails(capsys, "generate", "--out", tmp_path / "out", "--checkpoint", checkpoint)
     assert (code, stderr) == (cli.INTERRUPTED, "primdiffusion: interrupted\n")
     assert not (tmp_path / "out").exists()
