@@ -28,7 +28,8 @@ from primdiffusion.evaluation.neighbours import nearest_stored
 from primdiffusion.evaluation.voxel_baseline import load_voxel_model
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.training.checkpoint import default_checkpoint, load_checkpoint
-from primdiffusion.training.latents import find_people, read_person, split_people
+from primdiffusion.training.latents import split_people
+from primdiffusion.training.stored_people import find_people, read_person
 from record import tell
 from torch import Tensor
 

@@ -34,7 +34,8 @@ from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.image import over
 from primdiffusion.render.march import march
 from primdiffusion.training.checkpoint import load_checkpoint
-from primdiffusion.training.latents import find_people, read_person, split_people
+from primdiffusion.training.latents import split_people
+from primdiffusion.training.stored_people import find_people, read_person
 from torch import Tensor
 
 BACKGROUND = (0.72, 0.72, 0.72)

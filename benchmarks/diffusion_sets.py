@@ -17,7 +17,7 @@ from primdiffusion.human import Human, generate_batch, place
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.march import march
-from primdiffusion.training.latents import read_person
+from primdiffusion.training.stored_people import read_person
 from torch import Tensor
 
 TOGETHER = 8

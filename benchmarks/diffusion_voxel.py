@@ -36,10 +36,11 @@ from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.staging import written_whole
 from primdiffusion.training.config import PhaseConfig, PriorConfig
-from primdiffusion.training.latents import LatentSet, find_people, read_person, read_vocabulary, split_people
+from primdiffusion.training.latents import LatentSet, split_people, vocabulary_of
 from primdiffusion.training.losses import PersonObjective, RestObjective
 from primdiffusion.training.prior import fit_prior
 from primdiffusion.training.state import TrainingState
+from primdiffusion.training.stored_people import find_people, read_outline, read_person
 from safetensors.torch import load_file, save
 from torch import Tensor
 
@@ -70,7 +71,7 @@ def main() -> None:
     if arguments.grids_only:
         return
     train_paths, _ = split_people(paths, arguments.holdout, arguments.seed)
-    vocabulary = read_vocabulary(train_paths)
+    vocabulary = vocabulary_of(each for path in train_paths for each in read_outline(path).known())
     codec, people, prior = prepared(train_paths, vocabulary, arguments.out)
     run = Run(people, codec, vocabulary, arguments.out, arguments.seed)
     torch.manual_seed(arguments.seed)

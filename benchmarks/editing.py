@@ -85,8 +85,14 @@ class Studio:
         """Regions made anew, whatever fits."""
         person = self.people[0]
         yield "before", person
-        for name, seed in (("top", 0), ("top", 1), ("top", 2), ("bottom", 0), ("hair", 0)):
-            yield f"{name}, seed {seed}", self._inpainted(person, name, seed)
+        for parts, seed in (
+            (("top", "hips"), 0),
+            (("top", "hips"), 1),
+            (("bottom",), 0),
+            (("shoes",), 0),
+            (("head",), 0),
+        ):
+            yield f"{' and '.join(parts)}, seed {seed}", self._inpainted(person, parts, seed)
 
     def dressed(self) -> Iterator[Shown]:
         """Clothes made anew as asked for, where the model knows outfits."""
@@ -95,12 +101,12 @@ class Studio:
         if outfits:
             yield "before", person
         for outfit in outfits[:: max(1, len(outfits) // (COLUMNS - 1))][: COLUMNS - 1]:
-            yield outfit, self._inpainted(person, "clothes", 0, {"outfit": outfit})
+            yield outfit, self._inpainted(person, ("clothes",), 0, {"outfit": outfit})
 
     def _inpainted(
-        self, person: Human, part: str, seed: int, attributes: dict[str, str | float] | None = None
+        self, person: Human, parts: tuple[str, ...], seed: int, attributes: dict[str, str | float] | None = None
     ) -> Human:
-        region = region_of([part])
+        region = region_of(parts)
         return self.took("inpaint", lambda: inpaint(self.model, person, region, seed, self.steps, attributes or {}))
 
     def transferred(self) -> Iterator[Shown]:

@@ -357,7 +357,8 @@ def _evaluate(arguments: Sequence[str]) -> None:
     def stage_two() -> StageTwo:
         from primdiffusion.machine import best_device
         from primdiffusion.training.checkpoint import load_checkpoint
-        from primdiffusion.training.latents import find_people, read_person, split_people
+        from primdiffusion.training.latents import split_people
+        from primdiffusion.training.stored_people import find_people, read_person
 
         return StageTwo(lambda path: load_checkpoint(path, best_device()), find_people, split_people, read_person)
 

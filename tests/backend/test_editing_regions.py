@@ -76,7 +76,8 @@ def test_parts_lie_where_their_joints_are(rest, joints):
     for upper, lower in (("thighs", "knee"), ("shins", "ankle")):
         assert rest[region_of([upper]), 1].min() > joints[f"left_{lower}"][1] - 0.06
     assert rest[region_of(["left_upper_arm"]), 0].max() < joints["left_elbow"][0] + 0.05
-    assert rest[region_of(["left_forearm"]), 0].max() < joints["left_wrist"][0] + 0.02
+    assert rest[region_of(["left_forearm"]), 0].max() < joints["left_wrist"][0] + 0.02, "where sleeves end"
+    assert rest[region_of(["left_hand"]), 0].min() > joints["left_wrist"][0] + 0.02
 
 
 def test_hair_covers_the_crown_and_the_back_of_the_head_but_no_cheek(rest, joints):

@@ -13,7 +13,8 @@ from primdiffusion.evaluation.neighbours import nearest_stored
 from primdiffusion.evaluation.portraits import PORTRAITS, SIDE, camera_of
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.training.latents import find_people, read_person, split_people
+from primdiffusion.training.latents import split_people
+from primdiffusion.training.stored_people import find_people, read_person
 from tiny_model import tiny_model
 
 

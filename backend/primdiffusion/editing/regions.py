@@ -27,6 +27,8 @@ COLLAR_HEIGHT, COLLAR_SLOPE = 0.007, -0.42
 NAPE_DEPTH, HAIRLINE_SLOPE = -0.052, 1.4
 """The plane z = depth + slope * y, metres from the head's joint: behind it, from the nape over the ears to the
 hairline, grows hair."""
+CUFF = 0.02
+"""Metres from the wrist's joint towards the hand: where long sleeves end."""
 
 _TRUNK = ("pelvis", "spine1", "spine2", "spine3", "left_collar", "right_collar")
 _SIDED = {
@@ -178,11 +180,16 @@ def _parts(body: BodyModel, anchors: Anchors) -> Mapping[str, Bool[Tensor, "k"]]
         "torso": above_hem | collar,
         "hips": above_seat & ~above_hem,
     }
-    for part, joints in _SIDED.items():
-        for side in ("left", "right"):
-            moved = torch.stack([by_joint[f"{side}_{name}"] for name in joints]).any(0)
+    for side, outward in (("left", 1.0), ("right", -1.0)):
+        for part, names in _SIDED.items():
+            moved = torch.stack([by_joint[f"{side}_{name}"] for name in names]).any(0)
             parts[f"{side}_{_ONE_OF[part]}"] = moved & ~above_seat
-        parts[part] = parts[f"left_{_ONE_OF[part]}"] | parts[f"right_{_ONE_OF[part]}"]
+        beyond_wrist = outward * (rest - joints[JOINT_NAMES.index(f"{side}_wrist")])[:, 0]
+        cuff = parts[f"{side}_hand"] & (beyond_wrist < CUFF)
+        parts[f"{side}_forearm"] |= cuff
+        parts[f"{side}_hand"] &= ~cuff
+    for part, one in _ONE_OF.items():
+        parts[part] = parts[f"left_{one}"] | parts[f"right_{one}"]
     for name, members in _UNIONS.items():
         parts[name] = torch.stack([parts[member] for member in members]).any(0)
     return parts

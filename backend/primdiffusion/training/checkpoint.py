@@ -15,8 +15,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from primdiffusion.diffusion.codec import SCALE_VALUE, LinearCodec
-from primdiffusion.diffusion.conditioning import NOTHING, Vocabulary
+from primdiffusion.diffusion.codec import LinearCodec
+from primdiffusion.diffusion.conditioning import Vocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkConfig
@@ -29,9 +29,10 @@ FORMAT = "primdiffusion-checkpoint"
 ENCODER_FORMAT = "primdiffusion-encoder"
 """Of encoders' files, which `encoder_checkpoint` reads."""
 FORMAT_VERSION = 2
-_READABLE = {FORMAT: ("1", str(FORMAT_VERSION)), ENCODER_FORMAT: ("1",)}
-_HALVED = ("codec.mean", "denoiser.")
+_READABLE = {FORMAT: str(FORMAT_VERSION), ENCODER_FORMAT: "1"}
+_HALVED = ("codec.mean", "codec.basis", "denoiser.")
 _WHOLE = ("prior_variance", "prior_log_weight")
+_SECTIONS = ("held_out_rms_x0_error", "limits")
 
 
 class CheckpointError(ValueError):
@@ -44,7 +45,7 @@ def default_checkpoint() -> Path:
 
 
 def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
-    """Write a model; networks, prior and codec mean in half precision. `schedule` is its schedule's name."""
+    """Write a model; networks, prior and codec in half precision. `schedule` is its schedule's name."""
     tensors: dict[str, Tensor] = {f"denoiser.{key}": value for key, value in model.denoiser.state_dict().items()}
     architecture: dict[str, Any] = {"schedule": schedule, "full_density": model.full_density}
     architecture |= {"vocabulary": model.vocabulary.to_json()}
@@ -86,8 +87,6 @@ def load_checkpoint(path: Path | str | None = None, device: torch.device | str =
     tensors = {key: value.float() for key, value in tensors.items()}
     try:
         architecture = json.loads(metadata["architecture"])
-        if metadata["format_version"] == "1":
-            tensors, architecture = _from_version_1(tensors, architecture)
         card = {**json.loads(metadata["card"]), "sha256": file_hash(path)}
         if architecture["kind"] == "released":
             from primdiffusion.released.imported import released_model  # the top room: pyproject.toml allows this one
@@ -147,21 +146,6 @@ def denoiser_config(tree: Mapping[str, Any]) -> DenoiserConfig:
     )
 
 
-def _from_version_1(
-    tensors: Mapping[str, Tensor], architecture: dict[str, Any]
-) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Groups of one part each, no attributes, no delta scale."""
-    tensors = dict(tensors)
-    if architecture["kind"] == "person":
-        mean, basis = tensors["codec.mean"], tensors["codec.basis"]
-        tensors["codec.mean"] = torch.cat([mean, torch.full((len(mean), 3), SCALE_VALUE)], dim=1)
-        tensors["codec.basis"] = torch.nn.functional.pad(basis, (0, 3))
-        tensors["denoiser.prior_log_weight"] = tensors.pop("denoiser.prior_weight").log()[:, None]
-        tensors["denoiser.prior_centre"] = tensors["denoiser.prior_centre"][:, None]
-        tensors["denoiser.prior_kind"] = torch.zeros(*tensors["denoiser.prior_log_weight"].shape, 0)
-    return tensors, {**architecture, "vocabulary": NOTHING.to_json()}
-
-
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     metadata = _read_metadata(path)
     with safe_open(path, framework="pt") as file:
@@ -184,10 +168,10 @@ def _read_metadata(path: Path, formats: Sequence[str] = (FORMAT,)) -> dict[str, 
         raise CheckpointError(
             f"{path} is a safetensors file of format {metadata.get('format')!r}, not {FORMAT!r}: choose another file"
         )
-    if metadata.get("format_version") not in _READABLE[metadata["format"]]:
-        version = metadata.get("format_version")
+    if metadata.get("format_version") != _READABLE[metadata["format"]]:
+        version, readable = metadata.get("format_version"), _READABLE[metadata["format"]]
         raise CheckpointError(
-            f"{path} has format version {version}, this program reads {FORMAT_VERSION}: use the matching release"
+            f"{path} has format version {version}, this program reads {readable}: use the matching release"
         )
     return metadata
 
@@ -211,7 +195,7 @@ def model_card(card: Mapping[str, Any]) -> str:
     errors = card["held_out_rms_x0_error"]
     levels = list(next(iter(errors.values())))
     rows = [f"| {name} | " + " | ".join(f"{by[level]:.4f}" for level in levels) + " |" for name, by in errors.items()]
-    facts = {key: value for key, value in card.items() if key not in ("name", "held_out_rms_x0_error", "limits")}
+    facts = {key: value for key, value in card.items() if key not in ("name", "attributes", *_SECTIONS)}
     return "\n".join(
         [
             f"# Model card: {card['name']}",
@@ -220,11 +204,12 @@ def model_card(card: Mapping[str, Any]) -> str:
             "",
             *(f"- {key.replace('_', ' ')}: {_plain(value)}" for key, value in facts.items()),
             "",
+            *_asked_for(card.get("attributes", {})),
             "## Held-out error",
             "",
             "Root mean square error of the guessed clean latents at each step t of 1000, for people whose geometry was",
             "never trained on; all on the same noise. `gaussian`: the closed-form denoiser of one Gaussian fitted to",
-            "the training people; `mixture`: of one Gaussian for each outfit; `denoiser`: what this checkpoint holds.",
+            "the training people; `mixture`: of Gaussians for all kinds of people; `denoiser`: what this checkpoint holds.",
             "",
             "| t | " + " | ".join(levels) + " |",
             "|---" * (len(levels) + 1) + "|",
@@ -236,6 +221,16 @@ def model_card(card: Mapping[str, Any]) -> str:
             "",
         ]
     )
+
+
+def _asked_for(attributes: Mapping[str, Any]) -> list[str]:
+    """The section on attributes; nothing where there are none."""
+    values = [f"- {name}: {', '.join(words)}" for name, words in attributes.get("categories", {}).items()]
+    numbers = [
+        f"- {name}: about {mean:.3g}, of standard deviation {spread:.2g}"
+        for name, (mean, spread) in attributes.get("scalars", {}).items()
+    ]
+    return ["## What it can be asked for", "", *values, *numbers, ""] if values or numbers else []
 
 
 def _plain(value: object) -> str:

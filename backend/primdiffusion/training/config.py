@@ -119,11 +119,11 @@ class TrainingConfig:
     prior: PriorConfig = dataclasses.field(default_factory=PriorConfig)
     model: DenoiserConfig = dataclasses.field(default_factory=DenoiserConfig)
     person: PhaseConfig = dataclasses.field(
-        default_factory=lambda: PhaseConfig(steps=5000, batch=256, evaluate_every=1000)
+        default_factory=lambda: PhaseConfig(steps=2400, batch=256, evaluate_every=800)
     )
     """The default preset's network over person components, trained first."""
     local: PhaseConfig = dataclasses.field(
-        default_factory=lambda: PhaseConfig(steps=8000, batch=16, blend=0.2, weight_decay=0.0, bfloat16=True)
+        default_factory=lambda: PhaseConfig(steps=6500, batch=16, blend=0.2, weight_decay=0.0, bfloat16=True)
     )
     """The default preset's network over the grid."""
     unet: UNetConfig = PAPER

@@ -17,10 +17,7 @@ from primdiffusion.diffusion.codec import LinearCodec, cells_from_voxels, fit_co
 from primdiffusion.diffusion.conditioning import Attributes, Vocabulary
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.training.config import CodecConfig
-from primdiffusion.training.stored_people import People, find_people, read_outline, read_person
-
-__all__ = ["LatentSet", "encode_people", "find_people", "fit_codec_to", "read_person", "read_vocabulary",
-           "split_people", "vocabulary_of"]  # fmt: skip
+from primdiffusion.training.stored_people import People
 
 Item = TypeVar("Item", int, Path)
 
@@ -82,11 +79,6 @@ def _known(attributes: Attributes, vocabulary: Vocabulary) -> Attributes:
         for name, value in attributes.items()
         if name in vocabulary.scalars or value in vocabulary.categories.get(name, ())
     }
-
-
-def read_vocabulary(paths: Sequence[Path]) -> Vocabulary:
-    """What can be said of the people in these files; does not read their voxels. Raises what `read_outline` does."""
-    return vocabulary_of(each for path in paths for each in read_outline(path).known())
 
 
 def vocabulary_of(people: Iterable[Attributes]) -> Vocabulary:
