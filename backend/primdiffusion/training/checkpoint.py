@@ -209,7 +209,7 @@ def model_card(card: Mapping[str, Any]) -> str:
             "",
             "Root mean square error of the guessed clean latents at each step t of 1000, for people whose geometry was",
             "never trained on; all on the same noise. `gaussian`: the closed-form denoiser of one Gaussian fitted to",
-            "the training people; `mixture`: of Gaussians for all kinds of people; `denoiser`: what this checkpoint holds.",
+            "the training people; `mixture`: of Gaussians for all kinds of people; `denoiser`: this checkpoint.",
             "",
             "| t | " + " | ".join(levels) + " |",
             "|---" * (len(levels) + 1) + "|",
