@@ -1,0 +1,95 @@
+"""The mixture over person components: which kinds of people it knows, and where it puts them."""
+
+import pytest
+import torch
+from primdiffusion.diffusion.conditioning import NOTHING, Vocabulary
+from primdiffusion.diffusion.gaussian import IMPOSSIBLE
+from primdiffusion.training.config import PriorConfig
+from primdiffusion.training.mixture import fit_mixture
+
+WORDS = Vocabulary(
+    {
+        "sex": ("female", "male"),
+        "outfit": ("dress", "jeans"),
+        "hair": ("bob", "crew", "long"),
+        "shoes": ("boots", "pumps"),
+    },
+    {"height": (1.7, 0.1)},
+)
+CONFIG = PriorConfig(components=4, lean=0.1)
+DRESS = {"sex": "female", "outfit": "dress"}
+PEOPLE = [
+    *[{**DRESS, "hair": "bob", "shoes": "boots"}] * 300,
+    *[{**DRESS, "hair": "long", "shoes": "boots"}] * 100,
+    *[{"sex": "female", "outfit": "jeans", "hair": "bob", "shoes": "pumps"}] * 200,
+    *[{"sex": "male", "outfit": "jeans", "hair": "crew", "shoes": "boots"}] * 400,
+]
+
+
+def components(spread=0.1):
+    """Of PEOPLE: the outfit moves the first, long hair the second, pumps the third; jeans vary in the fourth."""
+    c = spread * torch.randn(len(PEOPLE), 4, generator=torch.Generator().manual_seed(0))
+    for row, person in zip(c, PEOPLE, strict=True):
+        row[0] += 10 * (person["outfit"] == "jeans")
+        row[1] += 5 * (person["hair"] == "long")
+        row[2] += 3 * (person["shoes"] == "pumps")
+        row[3] *= 20 if person["outfit"] == "jeans" else 1
+    return c
+
+
+@pytest.fixture(scope="module")
+def mixture():
+    condition = torch.stack([WORDS.encode({**person, "height": 1.7}) for person in PEOPLE])
+    return fit_mixture(components(), condition, WORDS, CONFIG)
+
+
+def part(mixture, **asked):
+    """Where the part of a kind is."""
+    wanted = WORDS.encode(asked)
+    places = ((mixture.kind * wanted).sum(-1) == len(asked)).nonzero().tolist()
+    assert len(places) == 1
+    return tuple(places[0])
+
+
+def test_kinds_are_all_that_can_be_put_together_and_weights_sum_to_one(mixture):
+    real = mixture.log_weight > IMPOSSIBLE / 2
+    assert mixture.log_weight.exp().sum().item() == pytest.approx(1, abs=1e-5)
+    # two groups of women with two hair styles, one of men with one; two pairs of shoes each
+    assert real.sum() == 2 * 2 * 2 + 1 * 2
+    assert mixture.log_weight.shape == (3, 4)
+    assert not mixture.kind[..., WORDS.blocks()["hair"]][~real].any()
+
+
+def test_nobody_gets_the_hair_of_the_other_sex(mixture):
+    male, crew = WORDS.encode({"sex": "male"}), WORDS.encode({"hair": "crew"})
+    assert torch.equal((mixture.kind @ male).bool(), (mixture.kind @ crew).bool())
+
+
+def test_a_kind_that_nobody_showed_is_where_its_attributes_together_put_it(mixture):
+    # nobody wears jeans and pumps with long hair
+    new = part(mixture, sex="female", outfit="jeans", hair="long", shoes="pumps")
+    assert torch.allclose(mixture.centre[new][:3], torch.tensor([10.0, 5.0, 3.0]), atol=0.8)
+    seen = part(mixture, **DRESS, hair="bob", shoes="boots")
+    assert torch.allclose(mixture.centre[seen][:3], torch.zeros(3), atol=0.3)
+
+
+def test_shares_are_those_of_the_people_given_the_sex(mixture):
+    share = mixture.log_weight[part(mixture, **DRESS, hair="long", shoes="boots")].exp().item()
+    women_with_long_hair, with_boots = 100 / 600, 800 / 1000
+    assert share == pytest.approx(0.4 * women_with_long_hair * with_boots, rel=1e-4)
+
+
+def test_groups_keep_their_own_variance(mixture):
+    spread = [
+        torch.einsum("i,ij,ij->j", mixture.variance[group], mixture.axes[group], mixture.axes[group])[3]
+        for group in (part(mixture, **DRESS, hair="bob", shoes="boots")[0],
+                      part(mixture, sex="male", outfit="jeans", hair="crew", shoes="boots")[0])
+    ]  # fmt: skip
+    assert spread[1].item() == pytest.approx(4.0, rel=0.3)
+    assert spread[0] < 0.1
+
+
+def test_people_of_whom_nothing_is_known_are_one_gaussian():
+    mixture = fit_mixture(components(), torch.zeros(len(PEOPLE), 0), NOTHING, CONFIG)
+    assert mixture.log_weight.shape == (1, 1)
+    assert torch.allclose(mixture.centre[0, 0], components().mean(0), atol=0.1)
