@@ -36,7 +36,7 @@ def gaussian(model: DiffusionModel, seeds: Sequence[int]) -> Iterator[Human]:
         raise TypeError("only the default architecture holds a Gaussian of its training people")
     prior = model.denoiser.prior.gaussian()
     for seed in seeds:
-        x0 = prior.sample(1, seeded(seed, model.device))
+        x0 = prior.sample(1, seeded(seed))
         yield Human(model.decode(x0[0]), model.betas(x0, [seed])[0], {"seed": seed}).to("cpu")
 
 

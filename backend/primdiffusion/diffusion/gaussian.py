@@ -112,13 +112,15 @@ class PersonPrior(TensorRecord):
     def sample(
         self, count: int, generator: torch.Generator, condition: Float[Tensor, "1 a"] | None = None
     ) -> Float[Tensor, "count c h w"]:
-        """Draws from the prior, of what is asked for; on the generator's device, which is the prior's."""
+        """Draws from the prior, of what is asked for, on the prior's device; drawn on the generator's."""
 
         def normal(*shape: int) -> Tensor:
-            return torch.randn(shape, generator=generator, dtype=self.mean.dtype, device=self.mean.device)
+            draws = torch.randn(shape, generator=generator, dtype=self.mean.dtype, device=generator.device)
+            return draws.to(self.mean.device)
 
         weight = self.log_weights(condition)[0].flatten().softmax(0)
-        part = torch.multinomial(weight, count, replacement=True, generator=generator)
+        drawn = torch.multinomial(weight.to(generator.device), count, replacement=True, generator=generator)
+        part = drawn.to(self.mean.device)
         group = part // self.log_weight.shape[1]
         in_axes = self.variance[group].sqrt() * normal(count, self.basis.shape[0])
         coefficients = torch.einsum("bij,bi->bj", self.axes[group], in_axes) + self.centre.flatten(0, 1)[part]

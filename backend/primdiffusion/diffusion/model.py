@@ -194,7 +194,7 @@ class DiffusionModel:
         self, generator: torch.Generator, t: int, condition: Float[Tensor, "1 a"] | None
     ) -> Float[Tensor, "1 c h w"]:
         noise = torch.randn((1, *self.codec.shape), generator=generator, device=generator.device)
-        x = self.schedule.noise(t) * noise
+        x = self.schedule.noise(t) * noise.to(self.device)
         if isinstance(self.denoiser, PersonDenoiser):
             x = x + self.schedule.signal(t) * self.denoiser.prior.sample(1, generator, condition)
         return x
@@ -222,7 +222,7 @@ class DiffusionModel:
         if wanted and isinstance(self.denoiser, PersonDenoiser):
             coefficients, _ = self.denoiser.prior.split(x0)
             features = (coefficients / self.denoiser.component_std)[:, :wanted]
-        return self.shapes.sample(features, [seeded(seed, x0.device) for seed in seeds])
+        return self.shapes.sample(features, [seeded(seed) for seed in seeds])
 
 
 def sample(
@@ -235,15 +235,16 @@ def sample(
 ) -> Iterator[Step]:
     """Generate a person of each seed, yielding every step; the last step's x0 is the result (30 DDIM steps by default).
 
-    A seed's noise is the same in any batch; so is the person but for rounding. Stop asking to cancel. ValueError for an
-    unknown sampler, no seeds, a seed outside 0 ... 2^63-1 or a number of steps outside 1 ... T.
+    The same seeds in the same batch give the same bits on one device with one version of torch and number of threads.
+    A seed's noise is the same in any batch and on any device; so is the person, but for rounding. Stop asking to
+    cancel. ValueError for an unknown sampler, no seeds, a seed outside 0 ... 2^63-1 or a number of steps outside 1 ... T.
     """
     if sampler not in SAMPLERS:
         raise ValueError(f"there is no sampler {sampler!r}; choose one of {', '.join(sorted(SAMPLERS))}")
     if not len(seeds):
         raise ValueError("no seeds were given: a person needs one")
     chain = model.chain(model.schedule.length, steps)
-    generators = [seeded(seed, model.device) for seed in seeds]
+    generators = [seeded(seed) for seed in seeds]
     start = model.start(generators, chain[0], condition)
 
     def denoise(x: Tensor, t: int) -> Tensor:
@@ -252,8 +253,11 @@ def sample(
     return SAMPLERS[sampler](denoise, model.schedule, start, chain, generators)
 
 
-def seeded(seed: int, device: torch.device | str = "cpu") -> torch.Generator:
-    """A generator on `device` in the state of `seed`; ValueError for a seed that is no unsigned 63-bit number."""
+def seeded(seed: int) -> torch.Generator:
+    """A generator in the state of `seed`; ValueError for a seed that is no unsigned 63-bit number.
+
+    On the processor, whatever the model is on: devices have generators of their own, and a seed is to be one person.
+    """
     if not 0 <= seed < 2**63:
         raise ValueError(f"seed {seed} is out of range; choose a whole number from 0 to {2**63 - 1}")
-    return torch.Generator(device=device).manual_seed(seed)
+    return torch.Generator().manual_seed(seed)

@@ -55,10 +55,10 @@ def encoded(model: DiffusionModel, human: Human) -> Float[Tensor, "1 c h w"]:
     return model.encode(human.payload.map(lambda values: values[None]))
 
 
-def edit_generator(model: DiffusionModel, seed: int) -> torch.Generator:
-    """The noise of an edit, on the model's device; ValueError for a seed outside 0 ... 2^63-1."""
+def edit_generator(seed: int) -> torch.Generator:
+    """The noise of an edit; ValueError for a seed outside 0 ... 2^63-1."""
     seeded(seed)
-    return seeded(seed ^ EDITING, model.device)
+    return seeded(seed ^ EDITING)
 
 
 def asked(model: DiffusionModel, attributes: Mapping[str, str | float], guidance: float) -> Denoise:

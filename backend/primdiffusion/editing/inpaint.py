@@ -49,7 +49,7 @@ def inpaint(
     region = check_region(region)
     if region.all():
         raise ValueError("the region is the whole person: generate a new one, or vary this one")
-    generator = edit_generator(model, seed)
+    generator = edit_generator(seed)
     chain = model.chain(model.schedule.length, steps)
     model = fitted(model, human)
     denoise = asked(model, attributes, guidance)
@@ -78,7 +78,7 @@ def harmonise(
     does, and for an amount outside 0 ... 1.
     """
     region = check_region(region)
-    generator = edit_generator(model, seed)
+    generator = edit_generator(seed)
     model = fitted(model, human)
     chain = chain_down(model.schedule, amount, steps)
     payload = human.payload

@@ -45,7 +45,7 @@ def vary(
     Raises ValueError for an amount outside 0 ... 1, steps outside 1 ... T, a seed outside 0 ... 2^63-1 and attributes
     that the model does not know.
     """
-    generator = edit_generator(model, seed)
+    generator = edit_generator(seed)
     model = fitted(model, human)
     denoise = asked(model, attributes, guidance)
     chain = chain_down(model.schedule, amount, steps)
