@@ -237,7 +237,8 @@ def sample(
 
     The same seeds in the same batch give the same bits on one device with one version of torch and number of threads.
     A seed's noise is the same in any batch and on any device; so is the person, but for rounding. Stop asking to
-    cancel. ValueError for an unknown sampler, no seeds, a seed outside 0 ... 2^63-1 or a number of steps outside 1 ... T.
+    cancel. ValueError for an unknown sampler, no seeds, a seed outside 0 ... 2^63-1 or a number of steps outside
+    1 ... T.
     """
     if sampler not in SAMPLERS:
         raise ValueError(f"there is no sampler {sampler!r}; choose one of {', '.join(sorted(SAMPLERS))}")
