@@ -52,6 +52,45 @@ def test_count_writes_a_folder_for_each_seed(checkpoint, tmp_path, capsys):
     assert capsys.readouterr().out.splitlines()[1].startswith(f"{tmp_path / 'seed_000006'}  seed 6, 1 steps")
 
 
+def test_a_batch_is_asked_for_and_written_together(checkpoint, tmp_path, capsys):
+    out = tmp_path / "out"
+    line = [
+        "generate",
+        "--seed",
+        "5",
+        "--count",
+        "3",
+        "--batch",
+        "2",
+        "--steps",
+        "1",
+        "--size",
+        "16",
+        "--out",
+        str(out),
+    ]
+    line += ["--checkpoint", str(checkpoint)]
+    cli.main([*line, "--attributes", "outfit=suit", "height=1.8"])
+    assert sorted(path.name for path in out.iterdir()) == ["seed_000005", "seed_000006", "seed_000007"]
+    for seed in (5, 6, 7):
+        with np.load(out / f"seed_{seed:06d}" / "human.npz") as human:
+            meta = json.loads(str(human["meta"]))
+        assert (meta["seed"], meta["attributes"]) == (seed, {"outfit": "suit", "height": 1.8})
+    capsys.readouterr()
+    line[line.index(str(out))] = str(tmp_path / "none")
+    for wrong, said in (
+        ("outfit=robe", "jeans, suit"),
+        ("robe", "NAME=VALUE"),
+        ("beard=full", "outfit, height, weight"),
+    ):
+        code, error = fails(capsys, *line, "--attributes", wrong)
+        assert code == 1
+        assert said in error
+    assert "twice" in fails(capsys, *line, "--attributes", "height=1.7", "height=1.8")[1]
+    assert "batch is 0" in fails(capsys, *line, "--batch", "0")[1]
+    assert not any(path.is_dir() for path in (tmp_path / "none").glob("*"))
+
+
 def test_render_draws_a_pose_at_the_asked_size(person, tmp_path):
     theta = np.zeros((24, 3))
     theta[16, 2] = 1.2

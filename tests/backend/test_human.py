@@ -5,8 +5,9 @@ import math
 
 import pytest
 import torch
+from primdiffusion.body.measures import measure
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.human import Human, framing, generate, place, pose_body, render
+from primdiffusion.human import Human, framing, generate, generate_batch, place, pose_body, render
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import K
 from tiny_model import FULL_DENSITY, tiny_model
@@ -37,6 +38,28 @@ def test_a_person_knows_where_it_comes_from(human):
     assert human.provenance["sampler"] == "ddim"
     assert human.provenance["checkpoint"] == "tiny"
     assert human.provenance["full_density"] == FULL_DENSITY
+
+
+def test_a_person_is_as_tall_and_heavy_and_dressed_as_asked_for():
+    asked = {"outfit": "suit", "height": "1.9", "weight": 90.0}  # words of a command line will do
+    person = generate(tiny_model(), seed=3, steps=3, attributes=asked, guidance=1.0)
+    height, weight = measure(default_body().shape(person.betas))
+    assert height == pytest.approx(1.9, abs=1e-3)
+    assert weight == pytest.approx(90.0, abs=0.1)
+    assert person.provenance["attributes"] == {"outfit": "suit", "height": 1.9, "weight": 90.0}
+    assert person.provenance["guidance"] == 1.0
+    jeans = generate(tiny_model(), seed=3, steps=3, attributes={"outfit": "jeans"}, guidance=1.0)
+    assert not torch.allclose(person.payload.rgb, jeans.payload.rgb, atol=1e-4)
+    with pytest.raises(ValueError, match="guidance"):
+        generate(tiny_model(), seed=3, steps=3, guidance=math.nan)
+
+
+def test_people_of_a_batch_are_those_of_their_seeds():
+    alone = generate(tiny_model(), seed=4, steps=3)
+    together = generate_batch(tiny_model(), [3, 4], steps=3)
+    assert [person.provenance["seed"] for person in together] == [3, 4]
+    assert torch.allclose(together[1].payload.rgb, alone.payload.rgb, atol=1e-4)
+    assert torch.allclose(together[1].betas, alone.betas, atol=1e-4)
 
 
 def test_every_step_is_seen_in_order_and_the_last_is_the_person():
