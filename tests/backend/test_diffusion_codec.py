@@ -1,3 +1,5 @@
+import dataclasses
+
 import pytest
 import torch
 from primdiffusion.diffusion.codec import (
@@ -61,6 +63,13 @@ def test_latents_are_in_the_units_of_the_slab(codec, cells):
     moved = (slabs[0] - slabs[1]).square().sum().sqrt()
     assert (latents[0] - latents[1]).square().sum().sqrt().item() == pytest.approx(moved.item(), rel=0.01)
     assert pytest.approx(0.364) == SLAB_UNIT
+
+
+def test_a_delta_scale_moves_cells_as_far_as_the_slab_that_repeats_it():
+    one = Payload(torch.rand(K, 3, S, S, S), torch.full((K, S, S, S), 50.0), torch.ones(K, 3))
+    other = dataclasses.replace(one, delta_scale=0.5 + torch.rand(K, 3))
+    cells = (cells_from_payload(one, 100.0) - cells_from_payload(other, 100.0)).norm() * SLAB_UNIT
+    assert cells.item() == pytest.approx((pack(one, 100.0) - pack(other, 100.0)).norm().item(), rel=1e-3)
 
 
 def test_mirroring_latents_mirrors_cells(codec):

@@ -9,12 +9,21 @@ import torch
 from diffuse_runs import settings
 from diffusion_people import write_people
 from primdiffusion.diffusion.codec import mirror_cells
+from primdiffusion.diffusion.conditioning import Vocabulary
 from primdiffusion.diffusion.schedule import linear, sqrt_linear
 from primdiffusion.training.cells import CellTrainee, prepare
 from primdiffusion.training.config import PhaseConfig, PriorConfig, check_resumable, to_json
 from primdiffusion.training.interrupt import Interrupt
-from primdiffusion.training.latents import split_people
-from primdiffusion.training.losses import blends, closed_form, level_weight, objective, weighted_error, x0_errors
+from primdiffusion.training.latents import LatentSet, split_people
+from primdiffusion.training.losses import (
+    asked_of,
+    blends,
+    closed_form,
+    level_weight,
+    objective,
+    weighted_error,
+    x0_errors,
+)
 from primdiffusion.training.shards import open_people
 from primdiffusion.training.state import TrainingState, learning_rate_factor
 from primdiffusion.training.stored_people import find_people, read_person
@@ -244,3 +253,13 @@ def test_a_damaged_person_is_named(tmp_path, people):
 def test_an_empty_folder_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="primdiffusion payloads"):
         find_people(tmp_path)
+
+
+def test_blends_are_asked_for_by_what_both_people_have():
+    condition = torch.tensor([[1.0, 0, 1, 0], [1.0, 0, 0, 1]])
+    words = Vocabulary({"sex": ("female", "male"), "pattern": ("patterned", "plain")}, {})
+    people = LatentSet(torch.zeros(2, 1, 32, 32), torch.zeros(2, dtype=torch.int64), torch.zeros(1, 10), condition)
+    indices, weights = torch.tensor([[0, 1], [0, 1]]), torch.tensor([[0.6, 0.4], [1.0, 0.0]])
+    asked = [asked_of(people, indices, weights, words, 0.0, torch.Generator().manual_seed(s)) for s in range(200)]
+    most = torch.stack(asked).amax(0)
+    assert torch.equal(most, torch.tensor([[1.0, 0, 0, 0], [1.0, 0, 1, 0]]))
