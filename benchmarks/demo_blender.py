@@ -50,7 +50,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float]:
     scene_human = import_module(f"{MODULE}.scene.human")
     collection = scene_human.humans(bpy.context.scene)[0]
     armature = scene_human.armature_of(collection)
-    spent = import_module(f"{MODULE}.ui.generation").session.seconds
+    spent = import_module(f"{MODULE}.ui.jobs.session").session.seconds
     rotations = walk_and_wave(arguments.frames)
     numbers = np.arange(1, arguments.frames + 1)
     start = time.perf_counter()

@@ -33,9 +33,9 @@ from blender_primdiffusion.capture.options import (
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.human_file import JOINT_NAMES
-from blender_primdiffusion.ui.capture_operators import RIG
-from blender_primdiffusion.ui.capture_session import captures
-from blender_primdiffusion.ui.capture_settings import words_of
+from blender_primdiffusion.ui.captures.operators import RIG
+from blender_primdiffusion.ui.captures.session import captures
+from blender_primdiffusion.ui.captures.settings import words_of
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = "--poses 2 --cameras 2 --size 48 48 --samples 2 --device cpu --passes img mask depth"

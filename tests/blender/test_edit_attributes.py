@@ -12,8 +12,9 @@ import bpy
 import pytest
 
 from blender_primdiffusion.scene.human import humans, person_file
-from blender_primdiffusion.ui import attributes, edit_settings
-from blender_primdiffusion.ui.panel import PRIMDIFFUSION_PT_attributes
+from blender_primdiffusion.ui.generate import attributes
+from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_attributes
+from blender_primdiffusion.ui.human import edit_settings
 from blender_primdiffusion.worker.names import PARTS
 
 VOCABULARY = {

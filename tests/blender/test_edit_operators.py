@@ -15,9 +15,9 @@ import pytest
 from blender_primdiffusion.scene.body_mesh import body_of
 from blender_primdiffusion.scene.human import armature_of, humans, person_file, remove_human
 from blender_primdiffusion.scene.painted import painted_weights
-from blender_primdiffusion.ui import edit_operators, edit_panel
-from blender_primdiffusion.ui.generation import session
-from blender_primdiffusion.ui.operators import follow
+from blender_primdiffusion.ui.human import edit_operators, edit_panel
+from blender_primdiffusion.ui.jobs.follow import follow
+from blender_primdiffusion.ui.jobs.session import session
 
 DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
 """Seeds that the fake child takes as orders."""

@@ -17,10 +17,11 @@ import pytest
 
 import blender_primdiffusion
 from blender_primdiffusion.scene.human import folder_of, humans
-from blender_primdiffusion.ui import generation, operators
-from blender_primdiffusion.ui.generation import session
-from blender_primdiffusion.ui.operators import follow
-from blender_primdiffusion.ui.panel import PRIMDIFFUSION_PT_generate
+from blender_primdiffusion.ui.generate.operators import PRIMDIFFUSION_OT_generate
+from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_generate
+from blender_primdiffusion.ui.jobs import session as generation
+from blender_primdiffusion.ui.jobs.follow import follow
+from blender_primdiffusion.ui.jobs.session import session
 
 DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
 """Seeds that the fake child takes as orders."""
@@ -70,7 +71,7 @@ def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_j
 
 
 def test_generate_cannot_be_redone_with_a_slider():
-    assert not {"REGISTER", "UNDO"} & operators.PRIMDIFFUSION_OT_generate.bl_options
+    assert not {"REGISTER", "UNDO"} & PRIMDIFFUSION_OT_generate.bl_options
 
 
 @pytest.mark.parametrize(

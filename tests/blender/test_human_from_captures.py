@@ -15,11 +15,12 @@ import pytest
 import blender_primdiffusion
 from blender_primdiffusion import places
 from blender_primdiffusion.scene.human import folder_of, humans
-from blender_primdiffusion.ui import generation, reconstruct_operators, reconstruct_settings
-from blender_primdiffusion.ui.generation import session
-from blender_primdiffusion.ui.operators import follow
-from blender_primdiffusion.ui.panel import PRIMDIFFUSION_PT_generate
-from blender_primdiffusion.ui.reconstruct_panel import PRIMDIFFUSION_PT_human_from_captures
+from blender_primdiffusion.ui.captures import reconstruct_operators, reconstruct_settings
+from blender_primdiffusion.ui.captures.reconstruct_panel import PRIMDIFFUSION_PT_human_from_captures
+from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_generate
+from blender_primdiffusion.ui.jobs import session as generation
+from blender_primdiffusion.ui.jobs.follow import follow
+from blender_primdiffusion.ui.jobs.session import session
 from blender_primdiffusion.worker.environment import BackendPython
 
 FAKE = Path(__file__).parent / "fake_backend"

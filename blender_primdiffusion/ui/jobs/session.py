@@ -12,13 +12,13 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..places import new_backend, preference
-from ..scene.edited import replace_person
-from ..scene.human import build_human, overlap_warning, person_file
-from ..scene.human_file import HumanFileError
-from ..scene.volumes import VolumeWriteError
-from ..worker.job import Backend, EditJob, GenerateJob, PersonJob, ReconstructJob
-from .edit_target import Target
+from ...places import new_backend, preference
+from ...scene.edited import replace_person
+from ...scene.human import build_human, overlap_warning, person_file
+from ...scene.human_file import HumanFileError
+from ...scene.volumes import VolumeWriteError
+from ...worker.job import Backend, EditJob, GenerateJob, PersonJob, ReconstructJob
+from .target import Target
 
 TICK_S = 0.1
 _UNDO_NAMES = {

@@ -14,7 +14,7 @@ def execute(argv: list[str]) -> int:
     if argv[:1] != ["capture"]:
         print("blender -c primdiffusion capture --people FOLDER --out FOLDER ...; --help tells more", file=sys.stderr)
         return 2
-    from ..capture.command import main
+    from ...capture.command import main
 
     return main(argv[1:])
 

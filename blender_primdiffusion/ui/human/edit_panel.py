@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 import bpy
 
-from ..scene.body_mesh import body_of
-from ..worker.names import SIDED_PARTS, WHOLE_PARTS
-from .attributes import draw_attributes
+from ...scene.body_mesh import body_of
+from ...worker.names import SIDED_PARTS, WHOLE_PARTS
+from ..generate.attributes import draw_attributes
+from ..jobs.drawing import draw_job
+from ..jobs.target import selected_person
 from .edit_painting import painting
-from .edit_target import selected_person
-from .panel import draw_job
 
 
 class _InSidebar:

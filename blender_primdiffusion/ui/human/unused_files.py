@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import bpy
 
-from ..scene.edited import unused
-from ..scene.volumes import humans_folder
+from ...scene.edited import unused
+from ...scene.volumes import humans_folder
 
 
 class PRIMDIFFUSION_OT_remove_unused_files(bpy.types.Operator):

@@ -6,8 +6,8 @@ import dataclasses
 
 import bpy
 
-from ..scene.edited import check_editable
-from ..scene.human import human_of, humans, person_file_name
+from ...scene.edited import check_editable
+from ...scene.human import human_of, humans, person_file_name
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,14 +11,14 @@ from typing import Any
 import bpy
 from numpy.typing import NDArray
 
-from ..scene.body_mesh import body_of
-from ..scene.human import humans, person_file
-from ..scene.painted import painted_weights
-from .attributes import asked, parsed
+from ...scene.body_mesh import body_of
+from ...scene.human import humans, person_file
+from ...scene.painted import painted_weights
+from ..generate.attributes import asked, parsed
+from ..jobs.follow import see_through
+from ..jobs.session import Busy, session
+from ..jobs.target import named_person, selected_person
 from .edit_settings import TRANSFER_ITEMS, parts_property
-from .edit_target import named_person, selected_person
-from .generation import Busy, session
-from .operators import see_through
 
 _HUMAN = "Name of the person to edit (of their collection); empty: the selected one"
 _PANELS = "Not given: the panel's"

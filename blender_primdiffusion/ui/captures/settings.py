@@ -9,9 +9,9 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ..capture.blender_camera import CameraError, view_of
-from ..capture.rig import Rig
-from ..capture.settings import LAYOUTS, PASSES
+from ...capture.blender_camera import CameraError, view_of
+from ...capture.rig import Rig
+from ...capture.settings import LAYOUTS, PASSES
 
 _PASS_NAMES = {
     "img": ("Colour", "What the camera sees, over black"),

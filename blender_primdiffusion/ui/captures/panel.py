@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import bpy
 
-from .capture_operators import RIG
-from .capture_session import captures
+from .operators import RIG
+from .session import captures
 
 _LINE = 46
 _SHOWN_LINES = 4

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import textwrap
-
 import bpy
 
+from ..jobs.drawing import draw_job
+from ..jobs.session import session
 from .attributes import draw_attributes
-from .generation import session
-
-_LINE = 46
 
 
 class PRIMDIFFUSION_PT_generate(bpy.types.Panel):
@@ -51,19 +48,3 @@ class PRIMDIFFUSION_PT_attributes(bpy.types.Panel):
         layout.enabled = not session.busy
         draw_attributes(layout, settings.attributes)
         layout.prop(settings, "guidance")
-
-
-def draw_job(layout: bpy.types.UILayout, kind: str, button: str, icon: str) -> None:
-    """The button of an operator that makes people by the child's method `kind`; its progress, errors and news."""
-    job = session.job
-    if job is None or session.kind != kind:
-        layout.operator(button, icon=icon)
-    else:
-        left = f" ({job.eta_s:.0f} s left)" if job.eta_s else ""
-        layout.progress(factor=job.fraction, text=f"{job.message}{left}")
-        layout.operator("primdiffusion.cancel", icon="CANCEL")
-    if session.kind != kind:
-        return
-    for text, news_icon in ((session.error, "ERROR"), (session.notice, "INFO")):
-        for number, line in enumerate(textwrap.wrap(text, _LINE)):
-            layout.label(text=line, icon=news_icon if number == 0 else "BLANK1")

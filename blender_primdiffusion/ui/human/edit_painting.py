@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import bpy
 
-from ..scene.body_mesh import MARK, body_of
-from ..scene.painted import end_painting, start_painting
-from .edit_target import selected_person
+from ...scene.body_mesh import MARK, body_of
+from ...scene.painted import end_painting, start_painting
+from ..jobs.target import selected_person
 
 
 class PRIMDIFFUSION_OT_paint_region(bpy.types.Operator):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import bpy
 
-from ..scene.human import MARK, humans
-from ..worker.names import PARTS, TRANSFERS
-from .attributes import PRIMDIFFUSION_PG_attributes, title
+from ...scene.human import MARK, humans
+from ...worker.names import PARTS, TRANSFERS
+from ..generate.attributes import PRIMDIFFUSION_PG_attributes, title
 
 PAINTED_GROUP = "PrimDiffusion Region"
 """Vertex group of the body mesh that Paint Region makes."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import bpy
 
-from .generation import session
-from .panel import draw_job
+from ..jobs.drawing import draw_job
+from ..jobs.session import session
 
 
 class PRIMDIFFUSION_PT_human_from_captures(bpy.types.Panel):

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import bpy
 
-from ..places import backend_module_path, preference
-from ..worker.vocabulary import Vocabulary, read_vocabulary
+from ...places import backend_module_path, preference
+from ...worker.vocabulary import Vocabulary, read_vocabulary
 
 ANY = "ANY"
 CATEGORIES = ("sex", "outfit", "pattern", "shoes", "hair", "hat")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import bpy
 
-from .generation import Busy, session
-from .operators import see_through
+from ..jobs.follow import see_through
+from ..jobs.session import Busy, session
 
 
 class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import bpy
 
-from ..engine.engine import ENGINE
+from ...engine.engine import ENGINE
 
 _FROM_EEVEE = frozenset(
     {

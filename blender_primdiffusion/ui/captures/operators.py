@@ -11,14 +11,14 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
-from ..capture.blender_camera import aim
-from ..capture.options import parse, settings_of
-from ..capture.report import Report, report_path
-from ..capture.rig import bounding_sphere
-from ..scene.convention import points_to_backend
-from .capture_session import Busy, captures
-from .capture_settings import words_of
-from .operators import redraw
+from ...capture.blender_camera import aim
+from ...capture.options import parse, settings_of
+from ...capture.report import Report, report_path
+from ...capture.rig import bounding_sphere
+from ...scene.convention import points_to_backend
+from ..jobs.follow import redraw
+from .session import Busy, captures
+from .settings import words_of
 
 RIG = "Capture Rig"
 _TICK_S = 0.1
@@ -58,8 +58,8 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
         return {"FINISHED"}
 
     def _render_here(self, context: bpy.types.Context, words: list[str]) -> set[str]:
-        from ..capture.command import describe, scans_in  # the reading of scans and poses would slow Blender's start
-        from ..capture.job import run
+        from ...capture.command import describe, scans_in  # the reading of scans and poses would slow Blender's start
+        from ...capture.job import run
 
         options = parse(words)
         settings, report, told = settings_of(options), Report(), 0.0
@@ -112,7 +112,7 @@ class PRIMDIFFUSION_OT_verify_captures(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """With a window in a Blender of its own; in background mode here, and it fails where something is wrong."""
-        from ..capture.verify import repair, verify
+        from ...capture.verify import repair, verify
 
         out = bpy.path.abspath(self.out or context.scene.primdiffusion_captures.out)
         try:

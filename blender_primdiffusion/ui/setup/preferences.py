@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..places import EXTENSION
+from ...places import EXTENSION
 
 
 class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):

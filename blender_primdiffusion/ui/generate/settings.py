@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..worker.names import SAMPLERS
+from ...worker.names import SAMPLERS
 from .attributes import PRIMDIFFUSION_PG_attributes
 
 _SAMPLERS = {

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import bpy
 
-from ..capture.layout import LIST_FILE
+from ...capture.layout import LIST_FILE
 
 _CAMERAS_FILE = "cameras.json"
 

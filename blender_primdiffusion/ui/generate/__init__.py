@@ -1,0 +1,29 @@
+"""The panel Generate Human."""
+
+from __future__ import annotations
+
+import bpy
+
+from . import attributes, operators, panel, settings
+
+CLASSES = (
+    attributes.PRIMDIFFUSION_PG_attributes,
+    settings.PRIMDIFFUSION_PG_settings,
+    operators.PRIMDIFFUSION_OT_generate,
+    panel.PRIMDIFFUSION_PT_generate,
+    panel.PRIMDIFFUSION_PT_attributes,
+)
+
+
+def register() -> None:
+    """Make the room known to Blender."""
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.types.Scene.primdiffusion = bpy.props.PointerProperty(type=settings.PRIMDIFFUSION_PG_settings)
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    del bpy.types.Scene.primdiffusion
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

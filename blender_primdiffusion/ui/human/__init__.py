@@ -1,0 +1,31 @@
+"""The panel of the person who is selected."""
+
+from __future__ import annotations
+
+import bpy
+
+from . import edit_operators, edit_painting, edit_panel, edit_settings, unused_files
+
+CLASSES = (
+    edit_settings.PRIMDIFFUSION_PG_edit,
+    *edit_operators.EDITS,
+    edit_painting.PRIMDIFFUSION_OT_paint_region,
+    edit_painting.PRIMDIFFUSION_OT_finish_painting,
+    unused_files.PRIMDIFFUSION_OT_remove_unused_files,
+    edit_panel.PRIMDIFFUSION_PT_edit,
+    *edit_panel.SUB_PANELS,
+)
+
+
+def register() -> None:
+    """Make the room known to Blender."""
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.types.Scene.primdiffusion_edit = bpy.props.PointerProperty(type=edit_settings.PRIMDIFFUSION_PG_edit)
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    del bpy.types.Scene.primdiffusion_edit
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)
