@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import bpy
 
-from . import edit_operators, edit_painting, edit_panel, edit_settings, unused_files
+from . import edit_operators, edit_painting, edit_panel, edit_settings, panel, unused_files
 
 CLASSES = (
+    panel.PRIMDIFFUSION_PT_human,
     edit_settings.PRIMDIFFUSION_PG_edit,
     *edit_operators.EDITS,
     edit_painting.PRIMDIFFUSION_OT_paint_region,
