@@ -10,18 +10,17 @@ import argparse
 import contextlib
 import dataclasses
 import json
-import os
-import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import bpy
 
+from ..console import CANCELLED, DONE, FAILED, UNUSABLE, duration, stdout_of_our_own, stopped_by_signals
 from .job import CaptureError, Progress, run
 from .layout import CaptureFolderError
-from .options import CANCELLED, DONE, FAILED, MARK, UNUSABLE, UsageError, parse, settings_of
+from .options import MARK, UsageError, parse, settings_of
 from .report import Report, report_path
 from .scan import ScanError, ScanFile, find_scans
 from .settings import CaptureSettings
@@ -44,10 +43,10 @@ def main(argv: Sequence[str]) -> int:
     except UsageError as error:
         print(f"capture: {error}; --help names all options", file=sys.stderr, flush=True)
         return UNUSABLE
-    with _stdout_of_our_own() as write:
+    with stdout_of_our_own() as write:
         say = _saying_json(write) if options.progress == "json" else write
         try:
-            with _stopped_by_signals() as stop:
+            with stopped_by_signals() as stop:
                 return _run(options, say, stop)
         except (CaptureFolderError, CaptureError, ScanError, OSError, ValueError) as error:
             print(f"capture: {error}", file=sys.stderr, flush=True)
@@ -134,58 +133,8 @@ def _saying_json(write: Callable[[str], None]) -> Say:
 
 def describe(progress: Progress) -> str:
     """A line for people."""
-    left = "" if progress.eta_s is None else f", {_duration(progress.eta_s)} left"
+    left = "" if progress.eta_s is None else f", {duration(progress.eta_s)} left"
     return f"{progress.subject}: view {progress.done} of {progress.total}{left}"
-
-
-def _duration(seconds: float) -> str:
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {seconds} s" if minutes else f"{seconds} s"
-
-
-@contextlib.contextmanager
-def _stdout_of_our_own() -> Iterator[Callable[[str], None]]:
-    """A way to write lines to stdout while all else that is written there, by Blender, is dropped."""
-    sys.stdout.flush()
-    ours = os.dup(1)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.close(nowhere)
-
-    def say(line: str) -> None:
-        os.write(ours, f"{line}\n".encode())
-
-    try:
-        yield say
-    finally:
-        sys.stdout.flush()
-        os.dup2(ours, 1)
-        os.close(ours)
-
-
-@contextlib.contextmanager
-def _stopped_by_signals() -> Iterator[threading.Event]:
-    """Set by Ctrl-C or a polite kill, for the time between views; the second one ends the process at once.
-
-    An exception would not do: raised while Cycles calls Python, it is printed and forgotten.
-    """
-    stop = threading.Event()
-
-    def note(*_: object) -> None:
-        if stop.is_set():
-            os._exit(CANCELLED)
-        stop.set()
-
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
 
 def _set_at_end_of_stdin(stop: threading.Event) -> None:

@@ -16,8 +16,6 @@ from .settings import LAYOUTS, PASSES, Background, CaptureSettings, Device, Ligh
 if TYPE_CHECKING:
     import argparse  # takes a fifth of what registering may take; imported where it is used
 
-DONE, FAILED, UNUSABLE, CANCELLED = 0, 1, 2, 130
-"""Exit codes: all is well; something failed or is damaged; nothing could be begun; told to stop."""
 MARK = "PRIMDIFFUSION "
 """Begins each line of --progress json; an object follows: {"line": ...}, or the fields of `job.Progress`."""
 _POSE_ENDINGS = (".npz", ".npy", ".json", ".bvh")

@@ -20,16 +20,8 @@ from blender_primdiffusion.capture import launch
 from blender_primdiffusion.capture.belongings import data_blocks
 from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.capture.layout import picture_path
-from blender_primdiffusion.capture.options import (
-    CANCELLED,
-    DONE,
-    FAILED,
-    MARK,
-    UNUSABLE,
-    UsageError,
-    parse,
-    settings_of,
-)
+from blender_primdiffusion.capture.options import MARK, UsageError, parse, settings_of
+from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.human_file import JOINT_NAMES

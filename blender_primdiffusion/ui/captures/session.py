@@ -20,7 +20,8 @@ from typing import IO
 import bpy
 
 from ...capture import launch
-from ...capture.options import CANCELLED, DONE, MARK
+from ...capture.options import MARK
+from ...console import CANCELLED, DONE
 
 PATIENCE_S = 0.7
 """After this a child that was asked to stop is ended: its views are written whole or not at all."""
