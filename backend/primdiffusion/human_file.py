@@ -25,18 +25,20 @@ import safetensors
 import safetensors.torch
 import torch
 
-from primdiffusion.body.model import JOINT_NAMES
+from primdiffusion.body.model import JOINT_NAMES, BodyModel
 from primdiffusion.human import Human, body_of
-from primdiffusion.primitives.anchors import anchor_skin_weights, attach
+from primdiffusion.primitives.anchors import Anchors, anchor_skin_weights, attach
 from primdiffusion.primitives.primitives import K, Payload, S
 from primdiffusion.primitives.stand import BodyFiles, Stand, StandError, find_stand
 from primdiffusion.staging import written_whole
 
 FORMAT = "primdiffusion.human"
 FORMAT_VERSION = 1
-"""Of both files."""
+"""Of people who stand on the default body."""
 FORMAT_VERSION_ON_FILES = 2
 """Of people who stand on a body of the user's files; readers refuse a higher one."""
+BLENDER_FORMAT_VERSION = 2
+"""Of human.npz."""
 LARGEST_BETA = 5.0
 """Standard deviations of body shape; beyond, no body is a person's."""
 SHAPES = {"rgb": (K, 3, S, S, S), "density": (K, S, S, S), "delta_scale": (K, 3), "betas": (10,)}
@@ -205,6 +207,10 @@ def export_for_blender(path: str | Path, human: Human) -> None:
     [V,24], joints [24,3], parents [24], joint_names [24]. Primitives: position [K,3], rotation [K,3,3] local to rest
     (columns T, B, N), half_extent [K,3] with the delta scale in it, primitive_weights [K,24], rgb [K,8,8,8,3] float16
     linear and density [K,8,8,8] (1/m, without the window), voxels in the order D, H, W = along N, B, T. meta: JSON.
+
+    Since format version 2 also what all of this is at other betas: template [V,3] and shape_basis [V,3,10] of the
+    surface, joint_template [24,3] and joint_basis [24,3,10], and what `attach` needs: face [K], barycentric [K,3],
+    stencil_vertex [K,m], stencil_du [K,m], stencil_dv [K,m]. Half extents and weights do not depend on the shape.
     """
     human.validate()
     body, anchors = body_of(human)
@@ -224,13 +230,31 @@ def export_for_blender(path: str | Path, human: Human) -> None:
         "primitive_weights": anchor_skin_weights(anchors, body),
         "rgb": human.payload.rgb.movedim(1, -1).to(torch.float16),
         "density": human.payload.density,
+        **_shape_fields(body, anchors, len(human.betas)),
     }
     plain = {name: value.detach().cpu().contiguous().numpy() for name, value in arrays.items()}
     with written_whole(path) as unfinished, unfinished.open("wb") as file:
         np.savez(
             file,
-            format_version=np.int64(FORMAT_VERSION),
+            format_version=np.int64(BLENDER_FORMAT_VERSION),
             meta=np.array(json.dumps(dict(human.provenance))),
             joint_names=np.array(JOINT_NAMES),
             **plain,
         )
+
+
+def _shape_fields(body: BodyModel, anchors: Anchors, betas: int) -> dict[str, torch.Tensor]:
+    """How the body at rest and the frames on it follow `betas` shape coefficients."""
+    basis = body.shape_basis[..., :betas]
+    regressor = body.joint_regressor.double()
+    return {
+        "template": body.template,
+        "shape_basis": basis,
+        "joint_template": (regressor @ body.template.double()).float(),
+        "joint_basis": torch.einsum("jv,vcn->jcn", regressor, basis.double()).float(),
+        "face": anchors.face.to(torch.int32),
+        "barycentric": anchors.barycentric,
+        "stencil_vertex": anchors.stencil_vertex.to(torch.int32),
+        "stencil_du": anchors.stencil_du,
+        "stencil_dv": anchors.stencil_dv,
+    }

@@ -9,6 +9,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from .human import people_files, volume_path
+from .shape_file import body_files
 from .volumes import humans_folder
 
 
@@ -26,8 +27,10 @@ def collect_temporary_volumes(blend_path: str) -> int:
         if source.is_relative_to(temporary) and source.is_file():
             moved[volume] = target / source.relative_to(temporary)
     sources = {volume_path(volume) for volume in moved}
-    for person in people_files():
-        sources |= {folder / person for folder in {path.parent for path in sources} if (folder / person).is_file()}
+    folders = {path.parent for path in sources}
+    places = [(folders, people_files()), ({folder.parent for folder in folders}, body_files())]
+    for near, names in places:
+        sources |= {folder / name for folder in near for name in names if (folder / name).is_file()}
     for source in sources:
         destination = target / source.relative_to(temporary)
         destination.parent.mkdir(parents=True, exist_ok=True)

@@ -17,13 +17,24 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from . import volumes
+from . import shape_file, volumes
 from .armature import move_rest_joints
 from .body_mesh import body_of
 from .convention import frames_to_blender, points_to_blender
-from .human import BETAS, MARK, PERSON, armature_of, folder_of, people_files, person_file, provenance, volume_path
+from .human import (
+    BETAS,
+    MARK,
+    PERSON,
+    armature_of,
+    folder_of,
+    people_files,
+    person_file,
+    provenance,
+    volume_path,
+)
 from .human_file import HumanFile, read_human
 from .quaternion import matrix_to_quaternion
+from .shape_file import body_files, body_kept
 
 _SAME_BETAS = 1e-5
 _PRIMITIVE = re.compile(r"prim_(\d{4,})_[0-9a-f]{12}\.vdb")
@@ -82,7 +93,7 @@ def replace_person(
         files[k] = home / volumes.file_name(grids, k, bpy.app.version)
     name = f"person_{hashlib.sha256(person.read_bytes()).hexdigest()[:12]}.human.safetensors"
     missing = [k for k, path in files.items() if not path.is_file()]
-    with volumes.written(grids, home, {name: person}, missing):
+    with volumes.written(grids, home, {name: person}, missing), body_kept(collection, human.shape_model, home.parent):
         pass
     reshaped = not np.allclose(human.betas, _betas(collection), atol=_SAME_BETAS)
     warning = _reshape(context, collection, human, shown) if reshaped else ""
@@ -106,11 +117,11 @@ def unused(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     used = {volume_path(volume).resolve() for volume in bpy.data.volumes if volume.filepath}
-    kept = people_files()
+    kept = people_files() | body_files()
     found = []
     for path in sorted(folder.rglob("*")):
-        of_people = _PRIMITIVE.fullmatch(path.name) or (_PERSON.fullmatch(path.name) and path.name not in kept)
-        if of_people and path.resolve() not in used:
+        of_people = any(pattern.fullmatch(path.name) for pattern in (_PRIMITIVE, _PERSON, shape_file.NAME))
+        if of_people and path.name not in kept and path.resolve() not in used:
             found.append(path)
     return found
 

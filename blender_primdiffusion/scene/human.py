@@ -18,6 +18,7 @@ from .convention import frames_to_blender, points_to_blender
 from .human_file import HumanFile, read_human
 from .material import volume_material
 from .overlap import CYCLES_LIMIT, most_overlapping
+from .shape_file import body_kept
 
 MARK = "primdiffusion_human"
 """Custom property of a person's collection: its provenance as JSON."""
@@ -38,9 +39,9 @@ def build_human(
     """Build the person of a human.npz in the scene: armature, hidden body mesh and a volume for every primitive.
 
     The person faces -y with the soles on z = 0 at the world's origin: the armature object is lifted, its space is the
-    backend's turned z up. Volumes are written to `folder_of(collection)`, and the files in `keep` are copied
-    beside them. Raises HumanFileError or VolumeWriteError, and then leaves neither data nor files. Takes several
-    seconds; makes no undo step, its caller does.
+    backend's turned z up. Volumes are written to `folder_of(collection)`, the files in `keep` are copied beside them,
+    and the body's file is put beside that folder. Raises HumanFileError or VolumeWriteError, and then leaves neither
+    data nor files. Takes several seconds; makes no undo step, its caller does.
     """
     human = read_human(human_npz)
     with _nothing_left_on_failure():
@@ -59,7 +60,10 @@ def build_human(
         rotation = frames_to_blender(human.rotation)
         grids = volumes.bake(human.density, human.rgb, human.half_extent)
         kept = {path.name: path for path in keep}
-        with volumes.written(grids, folder_of(collection), kept) as files:
+        with (
+            volumes.written(grids, folder_of(collection), kept) as files,
+            body_kept(collection, human.shape_model, folder_of(collection).parent),
+        ):
             attach_volumes(
                 label,
                 armature,
@@ -86,11 +90,7 @@ def person_file(collection: bpy.types.Collection) -> Path:
     Volumes keep their paths when a collection is renamed and when a .blend is saved elsewhere. Raises FileNotFoundError
     with a sentence that names the person and the file.
     """
-    name = person_file_name(collection)
-    volume = next((thing.data for thing in collection.all_objects if thing.type == "VOLUME"), None)
-    folders = [folder_of(collection)]
-    if volume is not None and volume.filepath:
-        folders.insert(0, volume_path(volume).parent)
+    name, folders = person_file_name(collection), folders_of(collection)
     for folder in folders:
         if (folder / name).is_file():
             return folder / name
@@ -98,6 +98,13 @@ def person_file(collection: bpy.types.Collection) -> Path:
         f"the file of the person {collection.name!r} is missing: {str(folders[0] / name)!r}; put it back beside "
         "the person's volumes, or generate the person again"
     )
+
+
+def folders_of(collection: bpy.types.Collection) -> list[Path]:
+    """Where a person's files may be: beside the volumes as they are now, else `folder_of`."""
+    volume = next((thing.data for thing in collection.all_objects if thing.type == "VOLUME"), None)
+    beside = [volume_path(volume).parent] if volume is not None and volume.filepath else []
+    return [*beside, folder_of(collection)]
 
 
 def person_file_name(collection: bpy.types.Collection) -> str:

@@ -11,7 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-FORMAT_VERSION = 1
+from .shape_model import FIELDS, INTEGERS, ShapeModel, faulty_field
+
+FORMAT_VERSION = 2
+"""The newest that is read; 1 knows the person in one shape only."""
 VOXELS = 8
 """Voxels along a side of a primitive."""
 JOINT_NAMES: tuple[str, ...] = (
@@ -58,6 +61,8 @@ class HumanFile:
     """Linear colour [K, D, H, W, 3]; D along N, H along B, W along T."""
     density: NDArray[np.float32]
     """Opacity per metre [K, D, H, W], before the marcher's window."""
+    shape_model: ShapeModel | None = None
+    """How all of this follows other betas; None in files of format version 1."""
 
 
 _SHAPES: dict[str, tuple[int | str, ...]] = {
@@ -66,6 +71,8 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
     "primitive_weights": ("K", 24), "rgb": ("K", VOXELS, VOXELS, VOXELS, 3), "density": ("K", VOXELS, VOXELS, VOXELS),
 }  # fmt: skip
 _DTYPES: dict[str, type] = {"faces": np.int64, "rgb": np.float32, "density": np.float32}
+_SAME_SURFACE = 1e-4
+"""Metres the person's own surface may be from what the shape model gives for their betas."""
 _REMEDY = "generate the person again"
 
 
@@ -86,9 +93,9 @@ def read_human(path: str | Path) -> HumanFile:
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
         raise HumanFileError(f"{path.name!r} is damaged or no human file ({error}); {_REMEDY}") from error
     version = int(_plain(arrays, "format_version", path))
-    if version != FORMAT_VERSION:
+    if not 1 <= version <= FORMAT_VERSION:
         raise HumanFileError(
-            f"{path.name!r} has format version {version}, this add-on reads {FORMAT_VERSION}; "
+            f"{path.name!r} has format version {version}, this add-on reads 1 to {FORMAT_VERSION}; "
             "use an add-on and a backend of the same release"
         )
     try:
@@ -96,7 +103,14 @@ def read_human(path: str | Path) -> HumanFile:
     except json.JSONDecodeError as error:
         raise HumanFileError(f"the field 'meta' of {path.name!r} is not JSON ({error}); {_REMEDY}") from error
     _check_skeleton(arrays, path)
-    return _checked_values(HumanFile(meta=meta, **_shaped_fields(arrays, path)), path)
+    sizes: dict[str, int] = {}
+    human = _checked_values(HumanFile(meta=meta, **_shaped_fields(arrays, path, _SHAPES, sizes)), path)
+    if version == 1:
+        return human
+    fields = _shaped_fields(arrays, path, FIELDS, sizes)
+    dtypes = {name: np.int32 if name in INTEGERS else np.float32 for name in FIELDS}
+    model = ShapeModel(**{name: value.astype(dtypes[name]) for name, value in fields.items()})
+    return dataclasses.replace(human, shape_model=_checked_shape(model, human, path))
 
 
 def _plain(arrays: dict[str, NDArray], name: str, path: Path) -> Any:
@@ -119,11 +133,12 @@ def _check_skeleton(arrays: dict[str, NDArray], path: Path) -> None:
         raise HumanFileError(f"the skeleton of {path.name!r} is not SMPL's 24 joints; choose a body in SMPL format")
 
 
-def _shaped_fields(arrays: dict[str, NDArray], path: Path) -> dict[str, NDArray]:
-    """Every array of _SHAPES with its dtype, sizes named by letters being equal among the fields."""
-    sizes: dict[str, int] = {}
+def _shaped_fields(
+    arrays: dict[str, NDArray], path: Path, shapes: dict[str, tuple[int | str, ...]], sizes: dict[str, int]
+) -> dict[str, NDArray]:
+    """Every array of `shapes` with its dtype; those named by letters are equal among the fields, `sizes` keeps them."""
     fields: dict[str, NDArray] = {}
-    for name, shape in _SHAPES.items():
+    for name, shape in shapes.items():
         value = _field(arrays, name, path)
         fits = value.ndim == len(shape) and value.dtype.kind in "fiu"
         for wanted, given in zip(shape, value.shape, strict=False):
@@ -155,6 +170,15 @@ def _checked_values(human: HumanFile, path: Path) -> HumanFile:
         if faulty:
             raise HumanFileError(f"the field {name!r} of {path.name!r} holds impossible values; {_REMEDY}")
     return human
+
+
+def _checked_shape(model: ShapeModel, human: HumanFile, path: Path) -> ShapeModel:
+    name = faulty_field(model)
+    if name is None and np.abs(model.rest(human.betas).vertices - human.vertices).max() > _SAME_SURFACE:
+        name = "shape_basis"
+    if name is not None:
+        raise HumanFileError(f"the field {name!r} of {path.name!r} holds impossible values; {_REMEDY}")
+    return model
 
 
 def _rows_are_weights(weights: NDArray) -> bool:

@@ -54,7 +54,8 @@ def thinned(npz: Path) -> Path:
     """A copy of a human.npz with few primitives, so that building is quick."""
     with np.load(npz) as archive:
         arrays = {name: archive[name] for name in archive.files}
-    for name in ("position", "rotation", "half_extent", "primitive_weights", "rgb", "density"):
+    count = len(arrays["position"])
+    for name in (name for name, array in arrays.items() if array.ndim and len(array) == count):
         arrays[name] = arrays[name][:PRIMITIVES_IN_BLENDER]
     target = npz.with_name("few.npz")
     np.savez(target, **arrays)

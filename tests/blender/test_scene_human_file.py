@@ -18,7 +18,7 @@ SPOILED = {
     "'density'.*impossible": {"density": np.full((4, 8, 8, 8), -1, np.float32)},
     "'primitive_weights'.*impossible": {"primitive_weights": np.full((4, 24), 0.5)},
     "'faces'.*impossible": {"faces": np.full((1104, 3), 10**6)},
-    "version 2.*reads 1": {"format_version": np.array(2)},
+    "version 3.*reads 1 to 2": {"format_version": np.array(3)},
     "not JSON": {"meta": np.array("{")},
     "not SMPL's 24 joints": {"joint_names": np.array(["bone"] * 24)},
 }

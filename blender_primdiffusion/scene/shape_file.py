@@ -1,0 +1,121 @@
+"""body_<hash>.npz: the shape model of people, beside their folders, so that shapes can be changed without a backend.
+
+All people on the same body share one file; its name tells its content, so a file once written never changes.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import re
+import tempfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from .shape_model import FIELDS, INTEGERS, ShapeModel, faulty_field
+from .volumes import VolumeWriteError
+
+BODY_FILE = "primdiffusion_body_file"
+"""Custom property of a person's collection: the name of their body's file."""
+NAME = re.compile(r"body_[0-9a-f]{12}\.npz")
+_SMALL, _SMALL_LIMIT = np.uint16, 2**16
+"""Of whole numbers in files: vertices and faces of bodies are fewer."""
+
+
+def file_name(model: ShapeModel) -> str:
+    """The name that a shape model's file has."""
+    digest = hashlib.sha256()
+    for name in FIELDS:
+        digest.update(np.ascontiguousarray(getattr(model, name)).tobytes())
+    return f"body_{digest.hexdigest()[:12]}.npz"
+
+
+@contextmanager
+def kept(model: ShapeModel, folder: Path) -> Iterator[str]:
+    """The name of the model's file in `folder`, which is written if it is not there, and goes again where the block
+    fails.
+
+    Raises VolumeWriteError when it cannot be written.
+    """
+    path = folder / file_name(model)
+    made = not path.exists()
+    if made:
+        _write(path, model)
+    try:
+        yield path.name
+    except BaseException:
+        if made:
+            path.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def body_kept(collection: bpy.types.Collection, model: ShapeModel | None, folder: Path) -> Iterator[None]:
+    """As `kept`; the collection names the file where the block ends well.
+
+    Without a model (human.npz of format version 1) nothing is written: such people stay in one shape.
+    """
+    if model is None:
+        yield
+        return
+    with kept(model, folder) as name:
+        yield
+        collection[BODY_FILE] = name
+
+
+def body_files() -> set[str]:
+    """Names of the files of bodies that people of this .blend stand on, those linked included."""
+    return {str(collection[BODY_FILE]) for collection in bpy.data.collections if BODY_FILE in collection}
+
+
+@functools.lru_cache(maxsize=4)
+def read(path: Path) -> ShapeModel:
+    """The shape model in a file; kept in memory, since a file of this name never has another content.
+
+    Raises FileNotFoundError, or ValueError for a damaged file, with what to do.
+    """
+    import zipfile  # slow to import, and not needed to register
+
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"the body's file is missing: {str(path)!r}; put it back beside the people's folders, or generate the "
+            "person again"
+        )
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in FIELDS}
+        dtypes = {name: np.int32 if name in INTEGERS else np.float32 for name in FIELDS}
+        model = ShapeModel(**{name: arrays[name].astype(dtypes[name]) for name in FIELDS})
+        fault = faulty_field(model)
+    except (OSError, ValueError, EOFError, KeyError, IndexError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"the body's file {str(path)!r} is damaged ({error}); generate the person again") from error
+    if fault is not None:
+        raise ValueError(f"the field {fault!r} of {str(path)!r} holds impossible values; generate the person again")
+    return model
+
+
+def _write(path: Path, model: ShapeModel) -> None:
+    arrays = {name: getattr(model, name) for name in FIELDS}
+    for name in INTEGERS:
+        if arrays[name].max() < _SMALL_LIMIT:
+            arrays[name] = arrays[name].astype(_SMALL)
+    unfinished = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".writing_", suffix=".npz", delete=False) as file:
+            unfinished = Path(file.name)
+            np.savez_compressed(file, **arrays)
+        os.replace(unfinished, path)
+    except OSError as error:
+        if unfinished is not None:
+            unfinished.unlink(missing_ok=True)
+        raise VolumeWriteError(
+            f"the body's file could not be written to {str(path.parent)!r} ({error}); save the .blend in a folder with "
+            "write permission and free space"
+        ) from error

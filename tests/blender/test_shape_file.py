@@ -1,0 +1,126 @@
+"""What is known of a body's shape: in human.npz, in a file beside people's folders, and gone where nobody needs it."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+import synthetic
+import synthetic_shape
+
+from blender_primdiffusion.scene import human as human_module
+from blender_primdiffusion.scene.collect import collect_before_saving
+from blender_primdiffusion.scene.edited import unused
+from blender_primdiffusion.scene.human import build_human, folder_of, humans, remove_human
+from blender_primdiffusion.scene.human_file import HumanFileError, read_human
+from blender_primdiffusion.scene.shape import shape_model_of
+from blender_primdiffusion.scene.shape_file import read
+from blender_primdiffusion.scene.shape_model import FIELDS
+
+SPOILED = {
+    "'shape_basis'.*instead of numbers of shape": {"shape_basis": np.zeros((7, 3, 10))},
+    "'shape_basis'.*impossible": {"shape_basis": np.zeros((736, 3, 10))},
+    "'template'.*impossible": {"template": np.full((736, 3), np.nan)},
+    "'face'.*impossible": {"face": np.full(12, 10**6)},
+    "'barycentric'.*impossible": {"barycentric": np.full((12, 3), 0.5)},
+    "'stencil_vertex'.*impossible": {"stencil_vertex": np.full((12, 5), -1)},
+    "'stencil_dv'.*impossible": {"stencil_dv": np.full((12, 5), np.inf)},
+}
+
+
+@pytest.fixture
+def person(saved_scene, tmp_path):
+    return build_human(saved_scene, synthetic_shape.write(tmp_path / "human.npz"))
+
+
+def body_file(person):
+    (path,) = folder_of(person).parent.glob("body_*.npz")
+    return path
+
+
+def test_the_shape_model_gives_the_persons_own_surface_joints_and_frames(tmp_path):
+    human = read_human(synthetic_shape.write(tmp_path / "human.npz"))
+    rest = human.shape_model.rest(human.betas)
+    for name in ("vertices", "joints", "position", "rotation"):
+        np.testing.assert_allclose(getattr(rest, name), getattr(human, name), atol=1e-6)
+
+
+@pytest.mark.parametrize("sentence", SPOILED)
+def test_a_spoiled_field_is_named_in_one_sentence(tmp_path, sentence):
+    path = synthetic_shape.write(tmp_path / "human.npz", **SPOILED[sentence])
+    with pytest.raises(HumanFileError, match=sentence) as caught:
+        read_human(path)
+    assert "\n" not in str(caught.value)
+    assert ";" in str(caught.value)
+
+
+def test_a_file_of_version_2_without_its_fields_is_refused(tmp_path):
+    with pytest.raises(HumanFileError, match="no field 'template'"):
+        read_human(synthetic.write(tmp_path / "human.npz", 4, format_version=np.array(2)))
+
+
+def test_the_model_comes_back_from_its_file_bit_for_bit(person, tmp_path):
+    written = read_human(tmp_path / "human.npz").shape_model
+    back = shape_model_of(person)
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(back, name), getattr(written, name))
+
+
+def test_people_on_one_body_share_its_file_and_nothing_else_is_left_beside_them(person, saved_scene, tmp_path):
+    other = build_human(saved_scene, synthetic_shape.write(tmp_path / "other.npz", rgb=np.zeros((12, 8, 8, 8, 3))))
+    assert shape_model_of(other) is shape_model_of(person)
+    assert sorted(path.name for path in folder_of(person).parent.iterdir()) == [
+        "Human", "Human_001", body_file(person).name
+    ]  # fmt: skip
+
+
+def test_a_person_of_an_earlier_version_is_told_to_be_generated_again(saved_scene, tmp_path):
+    person = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 8))
+    with pytest.raises(ValueError, match=r"'Human' was made by an earlier version.*to reshape"):
+        shape_model_of(person)
+    assert not list(folder_of(person).parent.glob("body_*"))
+
+
+def test_a_missing_or_damaged_file_is_named_with_what_to_do(person):
+    path = body_file(person)
+    whole = path.read_bytes()
+    read.cache_clear()
+    path.write_bytes(whole[:1000])
+    with pytest.raises(ValueError, match=r"body_.*damaged.*generate the person again"):
+        shape_model_of(person)
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match=r"missing.*body_.*put it back"):
+        shape_model_of(person)
+    (folder_of(person) / path.name).write_bytes(whole)
+    assert shape_model_of(person).template.shape == (736, 3)
+
+
+def test_a_failure_while_building_leaves_no_file(saved_scene, tmp_path, monkeypatch):
+    def failing(*_):
+        raise MemoryError("no memory for the volumes")
+
+    monkeypatch.setattr(human_module, "provenance", failing)
+    with pytest.raises(MemoryError):
+        build_human(saved_scene, synthetic_shape.write(tmp_path / "human.npz"))
+    assert not (tmp_path / "shot_humans").exists()
+
+
+def test_the_file_is_unused_only_when_nobody_stands_on_that_body(person):
+    assert unused(folder_of(person).parent) == []
+    path = body_file(person)
+    remove_human(person)
+    assert path in unused(path.parent)
+
+
+def test_saving_for_the_first_time_brings_the_file_along(empty_scene, tmp_path):
+    build_human(empty_scene, synthetic_shape.write(tmp_path / "human.npz"))
+    bpy.app.handlers.save_pre.append(collect_before_saving)
+    try:
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shöt of two.blend"))
+    finally:
+        bpy.app.handlers.save_pre.remove(collect_before_saving)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "shöt of two.blend"))
+    (person,) = humans(bpy.context.scene)
+    assert body_file(person).parent == tmp_path / "shöt of two_humans"
+    read.cache_clear()
+    assert shape_model_of(person).template.shape == (736, 3)
