@@ -185,14 +185,22 @@ def test_the_export_has_the_shapes_blender_expects(exported):
         "format_version": (), "meta": (), "betas": (10,), "parents": (24,), "joint_names": (24,), "joints": (24, 3),
         "vertices": (v, 3), "faces": (f, 3), "uv_corner": (f, 3, 2), "skin_weights": (v, 24), "position": (K, 3),
         "rotation": (K, 3, 3), "half_extent": (K, 3), "primitive_weights": (K, 24), "rgb": (K, 8, 8, 8, 3),
-        "density": (K, 8, 8, 8),
+        "density": (K, 8, 8, 8), "template": (v, 3), "shape_basis": (v, 3, 10), "joint_template": (24, 3),
+        "joint_basis": (24, 3, 10), "face": (K,), "barycentric": (K, 3), "stencil_vertex": (K, 64),
+        "stencil_du": (K, 64), "stencil_dv": (K, 64),
     }  # fmt: skip
     assert {name: array.shape for name, array in exported.items()} == shapes
     assert tuple(exported["joint_names"]) == JOINT_NAMES
     assert exported["parents"][0] == -1
     assert exported["rgb"].dtype == np.float16
     assert json.loads(str(exported["meta"]))["seed"] == 3
-    assert exported["format_version"] == 1
+    assert exported["format_version"] == 2
+
+
+def test_joints_in_the_export_follow_the_shape_as_the_bodys_do(exported):
+    betas = torch.linspace(-2, 2, 10)
+    joints = exported["joint_template"] + exported["joint_basis"] @ betas.numpy()
+    np.testing.assert_allclose(joints, default_body().shape(betas).joints, atol=5e-6)
 
 
 def test_the_export_is_the_person_in_the_t_pose_with_delta_scale_in_the_boxes(exported, human):
