@@ -50,7 +50,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float]:
     scene_human = import_module(f"{MODULE}.scene.human")
     collection = scene_human.humans(bpy.context.scene)[0]
     armature = scene_human.armature_of(collection)
-    spent = import_module(f"{MODULE}.ui.jobs.session").session.seconds
+    spent = import_module(f"{MODULE}.ui.jobs.queue").queue.last.seconds
     rotations = walk_and_wave(arguments.frames)
     numbers = np.arange(1, arguments.frames + 1)
     start = time.perf_counter()
@@ -68,8 +68,8 @@ def person(arguments: argparse.Namespace) -> dict[str, float]:
     bpy.ops.wm.save_as_mainfile(filepath=str(arguments.blend))
     return {
         "seconds_pressed_to_standing": pressed,
-        "seconds_generate": spent["generate"],
-        "seconds_build_scene": spent["build"],
+        "seconds_generate": spent["work"],
+        "seconds_build_scene": spent["finish"],
         "seconds_keyframes": keyframed,
         "lbs_error_mm_max": error,
     }

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import bpy
 
+from .worker.backend import Backend
 from .worker.client import BackendClient
 from .worker.environment import find_backend_python
-from .worker.job import Backend
 
 EXTENSION = str(__package__)
 """The extension's full module name; `bl_ext.<repository>.primdiffusion` once installed."""

@@ -120,6 +120,7 @@ class BackendClient:
         self._silence = 0.0
         self._reported_silence = False
         self._polled_at = time.monotonic()
+        self._abandoned: set[int] = set()
         self.info: dict[str, Any] = {}
         """What the child said of itself: version, python, memory, and device once torch is loaded (`ready`)."""
 
@@ -170,6 +171,15 @@ class BackendClient:
         """Asks the child to stop request `id`; it then fails with code -32001."""
         self.request("cancel", {"id": id})
 
+    def abandon(self, id: int) -> None:
+        """Nobody wants the answer to request `id` any more, whose cancel the child has not got round to yet."""
+        self._abandoned.add(id)
+
+    @property
+    def occupied(self) -> bool:
+        """The child has still to end a request that was abandoned; another one would be refused as busy."""
+        return bool(self._abandoned)
+
     def poll(self) -> list[Event]:
         """What has happened since the last call, in order. Takes no time; call it a few times a second."""
         events: list[Event] = []
@@ -180,7 +190,10 @@ class BackendClient:
             self._heard.clear()
             self._silence, self._reported_silence = 0.0, False
         for message in self._arrived():
-            events.append(self._event(message))
+            if message.get("id") in self._abandoned and "method" not in message:
+                self._abandoned.discard(message["id"])
+            else:
+                events.append(self._event(message))
         events.extend(self._ending(now))
         if self.alive and self._silence > self._silence_s and not self._reported_silence:
             self._reported_silence = True

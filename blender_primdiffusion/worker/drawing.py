@@ -12,11 +12,14 @@ import time
 from collections.abc import Mapping
 from typing import Any, Literal
 
+from .backend import Backend
 from .client import BackendClient, Died, Event, Failure, Notification, Response, Silent
-from .job import CANCEL_PATIENCE_S, CANCELLED_CODE, Backend, JobError
+from .job import CANCELLED_CODE, JobError
 
 IDLE_S = 600.0
 """A child at rest holds about half a gigabyte; starting one takes seconds."""
+CANCEL_PATIENCE_S = 15.0
+"""A cancel takes effect at the end of a band; a child that takes longer than this is ended."""
 LISTEN_S = 0.02
 """How late a cancel may be noticed."""
 State = Literal["waiting", "starting", "drawing", "done", "failed", "cancelled"]

@@ -1,4 +1,4 @@
-"""One person in the making as Blender follows it: a small state machine that a timer ticks."""
+"""One request to the child as Blender follows it: a small state machine that a timer ticks."""
 
 from __future__ import annotations
 
@@ -7,74 +7,31 @@ import dataclasses
 import shutil
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+from .backend import Backend
 from .client import BackendClient, Died, Event, Failure, Notification, Response, Silent
+from .sentence import sentence
 
 State = Literal["starting", "running", "cancelling", "done", "failed", "cancelled"]
 FINAL: tuple[State, ...] = ("done", "failed", "cancelled")
 CANCELLED_CODE = -32001
-CANCEL_PATIENCE_S = 15.0
-"""A cancel takes effect at the end of a step; a child that takes longer than this is ended."""
+CANCEL_PATIENCE_S = 0.8
+"""A cancel takes effect at the end of a step; the user waits no longer than this."""
 STAGES = {
     "read": "Reading the pictures",
     "load": "Loading the model",
     "sample": "Generating",
     "encode": "Reconstructing",
     "preview": "Drawing the previews",
+    "render": "Drawing the previews",
     "write": "Writing the person",
+    "merge": "Merging the volumes",
+    "fit": "Fitting",
 }
-
-_PICTURE_PX = 16
-EDITS = {"vary": "Varied", "interpolate": "Blended", "inpaint": "Re-dressed", "transfer": "Texture transferred"}
-"""Methods of the child that make a person of a person, and what became of them."""
-
-
-class Backend:
-    """The child that jobs share: started at first use, kept warm, started anew after it died."""
-
-    def __init__(self, make_client: Callable[[], BackendClient]):
-        """`make_client` finds a Python and returns a client not yet started, in a thread: it must not touch bpy."""
-        self._make_client = make_client
-        self._lock = threading.Lock()
-        self._client: BackendClient | None = None
-        self._closed = False
-        self._job: PersonJob | None = None
-
-    def admit(self, job: PersonJob) -> bool:
-        """Takes `job` as the one at work; False while another is."""
-        if self._job is not None and not self._job.finished:
-            return False
-        self._job = job
-        return True
-
-    @property
-    def client(self) -> BackendClient | None:
-        """The running child, if there is one; never starts one."""
-        client = self._client
-        return client if client is not None and client.alive else None
-
-    def connect(self) -> BackendClient:
-        """The running child, started now if there is none. Takes seconds. Raises BackendNotFound or OSError."""
-        with self._lock:
-            running = self.client
-            if running is not None:
-                return running
-            client = self._make_client()
-            client.start()
-            self._client = client
-            if self._closed:
-                client.shutdown()
-                raise RuntimeError("the backend was shut down while it was starting")
-            return client
-
-    def shutdown(self) -> None:
-        """Ends the child for good, also one that is just being started."""
-        self._closed = True
-        if self._client is not None:
-            self._client.shutdown()
+"""What the child calls its stages, for people."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,40 +44,37 @@ class JobError:
     log: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        return " ".join(_sentence(part) for part in (self.message, self.remedy) if part)
+        return " ".join(sentence(part) for part in (self.message, self.remedy) if part)
 
 
-def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
-
-
-class PersonJob:
-    """Makes one person in `out_dir`. Call `tick` from a timer until `finished`; then read `result` or `error`.
+class Job:
+    """Asks the child for one thing. Call `tick` from a timer until `finished`; then read `result` or `error`.
 
     starting -> running -> done | failed;  cancel: -> cancelling -> cancelled.
+
+    Of a method with the parameter `steps` (a sampler's) those steps are the progress, else those of every stage.
     """
 
-    method: str
-    """Of the child."""
-    made: str
-    """What became of the person, for `message`."""
-
-    def __init__(self, backend: Backend, params: dict[str, Any], out_dir: Path, total: int):
-        self._params = {**params, "out_dir": str(out_dir)}
+    def __init__(self, backend: Backend, method: str, params: Mapping[str, Any]):
+        """The child's half-written files are looked for in the parameter `out_dir`, where the method has one."""
+        self.method = method
+        self._params = dict(params)
         self._backend = backend
-        self._out_dir = out_dir
-        self._out_dir_is_new = not out_dir.exists()
+        self._out_dir = Path(params["out_dir"]) if "out_dir" in params else None
+        self._out_dir_is_new = self._out_dir is not None and not self._out_dir.exists()
         self._client: BackendClient | None = None
         self._request: int | None = None
         self._cancel_asked_at: float | None = None
         self.state: State = "starting"
         self.step = 0
-        self.total = total
+        self.total = int(params.get("steps", 1))
         self.eta_s: float | None = None
         """Seconds that are left, None while unknown."""
         self.message = "Starting the backend"
+        self.picture: Path | None = None
+        """A PNG of what is there so far."""
         self.result: dict[str, Any] | None = None
-        """The child's: human, person, preview (paths), seconds and what the method adds."""
+        """The child's."""
         self.error: JobError | None = None
         self._connected: BackendClient | None = None
         self._connect_error: Exception | None = None
@@ -128,7 +82,7 @@ class PersonJob:
         if backend.admit(self):
             self._connecting.start()
         else:
-            self._fail(JobError("a person is being made already", "wait for it, or cancel it first", "busy"))
+            self._fail(JobError("the backend is at work already", "wait for it, or cancel it first", "busy"))
 
     @property
     def finished(self) -> bool:
@@ -138,7 +92,7 @@ class PersonJob:
     @property
     def fraction(self) -> float:
         """Progress from 0 to 1."""
-        return 1.0 if self.state == "done" else self.step / max(self.total, 1)
+        return 1.0 if self.state == "done" else min(self.step / max(self.total, 1), 1.0)
 
     @property
     def info(self) -> dict[str, Any]:
@@ -149,7 +103,7 @@ class PersonJob:
         """Takes in what has happened; True if something visible changed. Never waits."""
         if self.finished:
             return False
-        before = (self.state, self.step, self.total, self.eta_s, self.message)
+        before = (self.state, self.step, self.total, self.eta_s, self.message, self.picture)
         if self._client is None:
             self._tick_start()
         if self._client is not None and not self.finished:
@@ -157,11 +111,13 @@ class PersonJob:
                 self._take(event)
                 if self.finished:
                     break
-            self._lose_patience()
-        return before != (self.state, self.step, self.total, self.eta_s, self.message)
+            if self._request is None and not self.finished:
+                self._ask(self._client)
+        self._lose_patience()
+        return before != (self.state, self.step, self.total, self.eta_s, self.message, self.picture)
 
     def cancel(self) -> None:
-        """Asks for an end; `tick` goes on until the state is cancelled (within one step of the sampler)."""
+        """Asks for an end; `tick` goes on until the state is cancelled, which it is within a second."""
         if self.finished or self._cancel_asked_at is not None:
             return
         self._cancel_asked_at = time.monotonic()
@@ -184,15 +140,17 @@ class PersonJob:
         if self._cancel_asked_at is not None:
             self._end("cancelled", "Cancelled")
         elif self._client is None:
-            sentence = str(self._connect_error) or type(self._connect_error).__name__
-            self._fail(JobError(sentence, "", "environment"))
-        else:
-            self._ask(self._client)
+            said = str(self._connect_error) or type(self._connect_error).__name__
+            self._fail(JobError(said, "", "environment"))
+        elif not self._client.info.get("ready"):
+            self.message = "Loading PyTorch"
 
     def _ask(self, client: BackendClient) -> None:
-        self._request = client.request(self.method, self._params)
-        if not client.info.get("ready"):
-            self.message = "Loading PyTorch"
+        """Sends the request, unless the child has still to find out that an earlier one is not wanted any more."""
+        if self._cancel_asked_at is not None:
+            self._end("cancelled", "Cancelled")
+        elif not client.occupied:
+            self._request = client.request(self.method, self._params)
 
     # following
 
@@ -201,8 +159,8 @@ class PersonJob:
             self._take_progress(event.params)
         elif isinstance(event, Response) and event.id == self._request:
             self.result = event.result
-            self.step, self.eta_s = self.total, 0.0
-            self._end("done", f"{self.made} in {event.result['seconds']:.1f} s")
+            self.step = self.total
+            self._end("done", "Done")
         elif isinstance(event, Failure) and event.id == self._request:
             if event.code == CANCELLED_CODE:
                 self._end("cancelled", "Cancelled")
@@ -216,26 +174,35 @@ class PersonJob:
                 self._fail(JobError(event.message, "Try again; the log tells more", "died", event.stderr))
         elif isinstance(event, Silent):
             self._kill()
-            sentence = f"the backend hung: it said nothing for {event.seconds:.0f} s and was ended"
-            self._fail(JobError(sentence, "Try again; the log tells more", "hung", self._log()))
+            said = f"the backend hung: it said nothing for {event.seconds:.0f} s and was ended"
+            self._fail(JobError(said, "Try again; the log tells more", "hung", self._log()))
 
     def _take_progress(self, params: dict[str, Any]) -> None:
         if self._cancel_asked_at is not None:
             return
         stage = params.get("stage", "")
         self.state = "running"
-        self.message = STAGES.get(stage, stage)
+        self.message = STAGES.get(stage, stage.capitalize())
         self.eta_s = params.get("eta_s")
-        self._take_step(stage, params["step"], params["total"])
-
-    def _take_step(self, stage: str, step: int, total: int) -> None:
-        self.step, self.total = step, total
+        if params.get("picture"):
+            self.picture = Path(params["picture"])
+        samples = "steps" in self._params
+        if not samples or stage == "sample":
+            self.step, self.total = params["step"], params["total"]
+        if samples and stage == "sample":
+            self.message = f"{self.message}: step {self.step} of {self.total}"
 
     def _lose_patience(self) -> None:
         asked = self._cancel_asked_at
-        if not self.finished and asked is not None and time.monotonic() - asked > CANCEL_PATIENCE_S:
-            self._kill()
-            self._end("cancelled", "Cancelled; the backend did not answer and was ended")
+        if self.finished or asked is None or time.monotonic() - asked < CANCEL_PATIENCE_S:
+            return
+        client = self._client
+        if client is not None and self._request is not None:
+            if client.info.get("ready"):
+                self._kill()
+            else:  # importing torch takes seconds that need not be spent again: the child drops the request after it
+                client.abandon(self._request)
+        self._end("cancelled", "Cancelled")
 
     def _kill(self) -> None:
         if self._client is not None:
@@ -244,7 +211,7 @@ class PersonJob:
 
     def _clear_leftovers(self) -> None:
         """Half-written files of a killed child lie in a folder of its own (the backend's staging.py names it so)."""
-        if self._client is not None:
+        if self._client is not None and self._out_dir is not None:
             shutil.rmtree(self._out_dir / f".primdiffusion-partial-{self._client.pid}", ignore_errors=True)
             if self._out_dir_is_new:
                 with contextlib.suppress(OSError):  # holds other things, or never came to be
@@ -259,86 +226,3 @@ class PersonJob:
 
     def _end(self, state: State, message: str) -> None:
         self.state, self.message, self.eta_s = state, message, None
-
-
-class SamplingJob(PersonJob):
-    """A person whom the diffusion model draws; progress counts the sampler's steps. Its pictures are of no use here."""
-
-    def __init__(
-        self, backend: Backend, params: dict[str, Any], *, out_dir: Path, steps: int, checkpoint: Path | None = None
-    ):
-        if checkpoint is not None:
-            params = {**params, "checkpoint": str(checkpoint)}
-        super().__init__(backend, {**params, "steps": steps, "size": _PICTURE_PX}, out_dir, steps)
-
-    def _take_step(self, stage: str, step: int, total: int) -> None:
-        if stage == "sample":
-            super()._take_step(stage, step, total)
-            self.message = f"{self.message}: step {step} of {total}"
-
-
-class GenerateJob(SamplingJob):
-    """A person from noise."""
-
-    method = "generate"
-    made = "Generated"
-
-    def __init__(
-        self,
-        backend: Backend,
-        *,
-        seed: int,
-        steps: int,
-        out_dir: Path,
-        sampler: str = "ddim",
-        asked: Mapping[str, Any] | None = None,
-        checkpoint: Path | None = None,
-    ):
-        """`asked` are further parameters: attributes, guidance."""
-        params = {"seed": seed, "sampler": sampler, **(asked or {})}
-        super().__init__(backend, params, out_dir=out_dir, steps=steps, checkpoint=checkpoint)
-
-
-class EditJob(SamplingJob):
-    """A person made of one that exists, by one of the child's methods in EDITS."""
-
-    def __init__(
-        self,
-        backend: Backend,
-        method: str,
-        person: Path,
-        asked: Mapping[str, Any],
-        *,
-        out_dir: Path,
-        steps: int,
-        checkpoint: Path | None = None,
-    ):
-        """`person` is the backend's file of whom to edit, `asked` the method's other parameters."""
-        self.method, self.made = method, EDITS[method]
-        params = {**asked, "person": str(person)}
-        super().__init__(backend, params, out_dir=out_dir, steps=steps, checkpoint=checkpoint)
-
-
-class ReconstructJob(PersonJob):
-    """A person from captures; progress counts reading, loading, encoding and writing."""
-
-    method = "reconstruct"
-    made = "Reconstructed"
-
-    def __init__(
-        self,
-        backend: Backend,
-        *,
-        capture: Path,
-        out_dir: Path,
-        subject: str | None = None,
-        frame: int = 0,
-        views: int = 8,
-        checkpoint: Path | None = None,
-    ):
-        params: dict[str, Any] = {"capture": str(capture), "frame": frame, "views": views}
-        if subject is not None:
-            params["subject"] = subject
-        if checkpoint is not None:
-            params["checkpoint"] = str(checkpoint)
-        super().__init__(backend, params, out_dir, 4)

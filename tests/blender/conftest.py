@@ -43,14 +43,15 @@ def addon(saved_scene, tmp_path, monkeypatch):
 
     import blender_primdiffusion
     from blender_primdiffusion import places
-    from blender_primdiffusion.ui.jobs.session import session
+    from blender_primdiffusion.ui.jobs.queue import queue
     from blender_primdiffusion.worker.environment import BackendPython
 
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic.write(tmp_path / "prepared.npz", 8)))
     python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
     monkeypatch.setattr(places, "find_backend_python", lambda *_, **__: python)
     monkeypatch.setattr(places, "backend_module_path", lambda: Path(__file__).parent / "fake_backend")
-    session.error = session.notice = session.kind = session.device = ""
+    queue.outcomes.clear()
+    queue.info = {}
     blender_primdiffusion.register()
     yield saved_scene
     blender_primdiffusion.unregister()

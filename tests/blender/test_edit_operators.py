@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
-from types import SimpleNamespace
-from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
 import pytest
+from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 from blender_primdiffusion.scene.body_mesh import body_of
 from blender_primdiffusion.scene.human import armature_of, humans, person_file, remove_human
 from blender_primdiffusion.scene.painted import painted_weights
 from blender_primdiffusion.ui.human import edit_operators, edit_panel
+from blender_primdiffusion.ui.human.edit_work import VaryWork
 from blender_primdiffusion.ui.jobs.follow import follow
-from blender_primdiffusion.ui.jobs.session import session
+from blender_primdiffusion.ui.jobs.queue import queue
 
 DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
 """Seeds that the fake child takes as orders."""
@@ -47,30 +46,12 @@ def sent(person) -> dict:
     return asked
 
 
-def drive(seconds: float = 60.0) -> None:
-    """The timer's part, by hand: background mode runs no timers."""
-    end = time.monotonic() + seconds
-    while follow() is not None:
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
-def until_running() -> None:
-    while session.job.state != "running":
-        session.tick()
-        time.sleep(0.01)
-
-
 def start(person, seed: int = FINE, **params) -> None:
-    session.start_edit(person, "vary", 2, {"amount": 0.5, "seed": seed, **params})
+    queue.add(bpy.context, VaryWork.of(person, 2, {"amount": 0.5, "seed": seed, **params}))
 
 
 def texts(panel, context) -> str:
-    layout = MagicMock()
-    layout.panel.return_value = (MagicMock(), None)
-    panel.draw(SimpleNamespace(layout=layout), context)
-    shown = [call.kwargs["text"] for drawn in (layout.label, layout.progress) for call in drawn.call_args_list]
-    return " | ".join([call.args[0] for call in layout.operator.call_args_list] + shown)
+    return " | ".join(shown(panel, context))
 
 
 def test_vary_changes_the_selected_person_in_place_as_one_undo_step(person):
@@ -81,7 +62,7 @@ def test_vary_changes_the_selected_person_in_place_as_one_undo_step(person):
     assert sent(person) == {"person": str(first), "amount": 0.25, "seed": FINE, "steps": 3}
     assert not set(before) & set(paths(person))
     assert armature_of(person).location.x == 3.0
-    assert "8 of 8 volumes of Human changed" in session.notice
+    assert "8 of 8 volumes of Human changed" in notice_of("vary")
     after = paths(person)
     bpy.ops.ed.undo()
     person = humans(bpy.context.scene)[0]
@@ -123,7 +104,7 @@ def test_a_blend_moves_the_body_where_the_betas_differ(person):
     assert (asked["other"], asked["fraction"]) == (str(person_file(humans(bpy.context.scene)[1])), 0.75)
     moved = [list(bone.head_local) for bone in armature_of(person).data.bones]
     np.testing.assert_allclose(moved, np.array(joints) * 1.1, atol=1e-5)
-    assert "the body's shape too" in session.notice
+    assert "the body's shape too" in notice_of("interpolate")
 
 
 def test_any_part_of_a_person_selects_it_and_a_script_may_name_it(person):
@@ -196,7 +177,7 @@ def test_a_person_removed_while_the_job_runs_is_said_so_and_the_other_is_untouch
     until_running()
     remove_human(person)
     drive()
-    assert "'Human' was removed while the edit was under way" in session.error
+    assert "'Human' was removed while the edit was under way" in error_of("vary")
     assert [paths(left) for left in humans(bpy.context.scene)] == [other]
 
 
@@ -205,8 +186,8 @@ def test_objects_deleted_by_hand_while_the_job_runs_count_as_removal(person):
     until_running()
     bpy.data.batch_remove(list(person.all_objects))
     drive()
-    assert "was removed while the edit was under way" in session.error
-    assert not session.busy
+    assert "was removed while the edit was under way" in error_of("vary")
+    assert not queue.busy
 
 
 def test_undo_of_something_else_during_the_job_does_not_lose_the_person(person):
@@ -218,7 +199,7 @@ def test_undo_of_something_else_during_the_job_does_not_lose_the_person(person):
     until_running()
     bpy.ops.ed.undo()
     drive()
-    assert session.error == ""
+    assert error_of("vary") == ""
     assert not set(paths(humans(bpy.context.scene)[0])) & set(before)
 
 
@@ -229,7 +210,7 @@ def test_undo_of_an_earlier_edit_during_the_job_refuses_the_result(person):
     until_running()
     bpy.ops.ed.undo()
     drive()
-    assert "became another while the edit was under way" in session.error
+    assert "became another while the edit was under way" in error_of("vary")
     assert paths(humans(bpy.context.scene)[0]) == before
 
 
@@ -242,7 +223,7 @@ def test_saving_for_the_first_time_and_renaming_during_the_job_do_not_matter(add
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "late.blend"))
     person.name = "Anna"
     drive()
-    assert session.error == ""
+    assert error_of("vary") == ""
     assert all(path.startswith("//late_humans/Human/") for path in paths(person))
     assert person_file(person).parent == tmp_path / "late_humans" / "Human"
     assert sent(person)["seed"] == FINE
@@ -253,7 +234,7 @@ def test_loading_a_file_during_the_job_drops_it(person):
     until_running()
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-    assert not session.busy
+    assert not queue.busy
     assert follow() is None
     assert len(humans(bpy.context.scene)) == 2
 
@@ -270,7 +251,7 @@ def test_a_result_that_comes_in_edit_mode_leaves_it_and_can_be_undone(person, pa
     start(person)
     bpy.ops.object.mode_set(mode="EDIT")
     drive()
-    assert session.error == ""
+    assert error_of("vary") == ""
     assert bpy.context.mode == "OBJECT"
     assert not set(paths(person)) & set(before)
     bpy.ops.ed.undo()
@@ -302,23 +283,22 @@ def test_who_cannot_be_edited_is_said_before_a_job_begins(addon, tmp_path):
     for sentence, edit in refused.items():
         with pytest.raises(RuntimeError, match=sentence):
             edit()
-        assert not session.busy
+        assert not queue.busy
     person_file(humans(addon.scene)[0]).unlink()
     with pytest.raises(RuntimeError, match="file of the person 'Human' is missing"):
         ops.vary(human="Human")
 
 
-def test_one_job_at_a_time(person):
+def test_a_panel_shows_its_own_work_alone_and_cancels_it(person):
     start(person, TAKES_LONG)
     until_running()
-    with pytest.raises(RuntimeError, match="being made; wait for it or press Cancel"):
-        ops.redress(seed=FINE)
-    shown = texts(edit_panel.SUB_PANELS[0], bpy.context)
-    assert "primdiffusion.cancel" in shown
-    assert "step" in shown
+    shown_by_vary = texts(edit_panel.SUB_PANELS[0], bpy.context)
+    assert "primdiffusion.cancel" in shown_by_vary
+    assert "step" in shown_by_vary
+    assert "primdiffusion.cancel" not in texts(edit_panel.SUB_PANELS[1], bpy.context)
     ops.cancel()
     drive()
-    assert session.notice == "Cancelled"
+    assert notice_of("vary") == "Cancelled"
 
 
 def test_no_edit_can_be_redone_with_a_slider():

@@ -15,7 +15,7 @@ from blender_primdiffusion import places
 from blender_primdiffusion.scene.body_mesh import body_of
 from blender_primdiffusion.scene.human import MARK, armature_of, humans, person_file
 from blender_primdiffusion.scene.human_file import JOINT_NAMES
-from blender_primdiffusion.ui.jobs import session as generation
+from blender_primdiffusion.ui.jobs import work
 from blender_primdiffusion.worker.client import BackendClient
 from blender_primdiffusion.worker.environment import BackendPython
 
@@ -31,7 +31,7 @@ def people(saved_scene, tmp_path, monkeypatch):
     checkpoint = save_tiny_checkpoint(tmp_path / "tiny.safetensors")
     python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
     monkeypatch.setattr(places, "find_backend_python", lambda *_, **__: python)
-    monkeypatch.setattr(generation, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
+    monkeypatch.setattr(work, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
     # With a cache in Blender's temporary folder the child would compile its marcher anew for each test.
     monkeypatch.setattr(places, "BackendClient", lambda python, module, cache_dir: BackendClient(python, module))
     blender_primdiffusion.register()

@@ -9,39 +9,31 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
-from unittest.mock import MagicMock
 
 import bpy
 import pytest
+from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 import blender_primdiffusion
 from blender_primdiffusion.scene.human import folder_of, humans
 from blender_primdiffusion.ui.generate.operators import PRIMDIFFUSION_OT_generate
 from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_generate
-from blender_primdiffusion.ui.jobs import session as generation
+from blender_primdiffusion.ui.generate.work import GenerateWork
+from blender_primdiffusion.ui.jobs import queue as queue_module
 from blender_primdiffusion.ui.jobs.follow import follow
-from blender_primdiffusion.ui.jobs.session import session
+from blender_primdiffusion.ui.jobs.queue import queue
 
 DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
 """Seeds that the fake child takes as orders."""
 FAKE = Path(__file__).parent / "fake_backend"
 
 
-def drive(seconds: float = 30.0) -> None:
-    """The timer's part, by hand: background mode runs no timers."""
-    end = time.monotonic() + seconds
-    while follow() is not None:
-        assert time.monotonic() < end
-        time.sleep(0.01)
+def ask(context, seed: int, steps: int) -> None:
+    queue.add(context, GenerateWork(seed, steps))
 
 
 def panel_texts(context) -> list[str]:
-    layout = MagicMock()
-    PRIMDIFFUSION_PT_generate.draw(SimpleNamespace(layout=layout), context)
-    labels = [call.kwargs["text"] for call in layout.label.call_args_list]
-    buttons = [call.args[0] for call in layout.operator.call_args_list]
-    return labels + buttons + [call.kwargs["text"] for call in layout.progress.call_args_list]
+    return shown(PRIMDIFFUSION_PT_generate, context)
 
 
 def test_generate_builds_a_person_and_keeps_the_backends_file_beside_its_volumes(addon):
@@ -51,10 +43,10 @@ def test_generate_builds_a_person_and_keeps_the_backends_file_beside_its_volumes
     sent = json.loads((folder_of(person) / "person.human.safetensors").read_bytes())
     assert Path(sent.pop("out_dir")).name.startswith("generate_")
     assert sent == {"seed": 7, "steps": 3, "sampler": "ddim", "size": 16}
-    assert not session.busy
-    assert session.error == ""
-    assert session.device == "fake device"
-    assert set(session.seconds) == {"generate", "build"}
+    assert not queue.busy
+    assert error_of("generate") == ""
+    assert queue.info["device_name"] == "fake device"
+    assert set(queue.last.seconds) == {"work", "finish"}
 
 
 def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_job(addon):
@@ -67,7 +59,7 @@ def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_j
     bpy.ops.ed.redo()
     assert len(humans(bpy.context.scene)) == 1
     assert all(volume.grids.load() for volume in bpy.data.volumes)
-    assert not session.busy
+    assert not queue.busy
 
 
 def test_generate_cannot_be_redone_with_a_slider():
@@ -92,33 +84,29 @@ def test_after_a_death_the_next_generation_works(addon):
     with pytest.raises(RuntimeError):
         bpy.ops.primdiffusion.generate(seed=DIES, steps=1)
     assert bpy.ops.primdiffusion.generate(seed=7, steps=1) == {"FINISHED"}
-    assert session.error == ""
+    assert error_of("generate") == ""
 
 
 def test_a_killed_child_is_reported_within_a_second(addon):
-    session.start(TAKES_LONG, 50)
-    while session.job.state != "running":
-        session.tick()
-        time.sleep(0.01)
-    os.kill(session._backend.client.pid, signal.SIGKILL)
+    ask(addon, TAKES_LONG, 50)
+    until_running()
+    os.kill(queue.child_pid, signal.SIGKILL)
     killed = time.monotonic()
     drive()
     assert time.monotonic() - killed < 1.0
-    assert "killed by the system" in session.error
+    assert "killed by the system" in error_of("generate")
     assert not humans(addon.scene)
 
 
-def test_a_second_click_is_one_clear_error_and_does_not_disturb_the_first(addon):
-    session.start(7, 2)
-    with pytest.raises(RuntimeError, match="being made; wait for it or press Cancel"):
-        bpy.ops.primdiffusion.generate(seed=8, steps=1)
-    drive()
-    assert len(humans(addon.scene)) == 1
+def test_a_second_click_waits_in_line_and_does_not_disturb_the_first(addon):
+    ask(addon, 7, 2)
+    assert bpy.ops.primdiffusion.generate(seed=8, steps=1) == {"FINISHED"}
+    assert len(humans(addon.scene)) == 2
 
 
 def test_the_timer_builds_the_person_and_the_panel_shows_progress_then_the_result(addon):
     assert "primdiffusion.generate" in panel_texts(addon)
-    session.start(TAKES_LONG, 2)
+    ask(addon, TAKES_LONG, 2)
     seen = []
     while follow() is not None:
         seen += panel_texts(addon)
@@ -127,7 +115,7 @@ def test_the_timer_builds_the_person_and_the_panel_shows_progress_then_the_resul
             bpy.ops.primdiffusion.cancel()
     assert "primdiffusion.cancel" in seen
     assert any("step" in text for text in seen)
-    session.start(7, 2)
+    ask(addon, 7, 2)
     drive()
     assert len(humans(addon.scene)) == 1
     assert any("built in" in text for text in panel_texts(addon))
@@ -135,7 +123,7 @@ def test_the_timer_builds_the_person_and_the_panel_shows_progress_then_the_resul
 
 def test_cancel_ends_the_job_and_adds_nothing(addon):
     assert not bpy.ops.primdiffusion.cancel.poll()
-    session.start(TAKES_LONG, 50)
+    ask(addon, TAKES_LONG, 50)
     for _ in range(20):
         follow()
         time.sleep(0.01)
@@ -143,20 +131,20 @@ def test_cancel_ends_the_job_and_adds_nothing(addon):
     asked = time.monotonic()
     drive()
     assert time.monotonic() - asked < 2.0
-    assert (session.error, session.notice) == ("", "Cancelled")
+    assert (error_of("generate"), notice_of("generate")) == ("", "Cancelled")
     assert not humans(addon.scene)
 
 
 def test_loading_another_file_drops_the_job(addon):
-    session.start(TAKES_LONG, 50)
+    ask(addon, TAKES_LONG, 50)
     follow()
     bpy.ops.wm.read_homefile(use_empty=True)
-    assert not session.busy
+    assert not queue.busy
     assert follow() is None
 
 
 def test_an_interpreter_that_does_not_exist_is_named(saved_scene, monkeypatch):
-    monkeypatch.setattr(generation, "preference", lambda name: "/nowhere/python" if name == "backend_python" else "")
+    monkeypatch.setattr(queue_module, "preference", lambda name: "/nowhere/python" if name == "backend_python" else "")
     blender_primdiffusion.register()
     try:
         with pytest.raises(RuntimeError, match=r"/nowhere/python.*does not exist"):

@@ -11,16 +11,16 @@ from unittest.mock import MagicMock
 
 import bpy
 import pytest
+from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 import blender_primdiffusion
 from blender_primdiffusion import places
 from blender_primdiffusion.scene.human import folder_of, humans
-from blender_primdiffusion.ui.captures import reconstruct_operators, reconstruct_settings
+from blender_primdiffusion.ui.captures import reconstruct_operators, reconstruct_settings, reconstruct_work
 from blender_primdiffusion.ui.captures.reconstruct_panel import PRIMDIFFUSION_PT_human_from_captures
 from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_generate
-from blender_primdiffusion.ui.jobs import session as generation
-from blender_primdiffusion.ui.jobs.follow import follow
-from blender_primdiffusion.ui.jobs.session import session
+from blender_primdiffusion.ui.jobs import work
+from blender_primdiffusion.ui.jobs.queue import queue
 from blender_primdiffusion.worker.environment import BackendPython
 
 FAKE = Path(__file__).parent / "fake_backend"
@@ -37,23 +37,8 @@ def order(captures: Path, what: str) -> Path:
     return captures
 
 
-def drive(seconds: float = 30.0) -> None:
-    """The timer's part, by hand: background mode runs no timers."""
-    end = time.monotonic() + seconds
-    while follow() is not None:
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def asked_of_the_child(person: bpy.types.Collection) -> dict:
     return json.loads((folder_of(person) / "person.human.safetensors").read_bytes())
-
-
-def texts(panel, context) -> list[str]:
-    layout = MagicMock()
-    panel.draw(SimpleNamespace(layout=layout), context)
-    shown = [call.kwargs["text"] for drawn in (layout.label, layout.progress) for call in drawn.call_args_list]
-    return [call.args[0] for call in layout.operator.call_args_list] + shown
 
 
 def test_the_operator_builds_a_person_of_what_was_asked_for(addon, captures):
@@ -66,7 +51,7 @@ def test_the_operator_builds_a_person_of_what_was_asked_for(addon, captures):
     assert Path(sent.pop("out_dir")).name.startswith("reconstruct_")
     assert sent == {"subject": "anna", "frame": 2, "views": 5}
     assert not list(Path(bpy.app.tempdir).glob("reconstruct_*"))
-    assert session.notice.startswith("Reconstructed in ")
+    assert notice_of("reconstruct").startswith("Reconstructed in ")
 
 
 def test_what_the_operator_is_not_told_is_the_panels(addon, captures):
@@ -94,7 +79,7 @@ def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_j
     assert not bpy.data.volumes
     bpy.ops.ed.redo()
     assert len(humans(bpy.context.scene)) == 1
-    assert not session.busy
+    assert not queue.busy
 
 
 def test_the_operator_cannot_be_redone_with_a_slider():
@@ -120,36 +105,32 @@ def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, captures, tmp_p
     assert not bpy.data.objects
     assert not (tmp_path / "shot_humans").exists()
     assert not list(Path(bpy.app.tempdir).glob("reconstruct_*"))
-    assert sentence in " ".join(texts(PRIMDIFFUSION_PT_human_from_captures, addon))
-    assert sentence not in " ".join(texts(PRIMDIFFUSION_PT_generate, addon))
+    assert sentence in " ".join(shown(PRIMDIFFUSION_PT_human_from_captures, addon))
+    assert sentence not in " ".join(shown(PRIMDIFFUSION_PT_generate, addon))
 
 
 def test_a_warning_of_the_backend_is_shown(addon, captures):
     bpy.ops.primdiffusion.human_from_captures(directory=str(captures), views=1)
     assert len(humans(addon.scene)) == 1
-    assert "One view only." in texts(PRIMDIFFUSION_PT_human_from_captures, addon)
+    assert "One view only." in shown(PRIMDIFFUSION_PT_human_from_captures, addon)
 
 
 def test_the_panel_shows_progress_and_cancel_ends_the_job_without_a_person(addon, captures):
-    assert "primdiffusion.human_from_captures" in texts(PRIMDIFFUSION_PT_human_from_captures, addon)
-    session.start_reconstruction(order(captures, "take long"), "", 0, 8)
-    while session.job.state != "running":
-        follow()
-        time.sleep(0.01)
-    shown = texts(PRIMDIFFUSION_PT_human_from_captures, addon)
-    assert shown == ["primdiffusion.cancel", "Reconstructing"]
-    with pytest.raises(RuntimeError, match="being made; wait for it or press Cancel"):
-        bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    assert "primdiffusion.human_from_captures" in shown(PRIMDIFFUSION_PT_human_from_captures, addon)
+    queue.add(addon, reconstruct_work.ReconstructWork(str(order(captures, "take long")), "", 0, 8))
+    until_running()
+    texts = shown(PRIMDIFFUSION_PT_human_from_captures, addon)
+    assert texts == ["primdiffusion.human_from_captures", "Reconstructing", "primdiffusion.cancel"]
     bpy.ops.primdiffusion.cancel()
     asked = time.monotonic()
     drive()
     assert time.monotonic() - asked < 2.0
-    assert (session.error, session.notice) == ("", "Cancelled")
+    assert (error_of("reconstruct"), notice_of("reconstruct")) == ("", "Cancelled")
     assert not humans(addon.scene)
 
 
 def test_the_timer_builds_the_person(addon, captures):
-    session.start_reconstruction(captures, "", 0, 8)
+    queue.add(addon, reconstruct_work.ReconstructWork(str(captures), "", 0, 8))
     drive()
     assert len(humans(addon.scene)) == 1
 
@@ -181,7 +162,7 @@ def test_the_real_child_makes_a_person_of_real_captures(saved_scene, tmp_path, m
     folder = captured(tmp_path / "made", people=2, frames=1, passes=("img", "mask"))
     python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
     monkeypatch.setattr(places, "find_backend_python", lambda *_, **__: python)
-    monkeypatch.setattr(generation, "preference", lambda name: str(encoder) if name == "encoder" else "")
+    monkeypatch.setattr(work, "preference", lambda name: str(encoder) if name == "encoder" else "")
     blender_primdiffusion.register()
     try:
         with pytest.raises(RuntimeError, match=r"holds several subjects: name one of them \(person_000000"):

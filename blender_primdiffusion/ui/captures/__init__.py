@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import bpy
 
-from . import operators, panel, reconstruct_operators, reconstruct_panel, reconstruct_settings, settings
+from ..jobs.work import register_kind, unregister_kind
+from . import (
+    operators,
+    panel,
+    reconstruct_operators,
+    reconstruct_panel,
+    reconstruct_settings,
+    reconstruct_work,
+    settings,
+)
 from .session import captures
 
 CLASSES = (
@@ -29,11 +38,13 @@ def register() -> None:
     bpy.types.Scene.primdiffusion_reconstruct = bpy.props.PointerProperty(
         type=reconstruct_settings.PRIMDIFFUSION_PG_reconstruct
     )
+    register_kind(reconstruct_work.ReconstructWork)
 
 
 def unregister() -> None:
     """Undo `register`."""
     captures.close()
+    unregister_kind(reconstruct_work.ReconstructWork)
     if bpy.app.timers.is_registered(operators.follow):
         bpy.app.timers.unregister(operators.follow)
     del bpy.types.Scene.primdiffusion_reconstruct

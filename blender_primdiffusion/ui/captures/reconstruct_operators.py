@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 
-from ..jobs.follow import see_through
-from ..jobs.session import Busy, session
+from ..jobs.follow import submit
+from .reconstruct_work import ReconstructWork
 
 
 class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
@@ -15,7 +13,7 @@ class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
 
     bl_idname = "primdiffusion.human_from_captures"
     bl_label = "Human from Captures"
-    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO: the session pushes one step
+    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO: the result has one
 
     directory: bpy.props.StringProperty(
         name="Captures", description="Empty: the panel's", subtype="DIR_PATH", options={"SKIP_SAVE"}
@@ -33,17 +31,12 @@ class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Start; with a window a timer follows the job, in background mode this waits for it."""
+        """Put it in line; in background mode this waits for the person."""
         asked = context.scene.primdiffusion_reconstruct
         folder = bpy.path.abspath(self.directory or asked.capture)
         subject = self.subject or ("" if self.directory else asked.subject)  # the panel's is somebody of its folder
-        try:
-            if not folder:
-                raise ValueError("choose the folder of captures first")
-            session.start_reconstruction(
-                Path(folder), subject, self.frame if self.frame >= 0 else asked.frame, self.views or asked.views
-            )
-        except (Busy, OSError, ValueError) as error:
-            self.report({"ERROR"}, str(error))
+        if not folder:
+            self.report({"ERROR"}, "choose the folder of captures first")
             return {"CANCELLED"}
-        return see_through(self, context)
+        frame, views = self.frame if self.frame >= 0 else asked.frame, self.views or asked.views
+        return submit(self, context, ReconstructWork(folder, subject, frame, views))

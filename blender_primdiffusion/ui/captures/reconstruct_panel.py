@@ -5,7 +5,6 @@ from __future__ import annotations
 import bpy
 
 from ..jobs.drawing import draw_job
-from ..jobs.session import session
 
 
 class PRIMDIFFUSION_PT_human_from_captures(bpy.types.Panel):
@@ -19,12 +18,11 @@ class PRIMDIFFUSION_PT_human_from_captures(bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads the session; starts nothing."""
+        """Reads what is in line; starts nothing."""
         layout, asked = self.layout, context.scene.primdiffusion_reconstruct
         layout.use_property_split = True
         layout.use_property_decorate = False
         column = layout.column()
-        column.enabled = not session.busy
         for name in ("capture", "subject", "frame", "views"):
             column.prop(asked, name)
         draw_job(layout, "reconstruct", "primdiffusion.human_from_captures", "OUTLINER_OB_ARMATURE")

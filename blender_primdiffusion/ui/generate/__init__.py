@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import bpy
 
-from . import attributes, operators, panel, settings
+from ..jobs.work import register_kind, unregister_kind
+from . import attributes, operators, panel, settings, work
 
 CLASSES = (
     attributes.PRIMDIFFUSION_PG_attributes,
@@ -20,10 +21,12 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion = bpy.props.PointerProperty(type=settings.PRIMDIFFUSION_PG_settings)
+    register_kind(work.GenerateWork)
 
 
 def unregister() -> None:
     """Undo `register`."""
+    unregister_kind(work.GenerateWork)
     del bpy.types.Scene.primdiffusion
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

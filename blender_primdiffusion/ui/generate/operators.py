@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import bpy
 
-from ..jobs.follow import see_through
-from ..jobs.session import Busy, session
+from ..jobs.follow import submit
 from .attributes import asked, parsed
 from .settings import SAMPLER_ITEMS
+from .work import GenerateWork
 
 
 class PRIMDIFFUSION_OT_generate(bpy.types.Operator):
@@ -15,7 +15,7 @@ class PRIMDIFFUSION_OT_generate(bpy.types.Operator):
 
     bl_idname = "primdiffusion.generate"
     bl_label = "Generate Human"
-    bl_options: set[str] = set()  # noqa: RUF012  bpy wants a plain set; neither REGISTER (redo) nor UNDO (session pushes one)
+    bl_options: set[str] = set()  # noqa: RUF012  bpy wants a plain set; neither REGISTER (redo) nor UNDO (the result has one)
 
     seed: bpy.props.IntProperty(name="Seed", default=-1, min=-1, description="-1: the panel's")
     steps: bpy.props.IntProperty(name="Steps", default=0, min=0, description="0: the panel's")
@@ -32,21 +32,16 @@ class PRIMDIFFUSION_OT_generate(bpy.types.Operator):
     )
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Start; with a window a timer follows the job, in background mode this waits for it."""
+        """Put it in line; in background mode this waits for the person."""
         settings = context.scene.primdiffusion
         given = self.properties.is_property_set
         sampler = self.sampler if given("sampler") else settings.sampler
         guidance = self.guidance if given("guidance") else settings.guidance
         try:
             wanted = parsed(self.attributes) if given("attributes") else asked(settings.attributes)
-            asked_of_the_child = {"attributes": wanted, "guidance": guidance} if wanted else {}
-            session.start(
-                self.seed if self.seed >= 0 else settings.seed,
-                self.steps or settings.steps,
-                sampler,
-                asked_of_the_child,
-            )
-        except (Busy, OSError, ValueError) as error:
+        except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        return see_through(self, context)
+        asked_of_the_child = {"attributes": wanted, "guidance": guidance} if wanted else {}
+        seed, steps = self.seed if self.seed >= 0 else settings.seed, self.steps or settings.steps
+        return submit(self, context, GenerateWork(seed, steps, sampler, asked_of_the_child))

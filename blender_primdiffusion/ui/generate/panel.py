@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..jobs.drawing import draw_job
-from ..jobs.session import session
+from ..jobs.memory import device_line
 from .attributes import draw_attributes
 
 
@@ -18,15 +18,14 @@ class PRIMDIFFUSION_PT_generate(bpy.types.Panel):
     bl_category = "PrimDiffusion"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads the session; starts nothing."""
+        """Reads what is in line; starts nothing."""
         layout, settings = self.layout, context.scene.primdiffusion
         layout.use_property_split = True
         column = layout.column()
-        column.enabled = not session.busy
         column.prop(settings, "seed")
         column.prop(settings, "steps")
         column.prop(settings, "sampler")
-        layout.label(text=f"Device: {session.device or 'known after the first start'}", icon="MEMORY")
+        layout.label(text=f"Device: {device_line()}", icon="MEMORY")
         draw_job(layout, "generate", "primdiffusion.generate", "OUTLINER_OB_ARMATURE")
 
 
@@ -45,6 +44,5 @@ class PRIMDIFFUSION_PT_attributes(bpy.types.Panel):
         layout, settings = self.layout, context.scene.primdiffusion
         layout.use_property_split = True
         layout.use_property_decorate = False
-        layout.enabled = not session.busy
         draw_attributes(layout, settings.attributes)
         layout.prop(settings, "guidance")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import bpy
 
-from . import edit_operators, edit_painting, edit_panel, edit_settings, panel, unused_files
+from ..jobs.work import register_kind, unregister_kind
+from . import edit_operators, edit_painting, edit_panel, edit_settings, edit_work, panel, unused_files
 
 CLASSES = (
     panel.PRIMDIFFUSION_PT_human,
@@ -23,10 +24,14 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion_edit = bpy.props.PointerProperty(type=edit_settings.PRIMDIFFUSION_PG_edit)
+    for kind in edit_work.KINDS:
+        register_kind(kind)
 
 
 def unregister() -> None:
     """Undo `register`."""
+    for kind in edit_work.KINDS:
+        unregister_kind(kind)
     del bpy.types.Scene.primdiffusion_edit
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

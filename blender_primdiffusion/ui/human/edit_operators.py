@@ -1,7 +1,7 @@
 """Vary, Re-dress Region, Transfer Texture and Blend: edits of the selected person, in place.
 
 What a script does not give is the panel's. None is redoable: moving a redo slider must not start an expensive job
-again; the session makes one undo step when the edited person is there.
+again; the result makes one undo step.
 """
 
 from __future__ import annotations
@@ -9,16 +9,15 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
-from numpy.typing import NDArray
 
 from ...scene.body_mesh import body_of
 from ...scene.human import humans, person_file
 from ...scene.painted import painted_weights
 from ..generate.attributes import asked, parsed
-from ..jobs.follow import see_through
-from ..jobs.session import Busy, session
+from ..jobs.follow import submit
 from ..jobs.target import named_person, selected_person
 from .edit_settings import TRANSFER_ITEMS, parts_property
+from .edit_work import BlendWork, EditWork, RedressWork, TransferWork, VaryWork
 
 _HUMAN = "Name of the person to edit (of their collection); empty: the selected one"
 _PANELS = "Not given: the panel's"
@@ -28,9 +27,9 @@ _SKIP = {"SKIP_SAVE"}
 class _Edit:
     """What the edits have in common."""
 
-    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO (the session pushes one)
-    method: str
-    """Of the child."""
+    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO (the result has one)
+    work: type[EditWork]
+    """What is put in line."""
 
     human: bpy.props.StringProperty(name="Person", description=_HUMAN, options=_SKIP)
     seed: bpy.props.IntProperty(name="Seed", min=0, description=_PANELS, options=_SKIP)
@@ -43,18 +42,18 @@ class _Edit:
         return bool(humans(context.scene))
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Start; with a window a timer follows the job, in background mode this waits for it."""
+        """Put it in line; in background mode this waits for the edited person."""
         try:
             person = named_person(context, self.human) if self.human else selected_person(context)
             steps = self.chosen("steps", context.scene.primdiffusion)
-            session.start_edit(person, self.method, steps, self.params(context, person))
-        except (Busy, OSError, ValueError) as error:
+            work = self.work.of(person, steps, self.params(context, person))
+        except (OSError, ValueError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        return see_through(self, context)
+        return submit(self, context, work)
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
-        """Of the child's method, with the edit's own ones only (see `Session.start_edit`)."""
+        """Of the child's method, with the edit's own ones only (see `EditWork.asked`)."""
         raise NotImplementedError
 
     def chosen(self, name: str, settings: bpy.types.PropertyGroup) -> Any:
@@ -70,14 +69,16 @@ class _Region:
         name="Vertex Group", description="A painted region instead of parts", options=_SKIP
     )
 
-    def region(self, settings: bpy.types.PropertyGroup, person: bpy.types.Collection) -> list[str] | NDArray:
+    def region(
+        self, settings: bpy.types.PropertyGroup, person: bpy.types.Collection
+    ) -> list[str] | dict[str, list[float]]:
         """Names of parts, or painted weights [V]."""
         given = self.properties.is_property_set
         if given("vertex_group") or (not given("parts") and settings.region == "PAINTED"):
             body = body_of(person)
             if body is None:
                 raise ValueError(f"the body mesh of {person.name!r} was deleted: choose parts by name instead")
-            return painted_weights(body, self.chosen("vertex_group", settings))
+            return {"painted": painted_weights(body, self.chosen("vertex_group", settings)).tolist()}
         parts = sorted(self.chosen("parts", settings))
         if not parts:
             raise ValueError("no part of the body is chosen: choose one or more in the panel")
@@ -89,7 +90,7 @@ class PRIMDIFFUSION_OT_vary(_Edit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.vary"
     bl_label = "Vary"
-    method = "vary"
+    work = VaryWork
 
     amount: bpy.props.FloatProperty(name="Amount", min=0.0, max=1.0, description=_PANELS, options=_SKIP)
     attributes: bpy.props.StringProperty(
@@ -112,7 +113,7 @@ class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.redress"
     bl_label = "Re-dress Region"
-    method = "inpaint"
+    work = RedressWork
 
     attributes: bpy.props.StringProperty(name="Attributes", description=f"Like outfit=dress. {_PANELS}", options=_SKIP)
     guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=_PANELS, options=_SKIP)
@@ -133,7 +134,7 @@ class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.transfer_texture"
     bl_label = "Transfer Texture"
-    method = "transfer"
+    work = TransferWork
 
     source: bpy.props.StringProperty(name="Source", description=f"Name of the other person. {_PANELS}", options=_SKIP)
     what: bpy.props.EnumProperty(name="Transfer", items=TRANSFER_ITEMS, description=_PANELS, options=_SKIP)
@@ -156,7 +157,7 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.blend"
     bl_label = "Blend"
-    method = "interpolate"
+    work = BlendWork
 
     other: bpy.props.StringProperty(name="Other", description=f"Name of the other person. {_PANELS}", options=_SKIP)
     fraction: bpy.props.FloatProperty(name="Fraction", min=0.0, max=1.0, description=_PANELS, options=_SKIP)

@@ -1,4 +1,4 @@
-"""Jobs seen through to their end: by a timer while there is a window, by waiting in background mode."""
+"""Works seen through to their end: by a timer while there is a window, by waiting in background mode."""
 
 from __future__ import annotations
 
@@ -6,54 +6,92 @@ import time
 
 import bpy
 
-from .session import TICK_S, GenerationFailed, session
+from ...worker.job import JobError
+from .queue import GONE, Entry, Outcome, queue
+from .work import Work
 
+TICK_S = 0.1
 _TOLD_S = 1.0
 """Between lines of progress on the console in background mode."""
+_IN_THE_WAY = {"UNDO", "BLOCKING", "GRAB_CURSOR", "GRAB_CURSOR_X", "GRAB_CURSOR_Y"}
+"""Options of modal operators that hold on to the scene or the mouse; others (screencasts) may run for ever."""
 
 
-def see_through(operator: bpy.types.Operator, context: bpy.types.Context) -> set[str]:
-    """Follow the job that `operator` has just started: with a window by a timer, in background mode by waiting here."""
+def submit(operator: bpy.types.Operator, context: bpy.types.Context, work: Work) -> set[str]:
+    """Put `work` in line: with a window a timer sees it through, in background mode this waits for its end."""
+    entry = queue.add(context, work)
     if not bpy.app.background:
-        bpy.app.timers.register(follow, first_interval=TICK_S, persistent=True)
+        keep_following()
         return {"FINISHED"}
-    told = 0.0
-    while (job := session.job) is not None and not job.finished:
-        if session.tick() and time.monotonic() - told > _TOLD_S:
-            told = time.monotonic()
-            print(f"PrimDiffusion: {job.message}", flush=True)
-        time.sleep(TICK_S / 4)
-    try:
-        session.finish(context)
-    except GenerationFailed as error:
-        operator.report({"ERROR"}, str(error))
+    outcome = _wait_for(entry)
+    if outcome.error is not None:
+        operator.report({"ERROR"}, outcome.sentence)
         return {"CANCELLED"}
-    print(f"PrimDiffusion: {session.notice}", flush=True)
+    print(f"PrimDiffusion: {outcome.notice}", flush=True)
     return {"FINISHED"}
 
 
+def keep_following() -> None:
+    """Have Blender call `follow` until the line is empty."""
+    if not bpy.app.timers.is_registered(follow):
+        bpy.app.timers.register(follow, first_interval=TICK_S, persistent=True)
+
+
 def follow() -> float | None:
-    """The timer: one tick of the job; builds the person when it is done, unless a render is reading the scene."""
-    if session.job is None:
+    """The timer: one tick of the line; an answer enters the scene as soon as nothing is in the way."""
+    if not queue.busy:
         return None
-    if session.tick():
+    changed = queue.tick()
+    if queue.ready and not _in_the_way():
+        _enter()
+        changed = True
+    if changed:
         redraw()
-    if not session.job.finished or bpy.app.is_job_running("RENDER"):
-        return TICK_S
-    windows = bpy.context.window_manager.windows
-    try:
-        with bpy.context.temp_override(window=bpy.context.window or windows[0]):  # timers have no window of their own
-            session.finish(bpy.context)
-    except GenerationFailed as error:
-        print(f"PrimDiffusion: {error}")  # the panel's error line shows it
-    finally:
-        redraw()
-    return None
+    return TICK_S if queue.busy else None
 
 
 def redraw() -> None:
-    """Draw the sidebars anew: nothing else tells them that the job has moved on."""
+    """Draw the sidebars of all windows anew: nothing else tells them that the work has moved on."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
                 area.tag_redraw()
+
+
+def _wait_for(entry: Entry) -> Outcome:
+    told = 0.0
+    while queue.last is None or queue.last.entry is not entry:
+        if queue.tick() and queue.job is not None and time.monotonic() - told > _TOLD_S:
+            told = time.monotonic()
+            print(f"PrimDiffusion: {queue.job.message}", flush=True)
+        if queue.ready:
+            _enter()
+        else:
+            time.sleep(TICK_S / 4)
+    return queue.last
+
+
+def _in_the_way() -> bool:
+    """Blender renders, or the user is moving something."""
+    if bpy.app.is_job_running("RENDER"):
+        return True
+    windows = bpy.context.window_manager.windows
+    return any(_IN_THE_WAY & modal.bl_options for window in windows for modal in window.modal_operators)
+
+
+def _enter() -> None:
+    """Hand the answer to the operator that puts it into the scene it was asked for."""
+    entry = queue.current
+    windows = bpy.context.window_manager.windows
+    context: dict[str, object] = {}
+    if window := bpy.context.window or next(iter(windows), None):  # timers have no window of their own
+        context["window"] = window
+    if entry.work.undo:
+        scene = next((scene for scene in bpy.data.scenes if scene.session_uid == entry.scene_uid), None)
+        if scene is None:
+            queue.refuse(JobError(GONE.format(entry.scene), "", "scene"))
+            return
+        if window is None or window.scene != scene:
+            context |= {"scene": scene, "view_layer": scene.view_layers[0]}
+    with bpy.context.temp_override(**context):
+        bpy.ops.primdiffusion.take_result()

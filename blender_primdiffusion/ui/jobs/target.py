@@ -14,8 +14,8 @@ from ...scene.human import human_of, humans, person_file_name
 class Target:
     """A person as they were when the edit began. Undo may replace Blender's objects, so none is kept."""
 
-    uid: int
-    """Of the collection, for as long as the file is open."""
+    uid: int | None
+    """Of the collection, for as long as the file is open; None once it was closed: then the name counts."""
     name: str
     file: str
     """Name of the backend's file of the person."""
@@ -29,7 +29,7 @@ class Target:
     def found(self) -> bpy.types.Collection:
         """The person, if still in a scene and the one it was; else ValueError with a sentence."""
         people = [person for scene in bpy.data.scenes for person in humans(scene)]
-        person = next((person for person in people if person.session_uid == self.uid), None)
+        person = next((person for person in people if self._is(person)), None)
         if person is None or not any(thing.type == "ARMATURE" for thing in person.objects):
             raise ValueError(
                 f"the person {self.name!r} was removed while the edit was under way; nothing was changed. Undo the "
@@ -42,6 +42,9 @@ class Target:
             )
         check_editable(person)
         return person
+
+    def _is(self, person: bpy.types.Collection) -> bool:
+        return person.name == self.name if self.uid is None else person.session_uid == self.uid
 
 
 def selected_person(context: bpy.types.Context) -> bpy.types.Collection:

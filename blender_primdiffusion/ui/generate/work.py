@@ -1,0 +1,55 @@
+"""A person from noise, as the child is asked for it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..jobs.person import build_person
+from ..jobs.work import Work, chosen_checkpoint
+
+_PICTURE_PX = 16
+"""The child's pictures of the finished person are of no use here."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GenerateWork(Work):
+    """Generate Human."""
+
+    kind = method = "generate"
+    undo = "Generate Human"
+
+    seed: int
+    steps: int
+    sampler: str = "ddim"
+    asked: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """attributes and guidance, where something is asked for."""
+    checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return f"Generate Human, seed {self.seed}"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        """Of the child's method generate."""
+        params = {"seed": self.seed, "steps": self.steps, "sampler": self.sampler, **self.asked, "size": _PICTURE_PX}
+        checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
+        return {**params, **checkpoint, "out_dir": str(folder)}
+
+    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+        """Build the person."""
+        return build_person(context, result, "Generated")[1]
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, kept: dict[str, Any]) -> GenerateWork:
+        """What `to_json` gave."""
+        return cls(**kept)

@@ -1,0 +1,106 @@
+"""A person made of one in the scene, in place, as the child is asked for it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import bpy
+import numpy as np
+
+from ...scene.edited import replace_person
+from ...scene.human import overlap_warning, person_file
+from ...worker.sentence import sentence
+from ..jobs.target import Target
+from ..jobs.work import Work, chosen_checkpoint
+
+_PICTURE_PX = 16
+"""The child's pictures of the finished person are of no use here."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EditWork(Work):
+    """What the edits have in common."""
+
+    made: ClassVar[str]
+    """What became of the person, for the news."""
+
+    target: Target
+    file: str
+    """The backend's, of whom to edit."""
+    steps: int
+    asked: Mapping[str, Any]
+    """The method's other parameters. A region {"painted": [V numbers]} holds weights, and travels as a file."""
+    checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
+
+    @classmethod
+    def of(cls, person: bpy.types.Collection, steps: int, asked: Mapping[str, Any]) -> EditWork:
+        """Raises ValueError for a person that cannot be edited, FileNotFoundError for one whose file is missing."""
+        return cls(Target.of(person), str(person_file(person)), steps, asked)
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return f"{self.undo}: {self.target.name}"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        """Of the child's method."""
+        asked = dict(self.asked)
+        if isinstance(asked.get("region"), Mapping):
+            np.savez(folder / "region.npz", weights=np.asarray(asked["region"]["painted"], np.float32))
+            asked["region"] = {"weights": str(folder / "region.npz")}
+        checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
+        params = {**asked, "person": self.file, "steps": self.steps, "size": _PICTURE_PX}
+        return {**params, **checkpoint, "out_dir": str(folder)}
+
+    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+        """Show the edited person in the place of the one that was; in which scene does not matter."""
+        person = self.target.found()
+        done = replace_person(context, person, Path(result["human"]), Path(result["person"]))
+        shape = ", the body's shape too" if done.reshaped else ""
+        news = f"{self.made} in {result['seconds']:.1f} s; {done.volumes} of {done.of} volumes of {person.name} changed"
+        warnings = (*result.get("warnings", ()), done.warning, overlap_warning(person))
+        return " ".join([f"{news}{shape}.", *(sentence(text) for text in warnings if text)])
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, kept: dict[str, Any]) -> EditWork:
+        """What `to_json` gave; the person is known by name and file alone now."""
+        target = Target(**{**kept["target"], "uid": None})
+        return cls(**{**kept, "target": target})
+
+
+class VaryWork(EditWork):
+    """Vary."""
+
+    kind = method = "vary"
+    undo, made = "Vary Human", "Varied"
+
+
+class RedressWork(EditWork):
+    """Re-dress Region."""
+
+    kind = method = "inpaint"
+    undo, made = "Re-dress Region", "Re-dressed"
+
+
+class TransferWork(EditWork):
+    """Transfer Texture."""
+
+    kind = method = "transfer"
+    undo, made = "Transfer Texture", "Texture transferred"
+
+
+class BlendWork(EditWork):
+    """Blend."""
+
+    kind = method = "interpolate"
+    undo, made = "Blend Humans", "Blended"
+
+
+KINDS = (VaryWork, RedressWork, TransferWork, BlendWork)

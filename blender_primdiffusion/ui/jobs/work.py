@@ -1,0 +1,73 @@
+"""What the child can be asked for, and what becomes of the answer: rooms subclass `Work` for what they offer."""
+
+from __future__ import annotations
+
+import abc
+from pathlib import Path
+from typing import Any, ClassVar
+
+import bpy
+
+from ...places import preference
+
+
+class Work(abc.ABC):
+    """One thing the child is asked for. Plain data alone: undo and loading replace Blender's objects meanwhile."""
+
+    kind: ClassVar[str]
+    """Under which panels show it and a kept one is found again; unique."""
+    method: ClassVar[str]
+    """Of the child."""
+    undo: ClassVar[str] = ""
+    """Name of the undo step that `finish` makes; empty when it leaves the scene as it is."""
+
+    @property
+    @abc.abstractmethod
+    def label(self) -> str:
+        """For people: Generate Human, seed 7."""
+
+    @abc.abstractmethod
+    def params(self, folder: Path) -> dict[str, Any]:
+        """Of the child's method, asked for when the turn has come; `folder` is for its files, empty, and removed
+        after `finish`. Raises ValueError or OSError where it cannot be done any more."""
+
+    @abc.abstractmethod
+    def finish(self, context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
+        """Put the child's answer into the scene of `context`; returns the news for the panel.
+
+        Runs inside an operator, in object mode where `undo` is given; that operator makes the undo step. ValueError,
+        OSError and RuntimeError become the panel's error, and must leave the scene as it was.
+        """
+
+    def to_json(self) -> dict[str, Any] | None:
+        """What `from_json` needs after a restart of Blender; None: it is not kept."""
+        return None
+
+    @classmethod
+    def from_json(cls, kept: dict[str, Any]) -> Work:
+        """The work of `to_json`. Raises ValueError, KeyError or TypeError for what is none."""
+        raise ValueError(f"{cls.kind} is not kept")
+
+
+_kinds: dict[str, type[Work]] = {}
+
+
+def register_kind(cls: type[Work]) -> None:
+    """Make kept works of this class known. For a room's `register`."""
+    if _kinds.setdefault(cls.kind, cls) is not cls:
+        raise ValueError(f"there are two kinds of work {cls.kind!r}: give one another name")
+
+
+def unregister_kind(cls: type[Work]) -> None:
+    """Undo `register_kind`."""
+    _kinds.pop(cls.kind, None)
+
+
+def registered_kind(kind: str) -> type[Work] | None:
+    """The class of a kind of work; None for one that this version does not know."""
+    return _kinds.get(kind)
+
+
+def chosen_checkpoint(name: str) -> str:
+    """The file of the preference `checkpoint` or `encoder`; empty: the one that comes with the extension."""
+    return preference(name)

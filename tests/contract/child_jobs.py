@@ -1,0 +1,30 @@
+"""Requests of the extension's works, for tests with the real child."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from worker.backend import Backend
+from worker.job import Job
+
+_PICTURE_PX = 16
+
+
+def _job(backend: Backend, method: str, out_dir: Path, checkpoint: Path | None, **params) -> Job:
+    chosen = {} if checkpoint is None else {"checkpoint": str(checkpoint)}
+    return Job(backend, method, {**params, **chosen, "out_dir": str(out_dir)})
+
+
+def generate_job(backend: Backend, *, out_dir: Path, checkpoint: Path | None = None, **params) -> Job:
+    """A person from noise."""
+    return _job(backend, "generate", out_dir, checkpoint, size=_PICTURE_PX, **params)
+
+
+def edit_job(backend: Backend, method: str, person: Path, *, out_dir: Path, checkpoint: Path, **params) -> Job:
+    """A person of one that exists."""
+    return _job(backend, method, out_dir, checkpoint, person=str(person), size=_PICTURE_PX, **params)
+
+
+def reconstruct_job(backend: Backend, *, capture: Path, out_dir: Path, checkpoint: Path, **params) -> Job:
+    """A person from captures."""
+    return _job(backend, "reconstruct", out_dir, checkpoint, capture=str(capture), **params)
