@@ -117,12 +117,25 @@ def generate_batch(
     numbers = {name: float(attributes[name]) for name in model.vocabulary.scalars if name in attributes}
     asked = {"attributes": {**attributes, **numbers}, "guidance": guidance} if attributes else {}
     made = {"steps": steps, "sampler": sampler, **asked, **made_by(model)}
+    people = people_of(model, final, seeds, attributes)
+    return [
+        dataclasses.replace(human, provenance={"seed": seed, **made}).validate()
+        for human, seed in zip(people, seeds, strict=True)
+    ]
+
+
+def people_of(
+    model: DiffusionModel,
+    x0: Float[Tensor, "b c h w"],
+    seeds: Sequence[int],
+    attributes: Attributes = MappingProxyType({}),
+) -> list[Human]:
+    """The people whom clean samples of these seeds stand for, on the CPU; without provenance, and unchecked."""
+    body = default_body() if model.stand is None else model.stand.body
     people = []
-    for index, (seed, betas) in enumerate(zip(seeds, model.betas(final, seeds), strict=True)):
-        payload = model.decode(final[index])
-        body = default_body() if model.stand is None else model.stand.body
+    for sample_of_one, betas in zip(x0, model.betas(x0, seeds), strict=True):
         betas = betas_of_measures(betas.cpu(), model.shapes.scale.cpu(), body, *measures_of(attributes))
-        people.append(Human(payload, betas, {"seed": seed, **made}, model.stand).to("cpu").validate())
+        people.append(Human(model.decode(sample_of_one), betas, {}, model.stand).to("cpu"))
     return people
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from primdiffusion.editing.shares import check_share
-from primdiffusion.serve.params import check_attributes, check_seed, check_size, check_steps
+from primdiffusion.serve.params import check_attributes, check_picture_px, check_seed, check_size, check_steps
 
 TRANSFERS = ("texture", "garment")
 
@@ -23,10 +23,13 @@ class EditParams:
     """A .safetensors file; None for the one that ships with the package."""
     size: int = 512
     """Pixels a side of the pictures."""
+    picture_px: int = 0
+    """Pixels a side of the pictures while the person is sampled; 0 for none."""
 
     def __post_init__(self) -> None:
         check_steps(self.steps)
         check_size(self.size)
+        check_picture_px(self.picture_px)
         for name in ("person", "out_dir"):
             if not getattr(self, name):
                 raise ValueError(f"{name} is empty: name a {'folder' if name == 'out_dir' else 'file'}")

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torch import Tensor
+
 from primdiffusion.diffusion.conditioning import NOTHING
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.diffusion.samplers import Step
-from primdiffusion.human import framing, generate, place
+from primdiffusion.human import Human, framing, generate, people_of, place
 from primdiffusion.human_file import load_human
 from primdiffusion.machine import best_device, device_info, peak_memory_gb
 from primdiffusion.person_folder import FILES, write_person
@@ -19,10 +19,14 @@ from primdiffusion.pose_file import pose_from_numbers, read_pose
 from primdiffusion.render.image import depth_to_png, to_png
 from primdiffusion.render.march import march
 from primdiffusion.serve.draw_params import DrawParams
-from primdiffusion.serve.drawing import FrameDrawer, Report
+from primdiffusion.serve.drawing import FrameDrawer
 from primdiffusion.serve.edit_params import InpaintParams, InterpolateParams, TransferParams, VaryParams
 from primdiffusion.serve.editing import Editor
 from primdiffusion.serve.params import AttributesParams, GenerateParams, ReconstructParams, RenderParams
+from primdiffusion.serve.progress import Report, step_reporter
+from primdiffusion.serve.step_pictures import step_pictures
+from primdiffusion.serve.variation_params import VariationsParams
+from primdiffusion.serve.variations import variations
 from primdiffusion.staging import staged, written_whole
 from primdiffusion.training.checkpoint import load_checkpoint, read_card
 
@@ -38,7 +42,7 @@ class Jobs:
         self._loaded: tuple[str | None, DiffusionModel] | None = None
         self._reconstructor: Reconstructor | None = None
         self._drawer = FrameDrawer(self._device)
-        self._editor = Editor(self._model, _step_reporter)
+        self._editor = Editor(self._model)
 
     def device_info(self) -> dict[str, Any]:
         """As `ready` and `hello` state it."""
@@ -55,10 +59,20 @@ class Jobs:
             report("load", 0, params.steps, None)
             model = self._model(params.checkpoint)
             report("sample", 0, params.steps, None)
-            on_step = _step_reporter(report)
-            human = generate(
-                model, params.seed, params.steps, params.sampler, on_step, params.attributes, params.guidance
-            )
+
+            def show(x0: Tensor) -> Human:
+                return people_of(model, x0, [params.seed], params.attributes)[0]
+
+            with step_pictures(folder, params.picture_px, show) as picture:
+                human = generate(
+                    model,
+                    params.seed,
+                    params.steps,
+                    params.sampler,
+                    step_reporter(report, picture),
+                    params.attributes,
+                    params.guidance,
+                )
             sampled = time.perf_counter()
             report("write", params.steps, params.steps, None)
             write_person(folder, human, params.size)
@@ -71,6 +85,10 @@ class Jobs:
             "seconds_sampling": round(sampled - began, 3),
             "peak_gb": round(peak_memory_gb(), 3),
         }
+
+    def variations(self, params: VariationsParams, report: Report) -> dict[str, Any]:
+        """Makes people to choose from (see `serve.variations`)."""
+        return variations(self._model, params, report)
 
     def attributes(self, params: AttributesParams, report: Report) -> dict[str, Any]:
         """What a checkpoint can be asked for: values of categories, mean and standard deviation of scalars.
@@ -131,17 +149,3 @@ class Jobs:
             self._loaded = None  # frees the old one first
             self._loaded = (checkpoint, load_checkpoint(checkpoint, self._device))
         return self._loaded[1]
-
-
-def _step_reporter(report: Report) -> Callable[[Step], None]:
-    """Reports each step with the seconds left, from the mean of the steps after the first (which warms up)."""
-    times: list[float] = []
-
-    def on_step(step: Step) -> None:
-        times.append(time.perf_counter())
-        done, eta = step.index + 1, None
-        if len(times) > 1:
-            eta = round((times[-1] - times[0]) / (len(times) - 1) * (step.total - done), 3)
-        report("sample", done, step.total, eta)
-
-    return on_step

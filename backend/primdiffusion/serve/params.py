@@ -8,6 +8,8 @@ import math
 LARGEST_SEED = 2**63 - 1
 STEP_LIMIT = 1000
 """The schedule's length: a sampler cannot take more steps."""
+LARGEST_STEP_PICTURE = 1024
+"""Pixels a side: a larger picture would hold up the work, and cancelling."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,11 +29,14 @@ class GenerateParams:
     """What the person shall be: texts and numbers by name, of those that `attributes` tells."""
     guidance: float = 1.5
     """How strongly attributes are insisted on: 1 plainly, more at the cost of variety."""
+    picture_px: int = 0
+    """Pixels a side of the pictures while the person is sampled; 0 for none."""
 
     def __post_init__(self) -> None:
         check_seed(self.seed)
         check_steps(self.steps)
         check_size(self.size)
+        check_picture_px(self.picture_px)
         check_attributes(self.attributes, self.guidance)
         if not self.out_dir:
             raise ValueError("out_dir is empty: name a folder")
@@ -114,6 +119,12 @@ def check_size(size: int) -> None:
     """ValueError for a picture without pixels."""
     if size < 1:
         raise ValueError(f"pictures of {size} pixels a side: choose 1 or more")
+
+
+def check_picture_px(picture_px: int) -> None:
+    """ValueError outside 0 ... LARGEST_STEP_PICTURE."""
+    if not 0 <= picture_px <= LARGEST_STEP_PICTURE:
+        raise ValueError(f"picture_px is {picture_px}: choose 0, for no pictures, to {LARGEST_STEP_PICTURE}")
 
 
 def check_attributes(attributes: dict, guidance: float) -> None:

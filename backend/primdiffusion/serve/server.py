@@ -39,6 +39,7 @@ from primdiffusion.serve.rpc import (
     parse_request,
     read_params,
 )
+from primdiffusion.serve.variation_params import VariationsParams
 
 if TYPE_CHECKING:
     from primdiffusion.serve.jobs import Jobs
@@ -47,6 +48,7 @@ PROTOCOL = 1
 HEARTBEAT_S = 0.5
 JOBS = {
     "generate": GenerateParams,
+    "variations": VariationsParams,
     "attributes": AttributesParams,
     "vary": VaryParams,
     "interpolate": InterpolateParams,
@@ -206,10 +208,10 @@ class Server:
         return jobs
 
     def _run_job(self, jobs: Jobs | RpcError, job: Job) -> None:
-        def report(stage: str, step: int, total: int, eta_s: float | None) -> None:
+        def report(stage: str, step: int, total: int, eta_s: float | None, /, **more: Any) -> None:
             if job.cancelled.is_set():
                 raise Cancelled
-            self._notify("progress", id=job.request.id, stage=stage, step=step, total=total, eta_s=eta_s)
+            self._notify("progress", id=job.request.id, stage=stage, step=step, total=total, eta_s=eta_s, **more)
 
         try:
             if isinstance(jobs, RpcError):

@@ -1,0 +1,174 @@
+"""Pictures while a person is made: of the guess at that step, seldom enough, and gone in the end."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from primdiffusion.diffusion.samplers import Step
+from primdiffusion.serve import step_pictures as pictures
+from primdiffusion.serve.edit_params import InpaintParams, InterpolateParams, TransferParams, VaryParams
+from primdiffusion.serve.jobs import Jobs
+from primdiffusion.serve.params import GenerateParams
+from primdiffusion.serve.step_pictures import Allowance, PassingPictures, draw_front_and_back, step_pictures
+from tiny_model import save_tiny_checkpoint
+
+FILES = ["depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"]
+
+
+class Clock:
+    """Time that passes when it is told to."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(pictures.time, "perf_counter", clock)
+    return clock
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory) -> str:
+    return str(save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "tiny.safetensors"))
+
+
+@pytest.fixture
+def always(monkeypatch):
+    """Every step gets its picture."""
+    monkeypatch.setattr(pictures, "INTERVAL_S", 0.0)
+    monkeypatch.setattr(Allowance, "granted", lambda _: True)
+
+
+class Listener:
+    """Keeps what is reported and looks at each picture at once, as a panel would."""
+
+    def __init__(self):
+        self.stages, self.pictures = [], []
+
+    def __call__(self, stage, step, total, eta_s, /, **more):
+        self.stages.append(stage)
+        if "picture" in more:
+            with Image.open(more["picture"]) as picture:
+                self.pictures.append((step, picture.copy()))
+
+
+def test_pictures_come_no_more_often_than_the_interval_and_take_a_quarter_of_the_time_at_most(clock):
+    allowance, times, spent = Allowance(0.4), [], 0.0
+    for _ in range(300):
+        clock.now += 0.05
+        if allowance.granted():
+            times.append(clock.now)
+            with allowance.spending():
+                clock.now += 0.3
+            spent += 0.3
+    gaps = [later - earlier - 0.3 for earlier, later in itertools.pairwise(times)]
+    assert min(gaps) >= 0.4 - 1e-9
+    assert 0.2 < (spent - 0.3) / clock.now <= 0.25, "the first one, which loads and compiles, aside"
+
+
+def test_quick_pictures_come_at_the_interval(clock):
+    allowance, drawn = Allowance(0.5), 0
+    for _ in range(100):
+        clock.now += 1 / 8
+        if allowance.granted():
+            drawn += 1
+            with allowance.spending():
+                clock.now += 1 / 1024
+    assert drawn == 25
+
+
+def test_at_most_the_last_two_pictures_are_there_and_none_in_the_end(tmp_path):
+    with PassingPictures(tmp_path, 2) as passing:
+        names = []
+        for _ in range(4):
+            names.append(passing.next())
+            names[-1].touch()
+        assert sorted(tmp_path.iterdir()) == names[-2:]
+        assert len(set(names)) == 4
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_pixels_nothing_is_drawn(tmp_path):
+    with step_pictures(tmp_path, 0, pytest.fail) as picture:
+        assert picture(Step(0, 2, 500, torch.zeros(1), torch.zeros(1))) is None
+
+
+def test_the_last_step_has_no_picture_for_the_result_follows(tmp_path, always):
+    with step_pictures(tmp_path, 16, pytest.fail) as picture:
+        assert picture(Step(1, 2, 500, torch.zeros(1), torch.zeros(1))) is None
+
+
+def test_generate_shows_what_the_person_will_look_like_and_leaves_no_pictures_behind(checkpoint, tmp_path, always):
+    plain, shown = tmp_path / "plain", tmp_path / "shown"
+    Jobs().generate(GenerateParams(5, str(plain), 4, checkpoint=checkpoint, size=32), lambda *_: None)
+    listener = Listener()
+    Jobs().generate(GenerateParams(5, str(shown), 4, checkpoint=checkpoint, size=32, picture_px=24), listener)
+    assert [step for step, _ in listener.pictures] == [1, 2, 3]
+    assert {(picture.size, picture.mode) for _, picture in listener.pictures} == {((24, 24), "RGBA")}
+    assert all(picture.getchannel("A").getextrema() == (0, 255) for _, picture in listener.pictures)
+    assert sorted(path.name for path in shown.iterdir()) == FILES
+    for name in ("human.npz", "front.png"):
+        assert (plain / name).read_bytes() == (shown / name).read_bytes(), "looking changes nothing"
+
+
+def test_a_cancelled_job_leaves_no_picture(checkpoint, tmp_path, always):
+    class Stop(Exception):
+        pass
+
+    def stop(*_, **more):
+        if "picture" in more:
+            raise Stop
+
+    with pytest.raises(Stop):
+        Jobs().generate(GenerateParams(5, str(tmp_path / "out"), 4, checkpoint=checkpoint, picture_px=16), stop)
+    assert not (tmp_path / "out").exists()
+
+
+def test_every_edit_shows_its_guesses(checkpoint, tmp_path, always):
+    worker, people = Jobs(), []
+    for seed in (1, 2):
+        worker.generate(GenerateParams(seed, str(tmp_path / str(seed)), 2, checkpoint=checkpoint, size=8), lambda *_: 0)
+        people.append(str(tmp_path / str(seed) / "person.human.safetensors"))
+    same = {"person": people[0], "checkpoint": checkpoint, "size": 8, "steps": 4, "picture_px": 16}
+    edits = {
+        "vary": VaryParams(out_dir=str(tmp_path / "v"), **same),
+        "interpolate": InterpolateParams(out_dir=str(tmp_path / "i"), other=people[1], **same),
+        "inpaint": InpaintParams(out_dir=str(tmp_path / "p"), region=["top"], **same),
+        "transfer": TransferParams(
+            out_dir=str(tmp_path / "t"), source=people[1], region=["top"], harmonise=0.5, **same
+        ),
+    }
+    for method, params in edits.items():
+        listener = Listener()
+        getattr(worker, method)(params, listener)
+        assert len(listener.pictures) >= 2, method
+        assert sorted(path.name for path in tmp_path.joinpath(params.out_dir).iterdir()) == FILES, method
+
+
+def test_a_person_is_drawn_from_both_sides_in_halves_of_a_square(checkpoint, tmp_path):
+    from primdiffusion.human import generate
+    from primdiffusion.training.checkpoint import load_checkpoint
+
+    human = generate(load_checkpoint(checkpoint, torch.device("cpu")), 3, 2)
+    draw_front_and_back(tmp_path / "both.png", human, 64)
+    with Image.open(tmp_path / "both.png") as picture:
+        assert picture.size == (64, 64)
+        columns = np.asarray(picture)[..., 3].max(0) > 128
+    assert columns[:32].any()
+    assert columns[32:].any()
+    assert not columns[[0, 31, 32, 63]].any(), "nothing is cut off"
+
+
+@pytest.mark.parametrize("px", [-1, 1025])
+def test_sizes_out_of_range_are_refused(tmp_path, px):
+    with pytest.raises(ValueError, match=f"picture_px is {px}: choose 0, for no pictures, to 1024"):
+        GenerateParams(1, str(tmp_path), picture_px=px)
+    with pytest.raises(ValueError, match=f"picture_px is {px}"):
+        VaryParams(person="p", out_dir="o", picture_px=px)

@@ -1,0 +1,139 @@
+"""People to choose from: as generate and vary make them, with pictures, all or none."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from primdiffusion.editing.vary import vary
+from primdiffusion.human import generate
+from primdiffusion.human_file import load_human, save_human
+from primdiffusion.serve.jobs import Jobs
+from primdiffusion.serve.step_pictures import Allowance
+from primdiffusion.serve.variation_params import VariationsParams
+from primdiffusion.training.checkpoint import load_checkpoint
+from tiny_model import save_tiny_checkpoint
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory) -> str:
+    return str(save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "tiny.safetensors"))
+
+
+@pytest.fixture
+def model(checkpoint):
+    return load_checkpoint(checkpoint, torch.device("cpu"))
+
+
+class Listener:
+    def __init__(self):
+        self.reports = []
+
+    def __call__(self, stage, step, total, eta_s, /, **more):
+        if "picture" in more:
+            with Image.open(more["picture"]) as picture:
+                more["size"] = picture.size
+        self.reports.append((stage, step, total, more))
+
+
+def test_each_person_is_the_one_that_generate_makes_of_the_seed(checkpoint, model, tmp_path):
+    listener = Listener()
+    asked = {"attributes": {"outfit": "suit", "height": 1.7}, "guidance": 2.0}
+    params = VariationsParams([5, 2**63 - 1, 6], str(tmp_path / "out"), 3, "dpmpp_2m", checkpoint, 32, **asked)
+    result = Jobs().variations(params, listener)
+    assert [person["seed"] for person in result["people"]] == [5, 2**63 - 1, 6]
+    assert len(list((tmp_path / "out").iterdir())) == 9
+    for person in result["people"]:
+        kept = load_human(person["person"])
+        alone = generate(model, person["seed"], 3, "dpmpp_2m", None, **asked)
+        assert dict(kept.provenance) == dict(alone.provenance)
+        assert torch.allclose(kept.payload.rgb, alone.payload.rgb, atol=1e-4)
+        assert torch.allclose(kept.betas, alone.betas, atol=1e-4)
+        with np.load(person["human"], allow_pickle=False) as human:
+            assert np.allclose(human["betas"], kept.betas)
+        assert Path(person["picture"]).is_file()
+    written = [more for stage, *_, more in listener.reports if stage == "write"]
+    assert [(more["index"], more["size"]) for more in written] == [(0, (32, 32)), (1, (32, 32)), (2, (32, 32))]
+
+
+def test_while_they_are_sampled_each_gets_its_picture_in_turn(checkpoint, tmp_path, monkeypatch):
+    grants = itertools.cycle([True, True, False])
+    monkeypatch.setattr(Allowance, "granted", lambda _: next(grants))
+    listener = Listener()
+    Jobs().variations(VariationsParams([1, 2, 3], str(tmp_path), 4, checkpoint=checkpoint, size=16), listener)
+    shown = [(step, more["index"]) for stage, step, _, more in listener.reports if stage == "sample" and more]
+    assert shown == [(1, 0), (1, 1), (2, 2), (2, 0), (3, 1), (3, 2)]
+    assert sorted({path.suffix for path in tmp_path.iterdir()}) == [".npz", ".png", ".safetensors"]
+    assert len(list(tmp_path.iterdir())) == 9, "pictures of the steps are gone"
+
+
+def test_variants_of_a_person_are_those_that_vary_makes(checkpoint, model, tmp_path):
+    person = tmp_path / "person.human.safetensors"
+    save_human(person, generate(model, 3, 2))
+    params = VariationsParams(
+        [8, 9], str(tmp_path / "out"), 5, checkpoint=checkpoint, size=16, person=str(person), amount=0.8
+    )
+    listener = Listener()
+    result = Jobs().variations(params, listener)
+    for made in result["people"]:
+        kept, alone = load_human(made["person"]), vary(model, load_human(person), 0.8, made["seed"], 5)
+        assert torch.equal(kept.payload.rgb, alone.payload.rgb)
+        assert kept.provenance["edits"][0]["seed"] == made["seed"]
+    stages = [stage for stage, *_ in listener.reports]
+    assert stages.index("write") < len(stages) - 1 - stages[::-1].index("sample"), "the first shows before the second"
+    totals = {total for stage, _, total, _ in listener.reports[2:] if stage == "sample"}
+    assert totals == {10}
+
+
+def test_it_can_be_ended_at_every_report_and_then_leaves_nothing(checkpoint, tmp_path):
+    class Stop(Exception):
+        pass
+
+    params = VariationsParams([1, 2], str(tmp_path / "out"), 2, checkpoint=checkpoint, size=16)
+    listener = Listener()
+    Jobs().variations(params, listener)
+    for path in (tmp_path / "out").iterdir():
+        path.unlink()
+    (tmp_path / "out").rmdir()
+    for end in range(len(listener.reports)):
+        count = itertools.count()
+
+        def stop(*_, count=count, end=end, **more):
+            if next(count) == end:
+                raise Stop
+
+        with pytest.raises(Stop):
+            Jobs().variations(params, stop)
+        assert not (tmp_path / "out").exists()
+
+
+def test_a_person_that_is_not_there_is_named(checkpoint, tmp_path):
+    params = VariationsParams([1], str(tmp_path / "out"), 2, checkpoint=checkpoint, person=str(tmp_path / "nobody"))
+    with pytest.raises(FileNotFoundError, match=r"there is no person in .*nobody"):
+        Jobs().variations(params, lambda *_, **more: None)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"seeds": []}, "0 seeds were given: choose 1 to 64"),
+        ({"seeds": list(range(65))}, "65 seeds were given"),
+        ({"seeds": [1, "2"]}, "the seed '2' is no whole number"),
+        ({"seeds": [True]}, "the seed True is no whole number"),
+        ({"seeds": [-1]}, "seed -1 is outside"),
+        ({"seeds": [4, 5, 4]}, "two of the seeds are alike"),
+        ({"steps": 0}, "0 steps"),
+        ({"size": 1}, "pictures of 1 pixels a side: choose 2 or more"),
+        ({"size": 5000}, "picture_px is 5000"),
+        ({"out_dir": ""}, "out_dir is empty"),
+        ({"person": ""}, "person is empty"),
+        ({"amount": 1.5}, "amount is 1.5"),
+        ({"guidance": float("nan")}, "guidance is nan"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_any_work(changes, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        VariationsParams(**{"seeds": [1], "out_dir": "out", **changes})
