@@ -32,12 +32,25 @@ def setup_cycles_preview(
     transform is Standard, so that a colour in the volumes is that colour in the picture. A picture of 384 x 384 at one
     sample took a minute on two idle cores (docs/results/demo.json). Raises ValueError when nobody is in the scene.
     """
-    extents = [posed_extent(collection) for collection in humans(scene)]
-    if not extents:
-        raise ValueError(f"nobody is in the scene {scene.name!r}; generate a person first")
-    extent = np.min([low for low, _ in extents], 0), np.max([high for _, high in extents], 0)
-    cycles = scene.cycles
+    extent = people_extent(scene)
     scene.render.engine = "CYCLES"
+    fit_cycles_to_volumes(scene, samples)
+    scene.render.resolution_x = scene.render.resolution_y = size
+    scene.render.resolution_percentage = 100
+    scene.render.film_transparent = world is None
+    scene.render.image_settings.file_format = "PNG"
+    scene.render.image_settings.color_mode = "RGBA"
+    scene.view_settings.view_transform = "Standard"
+    scene.view_settings.look = "None"
+    scene.world = _flat_world(0.0 if world is None else world)
+    scene.camera = new_camera(scene, focal_mm)
+    frame_box(scene.camera, extent, yaw)
+    return scene.camera
+
+
+def fit_cycles_to_volumes(scene: bpy.types.Scene, samples: int) -> None:
+    """Settings of Cycles by which a person takes minutes and not hours; nothing of other objects' light is kept."""
+    cycles = scene.cycles
     cycles.samples = samples
     cycles.use_adaptive_sampling = False
     cycles.use_denoising = False
@@ -47,17 +60,14 @@ def setup_cycles_preview(
     cycles.volume_step_rate = 1.0
     if bpy.app.version >= (5, 0):
         cycles.volume_biased = True  # unbiased tracking takes seconds per volume object, an hour a frame
-    scene.render.resolution_x = scene.render.resolution_y = size
-    scene.render.resolution_percentage = 100
-    scene.render.film_transparent = world is None
-    scene.render.image_settings.file_format = "PNG"
-    scene.render.image_settings.color_mode = "RGBA"
-    scene.view_settings.view_transform = "Standard"
-    scene.view_settings.look = "None"
-    scene.world = _flat_world(0.0 if world is None else world)
-    scene.camera = _camera(scene, focal_mm)
-    _frame(scene.camera, extent, yaw)
-    return scene.camera
+
+
+def people_extent(scene: bpy.types.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lowest and highest corner [3] of everybody in a scene, as posed. Raises ValueError when nobody is there."""
+    extents = [posed_extent(collection) for collection in humans(scene)]
+    if not extents:
+        raise ValueError(f"nobody is in the scene {scene.name!r}; generate a person first")
+    return np.min([low for low, _ in extents], 0), np.max([high for _, high in extents], 0)
 
 
 def posed_extent(collection: bpy.types.Collection) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -78,7 +88,8 @@ def _flat_world(grey: float) -> bpy.types.World:
     return world
 
 
-def _camera(scene: bpy.types.Scene, focal_mm: float) -> bpy.types.Object:
+def new_camera(scene: bpy.types.Scene, focal_mm: float = 70.0) -> bpy.types.Object:
+    """A camera in the scene, at the origin until `frame_box` places it."""
     data = bpy.data.cameras.new("Preview Camera")
     data.lens, data.sensor_width = focal_mm, _SENSOR_MM
     camera = bpy.data.objects.new("Preview Camera", data)
@@ -86,15 +97,18 @@ def _camera(scene: bpy.types.Scene, focal_mm: float) -> bpy.types.Object:
     return camera
 
 
-def _frame(camera: bpy.types.Object, extent: tuple[NDArray, NDArray], yaw: float) -> None:
-    """Look at the middle of the box from `yaw`, level, as near as shows its eight corners."""
+def frame_box(
+    camera: bpy.types.Object, extent: tuple[NDArray, NDArray], yaw: float, size: tuple[int, int] = (1, 1)
+) -> None:
+    """Look at the middle of the box from `yaw` radians, level, as near as a picture of `size` shows its corners."""
     low, high = extent
     centre = (low + high) / 2
     towards = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
     right = np.array([math.cos(yaw), math.sin(yaw), 0.0])
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * (high - low) / 2
-    aside = np.maximum(np.abs(corners @ right), np.abs(corners[:, 2])) * _MARGIN
-    distance = float((aside * camera.data.lens / (_SENSOR_MM / 2) + corners @ towards).max())
+    half = np.array(size) / max(size) * (_SENSOR_MM / 2 / camera.data.lens)  # tangents of the half angles of view
+    aside = np.maximum(np.abs(corners @ right) / half[0], np.abs(corners[:, 2]) / half[1]) * _MARGIN
+    distance = float((aside + corners @ towards).max())
     camera.location = centre + towards * distance
     camera.rotation_euler = Vector(-towards).to_track_quat("-Z", "Y").to_euler()
     camera.data.clip_end = max(100.0, 2 * distance)

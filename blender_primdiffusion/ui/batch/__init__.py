@@ -1,4 +1,4 @@
-"""`blender -c primdiffusion ...`."""
+"""People and pictures without a window: `blender -c primdiffusion ...`."""
 
 from __future__ import annotations
 

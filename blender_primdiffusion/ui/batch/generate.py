@@ -1,0 +1,119 @@
+"""`blender -c primdiffusion generate`: people in folders, without a window.
+
+OUT/settings.json, report.json
+OUT/person_000007/person.human.safetensors, human.npz, front.png, side.png, depth.png
+OUT/person_000007/person.blend, person_humans/      where asked for
+"""
+
+from __future__ import annotations
+
+import argparse
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from ...capture.report import Report
+from ...console import duration
+from ...places import preference
+from ...worker.backend import Backend
+from ...worker.job import Job
+from ..generate.attributes import Attributes, parsed
+from .asking import NoBackend, Stopped, ask, backend_of
+from .people import NPZ_FILE, PERSON_FILE, Movement, motion_name, movement_of, person_blend
+from .running import Clock, Say, reason, run, write_report
+from .staging import claim, publish, staging
+from .words import parse_generate
+
+SETTINGS = "settings.json"
+"""How the people of a folder were made."""
+_TOLD_S = 2.0
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command with its words; returns the exit code."""
+    return run("generate", argv, parse_generate, _generate)
+
+
+def _generate(options: argparse.Namespace, say: Say, stop: threading.Event) -> Report:
+    attributes, movement = parsed(", ".join(options.attributes)), movement_of(options)
+    params = _params(options, attributes)
+    claim(options.out / SETTINGS, {**params, "motion": motion_name(options)}, options.resume)
+    report, clock = Report(), Clock(options.count)
+    try:
+        with backend_of(options.python) as backend:
+            for number in range(options.count):
+                seed = options.seed + number
+                if stop.is_set():
+                    raise Stopped
+                if _is_there(options.out / person_name(seed), options.blend):
+                    report.skipped.append(person_name(seed))
+                    clock.piece_skipped()
+                    continue
+                job = _Person(options, {**params, "seed": seed}, movement, f"{number + 1}/{options.count}", say, stop)
+                _try(job, backend, report, clock)
+    finally:
+        write_report(report, options.out)
+    return report
+
+
+def person_name(seed: int) -> str:
+    """The folder of a seed's person."""
+    return f"person_{seed:06d}"
+
+
+def _params(options: argparse.Namespace, attributes: Attributes) -> dict[str, object]:
+    """Of the child's method, those that are everybody's."""
+    checkpoint = options.checkpoint.resolve() if options.checkpoint is not None else preference("checkpoint")
+    return {
+        "steps": options.steps,
+        "sampler": options.sampler,
+        "size": options.pictures,
+        **({"attributes": attributes, "guidance": options.guidance} if attributes else {}),
+        **({"checkpoint": str(checkpoint)} if checkpoint else {}),
+    }
+
+
+def _is_there(folder: Path, blend: str | None) -> bool:
+    return (folder / PERSON_FILE).is_file() and (blend is None or (folder / blend).is_file())
+
+
+class _Person:
+    """One of the batch."""
+
+    def __init__(self, options, params, movement: Movement | None, which: str, say: Say, stop: threading.Event):
+        self.name = person_name(params["seed"])
+        self.say, self.which = say, which
+        self._folder: Path = options.out / self.name
+        self._blend, self._params, self._movement, self._stop = options.blend, params, movement, stop
+        self._told = 0.0
+
+    def make(self, backend: Backend) -> None:
+        """Their folder, or the .blend that is missing in it. Raises what `ask` does, ValueError and OSError."""
+        with staging(self._folder) as made:
+            source = self._folder
+            if not (source / PERSON_FILE).is_file():
+                ask(backend, "generate", {**self._params, "out_dir": str(made)}, self._stop, self._tell)
+                source = made
+            if self._blend is not None:
+                person_blend(source / NPZ_FILE, source / PERSON_FILE, made / self._blend, self.name, self._movement)
+            publish(made, self._folder, last=self._blend or PERSON_FILE)
+
+    def _tell(self, job: Job) -> None:
+        if not job.finished and time.monotonic() - self._told > _TOLD_S:
+            self._told = time.monotonic()
+            left = f" ({duration(job.eta_s)} left)" if job.eta_s else ""
+            self.say(f"{self.which} {self.name}: {job.message}{left}")
+
+
+def _try(person: _Person, backend: Backend, report: Report, clock: Clock) -> None:
+    try:
+        person.make(backend)
+    except (NoBackend, Stopped):
+        raise
+    except Exception as error:  # a batch of a night must not end for one person, whatever is wrong with it
+        report.fail(person.name, "generate", reason(error))
+        person.say(f"{person.which} {person.name} failed: {reason(error)}{clock.piece_made()}")
+    else:
+        report.done.append(person.name)
+        person.say(f"{person.which} {person.name} is there{clock.piece_made()}")

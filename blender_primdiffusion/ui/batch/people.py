@@ -1,0 +1,117 @@
+"""People in Blender without a window: a file of their own, moved, with a camera that sees them."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...engine.engine import ENGINE
+from ...motion.files import read_motion
+from ...motion.motion import Motion
+from ...scene.armature import pose_from_joint_rotations
+from ...scene.human import PERSON, armature_of, build_human, humans
+from ...scene.human import PERSON_FILE as PERSON_FILE
+from ...scene.keyframes import keyframe_poses
+from ...scene.preview import frame_box, people_extent, setup_cycles_preview
+
+NPZ_FILE = "human.npz"
+"""The person for Blender, beside `PERSON_FILE`."""
+_LOOKED_AT = 24
+"""Frames of a motion by which the camera finds its distance."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Movement:
+    """What everybody does: a pose of one frame, or a motion."""
+
+    motion: Motion
+    still: bool
+
+    def apply(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
+        """Pose the person, or key a motion from frame 1 on and set the scene to its length and rate."""
+        armature, motion = armature_of(person), self.motion
+        if self.still:
+            pose_from_joint_rotations(armature, motion.rotations[0], np.zeros(3))
+            return
+        keyframe_poses(armature, 1 + np.arange(len(motion)), motion.rotations, motion.translations, motion.name)
+        scene = context.scene
+        scene.frame_start, scene.frame_end = 1, len(motion)
+        scene.render.fps, scene.render.fps_base = max(1, round(motion.fps)), max(1, round(motion.fps)) / motion.fps
+        scene.frame_set(1)
+
+
+def movement_of(options: argparse.Namespace) -> Movement | None:
+    """What --pose or --motion names. Raises MotionFileError."""
+    path = options.pose or options.motion
+    return None if path is None else Movement(read_motion(path), options.pose is not None)
+
+
+def motion_name(options: argparse.Namespace) -> str | None:
+    """The absolute path of what --pose or --motion names."""
+    path = options.pose or options.motion
+    return None if path is None else str(path.resolve())
+
+
+def person_blend(npz: Path, person: Path, blend: Path, name: str, movement: Movement | None) -> None:
+    """Save a .blend that holds one person, ready to be rendered. The open file makes way for it.
+
+    Raises HumanFileError, VolumeWriteError, OSError.
+    """
+    new_file()
+    _save(blend)  # where the volumes go
+    build_person(bpy.context, npz, person, name, movement)
+    _save(blend)
+    blend.with_name(f"{blend.name}1").unlink(missing_ok=True)  # Blender's copy of what was there before
+
+
+def new_file() -> None:
+    """An empty file with nothing unsaved in it; preferences and add-ons stay."""
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+
+
+def build_person(
+    context: bpy.types.Context, npz: Path, person: Path, name: str, movement: Movement | None
+) -> bpy.types.Collection:
+    """The person of two files in the open file, moved, before a camera and in front of nothing."""
+    collection = build_human(context, npz, name, [person])
+    if person.name != PERSON_FILE:
+        collection[PERSON] = person.name
+    if movement is not None:
+        movement.apply(context, collection)
+    scene = context.scene
+    setup_cycles_preview(scene, size=512, samples=4)
+    scene.render.engine = ENGINE
+    frame_box(scene.camera, moving_extent(scene), 0.0)
+    return collection
+
+
+def moving_extent(scene: bpy.types.Scene) -> tuple[np.ndarray, np.ndarray]:
+    """The corners of the box that everybody stays in from the scene's first frame to its last, as far as looked at."""
+    if not any(armature_of(person).animation_data for person in humans(scene)):
+        return people_extent(scene)
+    before, lows, highs = scene.frame_current, [], []
+    for frame in np.unique(np.linspace(scene.frame_start, scene.frame_end, _LOOKED_AT).round().astype(int)):
+        scene.frame_set(int(frame))
+        low, high = people_extent(scene)
+        lows.append(low)
+        highs.append(high)
+    scene.frame_set(before)
+    return np.min(lows, 0), np.max(highs, 0)
+
+
+def look_from(scene: bpy.types.Scene, degrees: float, extent: tuple[np.ndarray, np.ndarray]) -> None:
+    """Turn the scene's camera to people's left of the front by so much."""
+    render = scene.render
+    frame_box(scene.camera, extent, math.radians(degrees), (render.resolution_x, render.resolution_y))
+
+
+def _save(blend: Path) -> None:
+    try:
+        bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
+    except RuntimeError as error:
+        raise OSError(f"{blend} could not be written: {error}") from error

@@ -1,0 +1,217 @@
+"""`blender -c primdiffusion render`: pictures of .blend files and of people, without a window.
+
+OUT/pictures.json, report.json
+OUT/NAME.png                    one picture
+OUT/NAME/0001.png ...           several frames; turn_00.png ... of a turntable
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import shutil
+import tempfile
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import bpy
+
+from ...capture.layout import replacing
+from ...capture.report import Report
+from ...engine import studio
+from ...engine.engine import ENGINE
+from ...scene.human import humans, volume_path
+from ...scene.preview import fit_cycles_to_volumes, new_camera
+from ...scene.volumes import humans_folder
+from ...worker.backend import Backend
+from .asking import NoBackend, Stopped, ask, backend_of, check_backend, everywhere
+from .people import NPZ_FILE, Movement, build_person, look_from, motion_name, movement_of, moving_extent, new_file
+from .running import Clock, Say, reason, run, write_report
+from .sources import Source, sources
+from .staging import claim
+from .words import ENGINES, parse_render
+
+SETTINGS = "pictures.json"
+"""How the pictures of a folder were drawn."""
+_PICTURE = (512, 512)
+_SAMPLES = 4
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command with its words; returns the exit code."""
+    return run("render", argv, parse_render, _render)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Shot:
+    """A picture to draw."""
+
+    path: Path
+    frame: int
+    yaw: float | None
+    """Degrees; None: as the camera stands."""
+
+
+def _render(options: argparse.Namespace, say: Say, stop: threading.Event) -> Report:
+    movement, everybody = movement_of(options), sources(options.source)
+    names = ("engine", "size", "frames", "yaw", "turntable", "transparent", "samples")
+    drawn = {name: getattr(options, name) for name in names}
+    claim(options.out / SETTINGS, {**drawn, "motion": motion_name(options)}, options.resume)
+    report, clock = Report(), Clock(len(everybody))
+    try:
+        with everywhere(options.python), backend_of(options.python) as backend:
+            drawing = _Drawing(options, movement, backend, stop, say)
+            for source in everybody:
+                if stop.is_set():
+                    raise Stopped
+                _try(drawing, source, report, clock)
+    finally:
+        studio.close()
+        write_report(report, options.out)
+    return report
+
+
+def _try(drawing: _Drawing, source: Source, report: Report, clock: Clock) -> None:
+    try:
+        count = drawing.draw(source)
+    except (NoBackend, Stopped):
+        raise
+    except Exception as error:  # a batch of a night must not end for one person, whatever is wrong with it
+        report.fail(source.name, "render", reason(error))
+        drawing.say(f"{source.name} failed: {reason(error)}{clock.piece_made()}")
+        return
+    if count:
+        report.done.append(source.name)
+        drawing.say(f"{source.name} is there{clock.piece_made()}")
+    else:
+        report.skipped.append(source.name)
+        clock.piece_skipped()
+
+
+class _Drawing:
+    """Draws one after the other as the options say."""
+
+    def __init__(
+        self,
+        options: argparse.Namespace,
+        movement: Movement | None,
+        backend: Backend,
+        stop: threading.Event,
+        say: Say,
+    ):
+        self.say = say
+        self._options, self._movement, self._backend, self._stop = options, movement, backend, stop
+        self._checked = False
+
+    def draw(self, source: Source) -> int:
+        """The pictures of somebody that are not there yet; how many these were."""
+        if source.is_blend:
+            bpy.ops.wm.open_mainfile(filepath=str(source.path), load_ui=False, use_scripts=False)
+            self._prepare_blend()
+        elif all(shot.path.is_file() for shot in self._shots(source.name, 1, self._last_frame())):
+            return 0
+        else:
+            self._build(source)
+        scene = bpy.context.scene
+        first, last = (scene.frame_current,) * 2 if source.is_blend and not self._movement else (1, self._last_frame())
+        shots = [shot for shot in self._shots(source.name, first, last) if not shot.path.is_file()]
+        if shots:
+            self._prepare(scene)
+            extent = None if all(shot.yaw is None for shot in shots) else moving_extent(scene)
+        for number, shot in enumerate(shots):
+            if self._stop.is_set():
+                raise Stopped
+            scene.frame_set(shot.frame)
+            if extent is not None and shot.yaw is not None:
+                look_from(scene, shot.yaw, extent)
+            _draw(scene, shot.path)
+            if len(shots) > 1:
+                self.say(f"{source.name}: picture {number + 1} of {len(shots)}")
+        if not source.is_blend:
+            new_file()
+            shutil.rmtree(humans_folder(""), ignore_errors=True)
+        return len(shots)
+
+    def _last_frame(self) -> int:
+        return len(self._movement.motion) if self._movement and not self._movement.still else 1
+
+    def _shots(self, name: str, first: int, last: int) -> Iterator[_Shot]:
+        options, out = self._options, self._options.out
+        first, last = options.frames or (first, last)
+        if options.turntable:
+            for turn in range(options.turntable):
+                yaw = (options.yaw or 0.0) + 360.0 * turn / options.turntable
+                yield _Shot(out / name / f"turn_{turn:02d}.png", first, yaw)
+        elif first == last:
+            yield _Shot(out / f"{name}.png", first, options.yaw)
+        else:
+            for frame in range(first, last + 1):
+                yield _Shot(out / name / f"{frame:04d}.png", frame, options.yaw)
+
+    def _prepare_blend(self) -> None:
+        scene = bpy.context.scene
+        if self._movement is not None:
+            for person in humans(scene):
+                self._movement.apply(bpy.context, person)
+        if self._options.yaw is not None or self._options.turntable or scene.camera is None:
+            scene.camera = new_camera(scene)
+            look_from(scene, self._options.yaw or 0.0, moving_extent(scene))
+
+    def _build(self, source: Source) -> None:
+        """The person of a file, in an empty .blend; the volumes lie in a temporary folder."""
+        new_file()
+        shutil.rmtree(humans_folder(""), ignore_errors=True)
+        with tempfile.TemporaryDirectory(dir=bpy.app.tempdir or None) as folder:
+            npz = source.path.with_name(NPZ_FILE)
+            if not (source.has_npz and npz.is_file()):
+                asked = {"person": str(source.path), "out_dir": folder, "size": 16}
+                npz = Path(ask(self._backend, "human_npz", asked, self._stop)["human"])
+            build_person(bpy.context, npz, source.path, source.name, self._movement)
+        render = bpy.context.scene.render
+        render.resolution_x, render.resolution_y = self._options.size or _PICTURE
+        look_from(bpy.context.scene, self._options.yaw or 0.0, moving_extent(bpy.context.scene))
+
+    def _prepare(self, scene: bpy.types.Scene) -> None:
+        """Engine, size and film as asked for."""
+        options, render = self._options, scene.render
+        if options.engine:
+            render.engine = ENGINES[options.engine]
+        if options.size:
+            render.resolution_x, render.resolution_y = options.size
+            render.resolution_percentage = 100
+        render.film_transparent = options.transparent or (options.source.suffix == ".blend" and render.film_transparent)
+        if render.engine == "CYCLES":
+            if options.engine or options.samples:
+                fit_cycles_to_volumes(scene, options.samples or _SAMPLES)
+            _refuse_missing_volumes(scene)
+        elif render.engine == ENGINE and not self._checked:
+            check_backend(options.python)
+            self._checked = True
+        if bpy.app.version >= (5, 0):
+            render.image_settings.media_type = "IMAGE"
+        render.image_settings.file_format = "PNG"
+        render.image_settings.color_mode = "RGBA" if render.film_transparent else "RGB"
+        render.use_file_extension = False
+
+
+def _refuse_missing_volumes(scene: bpy.types.Scene) -> None:
+    volumes = {thing.data for person in humans(scene) for thing in person.all_objects if thing.type == "VOLUME"}
+    missing = [path for path in (volume_path(volume) for volume in volumes if volume.filepath) if not path.is_file()]
+    if missing:
+        raise FileNotFoundError(
+            f"{len(missing)} of {len(volumes)} volumes have lost their files, {missing[0]} among them: put the folder "
+            "back beside the .blend, or open it and press Find Missing Volumes"
+        )
+
+
+def _draw(scene: bpy.types.Scene, path: Path) -> None:
+    with replacing(path) as unfinished:
+        scene.render.filepath = str(unfinished)
+        try:
+            bpy.ops.render.render(write_still=True)
+        except RuntimeError:
+            unfinished.unlink(missing_ok=True)
+            raise
+        if not unfinished.is_file():
+            raise OSError(f"{path} was not drawn: is there room on the disk?")

@@ -1,0 +1,88 @@
+"""What commands have in common: their words, their stdout, their report, their exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from ...capture.report import Report, report_path
+from ...console import CANCELLED, DONE, FAILED, NO_BACKEND, UNUSABLE, duration, stdout_of_our_own, stopped_by_signals
+from .asking import NoBackend, Stopped
+from .words import UsageError
+
+Say = Callable[[str], None]
+"""Takes a line for people."""
+_ALL = (0, 1)
+"""The shard of a batch that is not shared out."""
+
+
+def run(
+    name: str,
+    argv: Sequence[str],
+    parse: Callable[[Sequence[str]], argparse.Namespace],
+    work: Callable[[argparse.Namespace, Say, threading.Event], Report],
+) -> int:
+    """Run a command; returns its exit code. Blender's own messages on stdout are dropped.
+
+    `work` raises Stopped, NoBackend, and OSError or ValueError where nothing can be begun.
+    """
+    try:
+        options = parse(argv)
+    except UsageError as error:
+        return _refused(name, f"{error}; --help names all options", UNUSABLE)
+    except SystemExit as asked_for_help:
+        return int(asked_for_help.code or DONE)
+    with stdout_of_our_own() as say, stopped_by_signals() as stop:
+        try:
+            report = work(options, say, stop)
+        except Stopped:
+            say("Stopped; the same command goes on from here.")
+            return CANCELLED
+        except NoBackend as error:
+            return _refused(name, str(error), NO_BACKEND)
+        except (OSError, ValueError) as error:
+            return _refused(name, str(error), UNUSABLE)
+        say(f"{len(report.done)} done, {len(report.skipped)} were there, {len(report.failed)} failed")
+        if report.failed:
+            say(f"What failed and why: {report_path(options.out, _ALL)}")
+        return FAILED if report.failed else DONE
+
+
+def write_report(report: Report, out: Path) -> None:
+    """To report.json."""
+    report.write(out, _ALL)
+
+
+def reason(error: Exception) -> str:
+    """What an error says, in a line; with its kind where it was not meant for people."""
+    meant = isinstance(error, (ValueError, OSError, RuntimeError)) and str(error).strip()
+    return " ".join((str(error) if meant else f"{type(error).__name__}: {error}").split()).removeprefix("Error: ")
+
+
+def _refused(name: str, sentence: str, code: int) -> int:
+    print(f"{name}: {sentence}", file=sys.stderr, flush=True)
+    return code
+
+
+class Clock:
+    """How long a batch will still take, by what its pieces took so far."""
+
+    def __init__(self, pieces: int):
+        self._left, self._made, self._began = pieces, 0, time.monotonic()
+
+    def piece_made(self) -> str:
+        """One more is there; the time that is left, in words."""
+        self._made += 1
+        self._left -= 1
+        if not self._left:
+            return ""
+        each = (time.monotonic() - self._began) / self._made
+        return f", {duration(self._left * each)} left"
+
+    def piece_skipped(self) -> None:
+        """One was there already."""
+        self._left -= 1

@@ -1,0 +1,144 @@
+"""The words of the commands `generate` and `render`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+from ...worker.names import SAMPLERS
+
+if TYPE_CHECKING:
+    import argparse  # takes a fifth of what registering may take; imported where it is used
+
+ENGINES = {"primdiffusion": "PRIMDIFFUSION", "cycles": "CYCLES"}
+"""What the command line calls render engines, and what Blender does."""
+_ENDS = (
+    "exit codes: 0 all is done, 1 somebody failed (report.json tells who and why), 2 wrong words, 3 no Python runs the "
+    "backend, 130 stopped by Ctrl-C; the same command goes on from there"
+)
+
+
+class UsageError(ValueError):
+    """Words that a command does not understand."""
+
+
+def parse_generate(argv: Sequence[str]) -> argparse.Namespace:
+    """The options of `generate`. Raises UsageError; SystemExit after --help."""
+    made = _parser("generate", "Generate people, a folder each: the person, the person for Blender, pictures.")
+    add = made.add_argument
+    add("--out", type=Path, required=True, help="folder for all of them; one begun before is gone on with")
+    add("--count", type=_whole(1), default=1, help="how many (default %(default)s)")
+    add("--seed", type=_whole(0), default=0, help="of the first; the next ones follow (default %(default)s)")
+    add("--steps", type=_whole(1), default=30, help="denoising steps (default %(default)s)")
+    add("--sampler", choices=SAMPLERS, default=SAMPLERS[0], help="(default %(default)s)")
+    add("--attributes", nargs="+", default=[], metavar="NAME=VALUE", help='like sex=female height=1.7 "hair=long bob"')
+    add("--guidance", type=float, default=1.5, help="how strongly attributes are followed (default %(default)s)")
+    add("--checkpoint", type=Path, help="a .safetensors file instead of the preferences' or the default one")
+    add("--pictures", type=_whole(16), default=512, metavar="SIZE", help="pixels a side (default %(default)s)")
+    blend = made.add_mutually_exclusive_group()
+    blend.add_argument(
+        "--blend", nargs="?", const="person.blend", metavar="NAME", help="a .blend in each folder too, called so"
+    )
+    blend.add_argument("--no-blend", dest="blend", action="store_const", const=None, help="none (the default)")
+    _add_motion(made)
+    _add_python(made)
+    add("--resume", action="store_true", help="keep people there who were made with other settings than these")
+    options = made.parse_args(list(argv))
+    if options.blend is not None and (Path(options.blend).name != options.blend or not options.blend.strip(".")):
+        raise UsageError(f"--blend {options.blend!r} is no file name: name one without folders")
+    if options.blend is not None and not options.blend.endswith(".blend"):
+        options.blend += ".blend"
+    if (options.pose or options.motion) and options.blend is None:
+        raise UsageError("--pose and --motion move people in .blend files: add --blend")
+    _check_files(options, "checkpoint", "pose", "motion")
+    return options
+
+
+def parse_render(argv: Sequence[str]) -> argparse.Namespace:
+    """The options of `render`. Raises UsageError; SystemExit after --help."""
+    made = _parser("render", "Draw a .blend, a person's file, or everybody in a folder of people.")
+    add = made.add_argument
+    add("source", type=Path, metavar="SOURCE", help=".blend, .human, .human.safetensors, or a folder of people")
+    add("--out", type=Path, required=True, help="folder for the pictures; those that are there stay")
+    add("--engine", choices=ENGINES, help="default: the .blend's own; primdiffusion for people")
+    add("--frames", type=_frames, metavar="A..B", help="default: the frame the .blend is at; all of a --motion")
+    add("--size", type=_size, metavar="WxH", help="pixels; default: the .blend's own; 512x512 for people")
+    add("--yaw", type=float, help="degrees that a new camera stands to people's left of the front")
+    add("--turntable", type=_whole(2), metavar="N", help="N views all round")
+    _add_motion(made)
+    add("--transparent", action="store_true", help="no background")
+    add("--samples", type=_whole(1), help="of Cycles, for each pixel (default 4)")
+    _add_python(made)
+    add("--resume", action="store_true", help="keep pictures there that were drawn with other settings than these")
+    options = made.parse_args(list(argv))
+    if options.turntable and options.frames:
+        raise UsageError("--turntable and --frames ask for different pictures: give one of them")
+    if options.samples and options.engine == "primdiffusion":
+        raise UsageError("--samples is for --engine cycles; the marcher needs none")
+    if not options.source.exists():
+        raise UsageError(f"there is no {options.source}: check the path")
+    _check_files(options, "pose", "motion")
+    return options
+
+
+def _parser(name: str, description: str) -> argparse.ArgumentParser:
+    import argparse
+
+    made = argparse.ArgumentParser(prog=f"primdiffusion {name}", description=description, epilog=_ENDS)
+    made.error = _refuse
+    return made
+
+
+def _add_motion(made: argparse.ArgumentParser) -> None:
+    moved = made.add_mutually_exclusive_group()
+    moved.add_argument("--pose", type=Path, metavar="FILE", help="stand as in its first frame; .npz, .npy, .json, .bvh")
+    moved.add_argument("--motion", type=Path, metavar="FILE", help="move as in it: AMASS .npz, .npy, .json, .bvh")
+
+
+def _add_python(made: argparse.ArgumentParser) -> None:
+    made.add_argument("--python", type=Path, metavar="PATH", help="the backend's Python instead of the preferences'")
+
+
+def _refuse(message: str) -> NoReturn:
+    raise UsageError(message)
+
+
+def _check_files(options: argparse.Namespace, *names: str) -> None:
+    if options.out.exists() and not options.out.is_dir():
+        raise UsageError(f"--out {options.out} is a file: name a folder")
+    for name in names:
+        path = getattr(options, name)
+        if path is not None and not path.is_file():
+            raise UsageError(f"--{name} {path} is no file: check the path")
+
+
+def _whole(least: int):
+    """Whole numbers from `least` on."""
+
+    def number(text: str) -> int:
+        if not text.isdigit() or int(text) < least:
+            raise ValueError(text)
+        return int(text)
+
+    number.__name__ = f"whole number from {least}"
+    return number
+
+
+def _frames(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(-?\d+)(?:\.\.(-?\d+))?", text)
+    first, last = (int(found[1]), int(found[2] or found[1])) if found else (1, 0)
+    if last < first:
+        raise ValueError(text)
+    return first, last
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not found or not all(4 <= int(side) <= 65536 for side in found.groups()):
+        raise ValueError(text)
+    return int(found[1]), int(found[2])
+
+
+_frames.__name__, _size.__name__ = "range of frames like 1..48", "size like 1920x1080"

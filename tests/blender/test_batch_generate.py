@@ -1,0 +1,180 @@
+"""People from the command line: whole, gone on with, named when they fail; by a child that can be told to misbehave."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+import synthetic
+
+from blender_primdiffusion import places
+from blender_primdiffusion.console import CANCELLED, DONE, FAILED, NO_BACKEND, UNUSABLE
+from blender_primdiffusion.scene.human import armature_of, humans, person_file, volume_path
+from blender_primdiffusion.ui.batch.command import execute
+from blender_primdiffusion.worker.environment import BackendNotFound
+
+DIES, FAILS, TAKES_LONG = 1, 2, 4
+"""Seeds that the fake child takes as orders."""
+
+
+def generate(out: Path, *words: object) -> int:
+    return execute(["generate", "--out", str(out), "--steps", "1", "--pictures", "16", *map(str, words)])
+
+
+def report(out: Path) -> dict:
+    return json.loads((out / "report.json").read_text())
+
+
+def sent(folder: Path) -> dict:
+    return json.loads((folder / "person.human.safetensors").read_bytes())
+
+
+@pytest.fixture
+def out(addon, tmp_path) -> Path:
+    return tmp_path / "Leute in Köln"
+
+
+def test_everybody_has_a_folder_named_by_their_seed(out, capfd):
+    assert generate(out, "--count", 2, "--seed", 7, "--attributes", "sex=female", "height=1.7") == DONE
+    assert sorted(path.name for path in out.iterdir()) == [
+        "person_000007",
+        "person_000008",
+        "report.json",
+        "settings.json",
+    ]
+    asked = sent(out / "person_000008")
+    assert (asked["seed"], asked["steps"], asked["size"]) == (8, 1, 16)
+    assert (asked["attributes"], asked["guidance"]) == ({"sex": "female", "height": 1.7}, 1.5)
+    assert (out / "person_000007" / "human.npz").is_file()
+    assert report(out)["done"] == ["person_000007", "person_000008"]
+    assert "2/2 person_000008 is there" in capfd.readouterr().out
+
+
+def test_the_same_command_goes_on_and_leaves_what_is_there(out):
+    assert generate(out, "--seed", 7) == DONE
+    before = (out / "person_000007" / "human.npz").stat()
+    assert generate(out, "--seed", 7, "--count", 2) == DONE
+    after = (out / "person_000007" / "human.npz").stat()
+    assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+    assert (report(out)["done"], report(out)["skipped"]) == (["person_000008"], ["person_000007"])
+
+
+def test_other_settings_are_refused_until_told_to_go_on(out, capfd):
+    assert generate(out, "--seed", 7) == DONE
+    assert generate(out, "--seed", 8, "--sampler", "ddpm") == UNUSABLE
+    assert "was made with sampler = ddim, not ddpm" in capfd.readouterr().err
+    assert not (out / "person_000008").exists()
+    assert generate(out, "--seed", 8, "--sampler", "ddpm", "--resume") == DONE
+    assert sent(out / "person_000008")["sampler"] == "ddpm"
+
+
+def test_one_who_fails_is_named_and_does_not_stop_the_others(out, capfd):
+    assert (
+        generate(out, "--seed", 1, "--count", 3) == FAILED
+    )  # one whose child dies, one whose child refuses, one damaged
+    assert generate(out, "--seed", FAILS, "--count", 4, "--resume", "--blend") == FAILED
+    failed = report(out)["failed"]
+    assert failed[0]["subject"] == "person_000002"
+    assert "checkpoint is damaged" in failed[0]["why"]
+    assert failed[1]["subject"] == "person_000003"
+    assert "is damaged" in failed[1]["why"]
+    assert report(out)["done"][-1] == "person_000005"
+    assert not list(out.glob(".*"))
+    assert "person_000002 failed: " in capfd.readouterr().out
+
+
+def test_a_blend_holds_the_person_moved_and_finds_its_files_where_the_folder_is(out, tmp_path):
+    rotations = np.tile(np.eye(3), (3, 24, 1, 1))
+    rotations[2, 16] = synthetic.axis_angle(np.array([0.0, 0.0, 0.5]))
+    np.save(tmp_path / "wave.npy", rotations)
+    assert generate(out, "--seed", 7, "--blend", "--motion", tmp_path / "wave.npy") == DONE
+    moved = out.rename(tmp_path / "elsewhere") / "person_000007"
+    assert not list(moved.glob("*.blend1"))
+    bpy.ops.wm.open_mainfile(filepath=str(moved / "person.blend"))
+    scene = bpy.context.scene
+    (person,) = humans(scene)
+    assert person.name == "person_000007"
+    assert all(volume_path(thing.data).is_file() for thing in person.all_objects if thing.type == "VOLUME")
+    assert person_file(person).is_relative_to(moved)
+    assert (scene.frame_start, scene.frame_end, scene.render.engine) == (1, 3, "PRIMDIFFUSION")
+    bone = armature_of(person).pose.bones["left_shoulder"]
+    scene.frame_set(3)
+    assert bone.rotation_quaternion.angle == pytest.approx(0.5, abs=1e-3)
+
+
+def test_a_blend_that_is_asked_for_later_is_made_without_another_generation(out):
+    assert generate(out, "--seed", 7) == DONE
+    made = (out / "person_000007" / "person.human.safetensors").stat().st_mtime_ns
+    assert generate(out, "--seed", 7, "--blend", "anna") == DONE
+    folder = out / "person_000007"
+    assert (folder / "anna.blend").is_file()
+    assert (folder / "person.human.safetensors").stat().st_mtime_ns == made
+    assert list((folder / "anna_humans").rglob("*.vdb"))
+
+
+def test_ctrl_c_ends_within_a_second_and_leaves_nothing_half_made(out, capfd):
+    threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+    began = time.monotonic()
+    assert generate(out, "--seed", TAKES_LONG, "--count", 2, "--steps", 50) == CANCELLED
+    assert time.monotonic() - began < 4.0
+    assert "goes on from here" in capfd.readouterr().out
+    assert not list(out.glob("person*"))
+    assert not list(out.glob(".*"))
+    assert report(out)["done"] == []
+
+
+def test_without_a_backend_everybody_is_spared_the_attempt(out, monkeypatch, capfd):
+    def nowhere(*_, **__):
+        raise BackendNotFound("No Python for the backend: /nowhere does not exist")
+
+    monkeypatch.setattr(places, "find_backend_python", nowhere)
+    assert generate(out, "--count", 3) == NO_BACKEND
+    assert "/nowhere does not exist" in capfd.readouterr().err
+    assert not list(out.glob("person*"))
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--count", "0"], "invalid whole number from 1 value: '0'"),
+        (["--attributes", "tall"], "'tall' is no name=value"),
+        (["--sampler", "euler"], "invalid choice: 'euler'"),
+        (["--checkpoint", "/nowhere.safetensors"], "--checkpoint /nowhere.safetensors is no file"),
+        (["--motion", "/nowhere.bvh", "--blend"], "--motion /nowhere.bvh is no file"),
+        (["--blend", "../away.blend"], "is no file name"),
+        (["--blend", "--no-blend"], "not allowed with"),
+    ],
+)
+def test_wrong_words_are_named_before_anything_is_made(out, words, sentence, capfd):
+    assert generate(out, *words) == UNUSABLE
+    assert sentence in capfd.readouterr().err
+    assert not list(out.glob("person*"))
+
+
+def test_a_pose_without_a_blend_is_refused(out, tmp_path, capfd):
+    np.save(tmp_path / "pose.npy", np.zeros(72))
+    assert generate(out, "--pose", tmp_path / "pose.npy") == UNUSABLE
+    assert "add --blend" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["generate", "render", "capture"])
+def test_help_is_there_and_no_failure(addon, command, capfd):
+    try:
+        code = execute([command, "--help"])
+    except SystemExit as left:
+        code = left.code
+    assert code == DONE
+    assert "usage:" in capfd.readouterr().out
+
+
+def test_without_a_command_those_there_are_are_named(addon, capfd):
+    assert execute([]) == UNUSABLE
+    assert "generate --count" in capfd.readouterr().err
+    assert execute(["--help"]) == DONE

@@ -1,0 +1,144 @@
+"""Pictures from the command line: of .blend files, of people, of folders; whole, gone on with, named when they fail."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from engine_stage import pixels
+
+from blender_primdiffusion import places
+from blender_primdiffusion.console import DONE, FAILED, NO_BACKEND, UNUSABLE
+from blender_primdiffusion.ui.batch.command import execute
+from blender_primdiffusion.worker.environment import BackendNotFound
+
+SMALL = ("--size", "24x16")
+
+
+def render(source: Path, out: Path, *words: object) -> int:
+    return execute(["render", str(source), "--out", str(out), *map(str, words)])
+
+
+def report(out: Path) -> dict:
+    return json.loads((out / "report.json").read_text())
+
+
+def pictures(out: Path) -> list[str]:
+    return sorted(str(path.relative_to(out)) for path in out.rglob("*.png"))
+
+
+@pytest.fixture
+def people(addon, tmp_path) -> Path:
+    words = ["--out", str(tmp_path / "people"), "--seed", "7", "--count", "2", "--steps", "1", "--blend"]
+    assert execute(["generate", *words]) == DONE
+    return tmp_path / "people"
+
+
+@pytest.fixture
+def out(tmp_path) -> Path:
+    return tmp_path / "Bilder von überall"
+
+
+def test_a_folder_of_people_becomes_a_picture_of_each(people, out):
+    assert render(people, out, *SMALL, "--transparent") == DONE
+    assert pictures(out) == ["person_000007.png", "person_000008.png"]
+    assert pixels(out / "person_000007.png").shape == (16, 24, 4)
+    assert report(out)["done"] == ["person_000007", "person_000008"]
+
+
+def test_what_is_there_is_not_drawn_again(people, out):
+    assert render(people / "person_000007", out, *SMALL) == DONE
+    before = (out / "person_000007.png").stat().st_mtime_ns
+    assert render(people, out, *SMALL) == DONE
+    assert (out / "person_000007.png").stat().st_mtime_ns == before
+    assert (report(out)["done"], report(out)["skipped"]) == (["person_000008"], ["person_000007"])
+    assert render(people, out, "--size", "32x32") == UNUSABLE
+    assert render(people, out, "--size", "32x32", "--resume") == DONE
+
+
+def test_a_turntable_goes_all_round(people, out):
+    assert render(people / "person_000007", out, *SMALL, "--turntable", 3) == DONE
+    assert pictures(out) == [f"person_000007/turn_{turn:02d}.png" for turn in range(3)]
+
+
+def test_a_motion_is_drawn_frame_by_frame(people, out, tmp_path):
+    np.save(tmp_path / "still.npy", np.zeros((4, 72)))
+    assert render(people / "person_000007", out, *SMALL, "--motion", tmp_path / "still.npy", "--frames", "2..3") == DONE
+    assert pictures(out) == ["person_000007/0002.png", "person_000007/0003.png"]
+
+
+def test_a_blend_is_drawn_as_it_is_and_stays_so(people, out):
+    blend = people / "person_000007" / "person.blend"
+    before = blend.read_bytes()
+    bpy.ops.wm.open_mainfile(filepath=str(blend))
+    bpy.context.scene.render.resolution_x = bpy.context.scene.render.resolution_y = 20
+    bpy.ops.wm.save_as_mainfile(filepath=str(blend.with_name("small.blend")))
+    assert render(blend.with_name("small.blend"), out) == DONE
+    assert pixels(out / "small.png").shape[:2] == (20, 20)
+    assert render(blend, out / "turned", *SMALL, "--yaw", 90) == DONE
+    assert blend.read_bytes() == before
+
+
+def test_cycles_draws_the_volumes(people, out):
+    words = ("--engine", "cycles", "--samples", 1, "--size", "32x32", "--transparent")
+    assert render(people / "person_000007", out, *words) == DONE
+    alpha = pixels(out / "person_000007.png")[..., 3]
+    assert alpha.max() > 0.2
+    assert alpha[0, 0] == 0.0
+
+
+def test_one_who_fails_is_named_and_does_not_stop_the_others(people, out, capfd):
+    (people / "person_000007" / "human.npz").write_bytes(b"PK\x03\x04 no more")
+    assert render(people, out, *SMALL) == FAILED
+    assert pictures(out) == ["person_000008.png"]
+    (failed,) = report(out)["failed"]
+    assert failed["subject"] == "person_000007"
+    assert "'human.npz' is damaged" in failed["why"]
+    assert not list(out.rglob(".*"))
+
+
+def test_missing_volumes_are_said_before_cycles_draws_nobody(people, out):
+    folder = people / "person_000007"
+    next((folder / "person_humans").rglob("*.vdb")).unlink()
+    assert render(folder / "person.blend", out, *SMALL, "--engine", "cycles") == FAILED
+    assert "1 of 8 volumes have lost their files" in report(out)["failed"][0]["why"]
+
+
+def test_without_a_backend_it_says_so_at_once(people, out, monkeypatch, capfd):
+    def nowhere(*_, **__):
+        raise BackendNotFound("No Python for the backend: /nowhere does not exist")
+
+    monkeypatch.setattr(places, "find_backend_python", nowhere)
+    assert render(people, out, *SMALL) == NO_BACKEND
+    assert "/nowhere does not exist" in capfd.readouterr().err
+    assert pictures(out) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--size", "big"], "invalid size like 1920x1080 value: 'big'"),
+        (["--frames", "9..3"], "invalid range of frames like 1..48 value: '9..3'"),
+        (["--turntable", "4", "--frames", "1..3"], "ask for different pictures"),
+        (["--samples", "4", "--engine", "primdiffusion"], "the marcher needs none"),
+        (["--pose", "/nowhere.npy"], "--pose /nowhere.npy is no file"),
+    ],
+)
+def test_wrong_words_are_named(addon, tmp_path, out, words, sentence, capfd):
+    assert render(tmp_path, out, *words) == UNUSABLE
+    assert sentence in capfd.readouterr().err
+
+
+def test_what_is_no_source_is_named(addon, tmp_path, out, capfd):
+    (tmp_path / "photo.jpg").write_bytes(b"")
+    (tmp_path / "empty").mkdir()
+    for source, sentence in (
+        ("nobody", "there is no"),
+        ("photo.jpg", "is neither a .blend nor"),
+        ("empty", "no people"),
+    ):
+        assert render(tmp_path / source, out) == UNUSABLE
+        assert sentence in capfd.readouterr().err
