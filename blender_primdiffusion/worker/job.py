@@ -73,6 +73,8 @@ class Job:
         self.message = "Starting the backend"
         self.picture: Path | None = None
         """A PNG of what is there so far."""
+        self.pictures: dict[int, Path] = {}
+        """PNGs by index, of a method that makes several people."""
         self.result: dict[str, Any] | None = None
         """The child's."""
         self.error: JobError | None = None
@@ -103,7 +105,7 @@ class Job:
         """Takes in what has happened; True if something visible changed. Never waits."""
         if self.finished:
             return False
-        before = (self.state, self.step, self.total, self.eta_s, self.message, self.picture)
+        before = (self.state, self.step, self.total, self.eta_s, self.message, self.picture, dict(self.pictures))
         if self._client is None:
             self._tick_start()
         if self._client is not None and not self.finished:
@@ -114,7 +116,9 @@ class Job:
             if self._request is None and not self.finished:
                 self._ask(self._client)
         self._lose_patience()
-        return before != (self.state, self.step, self.total, self.eta_s, self.message, self.picture)
+        return before != (
+            self.state, self.step, self.total, self.eta_s, self.message, self.picture, self.pictures
+        )  # fmt: skip
 
     def cancel(self) -> None:
         """Asks for an end; `tick` goes on until the state is cancelled, which it is within a second."""
@@ -184,7 +188,9 @@ class Job:
         self.state = "running"
         self.message = STAGES.get(stage, stage.capitalize())
         self.eta_s = params.get("eta_s")
-        if params.get("picture"):
+        if params.get("picture") and "index" in params:
+            self.pictures[params["index"]] = Path(params["picture"])
+        elif params.get("picture"):
             self.picture = Path(params["picture"])
         samples = "steps" in self._params
         if not samples or stage == "sample":
