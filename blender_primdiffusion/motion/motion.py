@@ -3,13 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .rotation import to_axis_angle
 from .skeleton import joint_positions
+
+
+@dataclasses.dataclass(frozen=True)
+class Detected:
+    """What a file was found to hold, for people to see and to correct."""
+
+    rig: str = ""
+    """SMPL, SMPL-H, SMPL-X, or the naming of the bones; empty where nothing was said."""
+    up: str = ""
+    """The file's axis that points up, such as "z" or "-y"; empty where it was not to be found."""
+    unit: str = "metres"
+    """Of lengths in the file."""
+    fps: float = 0.0
+    """As the file tells; 0 where it does not."""
+    bones: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """SMPL's joint -> the file's bone, of files with bones."""
+    average_legs: bool = False
+    """Whether lengths were scaled so that the legs are an average person's: then they scale with whoever moves."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,6 +44,7 @@ class Motion:
     """Where it is from."""
     notes: tuple[str, ...] = ()
     """What was found out or assumed on reading, a sentence each."""
+    detected: Detected = dataclasses.field(default_factory=Detected)
 
     def __post_init__(self) -> None:
         frames = len(self.rotations)

@@ -76,7 +76,7 @@ class Pose:
     """Of the pelvis, and all with it."""
 
     def rotations(self) -> NDArray[np.float64]:
-        """SMPL's joint rotations [24, 3, 3]."""
+        """SMPL's joint rotations [24, 3, 3]; [F, 24, 3, 3] where angles are arrays [F]."""
         turned = {"pelvis": _bend(*self.whole)}
         for spine in ("spine1", "spine2", "spine3"):
             turned[spine] = _bend(*(angle / 3 for angle in self.trunk))
@@ -87,7 +87,8 @@ class Pose:
             ("right", -1, self.right_arm, self.right_leg),
         ):
             turned |= {f"{side}_{part}": turn for part, turn in (_arm(arm, sign) | _leg(leg, sign)).items()}
-        return np.array([turned.get(name, np.eye(3)) for name in JOINT_NAMES])
+        joints = [turned.get(name, np.eye(3)) for name in JOINT_NAMES]
+        return np.stack(np.broadcast_arrays(*joints), -3)
 
 
 def _bend(forward: float, left: float, lean: float) -> NDArray[np.float64]:
@@ -116,7 +117,7 @@ def _leg(leg: Leg, sign: int) -> dict[str, NDArray[np.float64]]:
     }
 
 
-def _turn(axis: int, degrees: float) -> NDArray[np.float64]:
+def _turn(axis: int, degrees: float | NDArray) -> NDArray[np.float64]:
     return about_axis(axis, np.radians(degrees))
 
 
