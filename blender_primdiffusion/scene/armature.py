@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import bpy
 import numpy as np
 from mathutils import Vector
@@ -70,35 +73,50 @@ def build_armature(context: bpy.types.Context, name: str, joints: NDArray) -> bp
     return armature
 
 
-def move_rest_joints(context: bpy.types.Context, data: bpy.types.Armature, joints: NDArray) -> None:
+def move_rest_joints(data: bpy.types.Armature, joints: NDArray) -> None:
     """Give an armature that exists other rest joints [24, 3] (z up, metres); poses and further bones stay.
 
     Each bone is moved as it is, not turned towards the new joints: its axes stay, so a pose or an animation means the
-    same joint rotations afterwards. An object of its own carries the armature into edit mode, since a person's may be
-    hidden or in another scene. Raises ValueError when a joint's bone is missing.
+    same joint rotations afterwards. Modes, selection and the active object stay too. Raises ValueError when a joint's
+    bone is missing, or the armature is in edit mode.
     """
     missing = [name for name in JOINT_NAMES if name not in data.bones]
     if missing:
         raise ValueError(f"the armature {data.name!r} has no bone {missing[0]!r}: its shape cannot be changed")
-    carrier = bpy.data.objects.new(f"{data.name}_carrier", data)
-    layer = context.view_layer
-    active = layer.objects.active
-    if active is not None and active.mode != "OBJECT":
-        bpy.ops.object.mode_set(mode="OBJECT")
-    context.scene.collection.objects.link(carrier)
+    if data.is_editmode:
+        raise ValueError(f"the armature {data.name!r} is in Edit Mode: leave it (Tab) to change the shape")
     mirrored, data.use_mirror_x = data.use_mirror_x, False
     try:
-        layer.objects.active = carrier
-        bpy.ops.object.mode_set(mode="EDIT")
-        for name, joint in zip(JOINT_NAMES, joints, strict=True):
-            bone = data.edit_bones[name]
-            along, bone.head = bone.tail - bone.head, Vector(joint)
-            bone.tail = bone.head + along
-        bpy.ops.object.mode_set(mode="OBJECT")
+        with _edit_bones(data) as bones:
+            for name, joint in zip(JOINT_NAMES, joints, strict=True):
+                bone = bones[name]
+                along, bone.head = bone.tail - bone.head, Vector(joint)
+                bone.tail = bone.head + along
     finally:
         data.use_mirror_x = mirrored
+
+
+@contextmanager
+def _edit_bones(data: bpy.types.Armature) -> Iterator[bpy.types.ArmatureEditBones]:
+    """An armature's bones for editing, by an object and in a scene of their own for as long as the block lasts.
+
+    Edit mode evaluates the scene it is in twice: with a person's thousand volumes that takes half a second, alone some
+    milliseconds. The person may be hidden, or in a mode.
+    """
+    scene, carrier = bpy.data.scenes.new("PrimDiffusion Bones"), bpy.data.objects.new("PrimDiffusion Bones", data)
+    try:
+        scene.collection.objects.link(carrier)
+        layer = scene.view_layers[0]
+        layer.objects.active = carrier
+        with bpy.context.temp_override(scene=scene, view_layer=layer, active_object=carrier, object=carrier):
+            bpy.ops.object.mode_set(mode="EDIT")
+            try:
+                yield data.edit_bones
+            finally:
+                bpy.ops.object.mode_set(mode="OBJECT")
+    finally:
         bpy.data.objects.remove(carrier)
-        layer.objects.active = active
+        bpy.data.scenes.remove(scene)
 
 
 def rest_rotations(armature: bpy.types.Object) -> NDArray[np.float64]:

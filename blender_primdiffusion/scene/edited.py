@@ -9,35 +9,28 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 import re
-from collections import defaultdict
 from pathlib import Path
 
 import bpy
 import numpy as np
 
 from . import shape_file, volumes
-from .armature import move_rest_joints
-from .body_mesh import body_of
-from .convention import frames_to_blender, points_to_blender
-from .human import (
-    BETAS,
-    MARK,
-    PERSON,
-    armature_of,
-    folder_of,
-    people_files,
-    person_file,
-    provenance,
-    volume_path,
+from .human import MARK, PERSON, armature_of, folder_of, people_files, person_file, provenance, volume_path
+from .human_file import read_human
+from .shape import (
+    PRIMITIVE,
+    SAME_BETAS,
+    check_shapeable,
+    generated_betas,
+    keeps_own_shape,
+    own_data,
+    show_rest,
+    volumes_of,
 )
-from .human_file import HumanFile, read_human
-from .quaternion import matrix_to_quaternion
 from .shape_file import body_files, body_kept
+from .shape_model import Rest
 
-_SAME_BETAS = 1e-5
-_PRIMITIVE = re.compile(r"prim_(\d{4,})_[0-9a-f]{12}\.vdb")
 _PERSON = re.compile(r"person(_[0-9a-f]{12})?\.human\.safetensors")
 
 
@@ -65,28 +58,32 @@ def check_editable(collection: bpy.types.Collection) -> None:
             f"the person {collection.name!r} is linked from {linked.filepath!r}: edit it there, or make it local with "
             "Object > Relations > Make Local > All"
         )
-    if not _volumes(collection):
+    if not volumes_of(collection):
         raise ValueError(f"the person {collection.name!r} has no volumes left; generate a person again")
 
 
-def replace_person(
-    context: bpy.types.Context, collection: bpy.types.Collection, human_npz: Path, person: Path
-) -> Replaced:
+def replace_person(collection: bpy.types.Collection, human_npz: Path, person: Path) -> Replaced:
     """Show the person of a human.npz where `collection` shows another, and keep the backend's file `person` of it.
 
     Armature, pose, animation, transform, names, materials and what else was changed by hand stay. Volumes whose file
-    would be another get it; volumes that were deleted stay deleted. Where the betas differ, the bones' rest, the body
-    mesh and the volumes' places move too. Raises HumanFileError, VolumeWriteError, ValueError or FileNotFoundError
-    before anything in the scene is touched. Takes up to some seconds; makes no undo step, its caller does.
+    would be another get it; volumes that were deleted stay deleted. Where the edit has changed the betas, the bones'
+    rest, the body mesh and the volumes' places move too, unless somebody has given the person a shape of their own
+    since they were generated or last edited: that stays. Raises HumanFileError, VolumeWriteError, ValueError or
+    FileNotFoundError before anything in the scene is touched. Takes up to some seconds; makes no undo step, its caller
+    does.
     """
     human = read_human(human_npz)
     check_editable(collection)
-    shown = _volumes(collection)
+    shown = volumes_of(collection)
     if max(shown) >= len(human.density):
         raise ValueError(
             f"the person {collection.name!r} has a volume {max(shown)} and the edited one only {len(human.density)}; "
             "use an add-on and a backend of the same release"
         )
+    other = not np.allclose(human.betas, generated_betas(collection), atol=SAME_BETAS)
+    reshaped = other and not keeps_own_shape(collection)
+    if reshaped:
+        check_shapeable(collection)
     grids = volumes.bake(human.density, human.rgb, human.half_extent)
     home, files = _home(collection), {}
     for k in shown:
@@ -95,13 +92,13 @@ def replace_person(
     missing = [k for k, path in files.items() if not path.is_file()]
     with volumes.written(grids, home, {name: person}, missing), body_kept(collection, human.shape_model, home.parent):
         pass
-    reshaped = not np.allclose(human.betas, _betas(collection), atol=_SAME_BETAS)
-    warning = _reshape(context, collection, human, shown) if reshaped else ""
+    rest = Rest(human.vertices, human.joints, human.position, human.rotation)
+    warning = show_rest(collection, rest, human.betas) if reshaped else ""
     changed = 0
     for k, objects in shown.items():
         for thing in objects:
             if volume_path(thing.data) != files[k]:
-                _own_data(thing, collection).filepath = volumes.stored_path(files[k])
+                own_data(thing, collection).filepath = volumes.stored_path(files[k])
                 changed += 1
     collection[MARK] = provenance(human, grids)
     collection[PERSON] = name
@@ -120,19 +117,10 @@ def unused(folder: Path) -> list[Path]:
     kept = people_files() | body_files()
     found = []
     for path in sorted(folder.rglob("*")):
-        of_people = any(pattern.fullmatch(path.name) for pattern in (_PRIMITIVE, _PERSON, shape_file.NAME))
+        of_people = any(pattern.fullmatch(path.name) for pattern in (PRIMITIVE, _PERSON, shape_file.NAME))
         if of_people and path.name not in kept and path.resolve() not in used:
             found.append(path)
     return found
-
-
-def _volumes(collection: bpy.types.Collection) -> dict[int, list[bpy.types.Object]]:
-    """A person's volume objects by primitive, which the name of the file tells whatever the object is called now."""
-    found = defaultdict(list)
-    for thing in collection.all_objects:
-        if thing.type == "VOLUME" and (match := _PRIMITIVE.fullmatch(volume_path(thing.data).name)):
-            found[int(match[1])].append(thing)
-    return dict(found)
 
 
 def _home(collection: bpy.types.Collection) -> Path:
@@ -146,41 +134,3 @@ def _home(collection: bpy.types.Collection) -> Path:
         if home.resolve().is_relative_to(own.resolve()):
             return home
     return folder_of(collection)
-
-
-def _betas(collection: bpy.types.Collection) -> list[float]:
-    return json.loads(collection[MARK])["betas"]
-
-
-def _own_data(thing: bpy.types.Object, collection: bpy.types.Collection):
-    """An object's data, copied first where another person's objects show it too (duplicates share data)."""
-    if thing.data.users > 1:
-        users = bpy.data.user_map(subset=[thing.data])[thing.data]
-        if any(isinstance(user, bpy.types.Object) and user not in set(collection.all_objects) for user in users):
-            thing.data = thing.data.copy()
-    return thing.data
-
-
-def _reshape(
-    context: bpy.types.Context,
-    collection: bpy.types.Collection,
-    human: HumanFile,
-    shown: dict[int, list[bpy.types.Object]],
-) -> str:
-    """Move bones, body mesh and volumes to the rest places of other betas; returns what could not be moved."""
-    armature = armature_of(collection)
-    move_rest_joints(context, _own_data(armature, collection), points_to_blender(human.joints))
-    armature[BETAS] = human.betas.tolist()
-    position, quaternion = points_to_blender(human.position), matrix_to_quaternion(frames_to_blender(human.rotation))
-    for k, objects in shown.items():
-        for thing in objects:
-            thing.location, thing.rotation_quaternion = position[k], quaternion[k]
-    body = body_of(collection)
-    if body is None:
-        return ""
-    mesh = _own_data(body, collection)
-    if len(mesh.vertices) != len(human.vertices) or mesh.shape_keys is not None:
-        return f"the mesh {body.name!r} was changed by hand and keeps its shape"
-    mesh.vertices.foreach_set("co", np.asarray(points_to_blender(human.vertices), np.float32).ravel())
-    mesh.update()
-    return ""

@@ -55,10 +55,13 @@ class ShapeModel:
 
     def rest(self, betas: NDArray) -> Rest:
         """The person of these betas [10] at rest (SMPL eqs. 8 and 10; paper sec. 3.1)."""
-        betas = np.asarray(betas, np.float64)
-        vertices = self.template + self.shape_basis @ betas
-        position, rotation = self.frames(vertices)
-        return Rest(vertices, self.joint_template + self.joint_basis @ betas, position, rotation)
+        vertices = self.surface(betas)
+        joints = self.joint_template + self.joint_basis @ np.asarray(betas, np.float64)
+        return Rest(vertices, joints, *self.frames(vertices))
+
+    def surface(self, betas: NDArray) -> NDArray[np.float64]:
+        """Vertices [V, 3] of the person of these betas [10] at rest."""
+        return self.template + self.shape_basis @ np.asarray(betas, np.float64)
 
     def frames(self, vertices: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Centres [K, 3] and axes [K, 3, 3] of the primitives on the body as its vertices [V, 3] lie, posed or not.

@@ -55,10 +55,10 @@ class EditWork(Work):
         params = {**asked, "person": self.file, "steps": self.steps, "size": _PICTURE_PX}
         return {**params, **checkpoint, "out_dir": str(folder)}
 
-    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Show the edited person in the place of the one that was; in which scene does not matter."""
         person = self.target.found()
-        done = replace_person(context, person, Path(result["human"]), Path(result["person"]))
+        done = replace_person(person, Path(result["human"]), Path(result["person"]))
         shape = ", the body's shape too" if done.reshaped else ""
         news = f"{self.made} in {result['seconds']:.1f} s; {done.volumes} of {done.of} volumes of {person.name} changed"
         warnings = (*result.get("warnings", ()), done.warning, overlap_warning(person))

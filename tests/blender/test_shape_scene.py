@@ -1,0 +1,239 @@
+"""A person reshaped in the scene: bones, mesh and volumes go where the new body has them, the pose stays."""
+
+from __future__ import annotations
+
+import json
+
+import bpy
+import numpy as np
+import pytest
+import synthetic
+import synthetic_shape
+from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices
+
+from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.body_mesh import body_of
+from blender_primdiffusion.scene.convention import points_to_blender
+from blender_primdiffusion.scene.edited import replace_person
+from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, build_human, humans
+from blender_primdiffusion.scene.keyframes import keyframe_poses
+from blender_primdiffusion.scene.shape import betas_of, generated_betas, keeps_own_shape, reshape
+
+COUNT = 12
+SHAPE = np.array([2.0, -1.5, 1, 0, 0.5, 0, 0, -2, 0, 1])
+
+
+@pytest.fixture
+def person(saved_scene, tmp_path):
+    keep = tmp_path / "first" / "person.human.safetensors"
+    keep.parent.mkdir()
+    keep.write_bytes(b"first")
+    return build_human(saved_scene, synthetic_shape.write(tmp_path / "human.npz"), keep=[keep])
+
+
+def at(betas: np.ndarray) -> dict:
+    return synthetic_shape.at(synthetic_shape.arrays(COUNT), np.asarray(betas))
+
+
+def heads(person) -> np.ndarray:
+    return np.array([armature_of(person).data.bones[name].head_local for name in synthetic.NAMES])
+
+
+def lowest(person) -> float:
+    armature = armature_of(person)
+    return min((armature.matrix_world @ vertex.co).z for vertex in body_of(person).data.vertices)
+
+
+def test_bones_mesh_and_volumes_go_where_the_new_body_has_them(person, saved_scene):
+    assert reshape(person, SHAPE) == ""
+    wanted = at(SHAPE)
+    np.testing.assert_allclose(heads(person), points_to_blender(wanted["joints"]), atol=TOLERANCE_M)
+    surface = np.array([vertex.co for vertex in body_of(person).data.vertices])
+    np.testing.assert_allclose(surface, points_to_blender(wanted["vertices"]), atol=TOLERANCE_M)
+    saved_scene.view_layer.update()
+    matrices = np.array(armature_of(person).matrix_world) @ blended_frames(
+        wanted, synthetic.axis_angle(np.zeros((24, 3))), np.zeros(3)
+    )
+    np.testing.assert_allclose(evaluated_matrices(person), matrices, atol=TOLERANCE_M)
+    np.testing.assert_allclose(betas_of(person), SHAPE)
+
+
+def test_a_posed_person_is_the_new_body_in_the_same_pose(person, saved_scene):
+    rng = np.random.default_rng(3)
+    rotations, translation = synthetic.axis_angle(rng.normal(0, 0.6, (24, 3))), rng.normal(0, 0.5, 3)
+    pose_from_joint_rotations(armature_of(person), rotations, translation)
+    reshape(person, SHAPE)
+    body_of(person).hide_viewport = False
+    saved_scene.view_layer.update()
+    wanted, matrix = at(SHAPE), np.array(armature_of(person).matrix_world)
+    corners = np.array([[x, y, z, 1] for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
+    difference = evaluated_matrices(person) - matrix @ blended_frames(wanted, rotations, translation)
+    assert np.abs(difference @ corners.T)[:, :3].max() < TOLERANCE_M
+    body = body_of(person).evaluated_get(bpy.context.evaluated_depsgraph_get())
+    vertices = np.array([vertex.co for vertex in body.data.vertices])
+    np.testing.assert_allclose(vertices, blended_vertices(wanted, rotations, translation), atol=TOLERANCE_M)
+
+
+def test_an_animation_turns_the_joints_as_before(person, saved_scene):
+    rotations = synthetic.axis_angle(np.random.default_rng(1).normal(0, 0.5, (2, 24, 3)))
+    keyframe_poses(armature_of(person), np.array([1, 5]), rotations, np.zeros((2, 3)))
+    reshape(person, SHAPE)
+    saved_scene.scene.frame_set(5)
+    expected = np.array(armature_of(person).matrix_world) @ blended_frames(at(SHAPE), rotations[1], np.zeros(3))
+    np.testing.assert_allclose(evaluated_matrices(person), expected, atol=2e-5)
+
+
+def test_changing_the_shape_and_back_is_no_change(person, saved_scene):
+    before = heads(person), betas_of(person)
+    reshape(person, SHAPE)
+    reshape(person, before[1])
+    np.testing.assert_allclose(heads(person), before[0], atol=1e-6)
+    assert not keeps_own_shape(person)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.3])
+def test_soles_on_the_floor_stay_there(person, saved_scene, scale):
+    armature = armature_of(person)
+    armature.location.z *= scale
+    armature.scale, armature.rotation_euler.z, armature.location.x = (scale,) * 3, 1.0, 4.0
+    reshape(person, SHAPE)
+    saved_scene.view_layer.update()
+    assert lowest(person) == pytest.approx(0, abs=1e-5)
+
+
+@pytest.mark.parametrize("change", [("location", 2, 0.2), ("rotation_euler", 0, 0.3)])
+def test_who_does_not_stand_on_the_floor_stays_in_place(person, saved_scene, change):
+    armature, (name, axis, value) = armature_of(person), change
+    getattr(armature, name)[axis] += value
+    height = armature.location.z
+    reshape(person, SHAPE)
+    assert armature.location.z == height
+
+
+def test_undo_and_redo_bring_back_bones_mesh_volumes_and_betas(person):
+    def state():
+        (someone,) = humans(bpy.context.scene)
+        bpy.context.view_layer.update()
+        surface = [list(vertex.co) for vertex in body_of(someone).data.vertices]
+        return heads(someone).tolist(), surface, evaluated_matrices(someone).tolist(), betas_of(someone).tolist()
+
+    bpy.ops.ed.undo_push(message="before")
+    before = state()
+    reshape(person, SHAPE)
+    bpy.ops.ed.undo_push(message="reshape")
+    after = state()
+    assert before[0] != after[0]
+    bpy.ops.ed.undo()
+    assert state() == before
+    bpy.ops.ed.redo()
+    assert state() == after
+
+
+def test_mode_selection_scenes_and_objects_stay_as_they_were(person, saved_scene):
+    armature = armature_of(person)
+    saved_scene.view_layer.objects.active = armature
+    bpy.ops.object.mode_set(mode="POSE")
+    before = [thing.name for kind in (bpy.data.objects, bpy.data.scenes, bpy.data.armatures) for thing in kind]
+    reshape(person, SHAPE)
+    assert armature.mode == "POSE"
+    assert saved_scene.view_layer.objects.active == armature
+    assert [thing.name for kind in (bpy.data.objects, bpy.data.scenes, bpy.data.armatures) for thing in kind] == before
+
+
+def test_files_on_disk_stay_as_they_are(person, tmp_path):
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    reshape(person, SHAPE)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+def in_edit_mode(context, person):
+    context.view_layer.objects.active = armature_of(person)
+    bpy.ops.object.mode_set(mode="EDIT")
+
+
+def with_renamed_bone(_context, person):
+    armature_of(person).data.bones["left_knee"].name = "knee.L"
+
+
+def of_an_earlier_version(_context, person):
+    del person["primdiffusion_body_file"]
+
+
+REFUSED = {
+    r"'Human' is in Edit Mode: leave it": (in_edit_mode, SHAPE),
+    r"no bone 'left_knee'.*name again": (with_renamed_bone, SHAPE),
+    r"earlier version": (of_an_earlier_version, SHAPE),
+    r"a shape is 10 numbers from -5 to 5, not": (lambda *_: None, SHAPE * 4),
+    r"a shape is 10 numbers .*, not \[1.0\]": (lambda *_: None, [1.0]),
+}
+
+
+@pytest.mark.parametrize("sentence", REFUSED)
+def test_what_cannot_be_reshaped_is_refused_untouched(person, saved_scene, sentence):
+    change, betas = REFUSED[sentence]
+    change(saved_scene, person)
+    before = list(armature_of(person)[BETAS])
+    with pytest.raises(ValueError, match=sentence):
+        reshape(person, betas)
+    assert list(armature_of(person)[BETAS]) == before
+    if armature_of(person).mode == "EDIT":
+        bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def test_a_linked_person_is_refused_with_what_to_do(person, tmp_path):
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.read_homefile(use_empty=True)
+    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True) as (_, wanted):
+        wanted.collections = ["Human"]
+    bpy.context.scene.collection.children.link(wanted.collections[0])
+    with pytest.raises(ValueError, match=r"'Human' is linked from .*shot\.blend.*Make Local"):
+        reshape(wanted.collections[0], SHAPE)
+
+
+def test_an_appended_person_finds_the_file_of_their_body(person, tmp_path):
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.read_homefile(use_empty=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"))
+    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=False) as (_, wanted):
+        wanted.collections = ["Human"]
+    bpy.context.scene.collection.children.link(wanted.collections[0])
+    (appended,) = humans(bpy.context.scene)
+    reshape(appended, SHAPE)
+    np.testing.assert_allclose(heads(appended), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
+
+
+def test_a_mesh_changed_by_hand_keeps_its_shape_and_is_named(person):
+    body_of(person).shape_key_add(name="Basis")
+    assert "'Human_body' was changed by hand" in reshape(person, SHAPE)
+    np.testing.assert_allclose(heads(person), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
+
+
+def test_without_body_mesh_the_rest_still_follows(person):
+    bpy.data.objects.remove(body_of(person))
+    assert reshape(person, SHAPE) == ""
+    np.testing.assert_allclose(heads(person), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
+
+
+def edited_file(tmp_path, betas):
+    arrays = at(betas)
+    np.savez(tmp_path / "edited.npz", **{**arrays, "meta": np.array(json.dumps({"seed": 9}))})
+    return tmp_path / "edited.npz", tmp_path / "first" / "person.human.safetensors"
+
+
+def test_a_shape_of_ones_own_outlives_an_edit_that_changes_the_shape(person, tmp_path):
+    reshape(person, SHAPE)
+    done = replace_person(person, *edited_file(tmp_path, np.ones(10)))
+    assert not done.reshaped
+    np.testing.assert_allclose(betas_of(person), SHAPE)
+    np.testing.assert_allclose(heads(person), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
+    assert json.loads(person[MARK])["seed"] == 9
+    np.testing.assert_allclose(generated_betas(person), 1)
+    reshape(person, generated_betas(person))
+    assert not keeps_own_shape(person)
+
+
+def test_a_shape_nobody_has_chosen_follows_the_edit(person, tmp_path):
+    assert replace_person(person, *edited_file(tmp_path, SHAPE)).reshaped
+    np.testing.assert_allclose(betas_of(person), SHAPE)
+    np.testing.assert_allclose(heads(person), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
+    assert not keeps_own_shape(person)

@@ -1,0 +1,84 @@
+"""Shape in the extension is shape in the backend: surface, joints, frames, measures, on the default body."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from primdiffusion.body.measures import betas_of_measures as backend_betas_of_measures
+from primdiffusion.body.measures import measure as backend_measure
+from primdiffusion.body.model import default_body
+from primdiffusion.human import Human
+from primdiffusion.human_file import export_for_blender
+from primdiffusion.primitives.anchors import attach, default_anchors
+from primdiffusion.primitives.primitives import K, Payload
+
+from blender_primdiffusion.scene.human_file import read_human
+from blender_primdiffusion.scene.shape_measures import betas_of_measures, measure
+
+SHAPES = np.random.default_rng(4).normal(0, 1.2, (4, 10))
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    path = tmp_path_factory.mktemp("person") / "human.npz"
+    payload = Payload(torch.rand(K, 3, 8, 8, 8), torch.rand(K, 8, 8, 8), torch.ones(K, 3))
+    export_for_blender(path, Human(payload, torch.zeros(10), {"seed": 1}))
+    return read_human(path).shape_model
+
+
+@pytest.mark.parametrize("betas", SHAPES)
+def test_surface_and_joints_are_the_backends_to_a_hundredth_of_a_millimetre(model, betas):
+    shaped, rest = default_body().shape(torch.tensor(betas, dtype=torch.float32)), model.rest(betas)
+    np.testing.assert_allclose(rest.vertices, shaped.vertices, atol=2e-6)
+    np.testing.assert_allclose(rest.joints, shaped.joints, atol=5e-6)
+
+
+@pytest.mark.parametrize("betas", SHAPES)
+def test_frames_are_the_backends(model, betas):
+    body = default_body().to(dtype=torch.float64)
+    anchors = default_anchors().to(dtype=torch.float64)
+    wanted = attach(anchors, body.shape(torch.tensor(betas)).vertices, body.faces)
+    rest = model.rest(betas)
+    np.testing.assert_allclose(rest.position, wanted.position, atol=1e-6)
+    np.testing.assert_allclose(rest.rotation, wanted.rotation, atol=1e-5)
+
+
+def test_frames_on_a_posed_surface_in_blenders_axes_are_the_backends_turned(model):
+    body = default_body()
+    vertices = body.shape(torch.tensor(SHAPES[0], dtype=torch.float32)).vertices
+    vertices = vertices + 0.02 * torch.sin(9 * vertices.flip(-1))
+    wanted = attach(default_anchors().to(dtype=torch.float64), vertices.double(), body.faces)
+    turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    position, rotation = model.frames(vertices.double().numpy() @ turn.T)
+    np.testing.assert_allclose(position, wanted.position.numpy() @ turn.T, atol=1e-6)
+    np.testing.assert_allclose(rotation, turn @ wanted.rotation.numpy(), atol=1e-5)
+
+
+@pytest.mark.parametrize("betas", SHAPES)
+def test_height_and_weight_are_the_backends(model, betas):
+    wanted = backend_measure(default_body().shape(torch.tensor(betas, dtype=torch.float32)))
+    assert measure(model, betas) == pytest.approx(wanted, abs=1e-4)
+
+
+@pytest.mark.parametrize(("height", "weight"), [(1.6, None), (None, 80.0), (1.9, 95.0), (None, None)])
+def test_bodies_of_given_measures_are_the_backends(model, height, weight):
+    wanted = backend_betas_of_measures(
+        torch.tensor(SHAPES[1]), torch.eye(10, dtype=torch.float64), default_body(), height, weight
+    )
+    moved = betas_of_measures(model, SHAPES[1], height, weight)
+    np.testing.assert_allclose(moved, wanted, atol=5e-3)
+    measured = measure(model, moved)
+    assert height is None or measured.height == pytest.approx(height, abs=1e-4)
+    assert weight is None or measured.weight == pytest.approx(weight, abs=1e-2)
+
+
+def test_measures_nobody_has_are_refused_with_them(model):
+    with pytest.raises(ValueError, match=r"a height of 3\.00 m with a weight of 40 kg.*more usual"):
+        betas_of_measures(model, np.zeros(10), 3.0, 40.0)
+
+
+def test_the_persons_own_body_is_left_in_peace(model):
+    betas = SHAPES[2].copy()
+    betas_of_measures(model, betas, 1.8)
+    np.testing.assert_array_equal(betas, SHAPES[2])
