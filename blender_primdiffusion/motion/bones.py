@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from ..scene.human_file import JOINT_NAMES
 
@@ -79,6 +79,7 @@ NEEDED = (
     "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
 )  # fmt: skip
 """Without these a rig cannot be posed; of the spine, the neck and the head one bone is enough."""
+BY_HAND = "chosen by hand"
 _TRUNK = ("spine1", "spine2", "spine3", "neck", "head")
 
 
@@ -91,7 +92,7 @@ class BoneMap:
     """Which bone of a rig is which joint."""
 
     rig: str
-    """A key of `RIGS`."""
+    """A key of `RIGS`, or `BY_HAND`."""
     joints: dict[str, str]
     """SMPL's joint -> the bone's name; all of `NEEDED`, and those of the others that are there."""
     tips: dict[str, str]
@@ -109,15 +110,42 @@ def map_bones(names: Iterable[str]) -> BoneMap:
         plain.setdefault(_plain(bone), bone)
     found = [_match(rig, prefix, plain) for rig in RIGS for prefix in _prefixes(rig, plain)]
     best = max(found, key=lambda m: (len(m.joints), len(m.tips)), default=BoneMap("SMPL", {}, {}))
-    lacking = [joint for joint in NEEDED if joint not in best.joints]
-    if not any(joint in best.joints for joint in _TRUNK):
-        lacking.append("spine1")
+    lacking = _lacking(best.joints)
     if lacking:
         raise UnknownBonesError(
             f"no bone is known to be {_listed(lacking)} (nearest rig: {best.rig}); the bones are {_listed(bones)}: "
             "name them as in SMPL, Mixamo, Unreal, Rigify or RenderPeople"
         )
     return best
+
+
+def chosen_bones(names: Iterable[str], joints: Mapping[str, str]) -> BoneMap:
+    """The map that somebody chose, SMPL's joint -> bone; empty bones count as not chosen.
+
+    Raises UnknownBonesError for a joint that SMPL does not have, a bone that is not among `names`, and where one that
+    is needed is not chosen.
+    """
+    bones = list(names)
+    chosen = {joint: bone for joint, bone in joints.items() if bone}
+    for joint, bone in chosen.items():
+        if joint not in JOINT_NAMES:
+            raise UnknownBonesError(
+                f"the bone map names {joint!r}, which is none of SMPL's joints: correct or remove it"
+            )
+        if bone not in bones:
+            raise UnknownBonesError(
+                f"the bone map wants {bone!r} for {joint}, which the file does not have; its bones are "
+                f"{_listed(bones)}: choose one of them"
+            )
+    lacking = _lacking(chosen)
+    if lacking:
+        raise UnknownBonesError(f"the bone map has no bone for {_listed(lacking)}: choose one for each")
+    return BoneMap(BY_HAND, chosen, {})
+
+
+def _lacking(joints: Mapping[str, str]) -> list[str]:
+    lacking = [joint for joint in NEEDED if joint not in joints]
+    return lacking if any(joint in joints for joint in _TRUNK) else [*lacking, "spine1"]
 
 
 def expected_names(part: str, rig: str, side: str) -> list[str]:

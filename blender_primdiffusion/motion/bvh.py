@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..scene.human_file import JOINT_NAMES, PARENTS
-from .bones import BoneMap, UnknownBonesError, map_bones
-from .motion import Motion
+from .bones import BoneMap, UnknownBonesError, chosen_bones, map_bones
+from .motion import Detected, Motion
 from .rest_alignment import facing, rig_from_smpl
 from .rotation import about_axis
 from .skeleton import REST_JOINTS, unchain
@@ -71,19 +72,28 @@ class Hierarchy:
         return rotations, places
 
 
-def read_bvh(path: Path) -> Motion:
-    """The motion of a BVH file on SMPL's skeleton; y is up as far as the rest pose tells.
+def read_bvh(path: Path, chosen: Mapping[str, str] | None = None) -> tuple[Motion, NDArray[np.float64]]:
+    """The motion of a BVH file on SMPL's skeleton, and the rotation [3, 3] out of the file's axes that it took.
+
+    y is up as far as the rest pose tells.
 
     Each part turns in the world as the file's does; where the file's rest pose is not SMPL's T, the difference counts
     as a turn (`rest_alignment`). The root's path is scaled by the length of the legs, so feet slip little. Places of
-    other joints than the root are left out. Raises BvhError.
+    other joints than the root are left out. `chosen` says which bones are which of SMPL's joints; without it their
+    names do. Raises BvhError.
     """
     hierarchy = parse_bvh(path)
     try:
-        bones = map_bones([name for name in hierarchy.names if not name.endswith("_end")])
+        names = bone_names(hierarchy)
+        bones = map_bones(names) if chosen is None else chosen_bones(names, chosen)
         return _retarget(hierarchy, bones, path)
     except (UnknownBonesError, ValueError) as e:
         raise BvhError(f"{path}: {e}") from e
+
+
+def bone_names(hierarchy: Hierarchy) -> list[str]:
+    """Of the file's joints, those at the ends of chains left out."""
+    return [name for name in hierarchy.names if not name.endswith("_end")]
 
 
 def parse_bvh(path: Path) -> Hierarchy:
@@ -157,7 +167,7 @@ def _parse_motion(text: str, columns: int) -> tuple[NDArray[np.float64], float]:
     return numbers[: frames * columns].reshape(frames, columns), frame_time
 
 
-def _retarget(hierarchy: Hierarchy, bones: BoneMap, path: Path) -> Motion:
+def _retarget(hierarchy: Hierarchy, bones: BoneMap, path: Path) -> tuple[Motion, NDArray[np.float64]]:
     rest = hierarchy.rest()
     index = {name: number for number, name in reversed(list(enumerate(hierarchy.names)))}
     heads = {joint: rest[index[bone]] for joint, bone in bones.joints.items()}
@@ -185,7 +195,10 @@ def _retarget(hierarchy: Hierarchy, bones: BoneMap, path: Path) -> Motion:
     if not hierarchy.frame_time > 0:
         notes.append("tells no frame rate: 30 frames a second are assumed")
     notes.append(f"lengths in {unit}, 1 taken as {metres:.4g} m so that the legs are an average person's")
-    return Motion(unchain(world), pelvis * metres - REST_JOINTS[0], fps, path.stem, tuple(notes))
+    told = fps if hierarchy.frame_time > 0 else 0.0
+    detected = Detected(bones.rig, "y", f"{unit} (1 = {metres:.4g} m)", told, bones.joints, average_legs=True)
+    motion = Motion(unchain(world), pelvis * metres - REST_JOINTS[0], fps, path.stem, tuple(notes), detected)
+    return motion, backend_from_file
 
 
 def _pelvis(hierarchy: Hierarchy, turned: NDArray, root: NDArray, rest: NDArray, pelvis: int) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -12,9 +13,9 @@ from numpy.typing import NDArray
 
 from .arrays import ArrayFileError, array_names, read_npy, read_npz
 from .bvh import BvhError, read_bvh
-from .motion import Motion
+from .motion import Detected, Motion
 from .rotation import from_axis_angle, nearest
-from .up_axis import find_up, turn_y_up
+from .up_axis import axis_direction, axis_name, find_up, turn_y_up
 
 DEFAULT_FPS = 30.0
 """Frames a second of a motion whose file does not tell."""
@@ -24,6 +25,9 @@ _TRANSLATIONS = ("trans", "transl", "translation")
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate")
 POSE_KEYS = (*_POSES, *_ROOT, *_REST, *_TRANSLATIONS, *_RATES)
 """What arrays of poses are called in the files that are read."""
+UP_AXES = ("", "x", "-x", "y", "-y", "z", "-z")
+"""What may be said to be up in a file; the first leaves it to be found out."""
+_BODIES = {24: "SMPL", 22: "SMPL without hands", 52: "SMPL-H", 55: "SMPL-X"}
 _BODY_JOINTS = 22
 """Joints before the hands, the same in SMPL, SMPL-H and SMPL-X."""
 
@@ -32,8 +36,11 @@ class MotionFileError(ValueError):
     """A file of poses that cannot be used; one sentence: what is wrong, and what to do."""
 
 
-def read_motion(path: str | Path) -> Motion:
+def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None = None) -> Motion:
     """The motion in a file, y up.
+
+    `up` is the file's axis that points up ("y", "-z", ...), found out where empty; `bones` says which of a .bvh's bones
+    are which of SMPL's joints, likewise.
 
     - .npz of AMASS: `poses` [F, 72 | 156 | 165] (SMPL, SMPL-H, SMPL-X; fingers, jaw and eyes are left out), `trans`,
       `mocap_framerate`, `mocap_frame_rate` or `fps`. Its z axis is up; which one really is, is found from the pelvis.
@@ -47,22 +54,29 @@ def read_motion(path: str | Path) -> Motion:
     path = Path(path)
     if not path.is_file():
         raise MotionFileError(f"there is no pose file {path}: check the path")
-    readers = {".npz": _read_npz, ".npy": _read_npy, ".json": _read_json, ".bvh": _read_bvh}
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        raise MotionFileError(f"{path} is no pose file: .npz, .npy, .json and .bvh files are")
+    if up not in UP_AXES:
+        raise MotionFileError(f"the axis {up!r} cannot be up: give one of {_listed(list(UP_AXES[1:]))}")
+    readers = {".npz": _read_npz, ".npy": _read_npy, ".json": _read_json}
+    suffix = path.suffix.lower()
+    axes = np.eye(3)
     try:
-        motion = reader(path)
+        if suffix == ".bvh":
+            (motion, axes), tells_up = read_bvh(path, bones), True
+        elif suffix in readers:
+            motion, tells_up = readers[suffix](path)
+        else:
+            raise MotionFileError(f"{path} is no pose file: .npz, .npy, .json and .bvh files are")
     except (ArrayFileError, BvhError) as e:
         raise MotionFileError(str(e)) from e
-    return motion
+    except OSError as e:
+        raise MotionFileError(f"{path} cannot be read ({e.strerror or e}): check that it may be opened") from e
+    if up:
+        return _turned(motion, axis_name(axes @ axis_direction(up)), up)
+    return _upright(motion, axes) if tells_up else motion
 
 
-def _read_bvh(path: Path) -> Motion:
-    return _upright(read_bvh(path))
-
-
-def _read_npz(path: Path) -> Motion:
+def _read_npz(path: Path) -> tuple[Motion, bool]:
+    """The motion as it is in the file, and whether its up axis is to be found out."""
     names = array_names(path)
     arrays = read_npz(path, POSE_KEYS)
     if "smpl" in names and not any(key in arrays for key in (*_POSES, *_REST)):
@@ -71,19 +85,18 @@ def _read_npz(path: Path) -> Motion:
         raise MotionFileError(
             f"{path} holds no poses: in it is {_listed(names)}, wanted are 'poses', or 'global_orient' and 'body_pose'"
         )
-    motion = motion_from_arrays(arrays, path)
-    return _upright(motion) if _is_amass(arrays) else motion
+    return motion_from_arrays(arrays, path), _is_amass(arrays)
 
 
 def _is_amass(arrays: Mapping[str, NDArray]) -> bool:
     return "trans" in arrays and ("poses" in arrays or "pose_body" in arrays)
 
 
-def _read_npy(path: Path) -> Motion:
-    return motion_from_arrays({"pose": read_npy(path)}, path)
+def _read_npy(path: Path) -> tuple[Motion, bool]:
+    return motion_from_arrays({"pose": read_npy(path)}, path), False
 
 
-def _read_json(path: Path) -> Motion:
+def _read_json(path: Path) -> tuple[Motion, bool]:
     try:
         content = json.loads(path.read_text("utf-8"))
     except (ValueError, OSError, RecursionError) as e:
@@ -96,7 +109,7 @@ def _read_json(path: Path) -> Motion:
         raise MotionFileError(f"{path} holds something else than lists of numbers of equal length ({e})") from e
     if not any(key in arrays for key in (*_POSES, *_REST)):
         raise MotionFileError(f"{path} holds no poses: it needs 'pose', or 'global_orient' and 'body_pose'")
-    return motion_from_arrays(arrays, path)
+    return motion_from_arrays(arrays, path), False
 
 
 def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
@@ -113,9 +126,11 @@ def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
             raise MotionFileError(f"{path}: {key!r} holds NaN or infinite numbers; export the motion again")
     rest = _first(arrays, _REST)
     if rest is None:
-        rotations = _rotations(_given(arrays, _POSES), path)
+        given = _matrices(_given(arrays, _POSES), path)
+        rotations, joints = _rotations(given, path), given.shape[1]
     else:
-        body = _rotations(rest, path, joints_before=1)
+        given = _matrices(rest, path)
+        body, joints = _rotations(given, path, joints_before=1), given.shape[1] + 1
         root = _first(arrays, _ROOT)
         if root is not None:
             first = _matrices(root, path)[:, 0]
@@ -130,34 +145,40 @@ def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
         raise MotionFileError(f"{path}: {frames} frames of poses but translations of shape {translations.shape}")
     translations = np.array(np.broadcast_to(translations.reshape(-1, 3), (frames, 3)))
     rate = _first(arrays, _RATES)
-    if rate is None or rate.size != 1 or not float(rate.ravel()[0]) > 0:
-        fps = DEFAULT_FPS
-        if frames > 1:
-            notes.append(f"tells no frame rate: {DEFAULT_FPS:g} frames a second are assumed")
-    else:
-        fps = float(rate.ravel()[0])
-    return Motion(rotations, translations, fps, path.stem, tuple(notes))
+    told = float(rate.ravel()[0]) if rate is not None and rate.size == 1 and float(rate.ravel()[0]) > 0 else 0.0
+    if not told and frames > 1:
+        notes.append(f"tells no frame rate: {DEFAULT_FPS:g} frames a second are assumed")
+    detected = Detected(rig=_BODIES.get(joints, f"{joints} joints"), up="y", fps=told)
+    return Motion(rotations, translations, told or DEFAULT_FPS, path.stem, tuple(notes), detected)
 
 
-def _upright(motion: Motion) -> Motion:
-    """The motion with y up, whichever axis of its file was."""
+def _upright(motion: Motion, axes: NDArray) -> Motion:
+    """The motion with y up, whichever axis of its file was; `axes` turned it out of the file's own ones already."""
     up = find_up(motion.rotations[:, 0])
     if not up:
-        return _noted(motion, "does not tell which axis is up: y is assumed")
+        unknown = dataclasses.replace(motion.detected, up="")
+        note = "does not tell which axis is up: y is assumed"
+        return dataclasses.replace(motion, notes=(*motion.notes, note), detected=unknown)
+    return _turned(motion, up, axis_name(axes.T @ axis_direction(up)))
+
+
+def _turned(motion: Motion, up: str, in_file: str) -> Motion:
     rotations, translations = turn_y_up(motion.rotations, motion.translations, up)
-    return _noted(Motion(rotations, translations, motion.fps, motion.name, motion.notes), f"{up} is up in the file")
+    return dataclasses.replace(
+        motion,
+        rotations=rotations,
+        translations=translations,
+        notes=(*motion.notes, f"{in_file} is up in the file"),
+        detected=dataclasses.replace(motion.detected, up=in_file),
+    )
 
 
-def _noted(motion: Motion, note: str) -> Motion:
-    return Motion(motion.rotations, motion.translations, motion.fps, motion.name, (*motion.notes, note))
-
-
-def _rotations(values: NDArray, path: Path, joints_before: int = 0) -> NDArray[np.float64]:
-    """Rotations [F, 24, 3, 3] of poses that lack the first `joints_before` joints; joints that are missing do not turn.
+def _rotations(given: NDArray, path: Path, joints_before: int = 0) -> NDArray[np.float64]:
+    """Rotations [F, 24, 3, 3] of matrices [F, n, 3, 3] that lack the first `joints_before` joints; joints that are
+    missing do not turn.
 
     SMPL-H and SMPL-X have fingers where SMPL has its two hand joints, so of them only the body's 22 are taken.
     """
-    given = _matrices(values, path)
     count = given.shape[1] + joints_before
     if count == 24:
         taken = 24
@@ -165,7 +186,7 @@ def _rotations(values: NDArray, path: Path, joints_before: int = 0) -> NDArray[n
         taken = _BODY_JOINTS
     else:
         raise MotionFileError(
-            f"{path} holds poses of {count} joints (shape {values.shape}): wanted are SMPL's 24, 22 without hands, or "
+            f"{path} holds poses of {count} joints (shape {given.shape}): wanted are SMPL's 24, 22 without hands, or "
             "those of SMPL-H or SMPL-X"
         )
     rotations = np.tile(np.eye(3), (len(given), 24, 1, 1))

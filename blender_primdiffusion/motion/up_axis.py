@@ -18,10 +18,18 @@ def find_up(pelvis: NDArray) -> str:
     People stand, sit and walk more than they lie, so over a motion the mean is along the world's vertical.
     """
     mean = np.asarray(pelvis)[:, :, 1].mean(0)
-    axis = int(np.abs(mean).argmax())
-    if abs(mean[axis]) < _CLEAR:
-        return ""
-    return ("-" if mean[axis] < 0 else "") + "xyz"[axis]
+    return "" if np.abs(mean).max() < _CLEAR else axis_name(mean)
+
+
+def axis_name(direction: NDArray) -> str:
+    """The axis, such as "z" or "-y", that a direction [3] is nearest to."""
+    axis = int(np.abs(direction).argmax())
+    return ("-" if direction[axis] < 0 else "") + "xyz"[axis]
+
+
+def axis_direction(name: str) -> NDArray[np.float64]:
+    """The unit vector [3] of an axis such as "z" or "-y"."""
+    return np.eye(3)["xyz".index(name[-1])] * (-1 if name[0] == "-" else 1)
 
 
 def turn_y_up(rotations: NDArray, translations: NDArray, up: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -29,8 +37,7 @@ def turn_y_up(rotations: NDArray, translations: NDArray, up: str) -> tuple[NDArr
 
     A translation is that of SMPL's files: it moves a body whose pelvis is at its rest place, not at the origin.
     """
-    axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
-    turn = between(axis, np.array([0.0, 1.0, 0.0]))
+    turn = between(axis_direction(up), np.array([0.0, 1.0, 0.0]))
     rotations = np.array(rotations, np.float64)
     rotations[:, 0] = turn @ rotations[:, 0]
     pelvis = REST_JOINTS[0]

@@ -56,7 +56,7 @@ def test_walking_feet_do_not_slide():
         flat &= np.abs(joints[:, ankle, 1] - REST_JOINTS[ankle, 1]) < 0.002
         both = flat[1:] & flat[:-1]
         assert both.mean() > 0.2
-        assert np.linalg.norm(np.diff(joints[:, [foot, ankle]][..., [0, 2]], axis=0)[both], axis=-1).max() < 5e-4
+        assert np.linalg.norm(np.diff(joints[:, [foot, ankle]][..., [0, 2]], axis=0)[both], axis=-1).max() < 1e-3
         swings = np.diff(joints[:, foot, 2]) * motion.fps > 0.6
         assert swings.mean() < 0.45
         assert joints[1:][swings][:, foot, 1].min() > REST_JOINTS[foot, 1] - 0.012  # the toes' joint, heel high
