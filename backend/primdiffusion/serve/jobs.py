@@ -22,6 +22,8 @@ from primdiffusion.serve.draw_params import DrawParams
 from primdiffusion.serve.drawing import FrameDrawer
 from primdiffusion.serve.edit_params import InpaintParams, InterpolateParams, TransferParams, VaryParams
 from primdiffusion.serve.editing import Editor
+from primdiffusion.serve.merge_params import FitGainParams, MergeFramesParams, MergeParams
+from primdiffusion.serve.merging import fit_gain_of, merge_frames, merge_people
 from primdiffusion.serve.params import AttributesParams, GenerateParams, ReconstructParams, RenderParams
 from primdiffusion.serve.progress import Report, step_reporter
 from primdiffusion.serve.step_pictures import step_pictures
@@ -143,6 +145,18 @@ class Jobs:
     def draw(self, params: DrawParams, report: Report) -> dict[str, Any]:
         """Fills a frame (see `FrameDrawer.draw`). Needs no checkpoint."""
         return self._drawer.draw(params, report)
+
+    def merge(self, params: MergeParams, report: Report) -> dict[str, Any]:
+        """Makes one grid of voxels of people (see `merge_people`). Needs no checkpoint."""
+        return merge_people(params, report)
+
+    def merge_frames(self, params: MergeFramesParams, report: Report) -> dict[str, Any]:
+        """Makes a grid for each frame of a person (see `serve.merging`). Needs no checkpoint."""
+        return merge_frames(params, report)
+
+    def fit_gain(self, params: FitGainParams, report: Report) -> dict[str, Any]:
+        """Fits the density gain of exponential renderers (see `fit_gain_of`). Needs no checkpoint."""
+        return fit_gain_of(params, report)
 
     def _model(self, checkpoint: str | None) -> DiffusionModel:
         if self._loaded is None or self._loaded[0] != checkpoint:

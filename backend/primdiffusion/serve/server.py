@@ -26,6 +26,7 @@ from primdiffusion.failures import Failure, describe
 from primdiffusion.machine import memory, share_processors
 from primdiffusion.serve.draw_params import DrawParams
 from primdiffusion.serve.edit_params import InpaintParams, InterpolateParams, TransferParams, VaryParams
+from primdiffusion.serve.merge_params import FitGainParams, MergeFramesParams, MergeParams
 from primdiffusion.serve.params import AttributesParams, GenerateParams, ReconstructParams, RenderParams
 from primdiffusion.serve.rpc import (
     CANCELLED,
@@ -57,6 +58,9 @@ JOBS = {
     "reconstruct": ReconstructParams,
     "render": RenderParams,
     "draw": DrawParams,
+    "merge": MergeParams,
+    "merge_frames": MergeFramesParams,
+    "fit_gain": FitGainParams,
 }
 """Methods of `Jobs`, which run on the main thread one at a time, and their parameters."""
 GRACE_S = 3.0

@@ -1,0 +1,112 @@
+"""The child's jobs for other renderers, without the child: files, axes, errors."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from primdiffusion.body.model import BodyPose
+from primdiffusion.human import generate, place, pose_body
+from primdiffusion.human_file import save_human
+from primdiffusion.render.gain import DEFAULT_GAIN
+from primdiffusion.render.merge import merge
+from primdiffusion.serve.draw_params import PersonParams
+from primdiffusion.serve.merge_params import FitGainParams, MergeFramesParams, MergeParams
+from primdiffusion.serve.merging import fit_gain_of, merge_frames, merge_people
+from primdiffusion.serve.server import JOBS, Cancelled
+from tiny_model import tiny_model
+
+VOXEL = 0.03
+STILL = torch.eye(3, 4).tolist()
+
+
+def pose(seed: int) -> BodyPose:
+    return BodyPose.from_axis_angle(0.3 * torch.randn(72, generator=torch.Generator().manual_seed(seed)))
+
+
+@pytest.fixture(scope="module")
+def human():
+    return generate(tiny_model(), seed=3, steps=5)
+
+
+@pytest.fixture
+def person(human, tmp_path) -> PersonParams:
+    save_human(tmp_path / "a.human.safetensors", human)
+    joints = pose_body(human.betas, pose(2)).skinning[:, :3].tolist()
+    return PersonParams(str(tmp_path / "a.human.safetensors"), STILL, joints)
+
+
+def quiet(*_: object, **__: object) -> None:
+    """Hears no report."""
+
+
+def test_a_grid_is_the_posed_person_turned_z_up(human, person, tmp_path):
+    result = merge_people(MergeParams([person], str(tmp_path / "grid.npz"), VOXEL), quiet)
+    with np.load(result["out"], allow_pickle=False) as grid:
+        density, colour, origin = grid["density"], grid["colour"], grid["origin"]
+        assert density.dtype == colour.dtype == np.float16
+        assert grid["voxel"] == VOXEL
+    expected = merge(place(human, pose(2)), VOXEL)
+    assert list(density.shape) == result["shape"]
+
+    def centre(values: np.ndarray, start: np.ndarray) -> np.ndarray:
+        where = np.stack(np.meshgrid(*map(np.arange, values.shape), indexing="ij"), -1)
+        return start + VOXEL * np.average(where.reshape(-1, 3), axis=0, weights=values.ravel().astype(np.float64))
+
+    x, y, z = centre(expected.density, expected.origin)
+    np.testing.assert_allclose(centre(density, origin), [x, -z, y], atol=2e-3)
+    assert density.astype(np.float64).sum() == pytest.approx(expected.density.sum(dtype=np.float64), rel=0.02)
+
+
+def test_frames_are_the_person_s_single_grids(human, person, tmp_path):
+    other = dataclasses.replace(person, joints=pose_body(human.betas, pose(5)).skinning[:, :3].tolist())
+    told = []
+    params = MergeFramesParams([person, other], str(tmp_path / "new" / "grids"), VOXEL)
+    result = merge_frames(params, lambda *news: told.append(news))
+    assert [news[:3] for news in told] == [("merge", 0, 2), ("merge", 1, 2), ("merge", 2, 2)]
+    for file, one in zip(result["files"], (person, other), strict=True):
+        alone = merge_people(MergeParams([one], str(tmp_path / "one.npz"), VOXEL), quiet)["out"]
+        with np.load(file) as grid, np.load(alone) as expected:
+            for name in ("density", "colour", "origin", "voxel"):
+                np.testing.assert_array_equal(grid[name], expected[name])
+
+
+def test_a_cancelled_merge_leaves_no_file(person, tmp_path):
+    def cancelled(_stage, step, *_):
+        if step:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        merge_people(MergeParams([person], str(tmp_path / "grid.npz"), VOXEL), cancelled)
+    assert not list(tmp_path.glob("*grid*"))
+
+
+def test_a_fitted_gain_is_at_least_as_good_as_the_usual_one(person):
+    fit = fit_gain_of(FitGainParams([person]), quiet)
+    assert fit["error"] <= fit["error_before"] < 0.2
+    assert fit["gain_before"] == DEFAULT_GAIN
+    assert 0.1 <= fit["gain"] <= 20
+    assert fit["rays"] > 1000
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda person: MergeParams([], "grid.npz"), "people is empty"),
+        (lambda person: MergeParams([person], ""), "out is empty"),
+        (lambda person: MergeParams([person], "grid.npz", 0.0), "voxel is 0"),
+        (lambda person: MergeFramesParams([], "folder"), "people is empty"),
+        (lambda person: MergeFramesParams([person], ""), "out_dir is empty"),
+        (lambda person: MergeFramesParams([person], "folder", float("inf")), "voxel is inf"),
+        (lambda person: FitGainParams([]), "people is empty"),
+    ],
+)
+def test_parameters_that_cannot_be_are_refused(person, make, message):
+    with pytest.raises(ValueError, match=message):
+        make(person)
+
+
+def test_the_child_knows_the_methods():
+    assert {"merge", "merge_frames", "fit_gain"} <= set(JOBS)
