@@ -42,7 +42,7 @@ def paths(person) -> list[str]:
 def sent(person) -> dict:
     """What the child was asked, but for the folder of the job."""
     asked = json.loads(person_file(person).read_bytes())
-    del asked["out_dir"], asked["size"]
+    del asked["out_dir"], asked["size"], asked["picture_px"]
     return asked
 
 

@@ -5,12 +5,16 @@ from __future__ import annotations
 import bpy
 
 from ..jobs.work import register_kind, unregister_kind
-from . import attributes, operators, panel, settings, work
+from . import attributes, operators, panel, presets, settings, work
 
 CLASSES = (
     attributes.PRIMDIFFUSION_PG_attributes,
     settings.PRIMDIFFUSION_PG_settings,
     operators.PRIMDIFFUSION_OT_generate,
+    operators.PRIMDIFFUSION_OT_random_seed,
+    presets.PRIMDIFFUSION_PT_generate_presets,
+    presets.PRIMDIFFUSION_OT_add_generate_preset,
+    presets.PRIMDIFFUSION_OT_use_generate_preset,
     panel.PRIMDIFFUSION_PT_generate,
     panel.PRIMDIFFUSION_PT_attributes,
 )

@@ -1,47 +1,62 @@
-"""Generate Human. Not redoable: moving a redo slider must not start an expensive job again."""
+"""Generate Human, and Random Seed."""
 
 from __future__ import annotations
 
 import bpy
 
 from ..jobs.follow import submit
-from .attributes import asked, parsed
-from .settings import SAMPLER_ITEMS
+from ..jobs.queue import queue
+from .asking import Asking, last_seed
+from .settings import random_seed
 from .work import GenerateWork
 
 
-class PRIMDIFFUSION_OT_generate(bpy.types.Operator):
-    """Generate a person from the seed, and add it to the scene with an armature"""
+class PRIMDIFFUSION_OT_generate(Asking, bpy.types.Operator):
+    """Generate people from the seed, and add them to the scene with armatures, side by side"""
 
     bl_idname = "primdiffusion.generate"
     bl_label = "Generate Human"
-    bl_options: set[str] = set()  # noqa: RUF012  bpy wants a plain set; neither REGISTER (redo) nor UNDO (the result has one)
 
-    seed: bpy.props.IntProperty(name="Seed", default=-1, min=-1, description="-1: the panel's")
-    steps: bpy.props.IntProperty(name="Steps", default=0, min=0, description="0: the panel's")
-    sampler: bpy.props.EnumProperty(
-        name="Sampler", items=SAMPLER_ITEMS, description="Not given: the panel's", options={"SKIP_SAVE"}
-    )
-    guidance: bpy.props.FloatProperty(
-        name="Guidance", min=0.0, max=20.0, description="Not given: the panel's", options={"SKIP_SAVE"}
-    )
-    attributes: bpy.props.StringProperty(
-        name="Attributes",
-        description="Like sex=female, height=1.7; empty: whatever comes. Not given: the panel's",
-        options={"SKIP_SAVE"},
+    count: bpy.props.IntProperty(
+        name="Count", default=0, min=0, max=1000, description="How many people; 0: the panel's", options={"SKIP_SAVE"}
     )
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Put it in line; in background mode this waits for the person."""
+        """Put them in line; in background mode this waits for all."""
         settings = context.scene.primdiffusion
-        given = self.properties.is_property_set
-        sampler = self.sampler if given("sampler") else settings.sampler
-        guidance = self.guidance if given("guidance") else settings.guidance
+        from_panel = self.seed < 0
+        # a script that names the seed means this one person, whatever the panel's number is
+        count = self.count or (settings.count if from_panel else 1)
+        if from_panel and not settings.keep_seed and settings.seed in _seeds_in_line():
+            settings.seed = random_seed()
+        seed = settings.seed if from_panel else self.seed
         try:
-            wanted = parsed(self.attributes) if given("attributes") else asked(settings.attributes)
+            last = last_seed(seed, count)
+            sampling = self.sampling(settings)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        asked_of_the_child = {"attributes": wanted, "guidance": guidance} if wanted else {}
-        seed, steps = self.seed if self.seed >= 0 else settings.seed, self.steps or settings.steps
-        return submit(self, context, GenerateWork(seed, steps, sampler, asked_of_the_child))
+        for each in range(seed, last + 1):
+            renews = from_panel and not settings.keep_seed and each == last
+            if submit(self, context, GenerateWork(each, **sampling, renews_seed=renews)) == {"CANCELLED"}:
+                return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_random_seed(bpy.types.Operator):
+    """Put a random seed into the panel"""
+
+    bl_idname = "primdiffusion.random_seed"
+    bl_label = "Random Seed"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Also when the seed is locked: the button says so."""
+        context.scene.primdiffusion.seed = random_seed()
+        return {"FINISHED"}
+
+
+def _seeds_in_line() -> set[int]:
+    """Of people who are asked for already: a second press of the button means somebody else."""
+    entries = [*queue.waiting, *([queue.current] if queue.current is not None else [])]
+    return {entry.work.seed for entry in entries if isinstance(entry.work, GenerateWork)}

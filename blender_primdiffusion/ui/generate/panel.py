@@ -4,29 +4,46 @@ from __future__ import annotations
 
 import bpy
 
+from .. import setup
 from ..jobs.drawing import draw_job
 from ..jobs.memory import device_line
 from .attributes import draw_attributes
+from .presets import PRIMDIFFUSION_PT_generate_presets
 
 
 class PRIMDIFFUSION_PT_generate(bpy.types.Panel):
-    """Seed, steps, Generate; progress and errors."""
+    """Seed, quality, Generate; progress and errors."""
 
-    bl_label = "Generate Human"
+    bl_label = "Generate"
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "PrimDiffusion"
+    bl_order = 0
+
+    def draw_header_preset(self, _context: bpy.types.Context) -> None:
+        """The menu of presets."""
+        PRIMDIFFUSION_PT_generate_presets.draw_panel_header(self.layout)
 
     def draw(self, context: bpy.types.Context) -> None:
         """Reads what is in line; starts nothing."""
         layout, settings = self.layout, context.scene.primdiffusion
         layout.use_property_split = True
+        layout.use_property_decorate = False
+        if hasattr(setup, "draw_set_up"):
+            setup.draw_set_up(layout)
         column = layout.column()
-        column.prop(settings, "seed")
-        column.prop(settings, "steps")
-        column.prop(settings, "sampler")
-        layout.label(text=f"Device: {device_line()}", icon="MEMORY")
+        row = column.row(align=True)
+        row.prop(settings, "seed")
+        row.prop(settings, "keep_seed", text="", icon="LOCKED" if settings.keep_seed else "UNLOCKED")
+        row.operator("primdiffusion.random_seed", text="", icon="FILE_REFRESH")
+        column.prop(settings, "count")
+        column = layout.column()
+        column.prop(settings, "quality")
+        if settings.quality == "CUSTOM":
+            column.prop(settings, "steps")
+            column.prop(settings, "sampler")
         draw_job(layout, "generate", "primdiffusion.generate", "OUTLINER_OB_ARMATURE")
+        layout.label(text=f"Device: {device_line()}", icon="MEMORY")
 
 
 class PRIMDIFFUSION_PT_attributes(bpy.types.Panel):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import random
+
 import bpy
 
 from ...worker.names import SAMPLERS
 from .attributes import PRIMDIFFUSION_PG_attributes
+from .quality import ITEMS, apply_quality, name_quality
 
 _SAMPLERS = {
     "ddim": ("DDIM", "The noise of the seed alone: as the paper samples"),
@@ -15,11 +18,38 @@ _SAMPLERS = {
 SAMPLER_ITEMS = [(name, *_SAMPLERS[name]) for name in SAMPLERS]
 
 
+LARGEST_SEED = 2**31 - 1
+"""Blender's properties hold no larger number; scripts of the backend may go to 2^63 - 1."""
+
+
+def random_seed() -> int:
+    """A seed that nobody chose."""
+    return random.randrange(LARGEST_SEED + 1)
+
+
 class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
     """`scene.primdiffusion`."""
 
     seed: bpy.props.IntProperty(
         name="Seed", description="Another seed is another person; the same seed is the same person", default=7, min=0
+    )
+    keep_seed: bpy.props.BoolProperty(
+        name="Lock Seed", description="Keep the seed; otherwise each new person leaves a new random one"
+    )
+    count: bpy.props.IntProperty(
+        name="Count",
+        description="How many people, of this seed and those that follow on it, one after the other and side by side",
+        default=1,
+        min=1,
+        max=1000,
+        soft_max=20,
+    )
+    quality: bpy.props.EnumProperty(
+        name="Quality",
+        description="How carefully the noise is taken away",
+        items=ITEMS,
+        default="STANDARD",
+        update=apply_quality,
     )
     steps: bpy.props.IntProperty(
         name="Steps",
@@ -28,8 +58,11 @@ class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
         min=1,
         max=1000,
         soft_max=100,
+        update=name_quality,
     )
-    sampler: bpy.props.EnumProperty(name="Sampler", description="How the noise is taken away", items=SAMPLER_ITEMS)
+    sampler: bpy.props.EnumProperty(
+        name="Sampler", description="How the noise is taken away", items=SAMPLER_ITEMS, update=name_quality
+    )
     guidance: bpy.props.FloatProperty(
         name="Guidance",
         description="How strongly the attributes are followed: 1 as people are, more exaggerates; "

@@ -18,6 +18,8 @@ from ..jobs.work import Work, chosen_checkpoint
 
 _PICTURE_PX = 16
 """The child's pictures of the finished person are of no use here."""
+_STEP_PICTURE_PX = 256
+"""Of the person so far, for the panel."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +55,7 @@ class EditWork(Work):
             asked["region"] = {"weights": str(folder / "region.npz")}
         checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
         params = {**asked, "person": self.file, "steps": self.steps, "size": _PICTURE_PX}
+        params["picture_px"] = _STEP_PICTURE_PX
         return {**params, **checkpoint, "out_dir": str(folder)}
 
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 import bpy
 
+from ...scene.beside import stand_beside_others
 from ...scene.human import build_human, overlap_warning
 from ...worker.sentence import sentence
 
@@ -22,6 +23,7 @@ def build_person(
     began = time.monotonic()
     keep = [Path(result["person"])] if "person" in result else []  # for the exact marcher, later
     collection = build_human(context, Path(result["human"]), name, keep)
+    stand_beside_others(context, collection)
     warnings = [sentence(text) for text in (*result.get("warnings", ()), overlap_warning(collection)) if text]
     notice = f"{made} in {result['seconds']:.1f} s, built in {time.monotonic() - began:.1f} s"
     return collection, " ".join(warnings) or notice

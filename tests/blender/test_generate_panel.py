@@ -1,0 +1,182 @@
+"""The panel Generate: seeds, counts, quality, presets, and people who stand side by side."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import bpy
+import numpy as np
+import pytest
+from jobs_driven import drive, shown
+
+from blender_primdiffusion.scene.beside import GAP_M
+from blender_primdiffusion.scene.human import armature_of, humans, person_file
+from blender_primdiffusion.scene.preview import posed_extent
+from blender_primdiffusion.ui.generate import operators, panel, presets, settings
+from blender_primdiffusion.ui.jobs.queue import queue
+
+FAILS = 2
+"""A seed that the fake child takes as an order."""
+
+
+@pytest.fixture
+def panel_settings(addon):
+    return addon.scene.primdiffusion
+
+
+@pytest.fixture
+def in_line(monkeypatch):
+    """Works as with a window: submit returns at once, and `drive` is the timer."""
+    monkeypatch.setattr(operators, "submit", lambda _operator, context, work: queue.add(context, work) and {"FINISHED"})
+
+
+@pytest.fixture
+def presets_folder(tmp_path, monkeypatch):
+    folder = Path(bpy.utils.user_resource("SCRIPTS", path=f"presets/{presets.SUBDIR}", create=True))
+    for path in folder.glob("*.py"):
+        path.unlink()
+    return folder
+
+
+def seeds(context) -> list[int]:
+    return [json.loads(person_file(person).read_bytes())["seed"] for person in humans(context.scene)]
+
+
+def test_an_unlocked_seed_is_another_one_after_each_result_and_a_locked_one_stays(addon, panel_settings, monkeypatch):
+    monkeypatch.setattr(settings.random, "randrange", lambda _: 99)
+    panel_settings.seed = 11
+    bpy.ops.primdiffusion.generate(steps=1)
+    assert (seeds(addon), panel_settings.seed) == ([11], 99)
+    panel_settings.keep_seed, panel_settings.seed = True, 12
+    bpy.ops.primdiffusion.generate(steps=1)
+    assert panel_settings.seed == 12
+
+
+def test_a_failure_keeps_the_seed_for_another_try(panel_settings):
+    panel_settings.seed = FAILS
+    with pytest.raises(RuntimeError):
+        bpy.ops.primdiffusion.generate(steps=1)
+    assert panel_settings.seed == FAILS
+
+
+def test_a_seed_from_a_script_leaves_the_panels_and_is_one_person(addon, panel_settings):
+    panel_settings.count = 3
+    bpy.ops.primdiffusion.generate(seed=31, steps=1)
+    assert (seeds(addon), panel_settings.seed) == ([31], 7)
+
+
+def test_pressing_twice_asks_for_two_different_people(addon, panel_settings, in_line):
+    bpy.ops.primdiffusion.generate(steps=1)
+    bpy.ops.primdiffusion.generate(steps=1)
+    drive()
+    first, second = seeds(addon)
+    assert first == 7
+    assert second != 7
+
+
+def test_a_count_is_as_many_works_in_line_of_seeds_that_follow_on_each_other(addon, panel_settings, in_line):
+    panel_settings.count = 3
+    bpy.ops.primdiffusion.generate(steps=1)
+    assert [entry.work.label for entry in queue.waiting] == [f"Generate Human, seed {seed}" for seed in (7, 8, 9)]
+    drive()
+    assert seeds(addon) == [7, 8, 9]
+    assert panel_settings.seed not in (7, 8, 9)
+
+
+def test_people_stand_side_by_side_and_the_first_at_the_origin(addon):
+    bpy.ops.primdiffusion.generate(seed=7, steps=1, count=3)
+    extents = sorted((posed_extent(person) for person in humans(addon.scene)), key=lambda extent: extent[0][0])
+    for (_, left), (right, _) in itertools.pairwise(extents):
+        assert right[0] - left[0] >= GAP_M - 1e-6
+    x = [armature_of(person).location.x for person in humans(addon.scene)]
+    assert x[0] == 0.0
+    assert np.isclose(x[1], -x[2]), "to both sides in turn"
+    assert x[1] > 0
+
+
+def test_a_new_person_takes_the_free_place_in_the_middle(addon):
+    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    armature_of(humans(addon.scene)[0]).location.x = 30.0
+    bpy.ops.primdiffusion.generate(seed=8, steps=1)
+    assert armature_of(humans(addon.scene)[1]).location.x == 0.0
+    armature_of(humans(addon.scene)[1]).location.y = 5.0
+    bpy.ops.primdiffusion.generate(seed=9, steps=1)
+    assert armature_of(humans(addon.scene)[2]).location.x == 0.0, "the one far behind is not in the way"
+
+
+def test_seeds_beyond_blenders_numbers_are_refused(addon):
+    with pytest.raises(RuntimeError, match="2 seeds from 2147483647 on go beyond 2147483647: choose a smaller seed"):
+        bpy.ops.primdiffusion.generate(seed=2**31 - 1, steps=1, count=2)
+    assert not humans(addon.scene)
+
+
+def test_random_seed_puts_another_one_into_the_panel(panel_settings, monkeypatch):
+    monkeypatch.setattr(settings.random, "randrange", lambda end: end - 1)
+    assert bpy.ops.primdiffusion.random_seed() == {"FINISHED"}
+    assert panel_settings.seed == 2**31 - 1
+
+
+def test_a_quality_stands_for_steps_and_sampler_and_these_name_the_quality(panel_settings):
+    assert (panel_settings.quality, panel_settings.steps, panel_settings.sampler) == ("STANDARD", 30, "ddim")
+    panel_settings.quality = "DRAFT"
+    assert (panel_settings.quality, panel_settings.steps, panel_settings.sampler) == ("DRAFT", 8, "dpmpp_2m")
+    panel_settings.quality = "HIGH"
+    assert (panel_settings.quality, panel_settings.steps, panel_settings.sampler) == ("HIGH", 60, "ddim")
+    panel_settings.steps = 17
+    assert panel_settings.quality == "CUSTOM"
+    panel_settings.steps = 30
+    assert panel_settings.quality == "STANDARD"
+    panel_settings.quality = "CUSTOM"
+    assert (panel_settings.quality, panel_settings.steps) == ("CUSTOM", 30)
+
+
+def test_a_preset_holds_everything_but_the_seed(panel_settings, presets_folder):
+    panel_settings.quality, panel_settings.guidance, panel_settings.seed = "HIGH", 2.5, 5
+    panel_settings.attributes.use_height, panel_settings.attributes.height = True, 1.9
+    assert bpy.ops.primdiffusion.add_generate_preset(name="Tall Ones") == {"FINISHED"}
+    (path,) = presets_folder.glob("*.py")
+    assert "seed" not in path.read_text()
+    panel_settings.quality, panel_settings.guidance, panel_settings.seed = "DRAFT", 1.0, 6
+    panel_settings.attributes.use_height = False
+    assert bpy.ops.primdiffusion.use_generate_preset(filepath=str(path)) == {"FINISHED"}
+    assert (panel_settings.quality, panel_settings.guidance, panel_settings.seed) == ("HIGH", 2.5, 6)
+    assert panel_settings.attributes.use_height
+    bpy.ops.primdiffusion.add_generate_preset(name="Tall Ones", remove_name=True)
+    assert not list(presets_folder.glob("*.py"))
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("import bpy\nbpy.context.scene.primdiffusion.sampler = 'magic'\n", "'Old One' does not suit this checkpoint"),
+        ("x = (\n", "'Old One' does not suit"),
+        (None, "The preset cannot be read"),
+    ],
+)
+def test_a_preset_that_does_not_fit_is_one_sentence(panel_settings, presets_folder, text, sentence):
+    path = presets_folder / "old_one.py"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(RuntimeError, match=sentence):
+        bpy.ops.primdiffusion.use_generate_preset(filepath=str(path))
+
+
+def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_of_the_backend(
+    addon, panel_settings, monkeypatch
+):
+    def drawn() -> list[str]:
+        layout = MagicMock()
+        panel.PRIMDIFFUSION_PT_generate.draw(SimpleNamespace(layout=layout), addon)
+        return [call.args[1] for call in layout.column().prop.call_args_list]
+
+    assert drawn() == ["count", "quality"]
+    panel_settings.quality = "CUSTOM"
+    assert drawn() == ["count", "quality", "steps", "sampler"]
+    monkeypatch.setattr(panel.setup, "draw_set_up", lambda layout: layout.label(text="not set up"), raising=False)
+    texts = shown(panel.PRIMDIFFUSION_PT_generate, addon)
+    assert texts[0] == "not set up"
+    assert {"primdiffusion.random_seed", "primdiffusion.generate"} <= set(texts)
