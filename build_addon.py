@@ -2,7 +2,8 @@
 
     python build_addon.py [--out dist]
 
-The same tree gives the same bytes. When `bpy` is installed, Blender's own extension tool validates the result.
+The manual's pages go along, for the panels' question marks. The same tree gives the same bytes. When `bpy` is
+installed, Blender's own extension tool validates the result.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ import sys
 import tomllib
 import zipfile
 from pathlib import Path
+
+from build_manual import ManualError, manual
 
 ROOT = Path(__file__).resolve().parent
 ADDON = ROOT / "blender_primdiffusion"
@@ -30,7 +33,10 @@ class BuildError(RuntimeError):
 
 
 def contents(addon: Path = ADDON, backend: Path = BACKEND) -> dict[str, Path]:
-    """Names in the zip to files, sorted by name: the add-on at the top, the backend under backend/primdiffusion."""
+    """Names in the zip to files, sorted by name: the add-on at the top, the backend under backend/primdiffusion.
+
+    The manual's pages are not files: see `build`.
+    """
     files = {"LICENSE": ROOT / "LICENSE"}
     for root, prefix in ((addon, ""), (backend, "backend/primdiffusion/")):
         for path in root.rglob("*"):
@@ -47,15 +53,20 @@ def build(out: Path) -> Path:
     files = contents()
     if "backend/primdiffusion/__init__.py" not in files:
         raise BuildError(f"the backend is missing in {BACKEND}; build from a complete checkout")
+    try:
+        pages = {f"manual/{name}": page for name, page in manual().items()}
+    except ManualError as error:
+        raise BuildError(str(error)) from error
     out.mkdir(parents=True, exist_ok=True)
     target = out / f"{manifest['id']}-{manifest['version']}.zip"
     unfinished = target.with_suffix(".zip.part")
     with zipfile.ZipFile(unfinished, "w") as archive:
-        for name, path in files.items():
+        for name in sorted({*files, *pages}):
             entry = zipfile.ZipInfo(name, FIXED_TIME)
             entry.external_attr = 0o644 << 16
-            entry.compress_type = zipfile.ZIP_STORED if path.suffix in STORED_SUFFIXES else zipfile.ZIP_DEFLATED
-            archive.writestr(entry, path.read_bytes())
+            stored = Path(name).suffix in STORED_SUFFIXES
+            entry.compress_type = zipfile.ZIP_STORED if stored else zipfile.ZIP_DEFLATED
+            archive.writestr(entry, pages[name] if name in pages else files[name].read_bytes())
     os.replace(unfinished, target)
     return target
 

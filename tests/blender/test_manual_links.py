@@ -1,0 +1,101 @@
+"""The manual: made of docs/manual for the zip, opened by panels and by F1, without a network."""
+
+from __future__ import annotations
+
+import re
+import webbrowser
+import zipfile
+
+import bpy
+import pytest
+
+import build_addon
+import build_manual
+from blender_primdiffusion.ui import manual
+
+
+@pytest.fixture
+def opened(monkeypatch) -> list[str]:
+    urls = []
+    monkeypatch.setattr(webbrowser, "open", lambda url, *_, **__: urls.append(url) or True)
+    return urls
+
+
+def test_the_button_opens_the_page_from_disk_at_its_section(addon, opened):
+    assert bpy.ops.primdiffusion.open_manual(page="batch", anchor="render") == {"FINISHED"}
+    (url,) = opened
+    assert re.fullmatch(r"file:///.*/docs/manual/batch\.md#render", url)
+
+
+@pytest.mark.parametrize("page", ["no_such_page", "../captures", ""])
+def test_a_page_that_is_not_there_is_named(addon, opened, page):
+    with pytest.raises(RuntimeError, match=rf"page '{page}' is not there: install"):
+        bpy.ops.primdiffusion.open_manual(page=page)
+    assert opened == []
+
+
+def test_without_a_browser_the_file_is_named(addon, monkeypatch):
+    monkeypatch.setattr(webbrowser, "open", lambda *_, **__: False)
+    with pytest.raises(RuntimeError, match=r"open .*batch\.md by hand"):
+        bpy.ops.primdiffusion.open_manual(page="batch")
+
+
+@pytest.mark.parametrize(
+    ("thing", "section"),
+    [
+        ("primdiffusion.generate", "generate"),
+        ("PRIMDIFFUSION_OT_render_captures.people", "render_captures"),
+        ("PRIMDIFFUSION_PG_settings.seed", "primdiffusion_pg_settings"),
+    ],
+)
+def test_f1_on_what_is_ours_leads_to_its_section(addon, opened, thing, section):
+    assert bpy.ops.wm.doc_view_manual(doc_id=thing) == {"FINISHED"}
+    assert opened[0].endswith(f"/docs/manual/api.md#{section}")
+    assert f"### {section}" in manual.page_file("api").read_text().lower()
+
+
+def test_f1_on_blenders_own_things_is_left_to_blender(addon):
+    prefix, mapping = manual.manual_map()
+    assert prefix.startswith("file:///")
+    assert all("primdiffusion" in pattern for pattern, _ in mapping)
+
+
+def test_the_zip_holds_pages_whose_links_and_pictures_are_there(tmp_path):
+    names = zipfile.ZipFile(build_addon.build(tmp_path)).namelist()
+    assert {"manual/api.html", "manual/batch.html"} <= set(names)
+    for name, content in build_manual.manual().items():
+        if not name.endswith(".html"):
+            continue
+        text = content.decode()
+        for target in re.findall(r'(?:href|src)="([^":#]+)', text):
+            assert f"manual/{target}" in names, f"{name} leads to {target}"
+
+
+def test_pages_have_tables_anchors_and_no_links_out_of_the_manual(tmp_path):
+    (tmp_path / "manual").mkdir()
+    (tmp_path / "other.md").write_text("elsewhere")
+    (tmp_path / "shot.png").write_bytes(b"picture")
+    text = (
+        "# A & B\n\n| a | b |\n|---|---|\n| 1 | [c](second.md#deep-down) |\n\n[away](../other.md) ![p](../shot.png) <b>"
+    )
+    (tmp_path / "manual" / "first.md").write_text(text)
+    (tmp_path / "manual" / "second.md").write_text("## Deep Down\n\n[web](https://example.org)")
+    files = build_manual.manual(tmp_path / "manual")
+    assert set(files) == {"first.html", "second.html", "pictures/shot.png"}
+    first = files["first.html"].decode()
+    assert "<title>A &amp; B - PrimDiffusion</title>" in first
+    assert '<a href="second.html#deep-down">c</a>' in first
+    assert '<img src="pictures/shot.png" alt="p"' in first
+    assert "other.md" not in first
+    assert "away" in first
+    assert "&lt;b&gt;" in first
+    second = files["second.html"].decode()
+    assert '<h2 id="deep-down">' in second
+    assert '<a href="https://example.org">' in second
+
+
+@pytest.mark.parametrize("text", ["[gone](gone.md)", "![gone](gone.png)"])
+def test_links_that_lead_nowhere_stop_the_build(tmp_path, text):
+    (tmp_path / "page.md").write_text(text)
+    with pytest.raises(build_manual.ManualError, match=r"page\.md .* gone"):
+        build_manual.manual(tmp_path)
