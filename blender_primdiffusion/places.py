@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import bpy
@@ -9,6 +10,7 @@ import bpy
 from .worker.backend import Backend
 from .worker.client import BackendClient
 from .worker.environment import find_backend_python
+from .worker.setup_folder import SetUpFolder, short_root
 
 EXTENSION = str(__package__)
 """The extension's full module name; `bl_ext.<repository>.primdiffusion` once installed."""
@@ -31,6 +33,16 @@ def own_folder() -> Path:
         return Path(bpy.app.tempdir) / "primdiffusion"
 
 
+def set_up_folder() -> SetUpFolder:
+    """Where the private environment is, or would be: lasting, and short enough for Windows."""
+    try:
+        own = Path(bpy.utils.extension_path_user(EXTENSION))
+    except ValueError:  # not installed as an extension
+        own = Path(bpy.utils.user_resource("DATAFILES", path="primdiffusion"))
+    local = os.environ.get("LOCALAPPDATA") if os.name == "nt" else None
+    return SetUpFolder(short_root(own, Path(local) if local else None, "{}{}".format(*bpy.app.version)))
+
+
 def preference(name: str) -> str:
     """A path from the add-on's preferences, absolute; empty when unset or when the add-on is not enabled."""
     addon = bpy.context.preferences.addons.get(EXTENSION)
@@ -44,7 +56,7 @@ def new_backend(python: str) -> Backend:
     What Blender knows is read here: the thread that starts the child must not touch bpy.
     """
     module_path, cache = backend_module_path(), own_folder() / "cache"
-    own_environment = own_folder() / "environment"
+    own_environment = set_up_folder().environment
 
     def make_client() -> BackendClient:
         found = find_backend_python(python or None, own_environment, module_path, cache_dir=cache)

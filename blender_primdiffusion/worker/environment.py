@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from .client import child_environment
+from .setup_folder import is_half_installed
 
 VARIABLE = "PRIMDIFFUSION_PYTHON"
 TRIAL_S = 90.0
@@ -48,7 +49,8 @@ def python_of_environment(folder: Path) -> Path:
 def candidates(preference: str | Path | None, own_environment: Path | None) -> Iterator[tuple[str, Path]]:
     """Who may name the Python, strongest first: the preferences, the variable, the extension's own, the running one.
 
-    An explicit wish (preferences or variable) that fails is an error and not a reason to look further.
+    An explicit wish (preferences or variable) that fails is an error and not a reason to look further. An environment
+    of the extension's own that is half installed is passed over.
     """
     if preference and str(preference).strip():
         yield "the extension's preferences", Path(preference)
@@ -56,7 +58,11 @@ def candidates(preference: str | Path | None, own_environment: Path | None) -> I
     if os.environ.get(VARIABLE):
         yield f"the environment variable {VARIABLE}", Path(os.environ[VARIABLE])
         return
-    if own_environment is not None and python_of_environment(own_environment).exists():
+    if (
+        own_environment is not None
+        and python_of_environment(own_environment).exists()
+        and not is_half_installed(own_environment)
+    ):
         yield "the extension's own environment", python_of_environment(own_environment)
     yield "Blender's own Python", Path(sys.executable)
 
@@ -80,7 +86,7 @@ def find_backend_python(
             return _try(path, source, environment, timeout_s)
         except BackendNotFound as e:
             reasons.append(str(e))
-    advice = "name a Python with PrimDiffusion's packages in the extension's preferences"
+    advice = "press Set Up Backend, or name a Python with PrimDiffusion's packages in the extension's preferences"
     raise BackendNotFound(f"No Python for the backend: {'; '.join(reasons)}. To go on, {advice}.")
 
 

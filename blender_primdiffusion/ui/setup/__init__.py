@@ -1,12 +1,23 @@
-"""Preferences: which Python runs the backend, which checkpoints it uses."""
+"""Preferences, and the backend's private environment: set up, repaired, removed, tried."""
 
 from __future__ import annotations
 
 import bpy
 
-from . import preferences
+from . import operators, preferences, session
+from .drawing import draw_set_up
 
-CLASSES = (preferences.PRIMDIFFUSION_AP_preferences,)
+__all__ = ["draw_set_up", "register", "unregister"]
+
+CLASSES = (
+    operators.PRIMDIFFUSION_OT_set_up_backend,
+    operators.PRIMDIFFUSION_OT_install_from_folder,
+    operators.PRIMDIFFUSION_OT_cancel_set_up,
+    operators.PRIMDIFFUSION_OT_repair_backend,
+    operators.PRIMDIFFUSION_OT_remove_backend,
+    operators.PRIMDIFFUSION_OT_test_backend,
+    preferences.PRIMDIFFUSION_AP_preferences,
+)
 
 
 def register() -> None:
@@ -16,6 +27,9 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Undo `register`."""
+    """Undo `register`; a set-up under way is ended, and can be resumed."""
+    session.session.cancel()
+    if bpy.app.timers.is_registered(session.follow):
+        bpy.app.timers.unregister(session.follow)
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

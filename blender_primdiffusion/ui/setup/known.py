@@ -1,0 +1,110 @@
+"""What is known of the backend without starting it: cheap enough for drawing."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.util
+import os
+from pathlib import Path
+from typing import Any, Literal
+
+import bpy
+
+from ...places import EXTENSION, preference, set_up_folder
+from ...worker.environment import VARIABLE
+from ...worker.setup_folder import state_of
+from ...worker.setup_locks import Lock, locks_for, read_lock
+from ...worker.setup_machine import Machine, chosen_compute, this_machine
+
+LOCKS = Path(__file__).resolve().parents[2] / "requirements"
+OWN_LOCK = "requirements.txt"
+"""In a folder of wheels: a list of packages that goes before ours."""
+_LINE_BYTES_PER_S = 50e6 / 8
+"""Of the network, for the estimate: 50 Mbit/s."""
+_UNPACKED_BYTES_PER_S = 30e6
+_SELF_TEST_S = 30.0
+
+machine = functools.cache(this_machine)
+read_once = functools.lru_cache(maxsize=16)(read_lock)
+
+
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """Which Python would run the backend."""
+
+    state: Literal["named", "own Python", "ready", "outdated", "half", "moved", "absent"]
+    usable: bool
+    line: str
+    """For people."""
+    about: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """What the environment's marker tells."""
+
+
+def known() -> Known:
+    """Follows the order in which a Python is looked for when the backend starts."""
+    if named := preference("backend_python"):
+        return Known("named", True, f"Uses {named}")
+    if named := os.environ.get(VARIABLE):
+        return Known("named", True, f"Uses {named}, named by the environment variable {VARIABLE}")
+    state, about = state_of(set_up_folder())
+    if state == "ready":
+        versions = f"torch {about.get('torch')}, Python {about.get('python')}"
+        line = f"Ready: {versions}, {about.get('device') or 'CPU'}"
+        if _made_of_another_lock(about):
+            return Known("outdated", True, f"{line}. Made for another version of the extension: press Repair", about)
+        return Known("ready", True, line, about)
+    if _has_torch():
+        return Known("own Python", True, "Uses Blender's own Python, which has torch")
+    if state == "moved":
+        return Known("moved", False, "Made by a Blender that is gone: press Repair", about)
+    if state == "half":
+        return Known("half", False, "Half installed: Set Up Backend goes on from there")
+    return Known("absent", False, "The backend is not set up yet")
+
+
+@functools.cache
+def _has_torch() -> bool:
+    """Blender's own Python has it: Blender as a module, in an environment of ours."""
+    return importlib.util.find_spec("torch") is not None
+
+
+def _made_of_another_lock(about: dict[str, Any]) -> bool:
+    path = LOCKS / str(about.get("lock_name", ""))
+    return path.is_file() and read_once(path).digest != about.get("lock")
+
+
+@functools.cache
+def available() -> dict[str, Path]:
+    """The locks for this machine, by what they compute on."""
+    return locks_for(LOCKS, machine().platform, machine().python)
+
+
+def wished_compute() -> str:
+    """The preference: automatic, cpu, cuda, apple."""
+    addon = bpy.context.preferences.addons.get(EXTENSION)
+    return addon.preferences.compute.lower() if addon is not None else "automatic"
+
+
+def chosen() -> tuple[str, Lock, str]:
+    """What would be set up: what it computes on, its packages, and a sentence where there is something to say.
+
+    Raises ValueError in a sentence.
+    """
+    found: Machine = machine()
+    compute, note = chosen_compute(found, wished_compute(), available())
+    return compute, read_once(available()[compute]), note
+
+
+def cost(lock: Lock) -> str:
+    """What setting up takes, said before it is begun."""
+    seconds = lock.download_bytes / _LINE_BYTES_PER_S + lock.installed_bytes / _UNPACKED_BYTES_PER_S + _SELF_TEST_S
+    return (
+        f"Downloads {gigabytes(lock.download_bytes)}, takes {gigabytes(lock.installed_bytes)} on disk, "
+        f"about {max(round(seconds / 60), 1)} min at 50 Mbit/s"
+    )
+
+
+def gigabytes(size: float) -> str:
+    """Bytes for people."""
+    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB"

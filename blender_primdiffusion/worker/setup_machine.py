@@ -1,0 +1,104 @@
+"""What this machine can compute on, found without starting anything; which lock suits it."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import platform
+import re
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+CUDA_DRIVER = 580
+"""The oldest NVIDIA driver that torch's CUDA 13 builds run on."""
+MACOS = 14
+"""The oldest macOS that torch has wheels for."""
+NAMES = {"cpu": "CPU", "cuda": "NVIDIA (CUDA)", "apple": "Apple Silicon"}
+_OWNERS = {"Linux": "linux", "Windows": "windows", "Darwin": "macos"}
+_CHIPS = {"x86_64": "x86_64", "AMD64": "x86_64", "arm64": "arm64", "aarch64": "arm64"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Machine:
+    """As far as the choice of packages depends on it."""
+
+    platform: str
+    """linux_x86_64, windows_x86_64, macos_arm64, or one without locks such as macos_x86_64."""
+    python: tuple[int, int]
+    macos: int | None
+    nvidia: bool
+    """There is an NVIDIA driver."""
+    driver: int | None
+    """Its major version where the system tells without being asked by a program."""
+
+    @property
+    def described(self) -> str:
+        """What was found, for people."""
+        chip = NAMES["apple"] if self.platform == "macos_arm64" else self.platform.replace("_", " ", 1)
+        card = f", NVIDIA driver{f' {self.driver}' if self.driver else ''}" if self.nvidia else ""
+        return f"{chip}{card}, Python {self.python[0]}.{self.python[1]}"
+
+
+def this_machine() -> Machine:
+    """The machine we run on. Reads one small file at most."""
+    chip = _CHIPS.get(platform.machine(), platform.machine().lower())
+    version = platform.mac_ver()[0]
+    nvidia, driver = _nvidia()
+    return Machine(
+        f"{_OWNERS.get(platform.system(), platform.system().lower())}_{chip}",
+        sys.version_info[:2],
+        int(version.split(".")[0]) if version else None,
+        nvidia,
+        driver,
+    )
+
+
+def _nvidia() -> tuple[bool, int | None]:
+    if os.name == "nt":
+        return Path(os.environ.get("SYSTEMROOT", r"C:\Windows"), "System32", "nvcuda.dll").exists(), None
+    try:
+        told = Path("/proc/driver/nvidia/version").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return False, None
+    found = re.search(r"\b(\d{3,})\.\d+", told)
+    return True, int(found[1]) if found else None
+
+
+def chosen_compute(machine: Machine, wish: str, available: Iterable[str]) -> tuple[str, str]:
+    """What to compute on, and a sentence about it where there is something to say.
+
+    `wish` is automatic, cpu, cuda or apple; `available` are the locks there are. Raises ValueError in a sentence for a
+    machine without packages, and for a wish that it cannot fulfil.
+    """
+    available = set(available)
+    if machine.macos is not None and machine.macos < MACOS:
+        raise ValueError(f"torch needs macOS {MACOS} or newer, and this is {machine.macos}: update the system")
+    if not available:
+        version = ".".join(map(str, machine.python))
+        raise ValueError(
+            f"there are no packages for {machine.platform} with Python {version}: "
+            "make an environment by hand and name its Python below"
+        )
+    if wish == "automatic":
+        return _automatic(machine, available)
+    if wish not in available:
+        found = ", ".join(NAMES[name] for name in sorted(available))
+        raise ValueError(f"there are no packages for {NAMES[wish]} here, but for {found}: choose another, or Automatic")
+    if wish == "cuda" and not machine.nvidia:
+        return wish, "No NVIDIA driver was found: the backend will compute on the CPU until there is one"
+    return wish, ""
+
+
+def _automatic(machine: Machine, available: set[str]) -> tuple[str, str]:
+    fallback = "apple" if "apple" in available else "cpu"
+    if not machine.nvidia:
+        return fallback, ""
+    if machine.driver is not None and machine.driver < CUDA_DRIVER:
+        return fallback, f"The NVIDIA driver {machine.driver} is too old for CUDA: {CUDA_DRIVER} or newer is needed"
+    if "cuda" not in available:
+        return (
+            fallback,
+            "There are no CUDA packages of known hashes for this Blender: the CPU is used (see the manual)",
+        )
+    return "cuda", ""

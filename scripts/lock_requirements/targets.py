@@ -1,0 +1,73 @@
+"""The machines that locks are made for: Blender's platforms and Pythons, and what torch computes on."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+
+@dataclasses.dataclass(frozen=True)
+class Target:
+    """One lock: a platform, a Python, a build of torch."""
+
+    platform: str
+    """As the extension names it: linux_x86_64, windows_x86_64, macos_arm64."""
+    python: str
+    """3.11 (Blender 4.5, 5.0), 3.13 (5.1 and newer)."""
+    compute: str
+    """cpu, cuda, apple."""
+    uv_platform: str
+    """As uv names it, with the oldest system that torch has wheels for."""
+    wheel_platforms: tuple[str, ...]
+    """Patterns of platform tags that run there, best first."""
+    torch_build: str = ""
+    """Local version of a build that is on download.pytorch.org alone: cpu, cu130; empty: PyPI's."""
+
+    @property
+    def name(self) -> str:
+        """Of the lock's file, without its suffix."""
+        return f"{self.platform}-py{self.python.replace('.', '')}-{self.compute}"
+
+    @property
+    def without_cuda(self) -> bool:
+        """torch is another build than the one whose requirements PyPI tells, and needs no CUDA packages."""
+        return bool(self.torch_build)
+
+    def runs(self, tags: str) -> int | None:
+        """How well a wheel of these tags (cp311-cp311-win_amd64) suits, lower is better; None: not at all."""
+        pythons, abis, platforms = tags.split("-")
+        version = self.python.replace(".", "")
+        exact = f"cp{version}" in pythons.split(".") and f"cp{version}" in abis.split(".")
+        stable = "abi3" in abis.split(".") and any(_not_newer(tag, version) for tag in pythons.split("."))
+        pure = "none" in abis.split(".") and bool({"py3", "py2.py3", f"cp{version}"} & {*pythons.split("."), pythons})
+        ranks = [
+            rank
+            for rank, pattern in enumerate((*self.wheel_platforms, "any"))
+            if any(re.fullmatch(pattern, tag) for tag in platforms.split("."))
+        ]
+        if not ranks or not (exact or stable or pure):
+            return None
+        return ranks[0] + (0 if exact else 100)
+
+
+def _not_newer(tag: str, version: str) -> bool:
+    found = re.fullmatch(r"cp3(\d+)", tag)
+    return found is not None and int(found[1]) <= int(version[1:])
+
+
+_LINUX = (r"manylinux_2_28_x86_64", r"manylinux_2_(?:1\d|2[0-7])_x86_64", r"manylinux(?:2014|2010|1|_2_5)_x86_64")
+_MAC = (r"macosx_1[1-4]_\d+_(?:arm64|universal2)", r"macosx_10_\d+_universal2")
+
+
+def _targets(python: str) -> tuple[Target, ...]:
+    linux, windows = ("linux_x86_64", python), ("windows_x86_64", python)
+    return (
+        Target(*linux, "cpu", "x86_64-manylinux_2_28", _LINUX, "cpu"),
+        Target(*linux, "cuda", "x86_64-manylinux_2_28", _LINUX),
+        Target(*windows, "cpu", "x86_64-pc-windows-msvc", ("win_amd64",)),
+        Target(*windows, "cuda", "x86_64-pc-windows-msvc", ("win_amd64",), "cu130"),
+        Target("macos_arm64", python, "apple", "aarch64-apple-darwin", _MAC),
+    )
+
+
+TARGETS = (*_targets("3.11"), *_targets("3.13"))

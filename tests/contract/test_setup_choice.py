@@ -1,0 +1,108 @@
+"""Which packages suit a machine, and where they go; the locks that are shipped."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from worker.setup_folder import LONGEST_INSIDE, WINDOWS_LONGEST, short_root
+from worker.setup_locks import grouped, locks_for, read_lock
+from worker.setup_machine import Machine, chosen_compute, this_machine
+
+ROOT = Path(__file__).parents[2]
+LOCKS = ROOT / "blender_primdiffusion" / "requirements"
+LINUX = Machine("linux_x86_64", (3, 11), None, False, None)
+CARD = Machine("linux_x86_64", (3, 11), None, True, 580)
+BOTH = ("cpu", "cuda")
+
+
+@pytest.mark.parametrize(
+    ("machine", "wish", "chosen", "note"),
+    [
+        (LINUX, "automatic", "cpu", ""),
+        (CARD, "automatic", "cuda", ""),
+        (CARD, "cpu", "cpu", ""),
+        (Machine("linux_x86_64", (3, 11), None, True, 535), "automatic", "cpu", "driver 535 is too old"),
+        (Machine("windows_x86_64", (3, 11), None, True, None), "automatic", "cuda", ""),
+        (LINUX, "cuda", "cuda", "No NVIDIA driver was found"),
+    ],
+)
+def test_what_is_computed_on_follows_the_machine_and_the_wish(machine, wish, chosen, note):
+    compute, said = chosen_compute(machine, wish, BOTH)
+    assert compute == chosen
+    assert note in said
+
+
+def test_an_nvidia_card_without_locked_packages_falls_back_and_says_so():
+    assert chosen_compute(CARD, "automatic", ["cpu"])[0] == "cpu"
+    assert "see the manual" in chosen_compute(CARD, "automatic", ["cpu"])[1]
+
+
+def test_an_apple_computer_takes_its_own_packages():
+    machine = Machine("macos_arm64", (3, 13), 15, False, None)
+    assert chosen_compute(machine, "automatic", ["apple"]) == ("apple", "")
+
+
+@pytest.mark.parametrize(
+    ("machine", "wish", "available", "said"),
+    [
+        (Machine("macos_arm64", (3, 11), 13, False, None), "automatic", ["apple"], "needs macOS 14 or newer"),
+        (Machine("macos_x86_64", (3, 11), 14, False, None), "automatic", [], "no packages for macos_x86_64"),
+        (LINUX, "apple", BOTH, "there are no packages for Apple Silicon here, but for CPU, NVIDIA"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_a_sentence(machine, wish, available, said):
+    with pytest.raises(ValueError, match=said):
+        chosen_compute(machine, wish, available)
+
+
+def test_this_machine_is_described_without_starting_anything():
+    assert re.fullmatch(r"[\w ]+(, NVIDIA driver[ \d]*)?, Python 3\.\d+", this_machine().described)
+
+
+def test_the_environment_goes_to_a_short_folder_only_where_windows_needs_it():
+    own = Path("C:/Users/Administrator/AppData/Roaming/Blender Foundation/Blender/5.0/extensions/.user/user_default")
+    local = Path("C:/Users/Administrator/AppData/Local")
+    assert short_root(own, None, "50") == own
+    assert short_root(Path("D:/b"), local, "50") == Path("D:/b")
+    short = short_root(own, local, "50")
+    assert short == local / "primdiffusion" / "50"
+    assert len(f"{short}/env/Lib/site-packages/") + LONGEST_INSIDE <= WINDOWS_LONGEST
+
+
+@pytest.mark.parametrize("python", [(3, 11), (3, 13)])
+@pytest.mark.parametrize(
+    ("platform", "computes"), [("linux_x86_64", BOTH), ("windows_x86_64", ("cpu",)), ("macos_arm64", ("apple",))]
+)
+def test_every_platform_has_locks_of_the_projects_own_pins(platform, computes, python):
+    locks = locks_for(LOCKS, platform, python)
+    assert set(computes) <= set(locks)
+    pins = dict(
+        line.split("==")
+        for line in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+        if "==" in line
+    )
+    for path in locks.values():
+        lock = read_lock(path)
+        versions = {package.name: package.version.split("+")[0] for package in lock.packages}
+        assert {name: versions[name] for name in pins} == pins
+        assert "numpy" in versions
+        assert lock.download_bytes > 150e6
+        assert lock.installed_bytes > lock.download_bytes
+        assert all(package.bytes for package in lock.packages)
+        assert bool(lock.indexes) == any("+" in package.version for package in lock.packages)
+
+
+def test_cpu_locks_hold_no_cuda_packages():
+    for path in LOCKS.glob("*-cpu.txt"):
+        assert not [package.name for package in read_lock(path).packages if package.name.startswith(("nvidia", "cuda"))]
+
+
+def test_groups_keep_the_order_and_end_when_they_are_large_enough():
+    packages = read_lock(LOCKS / "linux_x86_64-py311-cpu.txt").packages
+    groups = grouped(packages, 20_000_000)
+    assert sum(groups, ()) == packages
+    assert all(sum(package.bytes for package in group) >= 20e6 for group in groups[:-1])
+    assert all(sum(package.bytes for package in group[:-1]) < 20e6 for group in groups)
