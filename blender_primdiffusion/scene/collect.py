@@ -9,6 +9,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from .human import people_files, volume_path
+from .merged import sequence_files
 from .shape_file import body_files
 from .volumes import humans_folder
 
@@ -26,7 +27,7 @@ def collect_temporary_volumes(blend_path: str) -> int:
         source = volume_path(volume)
         if source.is_relative_to(temporary) and source.is_file():
             moved[volume] = target / source.relative_to(temporary)
-    sources = {volume_path(volume) for volume in moved}
+    sources = {path for volume in moved for path in sequence_files(volume)}
     folders = {path.parent for path in sources}
     places = [(folders, people_files()), ({folder.parent for folder in folders}, body_files())]
     for near, names in places:

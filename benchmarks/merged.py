@@ -1,0 +1,190 @@
+"""A person in Cycles as 1024 volumes and as one, beside the engine's exact picture; and the two ways of attachment.
+
+`python benchmarks/merged.py --json merged.json --pictures DIR` poses the default checkpoint's person 7 and renders
+512 x 512 pixels, one sample each. merged_speedup is the time of a Cycles picture of 1024 volumes through that of the
+merged one. PSNRs are of 8-bit pictures over grey. Frame times are of `frame_set` with 1024 volumes, the median;
+surface_error is against the backend's own frames on the surface as it poses it. `--no-volumes` leaves out the slow one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_benchmark_"))
+
+import bpy
+import numpy as np
+import psutil
+import torch
+from primdiffusion.body.model import BodyPose
+from primdiffusion.human import body_of, generate, pose_body
+from primdiffusion.human_file import export_for_blender, load_human, save_human
+from primdiffusion.primitives.anchors import attach
+from primdiffusion.render.gain import DEFAULT_GAIN
+from primdiffusion.serve.draw_params import PersonParams
+from primdiffusion.serve.merge_params import FitGainParams, MergeParams
+from primdiffusion.serve.merging import fit_gain_of, merge_people
+from primdiffusion.training.checkpoint import load_checkpoint
+from record import tell
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import blender_primdiffusion
+from blender_primdiffusion.scene import merged as merging
+from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.attachment import set_attachment
+from blender_primdiffusion.scene.gain import set_density_gain
+from blender_primdiffusion.scene.human import armature_of, build_human
+from blender_primdiffusion.scene.keyframes import keyframe_poses
+from blender_primdiffusion.scene.memory import person_memory
+from blender_primdiffusion.scene.preview import setup_cycles_preview
+
+SEED, STEPS, SIZE, GREY = 7, 30, 512, 0.48
+FRAMES = 10
+Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+
+
+def strong_poses(count: int) -> np.ndarray:
+    """Rotations [count, 24, 3, 3] of 25 degrees and more a joint."""
+    turns = torch.randn(count, 72, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 0.45
+    return BodyPose.from_axis_angle(turns).joint_rotation.numpy()
+
+
+def stepping() -> np.ndarray:
+    """A pose to look at [24, 3, 3]: a step, with bent arms."""
+    turns = torch.zeros(24, 3, dtype=torch.float64)
+    turns[1, 0], turns[2, 0], turns[5, 0] = -0.5, 0.35, 0.6
+    turns[16, 2], turns[17, 2], turns[18, 1], turns[19, 1] = -0.9, 0.8, -0.9, 0.5
+    return BodyPose.from_axis_angle(turns.flatten()).joint_rotation.numpy()
+
+
+def frame_ms() -> float:
+    """Median milliseconds of frame_set over the keyed frames, after one round."""
+    times = []
+    for number in [*range(1, FRAMES + 1)] * 3:
+        began = time.perf_counter()
+        bpy.context.scene.frame_set(number)
+        times.append(time.perf_counter() - began)
+    return 1e3 * float(np.median(times[FRAMES:]))
+
+
+def surface_error(human, armature, rotations: np.ndarray) -> tuple[float, float]:
+    """Largest distance (mm) and angle (degrees) of the drawn instances from the backend's frames, over all frames."""
+    body, anchors = body_of(human)
+    distance = angle = 0.0
+    for number, rotation in enumerate(rotations, 1):
+        bpy.context.scene.frame_set(number)
+        pose = BodyPose(torch.from_numpy(rotation).float(), torch.zeros(3))
+        frames = attach(anchors, pose_body(human.betas, pose).vertices, body.faces)
+        graph = bpy.context.evaluated_depsgraph_get()
+        found = {i.object.original.name: np.array(i.matrix_world) for i in graph.object_instances if i.is_instance}
+        matrices = np.array([found[name] for name in sorted(found)])
+        world = np.array(armature.matrix_world)
+        expected = frames.position.double().numpy() @ Z_UP.T @ world[:3, :3].T + world[:3, 3]
+        distance = max(distance, 1e3 * float(np.linalg.norm(matrices[:, :3, 3] - expected, axis=-1).max()))
+        apart = np.linalg.norm(
+            matrices[:, :3, :3] - world[:3, :3] @ Z_UP @ frames.rotation.double().numpy(), axis=(1, 2)
+        )
+        angle = max(angle, float(np.degrees(2 * np.arcsin(np.minimum(apart / np.sqrt(8), 1))).max()))
+    return distance, angle
+
+
+def rendered(path: Path) -> tuple[np.ndarray, float]:
+    """The scene's picture [H, W, 3] in 0 ... 1 as its PNG holds it, and the seconds it took."""
+    bpy.context.scene.render.filepath = str(path)
+    began = time.perf_counter()
+    bpy.ops.render.render(write_still=True)
+    seconds = time.perf_counter() - began
+    image = bpy.data.images.load(str(path))
+    pixels = np.array(image.pixels[:], np.float32).reshape(SIZE, SIZE, 4)[..., :3]
+    bpy.data.images.remove(image)
+    return pixels, seconds
+
+
+def psnr(one: np.ndarray, other: np.ndarray) -> float:
+    """Decibels."""
+    return float(-10 * np.log10(((one.astype(np.float64) - other) ** 2).mean()))
+
+
+def main() -> None:
+    """Measures, prints and, if asked, writes the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--pictures", type=Path, required=True, help="folder for the PNGs")
+    parser.add_argument("--person", type=Path, help="a .human.safetensors; otherwise one is generated")
+    parser.add_argument(
+        "--no-volumes", action="store_true", help="without the picture of 1024 volumes, which takes minutes"
+    )
+    arguments = parser.parse_args()
+    human = load_human(arguments.person) if arguments.person else generate(load_checkpoint(None), SEED, STEPS)
+    folder = arguments.pictures
+    folder.mkdir(parents=True, exist_ok=True)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder.resolve() / "shot.blend"))
+    blender_primdiffusion.register()
+    save_human(folder / "person.human.safetensors", human)
+    export_for_blender(folder / "human.npz", human)
+    figures: dict[str, float | int | str | None] = {"size": SIZE, "samples": 1}
+    before = psutil.Process().memory_info().rss
+    began = time.perf_counter()
+    person = build_human(bpy.context, folder / "human.npz", keep=[folder / "person.human.safetensors"])
+    figures["build_seconds"] = time.perf_counter() - began
+    bpy.context.view_layer.update()
+    figures["seconds_first_evaluation"] = time.perf_counter() - began - figures["build_seconds"]
+    armature = armature_of(person)
+    strong = strong_poses(FRAMES)
+    keyframe_poses(armature, np.arange(1, FRAMES + 1), strong, np.zeros((FRAMES, 3)))
+    figures["frame_ms"] = frame_ms()
+    figures["ram_per_human_mb"] = (psutil.Process().memory_info().rss - before) / 1e6
+    memory = person_memory(person)
+    figures |= {"files_mb": memory.files / 1e6, "grids_mb": memory.grids / 1e6}
+    set_attachment(person, "SURFACE")
+    figures["surface_frame_ms"] = frame_ms()
+    figures["surface_error_mm_max"], figures["surface_error_deg_max"] = surface_error(human, armature, strong)
+
+    armature.animation_data_clear()
+    pose_from_joint_rotations(armature, stepping())
+    joints = pose_body(human.betas, BodyPose(torch.from_numpy(stepping()).float(), torch.zeros(3))).skinning
+    params = PersonParams(str(folder / "person.human.safetensors"), torch.eye(3, 4).tolist(), joints[:, :3].tolist())
+    began = time.perf_counter()
+    merge_people(MergeParams([params], str(folder / "grid.npz")), lambda *_, **__: None)
+    figures["seconds_merge"] = time.perf_counter() - began
+    grid = merging.read_grid(folder / "grid.npz")
+    began = time.perf_counter()
+    digest = merging.write_grid(grid, folder / "grid.vdb")
+    files = merging.publish([folder / "grid.vdb"], [digest], merging.merged_folder(person))
+    figures |= {"seconds_write_merged": time.perf_counter() - began, "merged_mb": files[0].stat().st_size / 1e6}
+    merging.show_merged(person, files, merging.MergedState(("",), grid.voxel))
+    fit = fit_gain_of(FitGainParams([params]), lambda *_, **__: None)
+    figures |= {f"gain_{name}": fit[name] for name in ("gain", "error", "error_before")}
+
+    setup_cycles_preview(bpy.context.scene, size=SIZE, samples=1, yaw=0.5, world=GREY)
+    pictures = {}
+    for gain in (DEFAULT_GAIN, fit["gain"]):
+        set_density_gain(person, gain)
+        set_attachment(person, "MERGED")
+        pictures[f"merged_{gain}"], figures["seconds_cycles_merged"] = rendered(folder / f"merged_{gain}.png")
+    bpy.context.scene.render.engine = "PRIMDIFFUSION"
+    bpy.context.scene.render.dither_intensity = 0
+    rendered(folder / "exact.png")  # the child starts
+    exact, figures["seconds_exact"] = rendered(folder / "exact.png")
+    bpy.context.scene.render.engine = "CYCLES"
+    for name, picture in pictures.items():
+        figures[f"psnr_{name}_exact"] = psnr(picture, exact)
+    tell(figures, arguments.json)
+    if not arguments.no_volumes:
+        set_attachment(person, "SURFACE")
+        volumes, figures["seconds_cycles_volumes"] = rendered(folder / "volumes.png")
+        figures["merged_speedup"] = figures["seconds_cycles_volumes"] / figures["seconds_cycles_merged"]
+        figures["psnr_volumes_exact"] = psnr(volumes, exact)
+        figures["psnr_merged_volumes"] = psnr(pictures[f"merged_{fit['gain']}"], volumes)
+    blender_primdiffusion.unregister()
+    tell(figures, arguments.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,49 @@
+"""How a person's volumes follow the body: by the armature, on the posed surface, or merged into one grid."""
+
+from __future__ import annotations
+
+import bpy
+
+from .edited import check_editable
+from .merged import merged_of
+from .surface import build_surface, carrier_of, primitives_of
+
+ATTACHMENT = "primdiffusion_attachment"
+"""Custom property of a person's collection: one of MODES; ARMATURE where it is missing."""
+MODES = ("ARMATURE", "SURFACE", "MERGED")
+_BEFORE = "primdiffusion_attachment_before_merge"
+
+
+def attachment_of(collection: bpy.types.Collection) -> str:
+    """The person's mode."""
+    mode = str(collection.get(ATTACHMENT, MODES[0]))
+    return mode if mode in MODES else MODES[0]
+
+
+def set_attachment(collection: bpy.types.Collection, mode: str) -> None:
+    """Show the person in another mode. Files stay as they are; undo and redo go back and forth.
+
+    ARMATURE: each volume is an object whose frame is blended by linear blend skinning. SURFACE: instances of these
+    volumes on the posed surface's tangent planes, as the paper and the engine place them. MERGED: one volume, made by
+    `merged.show_merged` in one pose. Raises ValueError or FileNotFoundError, with what to do, before anything changes;
+    makes no undo step, its caller does.
+    """
+    if mode not in MODES:
+        raise ValueError(f"there is no attachment {mode!r}: choose from {', '.join(MODES)}")
+    check_editable(collection)
+    primitives, merged = primitives_of(collection), merged_of(collection)
+    if mode == "MERGED" and merged is None:
+        raise ValueError(f"{collection.name!r} has no merged volume yet: press Merge")
+    carrier = build_surface(collection) if mode == "SURFACE" else carrier_of(collection)
+    if mode == "MERGED" and attachment_of(collection) != "MERGED":
+        collection[_BEFORE] = attachment_of(collection)
+    collection[ATTACHMENT] = mode
+    for part, shown in ((primitives, "ARMATURE"), (carrier, "SURFACE"), (merged, "MERGED")):
+        if part is not None:
+            part.hide_viewport = part.hide_render = mode != shown
+
+
+def attachment_before_merge(collection: bpy.types.Collection) -> str:
+    """The mode to go back to when a merge is undone."""
+    mode = str(collection.get(_BEFORE, MODES[0]))
+    return mode if mode in MODES[:2] else MODES[0]

@@ -1,0 +1,125 @@
+"""Attachment to the surface: volumes on the tangent planes of the posed body, anew for every pose (paper sec. 3.1).
+
+An object without faces, the carrier, holds the sums that make centres and axes out of the body's vertices; a node group
+evaluates them on the skinned body and puts an instance of each volume there.
+"""
+
+from __future__ import annotations
+
+import re
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from .body_mesh import body_of
+from .human import armature_of
+from .shape import shape_model_of, volumes_of
+from .shape_model import ShapeModel
+from .surface_nodes import BODY, FIRST, PICK, PRIMITIVE, VERTEX, VOLUMES, WEIGHTS, surface_group
+
+MARK = "primdiffusion_surface"
+"""Custom property of a carrier."""
+_NOBODY = -1
+
+
+def carrier_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
+    """The person's carrier; None before they were first attached to their surface."""
+    return next((thing for thing in collection.all_objects if MARK in thing), None)
+
+
+def primitives_of(collection: bpy.types.Collection) -> bpy.types.Collection:
+    """The collection of the person's volumes. Raises ValueError where they lie in none of their own."""
+    volumes = {thing for objects in volumes_of(collection).values() for thing in objects}
+    children = collection.children_recursive
+    held = [sum(thing in volumes for thing in child.objects) for child in children]
+    if not any(held):
+        raise ValueError(
+            f"the volumes of {collection.name!r} lie in no collection of their own: move them into a new one inside "
+            f"{collection.name!r}"
+        )
+    return children[int(np.argmax(held))]
+
+
+def build_surface(collection: bpy.types.Collection) -> bpy.types.Object:
+    """The person's carrier, made or brought up to date; hides nothing (see `attachment`).
+
+    Raises ValueError for a person of an earlier version, or whose body mesh was deleted or changed, and
+    FileNotFoundError where the body's file is missing.
+    """
+    model, body, primitives = shape_model_of(collection), body_of(collection), primitives_of(collection)
+    if body is None or len(body.data.vertices) != len(model.template):
+        state = "was deleted" if body is None else "has other vertices now"
+        raise ValueError(
+            f"the body mesh of {collection.name!r} {state}: undo that, or generate the person again, to attach volumes "
+            "to its surface"
+        )
+    carrier = carrier_of(collection)
+    mesh = carrier_mesh(f"{collection.name}_surface", model, picks(collection, primitives, len(model.face)))
+    if carrier is None:
+        carrier = bpy.data.objects.new(mesh.name, mesh)
+        carrier[MARK] = True
+        carrier.parent = armature_of(collection)
+        collection.objects.link(carrier)
+    else:
+        former, carrier.data = carrier.data, mesh
+        if former.users == 0:
+            bpy.data.meshes.remove(former)
+    modifier = carrier.modifiers.get("Surface") or carrier.modifiers.new("Surface", "NODES")
+    modifier.node_group = surface_group()
+    sockets = {
+        item.name: item.identifier for item in modifier.node_group.interface.items_tree if item.in_out == "INPUT"
+    }
+    modifier[sockets[BODY]], modifier[sockets[VOLUMES]] = body, primitives
+    return carrier
+
+
+def picks(collection: bpy.types.Collection, primitives: bpy.types.Collection, count: int) -> NDArray[np.int32]:
+    """Which of the collection's children, in the node's order, shows each primitive [count]; -1 where it was deleted.
+
+    The node sorts objects and collections together, by name, as `_natural` does.
+    """
+    children = sorted([*primitives.objects, *primitives.children], key=lambda child: _natural(child.name))
+    rank = {child: number for number, child in enumerate(children)}
+    found = np.full(count, _NOBODY, np.int32)
+    for k, objects in volumes_of(collection).items():
+        here = [rank[thing] for thing in objects if thing in rank]
+        if here and k < count:
+            found[k] = min(here)
+    return found
+
+
+def carrier_mesh(name: str, model: ShapeModel, pick: NDArray) -> bpy.types.Mesh:
+    """A vertex for each vertex of the body that a primitive's centre or tangent plane is a sum of, with its weights."""
+    count, width = model.stencil_vertex.shape
+    vertex = np.concatenate([model.faces[model.face], model.stencil_vertex], 1)
+    none, nowhere = np.zeros((count, 3)), np.zeros((count, width))
+    weights = (
+        np.concatenate([model.barycentric, nowhere], 1),
+        np.concatenate([none, model.stencil_du], 1),
+        np.concatenate([none, model.stencil_dv], 1),
+    )
+    used = np.any([weight != 0 for weight in weights], 0)
+    used[:, 0] = True  # the point that becomes the instance
+    primitive = np.broadcast_to(np.arange(count)[:, None], used.shape)[used]
+    first = np.concatenate([[True], primitive[1:] != primitive[:-1]]) & (pick[primitive] != _NOBODY)
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(len(primitive))
+    for attribute, kind, values in (
+        (VERTEX, "INT", vertex[used].astype(np.int32)),
+        (PRIMITIVE, "INT", primitive.astype(np.int32)),
+        (PICK, "INT", np.maximum(pick, 0)[primitive].astype(np.int32)),
+        (FIRST, "BOOLEAN", first),
+        *(
+            (weight_name, "FLOAT", values[used].astype(np.float32))
+            for weight_name, values in zip(WEIGHTS, weights, strict=True)
+        ),
+    ):
+        mesh.attributes.new(attribute, kind, "POINT").data.foreach_set("value", values)
+    return mesh
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Names as Blender sorts them: numbers in them by value, letters whatever their case."""
+    parts = re.findall(r"\d+|\D", name.lower())
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]

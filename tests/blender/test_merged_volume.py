@@ -1,0 +1,219 @@
+"""A person as one volume: what the files hold, what is shown, names, stale poses, material."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+import synthetic
+
+from blender_primdiffusion.scene.attachment import attachment_before_merge, attachment_of, set_attachment
+from blender_primdiffusion.scene.collect import collect_before_saving
+from blender_primdiffusion.scene.gain import density_gain, person_material, set_density_gain
+from blender_primdiffusion.scene.human import build_human, folder_of, volume_path
+from blender_primdiffusion.scene.material import DENSITY_GAIN, volume_material
+from blender_primdiffusion.scene.memory import person_memory
+from blender_primdiffusion.scene.merged import (
+    Grid,
+    MergedState,
+    index_to_local,
+    merged_folder,
+    merged_of,
+    merged_state,
+    pose_digest,
+    publish,
+    read_grid,
+    remove_merged,
+    sequence_files,
+    show_merged,
+    write_grid,
+)
+from blender_primdiffusion.scene.volumes import VolumeWriteError
+
+bpy.utils.expose_bundled_modules()
+import openvdb  # noqa: E402
+
+
+def grid(seed: int = 0) -> Grid:
+    rng = np.random.default_rng(seed)
+    density = np.zeros((20, 12, 9), np.float16)
+    density[3:15, 2:10, 2:7] = rng.uniform(1, 90, (12, 8, 5))
+    colour = np.zeros((20, 12, 9, 3), np.float16)
+    colour[2:16, 1:11, 1:8] = rng.uniform(0.1, 1, (14, 10, 7, 3))
+    return Grid(density, colour, np.array([-0.3, 0.2, 0.6]), 0.02)
+
+
+@pytest.fixture
+def person(saved_scene, tmp_path):
+    return build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 6))
+
+
+def merge(person, tmp_path, seeds=(0,), start=0) -> bpy.types.Object:
+    written = [tmp_path / f"grid_{seed}.vdb" for seed in seeds]
+    digests = [write_grid(grid(seed), path) for seed, path in zip(seeds, written, strict=True)]
+    files = publish(written, digests, merged_folder(person))
+    return show_merged(person, files, MergedState(tuple(f"pose {seed}" for seed in seeds), 0.02, start))
+
+
+def visible_volumes() -> set[str]:
+    bpy.context.view_layer.update()
+    graph = bpy.context.evaluated_depsgraph_get()
+    return {i.object.original.name for i in graph.object_instances if i.object.type == "VOLUME" and i.show_self}
+
+
+def test_openvdb_reads_back_what_was_merged(tmp_path):
+    merged = grid()
+    origin = merged.origin
+    write_grid(merged, tmp_path / "m.vdb")
+    for name, values in (("density", merged.density), ("Cd", merged.colour)):
+        read = openvdb.read(str(tmp_path / "m.vdb"), name)
+        found = np.zeros(values.shape, np.float32)
+        read.copyToArray(found)
+        np.testing.assert_array_equal(found, values.astype(np.float32))
+        assert read.saveFloatAsHalf
+        shift = 0.01 if bpy.app.version < (5, 0) else 0.0
+        np.testing.assert_allclose(np.add(read.transform.indexToWorld((0, 0, 0)), shift), origin, atol=1e-7)
+        np.testing.assert_allclose(
+            np.add(read.transform.indexToWorld((1, 2, 3)), shift), origin + np.array([0.02, 0.04, 0.06])
+        )
+    box = openvdb.read(str(tmp_path / "m.vdb"), "density").evalActiveVoxelBoundingBox()
+    assert box == ((3, 2, 2), (14, 9, 6))  # what is empty is not stored
+
+
+def test_blender_before_5_gets_the_grid_half_a_voxel_lower():
+    shift = index_to_local(grid(), (5, 0, 1))[3, :3] - index_to_local(grid(), (4, 5, 15))[3, :3]
+    np.testing.assert_allclose(shift, 0.01)
+
+
+def test_a_merged_person_is_one_volume_and_goes_back(person, tmp_path):
+    merged = merge(person, tmp_path)
+    set_attachment(person, "MERGED")
+    assert visible_volumes() == {merged.name}
+    assert merged.data.materials[0] == volume_material()
+    assert merged.data.filepath.startswith("//shot_humans/Human/merged_")
+    assert merged.data.grids.load(), merged.data.grids.error_message
+    assert {one.name for one in merged.data.grids} == {"density", "Cd"}
+    back = attachment_before_merge(person)
+    set_attachment(person, back)
+    remove_merged(person)
+    assert (back, attachment_of(person), merged_of(person)) == ("ARMATURE", "ARMATURE", None)
+    assert len(visible_volumes()) == 6
+
+
+def test_a_merged_person_moves_with_the_armature_object(person, tmp_path):
+    merged = merge(person, tmp_path)
+    armature = merged.parent
+    armature.location, armature.rotation_euler = (1, 2, 3), (0.1, 0.2, 0.3)
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(np.array(merged.matrix_world), np.array(armature.matrix_world), atol=1e-6)
+
+
+def test_another_grid_has_another_name_and_the_same_one_the_same(person, tmp_path):
+    first = volume_path(merge(person, tmp_path).data)
+    assert volume_path(merge(person, tmp_path).data) == first
+    other = volume_path(merge(person, tmp_path, (1,)).data)
+    assert other != first
+    assert first.is_file()  # undo goes back to it
+
+
+def test_a_sequence_shows_the_grid_of_its_frame(person, tmp_path):
+    merged = merge(person, tmp_path, (0, 1, 2), start=10)
+    volume = merged.data
+    assert volume.is_sequence
+    assert [path.name[-9:] for path in sequence_files(volume)] == ["_0001.vdb", "_0002.vdb", "_0003.vdb"]
+    scene = bpy.context.scene
+    for frame, shown in ((10, 0), (11, 1), (12, 2), (20, 2), (3, 0)):
+        scene.frame_set(frame)
+        evaluated = merged.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+        evaluated.grids.load()
+        assert evaluated.grids.frame_filepath.endswith(f"_{shown + 1:04d}.vdb"), frame
+
+
+def test_a_merge_knows_the_pose_it_shows(person):
+    rng = np.random.default_rng(0)
+    joints = rng.normal(size=(24, 3, 4)).astype(np.float32)
+    digest = pose_digest(person, joints, None)
+    assert pose_digest(person, joints.astype(np.float32).tolist(), None) == digest
+    assert pose_digest(person, joints + 1e-3, None) != digest
+    assert pose_digest(person, joints, [0.5] * 10) != digest
+    single, several = MergedState((digest,), 0.006), MergedState(("a", digest), 0.006, 5)
+    assert single.shows(digest, 77)
+    assert not single.shows("a", 77)
+    assert [several.shows(digest, frame) for frame in (4, 5, 6, 7)] == [False, False, True, True]
+
+
+def test_the_state_survives_on_the_object(person, tmp_path):
+    merged = merge(person, tmp_path, (0, 1), start=3)
+    assert merged_state(merged) == MergedState(("pose 0", "pose 1"), 0.02, 3)
+
+
+def test_a_sequence_made_before_the_first_save_is_collected_whole(empty_scene, tmp_path):
+    person = build_human(empty_scene, synthetic.write(tmp_path / "human.npz", 3))
+    volume = merge(person, tmp_path, (0, 1, 2)).data
+    (tmp_path / "new").mkdir()
+    collect_before_saving(str(tmp_path / "new" / "shot.blend"))
+    assert [path.parent for path in sequence_files(volume)] == [tmp_path / "new" / "shot_humans" / "Human"] * 3
+
+
+def test_a_folder_that_cannot_be_written_leaves_nothing(person, tmp_path):
+    digest = write_grid(grid(), tmp_path / "grid.vdb")
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(VolumeWriteError, match="write permission"):
+        publish([tmp_path / "grid.vdb"], [digest], tmp_path / "file" / "folder")
+    with pytest.raises(VolumeWriteError, match="save the"):
+        publish([tmp_path / "grid.vdb", tmp_path / "missing.vdb"], [digest, "x"], tmp_path / "new")
+    assert not list((tmp_path / "new").iterdir())
+
+
+@pytest.mark.parametrize("content", [b"PK\x03\x04 no more", b""])
+def test_a_damaged_grid_is_refused_with_what_to_do(tmp_path, content):
+    (tmp_path / "grid.npz").write_bytes(content)
+    with pytest.raises(ValueError, match=r"damaged.*merge again"):
+        read_grid(tmp_path / "grid.npz")
+
+
+def test_a_grid_is_read_as_the_child_wrote_it(tmp_path):
+    merged = grid()
+    np.savez(tmp_path / "grid.npz", **vars(merged))
+    read = read_grid(tmp_path / "grid.npz")
+    np.testing.assert_array_equal(read.density, merged.density)
+    assert read.voxel == 0.02
+
+
+def test_a_gain_of_one_s_own_is_a_material_of_one_s_own(person, tmp_path):
+    other = build_human(bpy.context, synthetic.write(tmp_path / "second.npz", 3, seed=1), "Second")
+    merged = merge(person, tmp_path)
+    set_density_gain(person, 1.6)
+    assert density_gain(person) == pytest.approx(1.6)
+    assert density_gain(other) == pytest.approx(DENSITY_GAIN)
+    assert merged.data.materials[0] == person_material(person) != volume_material()
+    set_density_gain(person, 1.8)
+    assert len(bpy.data.materials) == 2
+    set_density_gain(person, DENSITY_GAIN)
+    assert person_material(person) == volume_material()
+
+
+def test_a_material_without_the_factor_is_refused(person):
+    other = bpy.data.materials.new("Smoke")
+    for thing in person.all_objects:
+        if thing.type == "VOLUME":
+            thing.data.materials[0] = other
+    assert density_gain(person) is None
+    with pytest.raises(ValueError, match=r"Smoke.*Density Gain"):
+        set_density_gain(person, 1.5)
+
+
+def test_memory_is_what_openvdb_says_of_the_loaded_grids(person):
+    files = sorted(folder_of(person).glob("prim_*.vdb"))
+    memory = person_memory(person)
+    assert memory.files == sum(path.stat().st_size for path in files)
+    assert memory.grids == sum(one.memUsage() for path in files for one in openvdb.readAll(str(path))[0])
+
+
+def test_missing_files_take_no_memory(person):
+    for path in folder_of(person).glob("prim_*.vdb"):
+        path.rename(path.with_suffix(".gone"))
+    from blender_primdiffusion.scene import memory
+
+    memory._of.cache_clear()
+    assert person_memory(person).files == 0
