@@ -22,6 +22,7 @@ import tyro
 
 from primdiffusion import __version__
 from primdiffusion.drawing.steps import check_step
+from primdiffusion.export_command import Export
 from primdiffusion.failures import describe
 from primdiffusion.generate_command import Generate
 from primdiffusion.machine import share_processors
@@ -214,6 +215,7 @@ Command = (
     | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
     | Annotated[Refine, tyro.conf.subcommand("refine")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[People, tyro.conf.subcommand("people")]
     | Annotated[Payloads, tyro.conf.subcommand("payloads")]
@@ -320,7 +322,7 @@ def run(arguments: Sequence[str]) -> None:
         FORWARDED[arguments[0]](arguments[1:])
         return
     command = tyro.cli(Command, args=arguments or ["--help"], prog="primdiffusion", description=DESCRIPTION)
-    assert isinstance(command, Generate | Render | Info), "the others are forwarded"
+    assert isinstance(command, Generate | Render | Export | Info), "the others are forwarded"
     command.run()
 
 

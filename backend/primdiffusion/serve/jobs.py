@@ -18,10 +18,12 @@ from primdiffusion.person_folder import FILES, write_person
 from primdiffusion.pose_file import pose_from_numbers, read_pose
 from primdiffusion.render.image import depth_to_png, to_png
 from primdiffusion.render.march import march
+from primdiffusion.serve import exporting
 from primdiffusion.serve.draw_params import DrawParams
 from primdiffusion.serve.drawing import FrameDrawer
 from primdiffusion.serve.edit_params import InpaintParams, InterpolateParams, TransferParams, VaryParams
 from primdiffusion.serve.editing import Editor
+from primdiffusion.serve.export_params import GaussiansParams, HumanNpzParams, ProxyParams
 from primdiffusion.serve.merge_params import FitGainParams, MergeFramesParams, MergeParams
 from primdiffusion.serve.merging import fit_gain_of, merge_frames, merge_people
 from primdiffusion.serve.params import AttributesParams, GenerateParams, ReconstructParams, RenderParams
@@ -157,6 +159,18 @@ class Jobs:
     def fit_gain(self, params: FitGainParams, report: Report) -> dict[str, Any]:
         """Fits the density gain of exponential renderers (see `fit_gain_of`). Needs no checkpoint."""
         return fit_gain_of(params, report)
+
+    def proxy(self, params: ProxyParams, report: Report) -> dict[str, Any]:
+        """Makes a textured mesh of a person (see `serve.exporting`, also for the next two). Needs no checkpoint."""
+        return exporting.proxy(params, report)
+
+    def gaussians(self, params: GaussiansParams, report: Report) -> dict[str, Any]:
+        """Writes a person as 3D Gaussians."""
+        return exporting.gaussians(params, report)
+
+    def human_npz(self, params: HumanNpzParams, report: Report) -> dict[str, Any]:
+        """Writes the files of generate for a person who exists."""
+        return exporting.human_npz(params, report)
 
     def _model(self, checkpoint: str | None) -> DiffusionModel:
         if self._loaded is None or self._loaded[0] != checkpoint:

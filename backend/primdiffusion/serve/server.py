@@ -26,6 +26,7 @@ from primdiffusion.failures import Failure, describe
 from primdiffusion.machine import memory, share_processors
 from primdiffusion.serve.draw_params import DrawParams
 from primdiffusion.serve.edit_params import InpaintParams, InterpolateParams, TransferParams, VaryParams
+from primdiffusion.serve.export_params import GaussiansParams, HumanNpzParams, ProxyParams
 from primdiffusion.serve.merge_params import FitGainParams, MergeFramesParams, MergeParams
 from primdiffusion.serve.params import AttributesParams, GenerateParams, ReconstructParams, RenderParams
 from primdiffusion.serve.rpc import (
@@ -61,6 +62,9 @@ JOBS = {
     "merge": MergeParams,
     "merge_frames": MergeFramesParams,
     "fit_gain": FitGainParams,
+    "proxy": ProxyParams,
+    "gaussians": GaussiansParams,
+    "human_npz": HumanNpzParams,
 }
 """Methods of `Jobs`, which run on the main thread one at a time, and their parameters."""
 GRACE_S = 3.0

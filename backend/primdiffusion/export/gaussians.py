@@ -1,0 +1,105 @@
+"""A person as 3D Gaussians (Kerbl et al. 2023), one for every voxel that can be seen, for viewers of such files."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from primdiffusion.export.field import pack_field
+from primdiffusion.export.surface import depth_below
+from primdiffusion.geometry.records import TensorRecord
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render.lattice import WINDOW_POWER, WINDOW_SHARPNESS
+
+WIDTH = 1 / 6**0.5
+"""Standard deviation of a voxel's trilinear kernel, in voxel spacings: the Gaussian has the kernel's own variance."""
+GAIN = 1.2
+"""How much more optical depth Gaussians get than voxels have opacity: theirs multiplies up as 1 - product(1 - a), the
+marcher's adds up until it is 1 and so hides sooner."""
+DEFAULT_LIMIT = 400_000
+"""Gaussians of a person at most."""
+DEEPEST = 0.025
+"""How far below the surface a voxel is still drawn, metres: what lies deeper nobody sees."""
+FAINTEST = 1 / 255
+"""Opacity below which viewers skip a Gaussian anyway."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Gaussians(TensorRecord):
+    """Splats in the world."""
+
+    position: Float[Tensor, "n 3"]
+    """Metres."""
+    rotation: Float[Tensor, "n 4"]
+    """Unit quaternions w, x, y, z, local to world."""
+    scale: Float[Tensor, "n 3"]
+    """Standard deviations along the local axes, metres."""
+    opacity: Float[Tensor, "n"]
+    """Of a ray through the centre, in (0, 1)."""
+    rgb: Float[Tensor, "n 3"]
+    """Linear, in [0, 1]."""
+
+
+def gaussians_of(primitives: Primitives, limit: int = DEFAULT_LIMIT) -> Gaussians:
+    """The voxels of an unbatched set of boxes as Gaussians, at most `limit`: the most opaque of every box are kept.
+
+    A voxel's opacity is that of a ray along the box's normal through it; matter deeper than DEEPEST is left out. Raises
+    ValueError for a limit below one and where there is nothing to be seen.
+    """
+    if limit < 1:
+        raise ValueError(f"{limit} Gaussians were asked for: choose 1 or more")
+    size = primitives.density.shape[-1]
+    share, centre = (moment.to(primitives.position) for moment in _kernel(size))
+    window = share[:, None, None] * share[:, None] * share
+    spacing = primitives.half_extent * 2 / (size - 1)
+    depth = GAIN * primitives.density * window * spacing[:, 2, None, None, None]
+    opacity = 1 - torch.exp(-depth)
+    box, d, h, w = (opacity >= FAINTEST).nonzero(as_tuple=True)
+    local = torch.stack([centre[w], centre[h], centre[d]], -1) * primitives.half_extent[box]
+    position = primitives.position[box] + (primitives.rotation[box] @ local[..., None])[..., 0]
+    seen = torch.from_numpy(depth_below(pack_field(primitives), position.double().cpu().numpy()) <= DEEPEST)
+    kept = opacity[box, d, h, w].clamp_max(0.995)
+    chosen = seen.to(kept.device).nonzero()[:, 0]
+    if len(chosen) > limit:
+        chosen = chosen[_rank_in_box(box[chosen], kept[chosen]).argsort(stable=True)[:limit]]
+    if not len(chosen):
+        raise ValueError("nothing of this person is dense enough to be seen: generate them again")
+    box, d, h, w = (index[chosen] for index in (box, d, h, w))
+    return Gaussians(
+        position=position[chosen],
+        rotation=_quaternions(primitives.rotation)[box],
+        scale=spacing[box] * WIDTH,
+        opacity=kept[chosen],
+        rgb=primitives.rgb.movedim(1, -1)[box, d, h, w].clamp(0, 1),
+    )
+
+
+def _rank_in_box(box: Int[Tensor, "n"], opacity: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
+    """How many of the same box are more opaque; so that a limit thins hands and torso alike."""
+    falling = opacity.argsort(descending=True, stable=True)
+    order = falling[box[falling].argsort(stable=True)]
+    count = torch.bincount(box)
+    rank = torch.empty_like(box)
+    rank[order] = torch.arange(len(box), device=box.device) - (count.cumsum(0) - count)[box[order]]
+    return rank
+
+
+def _kernel(size: int) -> tuple[Float[Tensor, "s"], Float[Tensor, "s"]]:
+    """For each voxel along an axis: the share of its linear kernel that the window leaves, and the centre of that."""
+    place = torch.linspace(-1, 1, 4001, dtype=torch.float64)
+    spacing = 2 / (size - 1)
+    voxel = torch.linspace(-1, 1, size, dtype=torch.float64)[:, None]
+    left = (1 - (place - voxel).abs() / spacing).clamp_min(0) * torch.exp(-WINDOW_SHARPNESS * place.pow(WINDOW_POWER))
+    mass = left.sum(1)
+    return mass * (2 / 4000) / spacing, (left * place).sum(1) / mass
+
+
+def _quaternions(rotation: Float[Tensor, "k 3 3"]) -> Float[Tensor, "k 4"]:
+    """w, x, y, z."""
+    from scipy.spatial.transform import Rotation
+
+    turned = Rotation.from_matrix(rotation.detach().cpu().double().numpy()).as_quat()[:, [3, 0, 1, 2]]
+    return torch.from_numpy(turned).to(rotation)

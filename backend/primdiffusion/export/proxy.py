@@ -1,0 +1,173 @@
+"""A clothed person at rest as one textured mesh that 24 joints move: for programs that draw no volumes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int64, UInt8
+from numpy import ndarray as Array
+from torch import Tensor
+
+from primdiffusion.body.model import JOINT_NAMES
+from primdiffusion.export.field import Field, look_along, pack_field, weights_at
+from primdiffusion.export.surface import Surface, outside_surface
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+from primdiffusion.geometry.uv_atlas import rasterise_uv
+from primdiffusion.human import Human, body_of, place
+from primdiffusion.people.gltf import Skeleton
+from primdiffusion.primitives.anchors import anchor_skin_weights
+
+OUTSIDE = 0.008
+"""Where a texel's ray begins: this far outside the surface, metres."""
+INSIDE = 0.024
+"""Where it ends: this far below."""
+STEP = 0.002
+SMOOTHING = 6
+"""How often skin weights are averaged with their neighbours' along the mesh."""
+INFLUENCES = 4
+"""Joints that may move a vertex: what glTF and game engines take."""
+SEAM = 4
+"""Texels between charts."""
+CHART_COST = 8.0
+"""xatlas's largest cost of a chart: its 2 cuts this noisy surface into three times as many."""
+OnStage = Callable[[str, int, int], None]
+"""Told what comes next: a name, how many of the stages are done, and how many there are."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ProxySettings:
+    """How fine the mesh is."""
+
+    spacing: float = 0.006
+    """Of the grid that the surface is found on, metres."""
+    triangles: int = 20_000
+    """At most."""
+    texture_px: int = 2048
+    """Pixels a side of the texture."""
+
+    def __post_init__(self) -> None:
+        if not 0.003 <= self.spacing <= 0.05:
+            raise ValueError(f"a grid of {self.spacing} m was asked for: choose 0.003 to 0.05")
+        if not 500 <= self.triangles <= 1_000_000:
+            raise ValueError(f"{self.triangles} triangles were asked for: choose 500 to 1000000")
+        if not 64 <= self.texture_px <= 8192:
+            raise ValueError(f"a texture of {self.texture_px} pixels a side was asked for: choose 64 to 8192")
+
+
+DEFAULT_PROXY = ProxySettings()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MeshProxy:
+    """The mesh in the T pose of the person's betas; metres, y up, facing z."""
+
+    vertices: Float64[Array, "v 3"]
+    faces: Int64[Array, "f 3"]
+    """Counter-clockwise seen from outside; closed."""
+    corner_uv: Float64[Array, "f 3 2"]
+    """v up."""
+    skin_weights: Float32[Array, "v 24"]
+    """At most INFLUENCES joints a vertex; rows sum to one."""
+    texture: UInt8[Array, "h w 3"]
+    """sRGB, the top row first."""
+    skeleton: Skeleton
+
+    def mesh(self) -> TexturedMesh:
+        """The same as a mesh of one part."""
+        index = np.argsort(-self.skin_weights, axis=1, kind="stable")[:, :INFLUENCES]
+        weight = np.take_along_axis(self.skin_weights, index, 1).astype(np.float64)
+        opaque = np.full((*self.texture.shape[:2], 1), 255, np.uint8)
+        part = TexturedPart(
+            "person",
+            self.vertices,
+            self.faces.astype(np.int32),
+            self.corner_uv,
+            np.concatenate([self.texture, opaque], -1),
+            index,
+            weight / weight.sum(1, keepdims=True),
+        )
+        return TexturedMesh((part,))
+
+
+def mesh_proxy(human: Human, settings: ProxySettings = DEFAULT_PROXY, on_stage: OnStage = lambda *_: None) -> MeshProxy:
+    """The person's outside with colours as the marcher sees them from there.
+
+    An exception that `on_stage` raises ends the work. Raises NoSurface. Takes some ten seconds.
+    """
+    body, anchors = body_of(human)
+    field = pack_field(place(human))
+    on_stage("surface", 0, 3)
+    surface = outside_surface(field, settings.spacing, settings.triangles)
+    weights = skin_weights(field, surface, anchor_skin_weights(anchors, body))
+    on_stage("unwrap", 1, 3)
+    corner_uv = unwrap(surface, settings.texture_px)
+    on_stage("texture", 2, 3)
+    texture = baked(field, surface, corner_uv, settings.texture_px)
+    joints = body.shape(human.betas).joints.detach().double().numpy()
+    skeleton = Skeleton(JOINT_NAMES, body.parents.tolist(), joints)
+    return MeshProxy(surface.vertices, surface.faces, corner_uv, weights, texture, skeleton)
+
+
+def skin_weights(field: Field, surface: Surface, box_weights: Float[Tensor, "k 24"]) -> Float32[Array, "v 24"]:
+    """The boxes' weights at the vertices, smoothed along the mesh, the largest INFLUENCES of them."""
+    from scipy import sparse
+
+    weights = weights_at(field, surface.vertices, box_weights.detach().cpu().numpy())
+    count = len(surface.vertices)
+    edges = np.concatenate([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]], surface.faces[:, [2, 0]]])
+    links = sparse.csr_array((np.ones(len(edges), np.float32), tuple(edges.T)), shape=(count, count))
+    links = ((links + links.T + sparse.eye_array(count)) > 0).astype(np.float32)
+    for _ in range(SMOOTHING):
+        weights = links @ weights
+        weights /= np.maximum(weights.sum(1, keepdims=True), 1e-12)  # rows of zeros take what is around them
+    weights[weights.sum(1) < 0.5, 0] = 1.0
+    largest = np.sort(weights, 1)[:, -INFLUENCES][:, None]
+    weights = np.where(weights >= largest, weights, 0)
+    return (weights / weights.sum(1, keepdims=True)).astype(np.float32)
+
+
+def unwrap(surface: Surface, texture_px: int) -> Float64[Array, "f 3 2"]:
+    """Texture coordinates of every corner, in charts that do not overlap (xatlas)."""
+    import xatlas
+
+    atlas, charts, packing = xatlas.Atlas(), xatlas.ChartOptions(), xatlas.PackOptions()
+    charts.max_cost = CHART_COST
+    packing.resolution, packing.padding, packing.bilinear = texture_px, SEAM, True
+    atlas.add_mesh(surface.vertices.astype(np.float32), surface.faces.astype(np.uint32))
+    atlas.generate(charts, packing)
+    _, corners, uv = atlas[0]
+    return np.asarray(uv, np.float64)[np.asarray(corners, np.int64)]
+
+
+def baked(field: Field, surface: Surface, corner_uv: Float[Array, "f 3 2"], texture_px: int) -> UInt8[Array, "h w 3"]:
+    """What the marcher sees along the normal of every texel, from outside; texels of no chart take the nearest's."""
+    from scipy import ndimage
+
+    raster = rasterise_uv(corner_uv, texture_px, texture_px)
+    row, column = np.nonzero(raster.covered)
+    corners, share = surface.faces[raster.face[row, column]], raster.barycentric[row, column]
+    points = np.einsum("nc,nci->ni", share, surface.vertices[corners])
+    normals = np.einsum("nc,nci->ni", share, vertex_normals(surface)[corners])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    colour, alpha = look_along(field, points + OUTSIDE * normals, -normals, OUTSIDE + INSIDE, STEP)
+    seen = alpha > 0.1
+    picture = np.zeros((texture_px, texture_px, 3), np.float32)
+    picture[row[seen], column[seen]] = encode_srgb(np.clip(colour[seen], 0, 1))
+    known = np.zeros((texture_px, texture_px), bool)
+    known[row[seen], column[seen]] = True
+    nearest = np.asarray(ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True))
+    picture = picture[tuple(nearest)][::-1]  # v points up, rows of a picture down
+    return np.rint(picture * 255).astype(np.uint8)
+
+
+def vertex_normals(surface: Surface) -> Float64[Array, "v 3"]:
+    """Unit normals, faces weighted by area."""
+    a, b, c = (surface.vertices[surface.faces[:, corner]] for corner in range(3))
+    across = np.cross(b - a, c - a)
+    total = np.zeros_like(surface.vertices)
+    for corner in range(3):
+        np.add.at(total, surface.faces[:, corner], across)
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)

@@ -1,0 +1,129 @@
+"""A person's outside as triangles: the opacity isosurface of their boxes, without what nobody sees."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from numpy import ndarray as Array
+
+from primdiffusion.export.field import Field, density_at
+
+LEVEL = 12.0
+"""Density at which a person begins, 1/m: then the silhouettes of mesh and marched picture have the same area. It is
+that low because rays that graze somebody are long."""
+SMALLEST_PIECE = 5e-5
+"""Volume below which a loose piece is dropped, cubic metres."""
+GAP = 0.012
+"""Openings narrower than this are closed before the inside is filled, metres."""
+POINTS_AT_ONCE = 2**21
+THIN = "nothing of this person is dense enough to have a surface: generate them again"
+
+
+class NoSurface(ValueError):
+    """A person of whom nothing is dense enough to have a surface."""
+
+
+class Surface(NamedTuple):
+    """Closed triangles, counter-clockwise seen from outside."""
+
+    vertices: Float64[Array, "v 3"]
+    """Metres."""
+    faces: Int64[Array, "f 3"]
+
+
+class DensityGrid(NamedTuple):
+    """Density at the points origin + spacing * index."""
+
+    density: Float64[Array, "x y z"]
+    """1/m."""
+    origin: Float64[Array, "3"]
+    spacing: float
+
+
+def outside_surface(field: Field, spacing: float, triangles: int) -> Surface:
+    """The surface that is seen from outside, in at most `triangles` triangles; cavities are filled, crumbs dropped.
+
+    Marching cubes on a grid of `spacing` metres, then quadric edge collapses, both libigl's. Raises NoSurface.
+    """
+    import igl  # 16 MB, and only this needs it
+
+    grid = density_grid(field, spacing)
+    solid = filled(grid.density > LEVEL, spacing)
+    if not solid.any():
+        raise NoSurface(THIN)
+    values = np.where(grid.density > LEVEL, grid.density, 2 * LEVEL)  # cavities and closed gaps count as full
+    values = np.where(solid, np.minimum(values, 2 * LEVEL), np.minimum(grid.density, LEVEL * 0.999))
+    corners, cubes = _cubes_across(solid)
+    places = grid.origin + spacing * np.stack(np.unravel_index(corners, solid.shape), -1)
+    vertices, faces, _ = igl.marching_cubes(values.ravel()[corners].astype(np.float64), places, cubes, LEVEL)
+    surface = _large_pieces(np.asarray(vertices), np.asarray(faces)[:, ::-1])
+    if len(surface.faces) <= triangles:
+        return surface
+    vertices, faces, *_ = igl.qslim(surface.vertices, surface.faces, triangles)
+    return Surface(np.asarray(vertices), np.asarray(faces))
+
+
+def density_grid(field: Field, spacing: float) -> DensityGrid:
+    """The field on a grid around all of it, three empty points on every side."""
+    margin = 3 * spacing
+    reach = np.abs(np.linalg.inv(field.to_local)).sum(-1)
+    low = (field.position - reach).min(0) - margin
+    shape = np.ceil(((field.position + reach).max(0) + margin - low) / spacing).astype(np.int64) + 1
+    total = int(shape.prod())
+    density = np.empty(total)
+    for first in range(0, total, POINTS_AT_ONCE):
+        index = np.arange(first, min(first + POINTS_AT_ONCE, total))
+        points = low + spacing * np.stack(np.unravel_index(index, tuple(shape)), -1)
+        density[first : first + len(index)] = density_at(field, points)
+    return DensityGrid(density.reshape(shape), low, spacing)
+
+
+def filled(solid: Bool[Array, "x y z"], spacing: float) -> Bool[Array, "x y z"]:
+    """The solid with its cavities, also those with openings narrower than GAP."""
+    from scipy import ndimage
+
+    closed = np.asarray(ndimage.binary_closing(solid, iterations=max(round(GAP / 2 / spacing), 1)))
+    inside = np.asarray(ndimage.binary_fill_holes(closed))
+    return solid | (inside & np.logical_not(closed))  # what only the closing has added is a gap of the person's own
+
+
+def depth_below(field: Field, points: Float64[Array, "n 3"], spacing: float = 0.008) -> Float64[Array, "n"]:
+    """How far points are from the nearest place outside, metres, to within `spacing`; 0 outside."""
+    from scipy import ndimage
+
+    grid = density_grid(field, spacing)
+    depth = np.asarray(ndimage.distance_transform_edt(filled(grid.density > LEVEL, spacing))) * spacing
+    index = np.rint((points - grid.origin) / spacing).astype(np.int64)
+    return depth[tuple(index.clip(0, np.array(depth.shape) - 1).T)]
+
+
+def _cubes_across(solid: Array) -> tuple[Int64[Array, "n"], Int64[Array, "c 8"]]:
+    """Flat indices of the grid points of cubes that the surface crosses, and these cubes in libigl's corner order."""
+    inner = tuple(size - 1 for size in solid.shape)
+    count = np.zeros(inner, np.int8)
+    offsets = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
+    for x, y, z in offsets:
+        count += solid[x : x + inner[0], y : y + inner[1], z : z + inner[2]]
+    cube = np.stack(np.nonzero((count > 0) & (count < 8)), -1)
+    flat = np.stack([np.ravel_multi_index(tuple((cube + offset).T), solid.shape) for offset in offsets], -1)
+    corners, cubes = np.unique(flat, return_inverse=True)
+    return corners, cubes.reshape(flat.shape).astype(np.int64)
+
+
+def _large_pieces(vertices: Array, faces: Array) -> Surface:
+    """Without pieces of less than SMALLEST_PIECE, cavities among them: their volume is negative."""
+    from scipy import sparse
+    from scipy.sparse import csgraph
+
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    links = sparse.coo_array((np.ones(len(edges), bool), tuple(edges.T)), shape=(len(vertices),) * 2)
+    _, piece = csgraph.connected_components(links, directed=False)
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    volume = np.bincount(piece[faces[:, 0]], np.einsum("fi,fi->f", a, np.cross(b, c)) / 6)
+    kept = faces[volume[piece[faces[:, 0]]] >= SMALLEST_PIECE]
+    if not len(kept):
+        raise NoSurface(THIN)
+    used, renumbered = np.unique(kept, return_inverse=True)
+    return Surface(vertices[used], renumbered.reshape(kept.shape).astype(np.int64))

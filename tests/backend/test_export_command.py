@@ -1,0 +1,117 @@
+"""`primdiffusion export` and the child's jobs proxy, gaussians and human_npz."""
+
+import numpy as np
+import pytest
+import splatter
+import torch
+import trimesh
+from export_people import person
+from primdiffusion import cli
+from primdiffusion.human import pose_body
+from primdiffusion.human_file import save_human
+from primdiffusion.serve import exporting
+from primdiffusion.serve.export_params import GaussiansParams, HumanNpzParams, ProxyParams
+
+COARSE = ["--triangles", "800", "--texture", "64"]
+
+
+@pytest.fixture
+def saved(tmp_path):
+    path = tmp_path / "anna.human"
+    save_human(path, person())
+    return path
+
+
+def silent(*_args, **_named):
+    pass
+
+
+def test_a_person_becomes_a_glb(saved, capsys):
+    out = saved.with_name("anna.glb")
+    cli.run(["export", str(saved), "--out", str(out), *COARSE])
+    assert capsys.readouterr().out.strip() == str(out)
+    assert len(trimesh.load(out).geometry["person"].faces) <= 800
+
+
+def test_a_posed_person_becomes_gaussians(saved):
+    pose = saved.with_name("pose.json")
+    pose.write_text(str([0.0] * 49 + [-1.2] + [0.0] * 22))
+    plain, bent = saved.with_name("a.ply"), saved.with_name("b.ply")
+    cli.run(["export", str(saved), "--out", str(plain), "--gaussians", "3000"])
+    cli.run(["export", str(saved), "--out", str(bent), "--gaussians", "3000", "--pose", str(pose)])
+    assert splatter.read_ply(plain)["x"].max() > splatter.read_ply(bent)["x"].max() + 0.05
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        (["--out", "anna.stl"], "choose one"),
+        (["--out", "anna.glb", "--pose", "pose.json"], "cannot hold a pose"),
+        (["--out", "anna.ply", "--frame", "2"], "without a pose file"),
+        (["--out", "nowhere/anna.glb"], "there is no folder"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_before_any_work(saved, monkeypatch, more, sentence):
+    monkeypatch.chdir(saved.parent)
+    with pytest.raises((ValueError, FileNotFoundError), match=sentence):
+        cli.run(["export", str(saved), *more])
+    assert list(saved.parent.iterdir()) == [saved]
+
+
+def test_the_childs_proxy_follows_other_betas(saved, tmp_path):
+    params = {"person": str(saved), "triangles": 800, "texture_px": 64, "spacing": 0.02}
+    own = exporting.proxy(ProxyParams(out_dir=str(tmp_path / "own"), **params), silent)
+    tall = exporting.proxy(ProxyParams(out_dir=str(tmp_path / "tall"), betas=[3.0] + [0.0] * 9, **params), silent)
+    heights = []
+    for result in (own, tall):
+        with np.load(result["proxy"]) as arrays:
+            heights.append(np.ptp(arrays["vertices"][:, 1]))
+            assert arrays["joint_names"][0] == "pelvis"
+    assert abs(heights[1] - heights[0]) > 0.03
+
+
+def test_the_childs_gaussians_stand_where_the_armature_does(saved, tmp_path):
+    skinning = pose_body(person().betas).skinning[:, :3].tolist()
+    moved = [[1.0, 0, 0, 2.0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]]
+    params = GaussiansParams(person=str(saved), out=str(tmp_path / "p.ply"), object=moved, joints=skinning, limit=2000)
+    assert exporting.gaussians(params, silent)["gaussians"] == 2000
+    assert splatter.read_ply(tmp_path / "p.ply")["x"].mean() == pytest.approx(2.0, abs=0.1)
+
+
+def test_a_person_who_exists_gets_the_files_of_generate(saved, tmp_path):
+    result = exporting.human_npz(HumanNpzParams(person=str(saved), out_dir=str(tmp_path / "out"), size=32), silent)
+    with np.load(result["human"]) as arrays:
+        assert torch.equal(torch.from_numpy(arrays["betas"]), person().betas)
+    assert {"human", "person", "preview", "side", "depth"} <= set(result)
+
+
+def test_a_cancelled_proxy_leaves_nothing(saved, tmp_path):
+    def cancel(stage, *_):
+        if stage == "write":
+            raise InterruptedError
+
+    params = ProxyParams(person=str(saved), out_dir=str(tmp_path / "new"), triangles=800, texture_px=64, spacing=0.03)
+    with pytest.raises(InterruptedError):
+        exporting.proxy(params, cancel)
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong"),
+    [
+        (ProxyParams, {"person": "", "out_dir": "x"}),
+        (ProxyParams, {"person": "p", "out_dir": "x", "betas": ["tall"]}),
+        (GaussiansParams, {"person": "p", "out": "x", "object": [[1, 0, 0, 0]] * 3}),
+        (GaussiansParams, {"person": "p", "out": "x", "limit": 0}),
+        (HumanNpzParams, {"person": "p", "out_dir": "x", "size": 0}),
+    ],
+)
+def test_impossible_parameters_are_refused(kind, wrong):
+    with pytest.raises(ValueError):
+        kind(**wrong)
+
+
+def test_betas_of_another_body_are_refused(saved, tmp_path):
+    params = ProxyParams(person=str(saved), out_dir=str(tmp_path / "out"), betas=[0.0] * 3)
+    with pytest.raises(ValueError, match="3 betas"):
+        exporting.proxy(params, silent)

@@ -1,0 +1,107 @@
+"""The textured, skinned mesh of a person, judged by what the marcher draws."""
+
+import functools
+import io
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from export_people import person
+from PIL import Image
+from primdiffusion.body.model import BodyPose
+from primdiffusion.capture.rasterise import rasterise
+from primdiffusion.export.proxy import ProxySettings, mesh_proxy
+from primdiffusion.export.proxy_files import ARRAYS, TEXTURE, write_proxy_arrays, write_proxy_glb, write_proxy_obj
+from primdiffusion.human import framing, place, pose_body
+from primdiffusion.render.march import march
+
+SMALL = ProxySettings(spacing=0.012, triangles=4000, texture_px=256)
+
+
+@functools.cache
+def proxy():
+    return mesh_proxy(person(), SMALL)
+
+
+def test_it_is_closed_and_as_fine_as_asked_for():
+    mesh = trimesh.Trimesh(proxy().vertices, proxy().faces, process=False)
+    assert mesh.is_watertight
+    assert mesh.volume > 0
+    assert len(proxy().faces) <= 4000
+    assert proxy().texture.shape == (256, 256, 3)
+
+
+def test_its_weights_are_four_joints_that_sum_to_one():
+    weights = proxy().skin_weights
+    assert np.abs(weights.sum(1) - 1).max() < 1e-6
+    assert (weights > 0).sum(1).max() <= 4
+    assert weights.min() >= 0
+
+
+def test_each_hand_follows_its_own_arm():
+    left = proxy().vertices[:, 0] > 0.65
+    arm = [16, 18, 20, 22]
+    assert proxy().skin_weights[left][:, arm].sum(1).min() > 0.99
+
+
+@pytest.mark.parametrize("raised", [0.0, -0.9])
+def test_posed_it_looks_like_the_marched_person(raised):
+    theta = torch.zeros(24, 3)
+    theta[16, 2], theta[1, 0] = raised, raised * 0.5
+    pose = BodyPose.from_axis_angle(theta.flatten())
+    primitives = place(person(), pose)
+    skinning = pose_body(person().betas, pose).skinning.double().numpy()
+    camera = framing(primitives, 0.3, 160, 160)
+    marched, drawn = march(primitives, camera), rasterise(proxy().mesh().posed(skinning), camera, 2)
+    there, covered = marched.alpha.numpy() > 0.5, drawn.alpha > 0.5
+    assert (there & covered).sum() / (there | covered).sum() > 0.93
+    both = there & covered
+    straight = marched.rgb.numpy() / np.maximum(marched.alpha.numpy(), 1e-6)[..., None]
+    assert np.abs(straight - drawn.rgb / np.maximum(drawn.alpha, 1e-6)[..., None])[both].mean() < 0.04
+
+
+def test_texels_between_charts_take_the_nearest_colour():
+    assert proxy().texture.max(-1).min() > 60  # nothing is left black
+
+
+def test_glb_is_read_by_trimesh_with_texture_and_the_same_surface(tmp_path):
+    write_proxy_glb(tmp_path / "p.glb", proxy(), {"seed": 1})
+    scene = trimesh.load(tmp_path / "p.glb")
+    mesh = scene.geometry["person"]
+    assert len(mesh.faces) == len(proxy().faces)
+    np.testing.assert_allclose(mesh.bounds, [proxy().vertices.min(0), proxy().vertices.max(0)], atol=1e-6)
+    assert mesh.visual.material.baseColorTexture.size == (256, 256)
+    assert list(tmp_path.iterdir()) == [tmp_path / "p.glb"]
+
+
+def test_obj_has_material_and_texture_beside_it(tmp_path):
+    write_proxy_obj(tmp_path / "eine Frau ä.obj", proxy())
+    assert {path.name for path in tmp_path.iterdir()} == {"eine Frau ä.obj", "eine Frau ä.mtl", "eine Frau ä.png"}
+    mesh = trimesh.load(tmp_path / "eine Frau ä.obj", process=False)
+    assert len(mesh.faces) == len(proxy().faces)
+
+
+def test_arrays_for_blender_are_plain_and_complete(tmp_path):
+    write_proxy_arrays(tmp_path, proxy())
+    with np.load(tmp_path / ARRAYS, allow_pickle=False) as arrays:
+        assert arrays["vertices"].shape == proxy().vertices.shape
+        assert arrays["uv_corner"].shape == (len(proxy().faces), 3, 2)
+        assert arrays["skin_weights"].shape == (len(proxy().vertices), 24)
+        assert arrays["joints"].shape == (24, 3)
+    picture = Image.open(io.BytesIO((tmp_path / TEXTURE).read_bytes()))
+    assert np.array_equal(np.array(picture), proxy().texture)
+
+
+def test_stages_are_told_and_may_end_the_work():
+    def stop(stage, _done, _total):
+        raise InterruptedError(stage)
+
+    with pytest.raises(InterruptedError, match="surface"):
+        mesh_proxy(person(), SMALL, stop)
+
+
+@pytest.mark.parametrize("wrong", [{"spacing": 0.0}, {"triangles": 10}, {"texture_px": 9000}])
+def test_impossible_settings_are_refused(wrong):
+    with pytest.raises(ValueError, match="choose"):
+        ProxySettings(**wrong)
