@@ -165,7 +165,7 @@ def remove_human(collection: bpy.types.Collection) -> None:
     The VDB files stay, so that an undo of the removal, or an older copy of the .blend, finds them.
     """
     objects = list(collection.all_objects)
-    data = [thing.data for thing in objects]
+    data = [thing.data for thing in objects if thing.data is not None]
     actions = [thing.animation_data.action for thing in objects if thing.animation_data and thing.animation_data.action]
     bpy.data.batch_remove([*objects, *collection.children_recursive, collection])
     bpy.data.batch_remove([thing for thing in {*data, *actions} if thing.users == 0])

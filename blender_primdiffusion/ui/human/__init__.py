@@ -5,16 +5,33 @@ from __future__ import annotations
 import bpy
 
 from ..jobs.work import register_kind, unregister_kind
-from . import edit_operators, edit_painting, edit_panel, edit_settings, edit_work, panel, unused_files
+from . import (
+    edit_operators,
+    edit_painting,
+    edit_panel,
+    edit_settings,
+    edit_work,
+    panel,
+    people_operators,
+    shape_operators,
+    shape_panel,
+    shape_settings,
+    unused_files,
+)
 
 CLASSES = (
+    panel.PRIMDIFFUSION_MT_people,
     panel.PRIMDIFFUSION_PT_human,
+    shape_settings.PRIMDIFFUSION_PG_human,
     edit_settings.PRIMDIFFUSION_PG_edit,
+    *people_operators.PEOPLE,
+    *shape_operators.SHAPES,
     *edit_operators.EDITS,
     edit_painting.PRIMDIFFUSION_OT_paint_region,
     edit_painting.PRIMDIFFUSION_OT_finish_painting,
     unused_files.PRIMDIFFUSION_OT_remove_unused_files,
-    edit_panel.PRIMDIFFUSION_PT_edit,
+    shape_panel.PRIMDIFFUSION_PT_shape,
+    shape_panel.PRIMDIFFUSION_PT_details,
     *edit_panel.SUB_PANELS,
 )
 
@@ -24,6 +41,7 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion_edit = bpy.props.PointerProperty(type=edit_settings.PRIMDIFFUSION_PG_edit)
+    bpy.types.Object.primdiffusion_human = bpy.props.PointerProperty(type=shape_settings.PRIMDIFFUSION_PG_human)
     for kind in edit_work.KINDS:
         register_kind(kind)
 
@@ -32,6 +50,7 @@ def unregister() -> None:
     """Undo `register`."""
     for kind in edit_work.KINDS:
         unregister_kind(kind)
+    del bpy.types.Object.primdiffusion_human
     del bpy.types.Scene.primdiffusion_edit
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -1,4 +1,4 @@
-"""The sidebar panel Edit Human, below Generate Human: 3D View > N > PrimDiffusion."""
+"""Edits of the selected person: sub-panels of Human."""
 
 from __future__ import annotations
 
@@ -14,35 +14,16 @@ from ..jobs.target import selected_person
 from .edit_painting import painting
 
 
-class _InSidebar:
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "PrimDiffusion"
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
-
-
-class PRIMDIFFUSION_PT_edit(_InSidebar, bpy.types.Panel):
-    """Who would be edited; the edits are sub-panels."""
-
-    bl_label = "Edit Human"
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Reads the scene; changes nothing."""
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
-        try:
-            layout.label(text=selected_person(context).name, icon="OUTLINER_OB_ARMATURE")
-        except ValueError as error:
-            layout.label(text=str(error), icon="INFO")
-        layout.prop(context.scene.primdiffusion_edit, "seed")
-
-
-def _sub_panel(name: str, label: str, content: Callable) -> type:
-    class SubPanel(_InSidebar, bpy.types.Panel):
+def _sub_panel(name: str, label: str, order: int, content: Callable) -> type:
+    class SubPanel(bpy.types.Panel):
         bl_idname = f"PRIMDIFFUSION_PT_edit_{name}"
         bl_label = label
-        bl_parent_id = "PRIMDIFFUSION_PT_edit"
+        bl_space_type = "VIEW_3D"
+        bl_region_type = "UI"
+        bl_category = "PrimDiffusion"
+        bl_parent_id = "PRIMDIFFUSION_PT_human"
+        bl_order = order
+        bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
         __doc__ = content.__doc__
 
         def draw(self, context: bpy.types.Context) -> None:
@@ -57,6 +38,7 @@ def _sub_panel(name: str, label: str, content: Callable) -> type:
 def _draw_vary(layout: bpy.types.UILayout, settings, _context) -> None:
     """How far, and the button."""
     layout.prop(settings, "amount")
+    layout.prop(settings, "seed")
     draw_job(layout, "vary", "primdiffusion.vary", "MOD_NOISE")
 
 
@@ -64,6 +46,7 @@ def _draw_redress(layout: bpy.types.UILayout, settings, context) -> None:
     """Where, into what, and the button."""
     _draw_region(layout, settings, context)
     draw_attributes(layout, settings.attributes)
+    layout.prop(settings, "seed")
     draw_job(layout, "inpaint", "primdiffusion.redress", "MATCLOTH")
 
 
@@ -73,6 +56,8 @@ def _draw_transfer(layout: bpy.types.UILayout, settings, context) -> None:
     _draw_region(layout, settings, context)
     layout.row().prop(settings, "what", expand=True)
     layout.prop(settings, "harmonise")
+    if settings.harmonise > 0:
+        layout.prop(settings, "seed")
     draw_job(layout, "transfer", "primdiffusion.transfer_texture", "TEXTURE")
 
 
@@ -115,9 +100,9 @@ def _draw_parts(layout: bpy.types.UILayout, settings, parts: tuple[str, ...], co
 
 
 SUB_PANELS = (
-    _sub_panel("vary", "Vary", _draw_vary),
-    _sub_panel("redress", "Re-dress Region", _draw_redress),
-    _sub_panel("transfer", "Transfer Texture", _draw_transfer),
-    _sub_panel("blend", "Blend", _draw_blend),
-    _sub_panel("files", "Files", _draw_files),
+    _sub_panel("vary", "Vary", 20, _draw_vary),
+    _sub_panel("redress", "Re-dress Region", 21, _draw_redress),
+    _sub_panel("transfer", "Transfer Texture", 22, _draw_transfer),
+    _sub_panel("blend", "Blend", 23, _draw_blend),
+    _sub_panel("files", "Files", 91, _draw_files),
 )

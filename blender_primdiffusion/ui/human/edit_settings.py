@@ -1,4 +1,4 @@
-"""What the panel Edit Human asks for; saved with the scene."""
+"""What the edits in the panel Human ask for; saved with the scene."""
 
 from __future__ import annotations
 

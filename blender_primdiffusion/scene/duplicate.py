@@ -1,0 +1,99 @@
+"""Another person like one in the scene: objects, bones and mesh of their own, the same volumes and files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import bpy
+
+from .human import armature_of
+from .rename import part_name
+
+_SHARED = {"VOLUME"}
+"""Types of objects whose data both people show: what edits change they copy first (see `shape.own_data`)."""
+
+
+def duplicate_human(collection: bpy.types.Collection) -> bpy.types.Collection:
+    """A copy of a person in the same place, linked beside them; posing, reshaping and editing one leaves the other.
+
+    Everything in the person's collections comes along, and what points to a part of the person points to the copy's.
+    Files are shared. Raises ValueError for a collection that holds no person.
+    """
+    armature_of(collection)
+    twin = collection.copy()
+    twins: dict[Any, Any] = {collection: twin}
+    for parent in [twin]:
+        _copy_children(parent, twins)
+    objects = [thing for thing in collection.all_objects if thing not in twins]
+    for thing in objects:
+        twins[thing] = thing.copy()
+    for copy in [twins[key] for key in list(twins) if isinstance(key, bpy.types.Collection)]:
+        for thing in list(copy.objects):
+            copy.objects.unlink(thing)
+            copy.objects.link(twins[thing])
+    for thing in objects:
+        _own(thing, twins[thing], twins)
+    for holder in _holders(collection):
+        holder.children.link(twin)
+    _name_parts(collection, twin, twins)
+    return twin
+
+
+def _copy_children(copy: bpy.types.Collection, twins: dict[Any, Any]) -> None:
+    for child in list(copy.children):
+        copy.children.unlink(child)
+        twins[child] = child.copy()
+        copy.children.link(twins[child])
+        _copy_children(twins[child], twins)
+
+
+def _own(thing: bpy.types.Object, copy: bpy.types.Object, twins: dict[Any, Any]) -> None:
+    """Give the copy data and an action of its own, and turn what it points to into the copies."""
+    if thing.data is not None and thing.type not in _SHARED:
+        copy.data = thing.data.copy()
+    if thing.animation_data is not None and thing.animation_data.action is not None:
+        slot = thing.animation_data.action_slot
+        copy.animation_data.action = thing.animation_data.action.copy()
+        if slot is not None:
+            copy.animation_data.action_slot = copy.animation_data.action.slots[slot.identifier]
+    if copy.parent in twins:
+        inverse = copy.matrix_parent_inverse.copy()
+        copy.parent = twins[copy.parent]
+        copy.matrix_parent_inverse = inverse
+    bones = copy.pose.bones if copy.pose is not None else ()
+    for pointing in (*copy.modifiers, *copy.constraints, *(one for bone in bones for one in bone.constraints)):
+        _point_to(pointing, twins)
+        for target in getattr(pointing, "targets", ()):
+            _point_to(target, twins)
+        _point_sockets_to(pointing, twins)
+
+
+def _point_to(pointing: Any, twins: dict[Any, Any]) -> None:
+    for prop in pointing.bl_rna.properties:
+        if prop.type == "POINTER" and not prop.is_readonly:
+            value = getattr(pointing, prop.identifier)
+            if isinstance(value, bpy.types.ID) and value in twins:
+                setattr(pointing, prop.identifier, twins[value])
+
+
+def _point_sockets_to(modifier: Any, twins: dict[Any, Any]) -> None:
+    """The inputs of a Geometry Nodes modifier are custom properties of it."""
+    if getattr(modifier, "type", "") == "NODES":
+        for key in list(modifier.keys()):
+            if isinstance(modifier[key], bpy.types.ID) and modifier[key] in twins:
+                modifier[key] = twins[modifier[key]]
+
+
+def _holders(collection: bpy.types.Collection) -> list[bpy.types.Collection]:
+    every: Iterable[bpy.types.Collection] = (*bpy.data.collections, *(scene.collection for scene in bpy.data.scenes))
+    return [holder for holder in every if collection in list(holder.children)]
+
+
+def _name_parts(collection: bpy.types.Collection, twin: bpy.types.Collection, twins: dict[Any, Any]) -> None:
+    """Call the parts of the copy as those of the person are called."""
+    for part, copy in twins.items():
+        copy.name = part_name(part.name, collection.name, twin.name)
+        data = getattr(copy, "data", None)
+        if data is not None and copy.type not in _SHARED:
+            data.name = part_name(part.data.name, collection.name, twin.name)

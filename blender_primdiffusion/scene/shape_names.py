@@ -1,0 +1,16 @@
+"""What the sliders of a shape are called."""
+
+from __future__ import annotations
+
+from .shape_model import BETAS, ShapeModel
+
+DEFAULT_BODY_VERTICES = 12196
+"""Only the body that comes with the extension has as many."""
+_CLEAR = {0: "Stature", 1: "Shoulders", 3: "Waist", 5: "Girth"}
+"""What single betas of the default body do; the others change several things a little."""
+
+
+def slider_names(model: ShapeModel) -> list[str]:
+    """A name for each beta [10]: by what it does where that is clear, else by its number, from 1."""
+    clear = _CLEAR if len(model.template) == DEFAULT_BODY_VERTICES else {}
+    return [clear.get(index, f"Shape {index + 1}") for index in range(BETAS)]
