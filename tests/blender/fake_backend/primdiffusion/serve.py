@@ -66,6 +66,33 @@ def write_edited(path: Path, params: dict) -> None:
     np.savez(path, **arrays)
 
 
+def variations(id: int, params: dict, cancelled: threading.Event) -> None:
+    """A person of each seed, whose picture is seen after a step; a seed of FAILS or TAKES_LONG among them is obeyed."""
+    seeds, out = params["seeds"], Path(params["out_dir"])
+    out.mkdir(parents=True, exist_ok=True)
+    people = []
+    for index, seed in enumerate(seeds):
+        picture = out / f"{seed}.png"
+        shutil.copyfile(Path(__file__).with_name("picture.png"), picture)
+        shown = {"picture": str(picture), "index": index}
+        for step in range(100 if seed == TAKES_LONG else 1):
+            progress = {"id": id, "stage": "sample", "step": step, "total": params["steps"], "eta_s": 1.0, **shown}
+            say(method="progress", params=progress)
+            time.sleep(0.02)
+            if cancelled.is_set():
+                say(id=id, error={"code": -32001, "message": "cancelled"})
+                return
+        shutil.copyfile(os.environ["FAKE_HUMAN"], out / f"{seed}.human.npz")
+        (out / f"{seed}.human.safetensors").write_bytes(json.dumps({**params, "seed": seed}).encode())
+        files = {"human": f"{seed}.human.npz", "person": f"{seed}.human.safetensors", "picture": f"{seed}.png"}
+        people.append({"seed": seed, **{name: str(out / file) for name, file in files.items()}})
+    if FAILS in seeds:
+        data = {"kind": "out_of_memory", "remedy": "ask for fewer people"}
+        say(id=id, error={"code": -32002, "message": "there is not enough memory", "data": data})
+        return
+    say(id=id, result={"people": people, "seconds": 0.1})
+
+
 def reconstruct(id: int, params: dict, cancelled: threading.Event) -> None:
     """Does what is written in the file `order` of the captures; without one it makes the person."""
     order, out = Path(params["capture"]) / "order", Path(params["out_dir"])
@@ -118,7 +145,7 @@ def edit(id: int, params: dict, cancelled: threading.Event) -> None:
 
 
 EDITS = dict.fromkeys(("vary", "interpolate", "inpaint", "transfer"), edit)
-WORK = {**EDITS, "generate": generate, "reconstruct": reconstruct, "draw": draw}
+WORK = {**EDITS, "generate": generate, "variations": variations, "reconstruct": reconstruct, "draw": draw}
 cancelled = threading.Event()
 for line in sys.stdin:
     request = json.loads(line)

@@ -1,0 +1,105 @@
+"""The sidebar panel Variations: a contact sheet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ..jobs.drawing import draw_job
+from ..jobs.queue import queue
+from .icons import icons
+from .sheet import sheet
+from .work import VariationsWork
+
+CELL_PX = 110
+"""Width of a picture at which a sidebar of ordinary width holds two or three."""
+MOST_COLUMNS = 8
+_MARGIN_PX = 40
+"""Borders and scroll bar of the sidebar."""
+_UNIT_PX = 20
+"""Of Blender's interface at a scale of 1: what `template_icon` counts in."""
+
+
+class PRIMDIFFUSION_PT_variations(bpy.types.Panel):
+    """Many people to choose from."""
+
+    bl_label = "Variations"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "PrimDiffusion"
+    bl_order = 1
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Reads the sheet and what is in line; starts nothing."""
+        layout, settings = self.layout, context.scene.primdiffusion_variations
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        column = layout.column()
+        column.row().prop(settings, "count", expand=True)
+        column.prop(settings, "seeds")
+        column.prop(settings, "quality")
+        draw_job(layout, "variations", "primdiffusion.variations", "LIGHTPROBE_VOLUME")
+        work = queue.current.work if queue.current is not None else None
+        if isinstance(work, VariationsWork):
+            _draw_coming(layout, _columns(context), work)
+        elif sheet.variations:
+            _draw_sheet(layout, _columns(context))
+            _draw_choice(layout, settings)
+
+
+def _columns(context: bpy.types.Context) -> tuple[int, float]:
+    """How many pictures stand side by side, and their size in units."""
+    scale = context.preferences.system.ui_scale or 1.0  # 0 without a window
+    width = (context.region.width if context.region is not None else 300 * scale) / scale - _MARGIN_PX
+    number = max(2, min(MOST_COLUMNS, int(width // CELL_PX)))
+    return number, max(2.0, (width / number - 10) / _UNIT_PX)
+
+
+def _grid(layout: bpy.types.UILayout, columns: int) -> bpy.types.UILayout:
+    return layout.grid_flow(row_major=True, columns=columns, even_columns=True, even_rows=True, align=False)
+
+
+def _draw_coming(layout: bpy.types.UILayout, columns: tuple[int, float], work: VariationsWork) -> None:
+    """Those who are being made, as far as they are."""
+    grid = _grid(layout, columns[0])
+    for index, seed in enumerate(work.seeds):
+        cell = grid.column(align=True)
+        _draw_picture(cell, queue.job.pictures.get(index), columns[1])
+        cell.label(text=str(seed))
+
+
+def _draw_sheet(layout: bpy.types.UILayout, columns: tuple[int, float]) -> None:
+    layout.label(text=f"{sheet.title}: {len(sheet.variations)}")
+    grid = _grid(layout, columns[0])
+    for index, variation in enumerate(sheet.variations):
+        cell = grid.column(align=True)
+        _draw_picture(cell, variation.picture, columns[1])
+        icon = "CHECKBOX_HLT" if variation.chosen else "CHECKBOX_DEHLT"
+        button = cell.operator(
+            "primdiffusion.select_variation", text=str(variation.seed), icon=icon, depress=variation.chosen
+        )
+        button.index = index
+
+
+def _draw_picture(cell: bpy.types.UILayout, path: Path | None, units: float) -> None:
+    cell.box().template_icon(icon_value=icons.of(path), scale=units)
+
+
+def _draw_choice(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
+    number = sum(variation.chosen for variation in sheet.variations)
+    row = layout.row(align=True)
+    chosen = row.row(align=True)
+    chosen.enabled = number > 0
+    chosen.operator("primdiffusion.build_variation", text=f"Build Selected ({number})", icon="OUTLINER_OB_ARMATURE")
+    row.operator("primdiffusion.build_variation", text="Build All").build_all = True
+    column = layout.column()
+    column.enabled = number == 1
+    row = column.row(align=True)
+    row.operator("primdiffusion.more_like_variation", icon="DUPLICATE")
+    seed = row.row(align=True)
+    seed.enabled = not sheet.around
+    seed.operator("primdiffusion.use_variation_seed", icon="COPYDOWN")
+    column.prop(settings, "amount")
+    layout.operator("primdiffusion.clear_variations", icon="TRASH")

@@ -1,0 +1,228 @@
+"""The contact sheet: people of many seeds, seen before anything is built, and exactly those that are then built."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import bpy
+import pytest
+from jobs_driven import drive, error_of, shown, until_running
+
+from blender_primdiffusion.scene.human import armature_of, humans, person_file
+from blender_primdiffusion.ui.jobs.queue import queue
+from blender_primdiffusion.ui.variations import operators, panel
+from blender_primdiffusion.ui.variations.icons import icons
+from blender_primdiffusion.ui.variations.sheet import sheet
+from blender_primdiffusion.ui.variations.work import VariationsWork
+
+FAILS, TAKES_LONG = 2, 4
+"""Seeds that the fake child takes as orders."""
+ops = bpy.ops.primdiffusion
+
+
+@pytest.fixture
+def shown_people(addon):
+    """A sheet of seeds 11 to 14."""
+    ops.variations(seed=11, count=4, steps=2)
+    return sheet
+
+
+def seeds() -> list[int]:
+    return [variation.seed for variation in sheet.variations]
+
+
+def sent(file: Path) -> dict:
+    return json.loads(file.read_bytes())
+
+
+def files_left() -> list[Path]:
+    return list(Path(bpy.app.tempdir).glob("variation*"))
+
+
+def test_people_are_kept_in_files_and_nothing_enters_the_scene(addon, shown_people):
+    assert seeds() == [11, 12, 13, 14]
+    assert not humans(addon.scene)
+    for variation in sheet.variations:
+        assert variation.human.is_file()
+        assert variation.picture.is_file()
+        assert sent(variation.person)["seed"] == variation.seed
+    assert [path.name.split("_")[1] for path in files_left()] == ["sheet"], "the child's folder is gone"
+
+
+def test_the_panels_settings_are_asked_for_and_random_seeds_differ_each_time(addon):
+    addon.scene.primdiffusion.quality = "HIGH"
+    ops.variations(count=4)
+    first = seeds()
+    asked = sent(sheet.variations[0].person)
+    assert (asked["steps"], asked["sampler"], asked["size"]) == (60, "ddim", 256)
+    addon.scene.primdiffusion_variations.quality = "DRAFT"
+    ops.variations()
+    assert len(set(seeds())) == 8
+    assert set(first).isdisjoint(seeds())
+    asked = sent(sheet.variations[0].person)
+    assert (asked["steps"], asked["sampler"]) == (8, "dpmpp_2m")
+    addon.scene.primdiffusion_variations.seeds = "CONSECUTIVE"
+    ops.variations(count=4, steps=3, sampler="ddpm")
+    assert seeds() == [7, 8, 9, 10]
+    assert sent(sheet.variations[0].person)["sampler"] == "ddpm"
+
+
+def test_the_one_that_is_built_is_the_very_one_seen_and_one_undo_takes_them_away(addon, shown_people):
+    bpy.ops.ed.undo_push(message="before")
+    assert ops.build_variation(index=2) == {"FINISHED"}
+    (person,) = humans(addon.scene)
+    assert person_file(person).read_bytes() == sheet.variations[2].person.read_bytes()
+    ops.select_variation(index=0)
+    ops.select_variation(index=3)
+    ops.build_variation()
+    assert [sent(person_file(person))["seed"] for person in humans(bpy.context.scene)] == [13, 11, 14]
+    assert len({armature_of(person).location.x for person in humans(bpy.context.scene)}) == 3, "side by side"
+    bpy.ops.ed.undo()
+    assert len(humans(bpy.context.scene)) == 1
+    assert [variation.chosen for variation in sheet.variations] == [True, False, False, True], "the sheet stays"
+    bpy.ops.ed.undo()
+    assert not humans(bpy.context.scene)
+
+
+def test_build_all_builds_all_in_edit_mode_too(addon, shown_people):
+    bpy.ops.object.armature_add()
+    bpy.ops.object.mode_set(mode="EDIT")
+    assert ops.build_variation(build_all=True) == {"FINISHED"}
+    assert len(humans(addon.scene)) == 4
+
+
+def test_whom_files_are_missing_of_is_not_built_and_those_before_stay(addon, shown_people):
+    sheet.variations[1].human.unlink()
+    with pytest.raises(RuntimeError, match="1 of 4 people were built"):
+        ops.build_variation(build_all=True)
+    assert len(humans(addon.scene)) == 1
+
+
+def test_nothing_selected_a_wrong_number_and_no_sheet_are_refused(addon):
+    for operator in (ops.build_variation, ops.more_like_variation, ops.use_variation_seed, ops.clear_variations):
+        assert not operator.poll()
+    assert not ops.select_variation.poll()
+    ops.variations(seed=11, count=2, steps=1)
+    with pytest.raises(RuntimeError, match="no variation is selected"):
+        ops.build_variation()
+    with pytest.raises(RuntimeError, match="there is no variation 2: there are 2, counted from 0"):
+        ops.select_variation(index=2)
+    for index in (0, 1):
+        ops.select_variation(index=index)
+    for operator in (ops.more_like_variation, ops.use_variation_seed):
+        with pytest.raises(RuntimeError, match="2 variations are selected: select"):
+            operator()
+    with pytest.raises(RuntimeError, match="2 seeds from 2147483647 on go beyond"):
+        ops.variations(seed=2**31 - 1, count=2)
+
+
+def test_more_like_this_asks_for_variants_of_the_kept_person(addon, shown_people):
+    ops.select_variation(index=1)
+    kept = sheet.variations[1].person
+    assert ops.more_like_variation(count=3, seed=20, amount=0.25, steps=4) == {"FINISHED"}
+    asked = sent(sheet.variations[0].person)
+    assert (asked["person"], asked["amount"], asked["steps"]) == (str(kept), 0.25, 4)
+    assert seeds() == [20, 21, 22]
+    assert sheet.title == "Like seed 12"
+    with pytest.raises(RuntimeError, match="no seed alone makes again"):
+        ops.use_variation_seed(index=0)
+
+
+def test_a_seed_is_put_into_the_panel_and_locked(addon, shown_people):
+    ops.use_variation_seed(index=3)
+    assert (addon.scene.primdiffusion.seed, addon.scene.primdiffusion.keep_seed) == (14, True)
+
+
+def test_a_failure_leaves_the_sheet_that_was_there(addon, shown_people):
+    with pytest.raises(RuntimeError, match=r"not enough memory\. Ask for fewer people"):
+        ops.variations(seed=FAILS, count=2, steps=1)
+    assert seeds() == [11, 12, 13, 14]
+    assert all(variation.human.is_file() for variation in sheet.variations)
+    assert "memory" in error_of("variations")
+
+
+def test_pictures_appear_one_by_one_while_they_are_made_and_cancelling_keeps_the_old_sheet(
+    addon, shown_people, monkeypatch
+):
+    drawn = []
+    monkeypatch.setattr(panel, "_draw_picture", lambda _cell, path, _units: drawn.append(path))
+    queue.add(addon, VariationsWork((31, TAKES_LONG, 33), 3, "ddim"))
+    until_running()
+    while len(queue.job.pictures) < 2:
+        queue.tick()
+    texts = shown(panel.PRIMDIFFUSION_PT_variations, addon)
+    assert [path is not None for path in drawn] == [True, True, False]
+    assert {"31", "4", "33", "primdiffusion.cancel"} <= set(texts)
+    ops.cancel()
+    drive()
+    assert seeds() == [11, 12, 13, 14]
+
+
+def test_the_panel_shows_the_sheet_and_what_can_be_done_with_those_selected(addon, shown_people):
+    ops.select_variation(index=1)
+    texts = shown(panel.PRIMDIFFUSION_PT_variations, addon)
+    assert texts.count("primdiffusion.select_variation") == 4
+    assert {"primdiffusion.build_variation", "primdiffusion.more_like_variation", "New people: 4"} <= set(texts)
+
+
+@pytest.mark.parametrize(("width", "columns"), [(300, 2), (420, 3), (2000, 8), (50, 2)])
+def test_as_many_pictures_stand_side_by_side_as_fit(width, columns):
+    from types import SimpleNamespace as Named
+
+    preferences = Named(system=Named(ui_scale=2.0))
+    number, units = panel._columns(Named(preferences=preferences, region=Named(width=width * 2)))
+    assert number == columns
+    assert number * units * 20 <= max(width, 100)
+
+
+def test_icons_are_of_files_that_are_there_and_can_be_freed_again_and_again(shown_people):
+    for variation in (*sheet.variations, sheet.variations[0]):
+        icons.of(variation.picture)
+    assert len(icons._previews) == 4, "numbers of icons are all 0 without a window"
+    assert icons.of(None) == icons.of(Path("/nowhere.png")) == 0
+    icons.free()
+    icons.free()
+    icons.of(sheet.variations[0].picture)
+    assert len(icons._previews) == 1
+
+
+@pytest.mark.parametrize("end", ["clear", "load", "unregister"])
+def test_files_and_pictures_go_when_it_is_cleared_another_file_is_loaded_or_the_extension_ends(shown_people, end):
+    icons.of(sheet.variations[0].picture)
+    assert files_left()
+    if end == "clear":
+        ops.clear_variations()
+    elif end == "load":
+        bpy.ops.wm.read_homefile(use_empty=True)
+    else:
+        import blender_primdiffusion
+
+        blender_primdiffusion.unregister()
+        blender_primdiffusion.register()
+    assert not sheet.variations
+    assert icons._previews is None
+    assert not files_left()
+
+
+def test_a_person_cleared_before_its_turn_is_named(addon, shown_people):
+    queue.add(addon, VariationsWork((1,), 1, "ddim", person=str(sheet.variations[0].person)))
+    ops.clear_variations()
+    drive()
+    assert "the person to vary was cleared meanwhile" in error_of("variations").lower()
+
+
+def test_a_disk_that_is_full_keeps_the_former_sheet(addon, shown_people, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("blender_primdiffusion.ui.variations.sheet.shutil.move", full)
+    with pytest.raises(RuntimeError, match="No space left"):
+        ops.variations(seed=40, count=2, steps=1)
+    assert seeds() == [11, 12, 13, 14]
+    assert len(files_left()) == 1
+
+
+def test_none_can_be_redone_with_a_slider():
+    for operator in (operators.PRIMDIFFUSION_OT_variations, operators.PRIMDIFFUSION_OT_more_like_variation):
+        assert not {"REGISTER", "UNDO"} & operator.bl_options
