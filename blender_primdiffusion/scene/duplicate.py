@@ -9,22 +9,21 @@ import bpy
 
 from .human import armature_of
 from .rename import part_name
-
-_SHARED = {"VOLUME"}
-"""Types of objects whose data both people show: what edits change they copy first (see `shape.own_data`)."""
+from .shape import volumes_of
 
 
 def duplicate_human(collection: bpy.types.Collection) -> bpy.types.Collection:
     """A copy of a person in the same place, linked beside them; posing, reshaping and editing one leaves the other.
 
     Everything in the person's collections comes along, and what points to a part of the person points to the copy's.
-    Files are shared. Raises ValueError for a collection that holds no person.
+    Files are shared, and so are the volumes' data, which edits copy before they change them (see `shape.own_data`).
+    Raises ValueError for a collection that holds no person.
     """
     armature_of(collection)
+    shared = {thing for objects in volumes_of(collection).values() for thing in objects}
     twin = collection.copy()
     twins: dict[Any, Any] = {collection: twin}
-    for parent in [twin]:
-        _copy_children(parent, twins)
+    _copy_children(twin, twins)
     objects = [thing for thing in collection.all_objects if thing not in twins]
     for thing in objects:
         twins[thing] = thing.copy()
@@ -33,6 +32,8 @@ def duplicate_human(collection: bpy.types.Collection) -> bpy.types.Collection:
             copy.objects.unlink(thing)
             copy.objects.link(twins[thing])
     for thing in objects:
+        if thing.data is not None and thing not in shared:
+            twins[thing].data = thing.data.copy()
         _own(thing, twins[thing], twins)
     for holder in _holders(collection):
         holder.children.link(twin)
@@ -49,9 +50,7 @@ def _copy_children(copy: bpy.types.Collection, twins: dict[Any, Any]) -> None:
 
 
 def _own(thing: bpy.types.Object, copy: bpy.types.Object, twins: dict[Any, Any]) -> None:
-    """Give the copy data and an action of its own, and turn what it points to into the copies."""
-    if thing.data is not None and thing.type not in _SHARED:
-        copy.data = thing.data.copy()
+    """Give the copy an action of its own, and turn what it points to into the copies."""
     if thing.animation_data is not None and thing.animation_data.action is not None:
         slot = thing.animation_data.action_slot
         copy.animation_data.action = thing.animation_data.action.copy()
@@ -95,5 +94,5 @@ def _name_parts(collection: bpy.types.Collection, twin: bpy.types.Collection, tw
     for part, copy in twins.items():
         copy.name = part_name(part.name, collection.name, twin.name)
         data = getattr(copy, "data", None)
-        if data is not None and copy.type not in _SHARED:
+        if data is not None and data != part.data:
             data.name = part_name(part.data.name, collection.name, twin.name)

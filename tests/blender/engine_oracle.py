@@ -6,6 +6,7 @@ Run by the backend's Python; Blender's tests compare the engine's pictures with 
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -47,9 +48,13 @@ def make(folder: Path, seed: int, betas: list[float]) -> None:
     export_for_blender(folder / "human.npz", human)
 
 
-def placed(folder: str, rotations: list, translation: list, world: list, **_: object) -> Primitives:
-    """A posed person, then moved, turned and scaled alike in all directions by `world` [4, 4]."""
+def placed(
+    folder: str, rotations: list, translation: list, world: list, betas: list | None = None, **_: object
+) -> Primitives:
+    """A posed person, of other betas if given, then moved, turned and scaled alike in all directions by `world`."""
     human = load_human(Path(folder) / "person.human.safetensors")
+    if betas is not None:
+        human = dataclasses.replace(human, betas=torch.tensor(betas, dtype=torch.float32))
     pose = BodyPose(torch.tensor(rotations, dtype=torch.float32), torch.tensor(translation, dtype=torch.float32))
     person, matrix = place(human, pose), torch.tensor(world, dtype=torch.float64)
     scale = float(torch.linalg.det(matrix[:3, :3])) ** (1 / 3)

@@ -12,6 +12,7 @@ import synthetic_shape
 from jobs_driven import shown
 from oracle import evaluated_matrices
 
+from blender_primdiffusion.scene.attachment import set_attachment
 from blender_primdiffusion.scene.body_mesh import body_of
 from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, build_human, folder_of, humans, person_file
 from blender_primdiffusion.scene.keyframes import keyframe_poses
@@ -242,6 +243,16 @@ def test_a_duplicate_is_a_person_of_their_own_on_the_same_files(person, addon):
         thing.data for thing in person.all_objects if thing.type == "VOLUME"
     }
     assert person_file(twin) == person_file(person)
+
+
+def test_a_duplicate_on_the_posed_surface_follows_its_own_body(person, addon):
+    set_attachment(person, "SURFACE")
+    ops.duplicate_human()
+    twin = bpy.data.collections["Human.001"]
+    nodes = next(one for thing in twin.all_objects for one in thing.modifiers if one.type == "NODES")
+    pointed = {value for value in nodes.values() if isinstance(value, bpy.types.ID)}
+    assert body_of(twin) in pointed
+    assert pointed <= {*twin.all_objects, *twin.children_recursive}
 
 
 def test_undo_and_redo_of_a_duplicate_and_of_a_removal(person):

@@ -15,6 +15,7 @@ from primdiffusion.primitives.primitives import K, Payload
 
 from blender_primdiffusion.scene.human_file import read_human
 from blender_primdiffusion.scene.shape_measures import betas_of_measures, measure
+from blender_primdiffusion.scene.shape_names import slider_names
 
 SHAPES = np.random.default_rng(4).normal(0, 1.2, (4, 10))
 
@@ -82,3 +83,28 @@ def test_the_persons_own_body_is_left_in_peace(model):
     betas = SHAPES[2].copy()
     betas_of_measures(model, betas, 1.8)
     np.testing.assert_array_equal(betas, SHAPES[2])
+
+
+def change(model, slider: str, measured) -> float:
+    """What two standard deviations of a slider change in what is measured of the body."""
+    betas = 2.0 * (np.array(slider_names(model)) == slider)
+    assert betas.sum() == 2.0
+    return measured(betas) - measured(-betas)
+
+
+def waist(model, betas: np.ndarray) -> float:
+    """Width [m] of the torso at 62 % of the height."""
+    x, y, _ = model.surface(betas).T
+    share = (y - y.min()) / np.ptp(y)
+    return np.ptp(x[(share > 0.60) & (share < 0.64) & (np.abs(x) < 0.3)])
+
+
+def test_named_sliders_of_the_default_body_do_what_they_are_called(model):
+    height, weight = (lambda betas, row=row: measure(model, betas)[row] for row in range(2))
+    assert change(model, "Stature", height) > 0.5
+    left, right = 16, 17
+    assert change(model, "Shoulders", lambda betas: np.subtract(*model.rest(betas).joints[[left, right], 0])) > 0.05
+    assert change(model, "Waist", lambda betas: waist(model, betas)) > 0.05
+    assert abs(change(model, "Waist", height)) < 0.01
+    assert change(model, "Girth", weight) > 15
+    assert abs(change(model, "Girth", height)) < 0.01

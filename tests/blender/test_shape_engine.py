@@ -1,0 +1,68 @@
+"""A reshaped person in the render engine is the backend's own picture of that body in that pose."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+import synthetic
+from engine_stage import PYTHON, STEP, Z_UP, Oracle, camera_by_hand, eight_bit, render_png, thinned
+
+import blender_primdiffusion
+from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.human import armature_of, build_human
+from blender_primdiffusion.scene.shape import betas_of
+
+SIZE = (120, 90)
+
+
+@pytest.fixture
+def stage(saved_scene, tmp_path, monkeypatch):
+    """A person of the backend before a camera."""
+    monkeypatch.setenv("PRIMDIFFUSION_PYTHON", PYTHON)
+    blender_primdiffusion.register()
+    oracle, folder = Oracle(tmp_path), tmp_path / "person"
+    oracle.ask({"make": str(folder), "seed": 1, "betas": [0.0] * 10})
+    person = build_human(saved_scene, thinned(folder / "human.npz"), keep=[folder / "person.human.safetensors"])
+    scene = saved_scene.scene
+    scene.render.engine = "PRIMDIFFUSION"
+    scene.render.resolution_x, scene.render.resolution_y = SIZE
+    scene.render.resolution_percentage = 100
+    scene.render.film_transparent = True
+    scene.render.dither_intensity = 0
+    scene.view_settings.view_transform = "Standard"
+    scene.primdiffusion_render.step = STEP
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    camera.location, camera.rotation_euler = (0.5, -3.4, 1.2), (math.radians(84), 0, math.radians(9))
+    yield SimpleNamespace(person=person, camera=camera, oracle=oracle, folder=folder, out=tmp_path / "picture.png")
+    oracle.close()
+    scene.render.engine = "CYCLES"
+    blender_primdiffusion.unregister()
+
+
+def test_the_engine_draws_a_reshaped_posed_person_as_the_backend_does(stage):
+    armature = armature_of(stage.person)
+    rng = np.random.default_rng(2)
+    rotations, translation = synthetic.axis_angle(rng.normal(0, 0.3, (24, 3))), np.array([0.1, 0.05, 0.0])
+    pose_from_joint_rotations(armature, rotations, translation)
+    armature.primdiffusion_human.betas = [1.5, -2.0, 1.0, 0, 0, 1.0, 0, 0, 0, 0]
+    armature.primdiffusion_human.height = 1.82
+    bpy.context.view_layer.update()
+    asked = {
+        "folder": str(stage.folder),
+        "rotations": rotations.tolist(),
+        "translation": translation.tolist(),
+        "world": (Z_UP.T @ np.array(armature.matrix_world) @ Z_UP).tolist(),
+        "betas": betas_of(stage.person).tolist(),
+    }
+    combined, _ = stage.oracle.picture([asked], camera_by_hand(stage.camera, SIZE), SIZE)
+    wanted = eight_bit(combined)
+    assert 0.02 < (wanted[..., 3] > 0).mean() < 0.98
+    assert np.abs(render_png(stage.out) - wanted).max() <= 1
+    as_generated, _ = stage.oracle.picture([{**asked, "betas": [0.0] * 10}], camera_by_hand(stage.camera, SIZE), SIZE)
+    assert np.abs(eight_bit(as_generated) - wanted).max() > 30
