@@ -1,0 +1,63 @@
+"""The user's own poses: a JSON file each in a folder, so that they can be copied to another computer."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+SUFFIX = ".pose.json"
+_LONGEST_NAME = 60
+
+
+class PoseFileError(ValueError):
+    """A pose that cannot be saved or read; one sentence."""
+
+
+def own_poses(folder: Path) -> dict[str, Path]:
+    """Names of the poses in a folder and their files, sorted; a folder that is not there holds none."""
+    return {path.name.removesuffix(SUFFIX): path for path in sorted(folder.glob(f"*{SUFFIX}"))}
+
+
+def save_pose(folder: Path, name: str, pose: NDArray, translation: NDArray) -> Path:
+    """Write a pose [24, 3] (axis-angle, radians) with its translation [3] (metres), both y up; returns the file.
+
+    Any pose-reading program of ours reads it too (`pose`, `transl`). Raises PoseFileError for a name that is empty or
+    no file's, or taken, and where the folder cannot be written to.
+    """
+    name = name.strip()
+    if not name or len(name) > _LONGEST_NAME or re.search(r'[\\/:*?"<>|\x00-\x1f]', name) or name.startswith("."):
+        raise PoseFileError(
+            f"a pose cannot be called {name!r}: give it a name of at most {_LONGEST_NAME} letters without any of "
+            r'\ / : * ? " < > |'
+        )
+    path = folder / f"{name}{SUFFIX}"
+    if path.exists():
+        raise PoseFileError(f"there is a pose {name!r} already: give another name, or delete that one first")
+    content = {"name": name, "pose": np.round(pose, 6).tolist(), "transl": np.round(translation, 6).tolist()}
+    unfinished = path.with_suffix(".part")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        unfinished.write_text(json.dumps(content, indent=1), encoding="utf-8")
+        os.replace(unfinished, path)
+    except OSError as error:
+        raise PoseFileError(f"the pose could not be written to {str(path)!r} ({error.strerror or error})") from error
+    return path
+
+
+def load_pose(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The pose [24, 3] and the translation [3] in a file. Raises PoseFileError where there is none."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        pose = np.asarray(content["pose"], np.float64)
+        translation = np.asarray(content["transl"], np.float64)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise PoseFileError(f"the pose file {str(path)!r} cannot be read ({error}): save the pose again") from error
+    finite = np.isfinite(pose).all() and np.isfinite(translation).all()
+    if pose.shape != (24, 3) or translation.shape != (3,) or not finite:
+        raise PoseFileError(f"the pose file {str(path)!r} holds no pose of 24 joints: save the pose again")
+    return pose, translation

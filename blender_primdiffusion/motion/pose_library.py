@@ -1,0 +1,133 @@
+"""The pose library: built-in poses, and poses taken from and given to an armature with SMPL's joints."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Collection
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene.armature import bone_bases, rest_rotations
+from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
+from ..scene.human_file import JOINT_NAMES
+from ..scene.quaternion import matrix_to_quaternion
+from .adjust import leg_ratio, slerp
+from .library_poses import LIBRARY
+from .poses import grounding
+from .rotation import from_axis_angle, to_axis_angle
+
+_MIRROR = np.array([1.0, -1.0, -1.0])
+"""Of an axis-angle vector when left and right change places."""
+
+
+@functools.cache
+def builtin_poses() -> dict[str, NDArray[np.float64]]:
+    """Poses of our own by name: axis-angle vectors [24, 3], radians, y up, relative to the parents. Read only."""
+    return {name: to_axis_angle(pose.rotations()) for name, pose in LIBRARY.items()}
+
+
+def mirrored(pose: NDArray) -> NDArray[np.float64]:
+    """A pose [24, 3] with left and right changed."""
+    names = [_other_side(name) for name in JOINT_NAMES]
+    return np.asarray(pose, np.float64)[[JOINT_NAMES.index(name) for name in names]] * _MIRROR
+
+
+def rest_joints(armature: bpy.types.Object) -> NDArray[np.float64]:
+    """Heads of SMPL's joints at rest [24, 3], y up, in the armature's units. Raises ValueError as `rest_rotations`."""
+    rest_rotations(armature)
+    return points_to_backend([armature.data.bones[name].head_local for name in JOINT_NAMES])
+
+
+def check_posable(armature: bpy.types.Object) -> None:
+    """Raises ValueError, in a sentence, where the armature cannot be posed or keyed now."""
+    if armature.library is not None:
+        raise ValueError(
+            f"{armature.name!r} is linked from another file: make a library override of it (Object > Library Override)"
+        )
+    if armature.mode == "EDIT":
+        raise ValueError(f"{armature.name!r} is in Edit Mode: leave it (Tab) first")
+    rest_rotations(armature)
+
+
+def current_pose(armature: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Joint rotations [24, 3, 3] and the translation [3], metres, y up, as the bones are set; constraints do not count.
+
+    Raises ValueError where one of SMPL's joints lacks.
+    """
+    rest = rest_rotations(armature)
+    bases = [armature.pose.bones[name].matrix_basis for name in JOINT_NAMES]
+    local = np.array([np.array(basis.to_quaternion().to_matrix()) for basis in bases], np.float64)
+    world = rest @ local @ np.swapaxes(rest, -1, -2)
+    rotations = BLENDER_FROM_BACKEND.T @ world @ BLENDER_FROM_BACKEND
+    return rotations, points_to_backend(rest[0] @ np.array(bases[0].translation))
+
+
+def standing(armature: bpy.types.Object, pose: NDArray) -> NDArray[np.float64]:
+    """The translation [3] that puts somebody of this armature's legs in a pose [24, 3] on the floor."""
+    return grounding(from_axis_angle(pose)[None])[0] * leg_ratio(rest_joints(armature))
+
+
+def apply_pose(
+    armature: bpy.types.Object,
+    pose: NDArray,
+    translation: NDArray | None = None,
+    amount: float = 1.0,
+    joints: Collection[str] = JOINT_NAMES,
+) -> list[str]:
+    """Give an armature a pose [24, 3] and, if given, a translation [3] (y up, metres); returns the bones changed.
+
+    `amount` from 0 to 1 goes from the pose it has to the new one, the shortest way. Only `joints` turn, only with the
+    pelvis among them the whole body moves, and bones all of whose rotation is locked stay. Raises ValueError as
+    `check_posable` does, and where the pose has another shape.
+    """
+    check_posable(armature)
+    pose = np.asarray(pose, np.float64)
+    if pose.shape != (len(JOINT_NAMES), 3) or not np.isfinite(pose).all():
+        raise ValueError(f"a pose is {len(JOINT_NAMES)} axis-angle vectors of finite numbers, not {pose.shape}")
+    now, place = current_pose(armature)
+    target = place if translation is None else np.asarray(translation, np.float64)
+    rest = rest_rotations(armature)
+    wanted, _ = bone_bases(rest, from_axis_angle(pose), target)
+    had, _ = bone_bases(rest, now, place)
+    quaternions = slerp(had, wanted, amount)
+    changed = []
+    for name, quaternion in zip(JOINT_NAMES, quaternions, strict=True):
+        bone = armature.pose.bones[name]
+        if name not in joints or all(bone.lock_rotation):
+            continue
+        bone.rotation_mode = "QUATERNION"
+        bone.rotation_quaternion = quaternion
+        changed.append(name)
+    if JOINT_NAMES[0] in changed and translation is not None:
+        _, location = bone_bases(rest, now, place + amount * (target - place))
+        armature.pose.bones[JOINT_NAMES[0]].location = location
+    return changed
+
+
+def key_pose(armature: bpy.types.Object, frame: float, joints: Collection[str] = JOINT_NAMES) -> None:
+    """Keyframes of the pose as it is now. Raises ValueError as `check_posable` does."""
+    check_posable(armature)
+    for name in joints:
+        bone = armature.pose.bones[name]
+        if bone.rotation_mode != "QUATERNION":
+            quaternion = matrix_to_quaternion(np.array(bone.matrix_basis.to_quaternion().to_matrix()))
+            bone.rotation_mode = "QUATERNION"
+            bone.rotation_quaternion = quaternion
+        bone.keyframe_insert("rotation_quaternion", frame=frame, group=name)
+        if name == JOINT_NAMES[0]:
+            bone.keyframe_insert("location", frame=frame, group=name)
+
+
+def selected_joints(armature: bpy.types.Object) -> list[str]:
+    """SMPL's joints whose bones are selected."""
+    bones = armature.pose.bones
+    if bpy.app.version >= (5, 0, 0):
+        return [name for name in JOINT_NAMES if name in bones and bones[name].select]
+    return [name for name in JOINT_NAMES if name in bones and bones[name].bone.select]
+
+
+def _other_side(name: str) -> str:
+    side, _, part = name.partition("_")
+    return {"left": f"right_{part}", "right": f"left_{part}"}.get(side, name)

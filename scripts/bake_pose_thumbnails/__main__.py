@@ -1,0 +1,47 @@
+"""Pictures of the pose library's poses for the extension: `python -m scripts.bake_pose_thumbnails`.
+
+A person of the default checkpoint is drawn by our own marcher in each pose; the pictures are 160 pixels wide.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import torch
+from PIL import Image
+from primdiffusion.body.model import BodyPose
+from primdiffusion.human import framing, generate, place
+from primdiffusion.render.image import to_png
+from primdiffusion.render.march import march
+from primdiffusion.training.checkpoint import load_checkpoint
+
+from blender_primdiffusion.motion.library_poses import LIBRARY
+
+OUT = Path(__file__).resolve().parents[2] / "blender_primdiffusion" / "motion" / "data" / "thumbnails"
+SEED, YAW, SIZE = 7, 0.45, 160
+_COLOURS = 96
+"""Of a picture's palette: a third of the size, and nothing to be seen of it."""
+
+
+def main() -> None:
+    """Writes a PNG for each pose, in place of those there were."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=OUT)
+    out = parser.parse_args().out
+    out.mkdir(parents=True, exist_ok=True)
+    human = generate(load_checkpoint(None), SEED)
+    with tempfile.TemporaryDirectory() as folder:
+        large = Path(folder) / "large.png"
+        for name, pose in LIBRARY.items():
+            rotations = torch.from_numpy(pose.rotations()).float()
+            primitives = place(human, BodyPose(rotations, torch.zeros(3)))
+            to_png(large, march(primitives, framing(primitives, YAW, 2 * SIZE, 2 * SIZE)), None)
+            small = Image.open(large).resize((SIZE, SIZE), Image.Resampling.LANCZOS)
+            small.quantize(_COLOURS, method=Image.Quantize.FASTOCTREE).save(out / f"{name}.png", optimize=True)
+    print(f"{len(LIBRARY)} pictures, {sum(path.stat().st_size for path in out.glob('*.png')) / 1e3:.0f} kB, in {out}")
+
+
+if __name__ == "__main__":
+    main()
