@@ -78,6 +78,7 @@ def set_up(plan: Plan, log: IO[str]) -> Iterator[Step]:
     """
     folder, lock = plan.folder, _lock(plan)
     yield Step("Checking", 0.0)
+    _check_online(plan, lock)
     _check_disk(folder, lock, Path(plan.offline) if plan.offline else folder.wheels)
     remove_tree(folder.temporary)
     folder.temporary.mkdir(parents=True)
@@ -96,9 +97,9 @@ def set_up(plan: Plan, log: IO[str]) -> Iterator[Step]:
 def repair(plan: Plan, log: IO[str]) -> Iterator[Step]:
     """Compares every installed file with its record; sets up anew when one differs. Raises as `set_up` does."""
     folder = plan.folder
-    state, about = state_of(folder)
+    lock, (state, about) = _lock(plan), state_of(folder)
     yield Step("Comparing the installed files", 0.0)
-    if state == "ready" and about.get("lock") == _lock(plan).digest:
+    if state == "ready" and about.get("lock") == lock.digest:
         wrong = damaged(folder.environment)
         if wrong is None:
             for step in self_test(plan):
@@ -108,6 +109,7 @@ def repair(plan: Plan, log: IO[str]) -> Iterator[Step]:
                 yield step
             return
         log.write(f"{wrong}\n")
+    _check_online(plan, lock)
     unmark(folder)
     yield from set_up(plan, log)
 
@@ -141,6 +143,13 @@ def _lock(plan: Plan) -> Lock:
         return read_lock(Path(plan.lock))
     except (OSError, ValueError) as error:
         raise SetUpFailed(f"the list of packages cannot be read: {error}") from error
+
+
+def _check_online(plan: Plan, lock: Lock) -> None:
+    """Before what is there is given up: what is missing can be fetched, as far as Blender's preferences go."""
+    missing = () if plan.offline or plan.online else _missing(lock, plan.folder.wheels)
+    if missing:
+        raise SetUpFailed(f"{len(missing)} packages have to be downloaded: {OFFLINE}")
 
 
 def _check_disk(folder: SetUpFolder, lock: Lock, wheels: Path) -> None:
@@ -227,8 +236,6 @@ def _download(plan: Plan, lock: Lock, pip: Pip) -> Iterator[Step]:
     missing, total = _missing(lock, folder.wheels), max(lock.download_bytes, 1)
     have = total - sum(package.bytes for package in missing)
     number = len(lock.packages) - len(missing)
-    if missing and not plan.online:
-        raise SetUpFailed(f"{len(missing)} packages have to be downloaded: {OFFLINE}")
     arriving = folder.wheels / "arriving"
     for group in grouped(missing, GROUP_BYTES):
         remove_tree(arriving)

@@ -1,0 +1,272 @@
+"""Set Up Backend and its neighbours as operators: what they do, what they refuse, what panels show."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import bpy
+import pytest
+
+sys.path.append(str(Path(__file__).parents[1] / "contract"))
+
+from tiny_packages import BACKEND, own_index, served, until, write_lock, write_packages, write_wheel
+
+import blender_primdiffusion
+import build_addon
+from blender_primdiffusion import places
+from blender_primdiffusion.ui.setup import drawing, known, preferences
+from blender_primdiffusion.ui.setup.session import session
+from blender_primdiffusion.worker.environment import VARIABLE
+from blender_primdiffusion.worker.setup_job import SetUpJob
+
+press = bpy.ops.primdiffusion
+
+
+@pytest.fixture
+def wheels(empty_scene, tmp_path, monkeypatch) -> Path:
+    """The add-on registered, no backend yet; a folder with all wheels that it needs."""
+    folder = tmp_path / "große räder"
+    lock = write_lock(tmp_path / "lock.txt", write_packages(folder))
+    monkeypatch.delenv(VARIABLE, raising=False)
+    own_index(monkeypatch)
+    monkeypatch.setattr(places, "short_root", lambda *_: tmp_path / "eigener ordner")
+    monkeypatch.setattr(places, "backend_module_path", lambda: BACKEND)
+    monkeypatch.setattr("blender_primdiffusion.ui.setup.plans.backend_module_path", lambda: BACKEND)
+    monkeypatch.setattr(known, "_has_torch", lambda: False)
+    monkeypatch.setattr(known, "available", lambda: {"cpu": lock})
+    bpy.context.preferences.system.use_online_access = False
+    session.error = session.notice = ""
+    blender_primdiffusion.register()
+    yield folder
+    blender_primdiffusion.unregister()
+    bpy.context.preferences.system.use_online_access = False
+
+
+@pytest.fixture
+def online(wheels):
+    bpy.context.preferences.system.use_online_access = True
+    return wheels
+
+
+class Layout:
+    """Takes what a draw function asks for; remembers texts and buttons."""
+
+    def __init__(self):
+        self.texts, self.buttons, self.props = [], [], []
+        self.filepath = ""
+
+    def label(self, text="", **_):
+        self.texts.append(text)
+
+    def operator(self, idname, **_):
+        self.buttons.append(idname)
+        return self
+
+    def prop(self, _data, name, **_):
+        self.props.append(name)
+
+    def progress(self, text="", **_):
+        self.texts.append(text)
+
+    def box(self):
+        return self
+
+    def row(self, **_):
+        return self
+
+    def column(self, **_):
+        return self
+
+    @property
+    def said(self) -> str:
+        return " ".join(self.texts)
+
+
+def draw_preferences() -> Layout:
+    layout = Layout()
+    fake = type("Preferences", (), {"layout": layout})()
+    fake._draw_backend = lambda box: preferences.PRIMDIFFUSION_AP_preferences._draw_backend(fake, box)
+    fake._draw_buttons = lambda box, state: preferences.PRIMDIFFUSION_AP_preferences._draw_buttons(fake, box, state)
+    preferences.PRIMDIFFUSION_AP_preferences.draw(fake, bpy.context)
+    return layout
+
+
+def test_from_no_backend_to_a_backend_and_back(wheels):
+    layout = Layout()
+    assert not drawing.draw_set_up(layout)
+    assert "The backend is not set up yet" in layout.said
+    assert "Downloads" in layout.said
+    assert "primdiffusion.set_up_backend" in layout.buttons
+
+    assert press.install_from_folder(directory=str(wheels)) == {"FINISHED"}
+    assert known.known().state == "ready"
+    assert session.notice.startswith("The backend is ready: torch 0-tiny")
+    layout = Layout()
+    assert drawing.draw_set_up(layout)
+    assert not layout.texts
+    said = draw_preferences()
+    assert "Ready: torch 0-tiny" in said.said
+    assert str(places.set_up_folder().environment)[:40] in said.said
+    assert {"primdiffusion.repair_backend", "primdiffusion.remove_backend"} <= set(said.buttons)
+
+    assert press.set_up_backend() == {"FINISHED"}  # nothing to do
+    assert press.test_backend() == {"FINISHED"}
+    assert press.repair_backend() == {"FINISHED"}
+    assert session.notice.startswith("Nothing had to be repaired")
+    assert press.remove_backend() == {"FINISHED"}
+    assert known.known().state == "absent"
+
+
+def test_set_up_backend_downloads_when_blender_may_use_the_network(online, monkeypatch):
+    with served(online) as (index, _):
+        own_index(monkeypatch, index)
+        assert press.set_up_backend() == {"FINISHED"}
+    assert known.known().state == "ready"
+
+
+def test_without_online_access_set_up_is_refused_and_says_how_to_allow_it(wheels):
+    with pytest.raises(RuntimeError, match=r"Preferences > System > Network > Allow Online Access"):
+        press.set_up_backend()
+    layout = Layout()
+    drawing.draw_set_up(layout)
+    assert "Allow Online Access" in layout.said
+    assert not places.set_up_folder().root.exists()
+
+
+def test_a_failure_raises_and_stays_in_the_panel(online):
+    with pytest.raises(RuntimeError, match="the package index cannot be reached"):
+        press.set_up_backend()
+    layout = Layout()
+    drawing.draw_set_up(layout)
+    assert "cannot be reached" in layout.said
+    assert "Half installed: Set Up Backend goes on from there" in layout.said
+    assert "wm.path_open" in draw_preferences().buttons
+
+
+@pytest.mark.parametrize("folder", ["", "/no/such/folder"])
+def test_a_folder_that_is_none_is_refused(wheels, folder):
+    with pytest.raises(RuntimeError, match="is no folder: choose the one that holds the wheels"):
+        press.install_from_folder(directory=folder)
+
+
+def test_a_folder_may_bring_its_own_list_of_packages(wheels, tmp_path, monkeypatch):
+    ours = write_lock(tmp_path / "ours.txt", [write_wheel(tmp_path / "elsewhere", "torch", "")])
+    monkeypatch.setattr(known, "available", lambda: {"cpu": ours})
+    with pytest.raises(RuntimeError, match=r"lacks the right wheels of torch 1\.0"):
+        press.install_from_folder(directory=str(wheels))
+    write_lock(wheels / known.OWN_LOCK, sorted(wheels.glob("*.whl")))
+    assert press.install_from_folder(directory=str(wheels)) == {"FINISHED"}
+    assert known.known().about["lock_name"] == "requirements.txt"
+
+
+def test_an_environment_of_other_packages_than_todays_says_so(wheels, monkeypatch):
+    assert press.install_from_folder(directory=str(wheels)) == {"FINISHED"}
+    (path,) = known.available().values()
+    monkeypatch.setattr(known, "LOCKS", path.parent)
+    path.write_text(path.read_text() + "# another\n")
+    known.read_once.cache_clear()
+    assert known.known().state == "outdated"
+    assert "press Repair" in known.known().line
+    with pytest.raises(RuntimeError, match="2 packages have to be downloaded"):
+        press.repair_backend()
+    assert known.known().state == "outdated"  # still there, and it works
+
+
+def test_nothing_to_remove_test_or_cancel_is_refused(wheels):
+    with pytest.raises(RuntimeError, match="There is no backend to remove"):
+        press.remove_backend()
+    with pytest.raises(RuntimeError, match="not set up yet: press Set Up Backend first"):
+        press.test_backend()
+    with pytest.raises(RuntimeError, match="Nothing is being set up"):
+        press.cancel_set_up()
+
+
+def test_while_one_is_under_way_a_second_is_refused_and_cancel_ends_it(online, tmp_path, monkeypatch):
+    from blender_primdiffusion.ui.setup.plans import plan_of_set_up
+
+    with served(online, stalls="torch") as (index, handler):
+        own_index(monkeypatch, index)
+        session.start("set_up", plan_of_set_up())
+        until(lambda: session.tick() or any(path.startswith("/torch-") for path in handler.asked))
+        layout = Layout()
+        assert not drawing.draw_set_up(layout)
+        assert layout.buttons == ["primdiffusion.cancel_set_up"]
+        with pytest.raises(RuntimeError, match="being set up already"):
+            press.repair_backend()
+        assert press.cancel_set_up() == {"FINISHED"}
+    assert not session.busy
+    assert session.notice.startswith("Cancelled; what has been downloaded is kept")
+    assert known.known().state == "half"
+
+
+def test_an_existing_python_goes_first_and_is_tried(wheels, monkeypatch):
+    monkeypatch.setenv(VARIABLE, "/no/such/python")
+    assert known.known().line == f"Uses /no/such/python, named by the environment variable {VARIABLE}"
+    with pytest.raises(RuntimeError, match=r"/no/such/python .* does not exist"):
+        press.test_backend()
+
+
+def test_a_machine_without_packages_is_told_what_to_do(online, monkeypatch):
+    monkeypatch.setattr(known, "available", dict)
+    with pytest.raises(RuntimeError, match="make an environment by hand and name its Python"):
+        press.set_up_backend()
+    layout = Layout()
+    drawing.draw_set_up(layout)
+    assert "there are no packages for" in layout.said
+
+
+def test_set_up_is_refused_while_a_person_is_made(online, monkeypatch):
+    from blender_primdiffusion.ui.jobs.queue import Queue
+
+    monkeypatch.setattr(Queue, "busy", property(lambda self: True))
+    with pytest.raises(RuntimeError, match="The backend is at work"):
+        press.set_up_backend()
+
+
+def test_disabling_the_extension_ends_a_set_up(online, monkeypatch):
+    from blender_primdiffusion.ui.setup.plans import plan_of_set_up
+
+    with served(online, stalls="torch") as (index, _):
+        own_index(monkeypatch, index)
+        session.start("set_up", plan_of_set_up())
+        job: SetUpJob = session.job
+        blender_primdiffusion.unregister()
+        blender_primdiffusion.register()
+    assert job.state == "cancelled"
+    assert not session.busy
+
+
+def test_the_preferences_show_what_was_found_and_what_it_costs(wheels):
+    said = draw_preferences()
+    assert re.search(r"Found: .*Python 3\.\d+", said.said)
+    assert re.search(r"Downloads \d+ MB, takes \d+ MB on disk, about \d+ min", said.said)
+    assert {"compute", "backend_python", "checkpoint", "encoder", "idle_minutes"} <= set(said.props)
+
+
+def test_the_zip_holds_the_locks_and_asks_for_the_network():
+    names = build_addon.contents()
+    assert "requirements/linux_x86_64-py311-cpu.txt" in names
+    assert "requirements/windows_x86_64-py313-cuda.txt" in names
+    manifest = (build_addon.ADDON / "blender_manifest.toml").read_text()
+    reason = re.search(r'^network = "(.+)"$', manifest, re.MULTILINE)
+    assert len(reason[1]) <= 64
+
+
+def test_registration_imports_nothing_that_sets_up():
+    program = (
+        "import sys, bpy; before = set(sys.modules); import blender_primdiffusion as addon; addon.register(); "
+        "new = set(sys.modules) - before; addon.unregister(); print(*sorted(new))"
+    )
+    root = Path(__file__).parents[2]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, cwd=root)
+    loaded = set(done.stdout.split())
+    assert "blender_primdiffusion.ui.setup.operators" in loaded, done.stderr
+    heavy = {"torch", "scipy", "numba", "ssl", "http.client", "urllib.request", "email", "asyncio", "multiprocessing"}
+    assert not heavy & loaded
+    ours = {name.rsplit(".", 1)[1] for name in loaded if name.startswith("blender_primdiffusion.worker.setup_")}
+    assert not ours & {"setup_job", "setup_steps", "setup_pip", "setup_trial", "setup_process", "setup_records"}
