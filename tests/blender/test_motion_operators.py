@@ -385,3 +385,31 @@ def test_a_hand_keyed_pose_is_where_it_was(addon, armature):
     np.testing.assert_allclose(current_pose(armature)[0][15], wanted, atol=1e-6)
     assert len(action_curves(armature)) == 24 * 4 + 3
     np.testing.assert_allclose(from_axis_angle(to_axis_angle(wanted)), wanted, atol=1e-6)
+
+
+def test_the_import_shows_what_it_finds_before_anything_is_done(addon, armature, tmp_path):
+    def drawn(path: str, **settings) -> tuple[list[str], list[str]]:
+        layout = MagicMock()
+        layout.box.return_value.column.return_value = layout
+        layout.split.return_value = layout.column.return_value = layout
+        values = {"filepath": path, "person": "", "into": "NEW", "bones": "AUTO", **settings}
+        operator = SimpleNamespace(layout=layout, axis=lambda: "", **values)
+        operator._draw_found = lambda *a: PRIMDIFFUSION_OT_import_motion._draw_found(operator, *a)
+        PRIMDIFFUSION_OT_import_motion.draw(operator, addon)
+        labels = [call.kwargs["text"] for call in layout.label.call_args_list]
+        return labels, [call.args[1] for call in layout.prop.call_args_list]
+
+    labels, settings = drawn(amass(tmp_path / "m.npz"))
+    assert {"Ann", "SMPL-H", "120", "z"} <= set(labels)
+    assert "bones" not in settings
+    (tmp_path / "bad.bvh").write_text("HIERARCHY")
+    assert any("is not a BVH file" in label for label in drawn(str(tmp_path / "bad.bvh"))[0])
+    assert drawn("")[0] == ["Ann"]
+    from test_motion_bvh import motion_of, write_bvh
+
+    from blender_primdiffusion.motion.skeleton import REST_JOINTS
+
+    path = write_bvh(
+        tmp_path / "m.bvh", REST_JOINTS, *motion_of(), {name: f"x{i}" for i, name in enumerate(JOINT_NAMES)}
+    )
+    assert "bone_left_knee" in drawn(str(path), bones="CHOSEN")[1]

@@ -93,6 +93,9 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
     bl_options = {"UNDO", "PRESET"}  # noqa: RUF012
 
     filename_ext = ""
+    filepath: bpy.props.StringProperty(
+        name="File", description="Path of the motion", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
     filter_glob: bpy.props.StringProperty(default=";".join(f"*{s}" for s in SUFFIXES), options={"HIDDEN"})
     up: bpy.props.EnumProperty(name="Up Axis", description="Which axis of the file points up", items=_UP_ITEMS)
     fps: bpy.props.FloatProperty(
