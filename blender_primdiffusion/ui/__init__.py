@@ -5,9 +5,9 @@ from __future__ import annotations
 import bpy
 
 from ..scene.collect import collect_before_saving
-from . import assets, batch, captures, generate, human, jobs, manual, motion, render, setup, variations
+from . import assets, batch, captures, generate, human, jobs, manual, motion, render, setup, translations, variations
 
-ROOMS = (setup, jobs, generate, variations, human, motion, assets, render, captures, batch, manual)
+ROOMS = (translations, setup, jobs, generate, variations, human, motion, assets, render, captures, batch, manual)
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
 
 

@@ -1,0 +1,38 @@
+"""The interface in German and French, where Blender is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import bpy
+
+LANGUAGES = ("de_DE", "fr_FR")
+"""In the order of the tables' columns, as Blender calls them."""
+_CONTEXTS = ("*", "Operator")
+"""Buttons of operators look their words up in a context of their own."""
+
+Messages = dict[str, dict[tuple[str, str], str]]
+
+
+def messages(*tables: Iterable[tuple[str, ...]]) -> Messages:
+    """Rows of English, German, French as Blender wants them: by language, then by context and English."""
+    found: Messages = {language: {} for language in LANGUAGES}
+    for table in tables:
+        for english, *others in table:
+            for language, translated in zip(LANGUAGES, others, strict=True):
+                for context in _CONTEXTS:
+                    found[language][context, english] = translated
+    return found
+
+
+def register() -> None:
+    """Make the words known to Blender."""
+    from .labels import LABELS
+    from .tooltips import TOOLTIPS
+
+    bpy.app.translations.register(__package__, messages(LABELS, TOOLTIPS))
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    bpy.app.translations.unregister(__package__)

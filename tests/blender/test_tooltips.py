@@ -1,0 +1,118 @@
+"""Words in the interface: every label a title, every tooltip a sentence, every refusal with its reason."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator
+
+import bpy
+import pytest
+
+_KINDS = (bpy.types.Operator, bpy.types.Panel, bpy.types.Menu, bpy.types.PropertyGroup, bpy.types.AddonPreferences)
+_SMALL = {"a", "an", "and", "as", "at", "by", "for", "from", "in", "into", "it", "of", "on", "or", "over", "per", "the",
+          "to", "until", "with", "vs", "x"}  # fmt: skip
+_LONGEST = 160
+_WITHIN_A_ROW = {"PRIMDIFFUSION_PG_captures.shards"}
+"""Labels that are words between two numbers: 0 of 4."""
+_BLENDERS = frozenset(bpy.types.Operator.bl_rna.properties.keys()) | {"name", "rna_type"}
+_FROM_BLENDER = {"filepath", "directory", "files", "check_existing", "filter_glob", "remove_active", "remove_name"}
+"""Properties that Blender's own mix-ins bring along, in Blender's words."""
+
+
+def classes(kind: type) -> list[type]:
+    found = [cls for cls in kind.__subclasses__() if cls.__name__.startswith("PRIMDIFFUSION_")]
+    return sorted({cls for cls in found if cls.is_registered}, key=lambda cls: cls.__name__)
+
+
+def rna(cls: type):
+    if issubclass(cls, bpy.types.Operator):
+        return getattr(bpy.ops.primdiffusion, cls.bl_idname.partition(".")[2]).get_rna_type()
+    return cls.bl_rna
+
+
+def ours(prop: bpy.types.Property) -> bool:
+    return not prop.is_hidden and prop.identifier not in _BLENDERS | _FROM_BLENDER
+
+
+def properties() -> Iterator[tuple[str, bpy.types.Property]]:
+    for kind in (bpy.types.Operator, bpy.types.PropertyGroup, bpy.types.AddonPreferences):
+        for cls in classes(kind):
+            for prop in filter(ours, rna(cls).properties):
+                yield f"{cls.__name__}.{prop.identifier}", prop
+
+
+def labels() -> Iterator[tuple[str, str]]:
+    for kind in (bpy.types.Operator, bpy.types.Panel, bpy.types.Menu):
+        for cls in classes(kind):
+            yield cls.__name__, cls.bl_label
+    for where, prop in properties():
+        if prop.type in ("POINTER", "COLLECTION") or where in _WITHIN_A_ROW:
+            continue
+        yield where, prop.name
+        for item in getattr(prop, "enum_items_static", ()):
+            yield f"{where}.{item.identifier}", item.name
+
+
+def tooltips() -> Iterator[tuple[str, str]]:
+    for cls in classes(bpy.types.Operator):
+        if "INTERNAL" not in cls.bl_options:
+            yield cls.__name__, rna(cls).description
+    for where, prop in properties():
+        if prop.type not in ("POINTER", "COLLECTION"):
+            yield where, prop.description
+
+
+def is_title(text: str) -> bool:
+    words = [word for part in text.split() for word in part.split("/")]
+    first = bool(words) and not re.match(r"[a-z]", words[0])
+    return first and all(not re.match(r"[a-z]", word) or word in _SMALL for word in words)
+
+
+def test_every_label_is_there_and_a_title(addon):
+    wrong = [f"{where}: {label!r}" for where, label in labels() if label and not is_title(label)]
+    missing = [where for where, label in labels() if not label and "_OT_" in where and "." not in where]
+    assert not wrong, "\n".join(wrong)
+    assert not missing, "\n".join(missing)
+
+
+def test_every_tooltip_is_a_sentence_without_a_full_stop(addon):
+    wrong = []
+    for where, text in tooltips():
+        text = text.strip()
+        if not text:
+            wrong.append(f"{where} has none")
+        elif not re.match(r"[A-Z0-9.\-]", text) or text.endswith(".") or "\n" in text:
+            wrong.append(f"{where}: {text!r}")
+        elif len(text) > _LONGEST:
+            wrong.append(f"{where} is {len(text)} characters long: {text!r}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_tooltip_repeats_its_label(addon):
+    said = {where: prop.name.lower() for where, prop in properties()}
+    assert not [where for where, text in tooltips() if text.strip().lower() == said.get(where)]
+
+
+def test_operators_that_are_greyed_out_say_why(addon):
+    silent = []
+    for cls in classes(bpy.types.Operator):
+        poll = getattr(cls, "poll", None)
+        if "INTERNAL" in cls.bl_options or not getattr(poll, "__module__", "").startswith("blender_primdiffusion"):
+            continue
+        if "poll_message_set" not in inspect.getsource(poll):
+            silent.append(cls.__name__)
+    assert not silent, f"poll without poll_message_set: {silent}"
+
+
+def test_no_operator_can_be_redone_with_a_slider_that_starts_the_backend(addon):
+    for cls in classes(bpy.types.Operator):
+        source = inspect.getsource(inspect.getmodule(cls))
+        if re.search(r"\bsubmit\(", source) and "submit(" in inspect.getsource(cls):
+            assert "REGISTER" not in cls.bl_options, cls.__name__
+
+
+@pytest.mark.parametrize("text", ["generate human", "Generate human", ""])
+def test_the_audit_can_fail(text):
+    assert not is_title(text)
+    assert is_title("Vary a Human by X/Y")
