@@ -90,6 +90,7 @@ class PRIMDIFFUSION_OT_cancel_captures(bpy.types.Operator):
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
         """Only while something runs."""
+        cls.poll_message_set("No captures are being rendered")
         return captures.busy
 
     def execute(self, _context: bpy.types.Context) -> set[str]:

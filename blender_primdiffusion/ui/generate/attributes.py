@@ -76,9 +76,9 @@ class PRIMDIFFUSION_PG_attributes(bpy.types.PropertyGroup):
     shoes: _menu_property("shoes")
     hair: _menu_property("hair")
     hat: _menu_property("hat")
-    use_height: bpy.props.BoolProperty(name="Ask for a Height")
+    use_height: bpy.props.BoolProperty(name="Ask for a Height", description="The body is of this height")
     height: bpy.props.FloatProperty(name="Height", description="Metres", default=1.7, min=0.5, max=2.5, step=1)
-    use_weight: bpy.props.BoolProperty(name="Ask for a Weight")
+    use_weight: bpy.props.BoolProperty(name="Ask for a Weight", description="The body is of this weight")
     weight: bpy.props.FloatProperty(name="Weight", description="Kilograms", default=70.0, min=10.0, max=300.0, step=100)
 
 

@@ -42,6 +42,7 @@ class PRIMDIFFUSION_OT_finish_painting(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Only while a body mesh is painted."""
+        cls.poll_message_set("No region is being painted: press Paint Region first")
         return painting(context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:

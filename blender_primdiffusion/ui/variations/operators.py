@@ -104,7 +104,7 @@ class PRIMDIFFUSION_OT_select_variation(bpy.types.Operator):
     bl_label = "Select Variation"
     bl_options = {"INTERNAL"}  # noqa: RUF012
 
-    index: bpy.props.IntProperty(name="Index", min=0, options=_SKIP)
+    index: bpy.props.IntProperty(name="Index", description="Place in the sheet, from 0", min=0, options=_SKIP)
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:

@@ -144,8 +144,23 @@ def edit(id: int, params: dict, cancelled: threading.Event) -> None:
     generate(id, {"seed": 0, **params}, cancelled)
 
 
+def render(id: int, params: dict, cancelled: threading.Event) -> None:
+    """Always the same picture; what was asked for is beside it."""
+    out = Path(params["out"])
+    shutil.copyfile(Path(__file__).with_name("picture.png"), out)
+    Path(os.environ["FAKE_HUMAN"]).with_name("rendered.json").write_text(json.dumps(params))
+    say(id=id, result={"out": str(out), "seconds": 0.0})
+
+
 EDITS = dict.fromkeys(("vary", "interpolate", "inpaint", "transfer"), edit)
-WORK = {**EDITS, "generate": generate, "variations": variations, "reconstruct": reconstruct, "draw": draw}
+WORK = {
+    **EDITS,
+    "generate": generate,
+    "variations": variations,
+    "reconstruct": reconstruct,
+    "draw": draw,
+    "render": render,
+}
 cancelled = threading.Event()
 for line in sys.stdin:
     request = json.loads(line)
