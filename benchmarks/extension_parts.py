@@ -1,0 +1,214 @@
+"""The parts of extension.py that run inside Blender, each in a process of its own: `PART FOLDER [options]` -> JSON.
+
+FOLDER holds `person/` (what `primdiffusion generate` has written) and takes each part's files.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import json
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_extension_"))
+
+import bpy
+import numpy as np
+import psutil
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+SEED, FRAMES, MOTION_FRAMES = 7, 48, 1500
+
+
+def register(_arguments: argparse.Namespace) -> dict[str, float]:
+    """Enabling the add-on, as at each start of Blender, its byte code being there."""
+    start = time.perf_counter()
+    import blender_primdiffusion
+
+    blender_primdiffusion.register()
+    return {"register_ms": 1e3 * (time.perf_counter() - start)}
+
+
+def person(arguments: argparse.Namespace) -> dict[str, float | None]:
+    """One person: building, memory, frames, motion, errors of both attachments."""
+    _enable(arguments)
+    from blender_primdiffusion.scene.human import armature_of, build_human
+
+    context = bpy.context
+    _trim()
+    before = _resident_mb()
+    start = time.perf_counter()
+    folder = arguments.folder / "person"
+    collection = build_human(context, folder / "human.npz", "Human", [folder / "person.human.safetensors"])
+    context.view_layer.update()
+    built = time.perf_counter() - start
+    _trim()
+    memory = _resident_mb() - before
+    armature = armature_of(collection)
+    context.view_layer.objects.active = armature
+
+    motion = _amass(arguments.folder / "amass.npz")
+    start = time.perf_counter()
+    bpy.ops.primdiffusion.import_motion(filepath=str(motion), timing="SOURCE")
+    keyed = time.perf_counter() - start
+    figures: dict[str, float | None] = {
+        "build_seconds": built,
+        "ram_per_human_mb": memory,
+        "amass_1500_seconds": keyed,
+        "frame_ms": _frame_ms(context.scene),
+    }
+    figures |= _errors(collection, armature, folder / "person.human.safetensors")
+    bpy.ops.primdiffusion.set_attachment(mode="SURFACE")
+    figures["frame_surface_ms"] = _frame_ms(context.scene)
+    return figures
+
+
+def merged(arguments: argparse.Namespace) -> dict[str, float]:
+    """The same Cycles frame with 1024 volumes and with one."""
+    _enable(arguments)
+    from blender_primdiffusion.scene.human import build_human
+    from blender_primdiffusion.scene.preview import setup_cycles_preview
+
+    folder = arguments.folder / "person"
+    build_human(bpy.context, folder / "human.npz", "Human", [folder / "person.human.safetensors"])
+    setup_cycles_preview(bpy.context.scene, size=arguments.size, samples=1, world=0.48)
+    many = _rendered(arguments.folder / "cycles_volumes.png")
+    start = time.perf_counter()
+    bpy.ops.primdiffusion.merge()
+    merging = time.perf_counter() - start
+    one = _rendered(arguments.folder / "cycles_merged.png")
+    return {
+        "cycles_volumes_seconds": many,
+        "cycles_merged_seconds": one,
+        "merged_speedup": many / one,
+        "merge_seconds": merging,
+    }
+
+
+def soak(arguments: argparse.Namespace) -> dict[str, float]:
+    """Generate, pose, delete, again and again: what grows, what stays behind."""
+    _enable(arguments)
+    from blender_primdiffusion.scene.human import armature_of, humans
+    from blender_primdiffusion.ui.jobs.queue import queue
+
+    context, resident = bpy.context, []
+    rng = np.random.default_rng(SEED)
+    for number in range(arguments.rounds):
+        bpy.ops.primdiffusion.generate(seed=SEED + number, steps=arguments.steps)
+        collection = humans(context.scene)[0]
+        armature = armature_of(collection)
+        for bone in armature.pose.bones:
+            bone.rotation_quaternion = (1.0, *rng.normal(0, 0.1, 3))
+        context.view_layer.update()
+        bpy.ops.primdiffusion.delete_human(human=collection.name)
+        bpy.ops.outliner.orphans_purge(do_recursive=True)
+        bpy.ops.primdiffusion.remove_unused_files()
+        _trim()
+        resident.append(_resident_mb() + _children_mb())
+        print(f"round {number + 1}: {resident[-1]:.0f} MB with the child", flush=True)
+    kept = {"shot.blend", "shot.blend1"}
+    stray = [path for path in (arguments.folder / "scene").rglob("*") if path.is_file() and path.name not in kept]
+    compiled = Path(bpy.app.tempdir) / "primdiffusion" / "cache"  # where an add-on that is not installed keeps code
+    temporary = [path for path in Path(bpy.app.tempdir).rglob("*") if path.is_file()]
+    stray += [path for path in temporary if not path.is_relative_to(compiled)]
+    for path in stray:
+        print(f"left behind: {path}", flush=True)
+    queue.close()
+    time.sleep(3.0)
+    warm = min(4, arguments.rounds - 1)  # the child's and Blender's own caches fill in the first rounds
+    third = max(1, (len(resident) - warm) // 3)
+    return {
+        "soak_rounds": float(arguments.rounds),
+        "soak_memory_mb": resident[-1],
+        "soak_memory_growth_mb": float(np.median(resident[-third:]) - np.median(resident[warm : warm + third])),
+        "soak_stray_files": float(len(stray)),
+        "soak_stray_processes": float(len(psutil.Process().children(recursive=True))),
+    }
+
+
+def _enable(arguments: argparse.Namespace) -> None:
+    """A new file in a folder of its own, the add-on from the checkout."""
+    import blender_primdiffusion
+
+    (arguments.folder / "scene").mkdir(exist_ok=True)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(arguments.folder / "scene" / "shot.blend"))
+    blender_primdiffusion.register()
+
+
+def _amass(path: Path) -> Path:
+    """A file like AMASS's: SMPL-H, z up, every body joint in motion."""
+    rng = np.random.default_rng(SEED)
+    times = np.arange(MOTION_FRAMES) / 120.0
+    poses = 0.3 * np.sin(times[:, None] * rng.uniform(1, 6, 156) + rng.uniform(0, 6, 156))
+    poses[:, :3] = [np.pi / 2, 0.0, 0.0]  # upright, where z is up
+    trans = np.stack([0.8 * times, np.zeros_like(times), np.full_like(times, 0.9)], -1)
+    np.savez(path, poses=poses, trans=trans, mocap_framerate=120.0, betas=np.zeros(16), gender="neutral")
+    return path
+
+
+def _frame_ms(scene: bpy.types.Scene) -> float:
+    """Median of a change of frame, the depsgraph evaluated."""
+    times = []
+    for number in range(1, FRAMES + 1):
+        start = time.perf_counter()
+        scene.frame_set(number)
+        times.append(time.perf_counter() - start)
+    return 1e3 * float(np.median(times[4:]))
+
+
+def _errors(collection: bpy.types.Collection, armature: bpy.types.Object, file: Path) -> dict[str, float | None]:
+    """Both attachments against the backend's own skinning and frames, over some frames of the motion."""
+    try:
+        import extension_oracle
+    except ImportError:  # without torch in this Python
+        return {"lbs_error_mm_max": None, "surface_error_mm_max": None, "surface_error_deg_max": None}
+    return extension_oracle.errors(collection, armature, file, range(1, MOTION_FRAMES, 211))
+
+
+def _rendered(path: Path) -> float:
+    bpy.context.scene.render.filepath = str(path)
+    start = time.perf_counter()
+    bpy.ops.render.render(write_still=True)
+    return time.perf_counter() - start
+
+
+def _trim() -> None:
+    """What the C library keeps of freed memory goes back to the system, so that resident memory is memory in use."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
+def _resident_mb() -> float:
+    return psutil.Process().memory_info().rss / 1e6
+
+
+def _children_mb() -> float:
+    return sum(child.memory_info().rss for child in psutil.Process().children(recursive=True)) / 1e6
+
+
+PARTS = {"register": register, "person": person, "merged": merged, "soak": soak}
+
+
+def main() -> None:
+    """One part; its figures on a line of their own at the end."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("part", choices=PARTS)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--rounds", type=int, default=50)
+    parser.add_argument("--steps", type=int, default=10)
+    arguments = parser.parse_args()
+    figures = PARTS[arguments.part](arguments)
+    print("\nfigures " + json.dumps(figures), flush=True)
+    os._exit(0)  # bpy as a module may hang when it is torn down
+
+
+if __name__ == "__main__":
+    main()
