@@ -8,6 +8,7 @@ import bpy
 
 from ...motion.own_poses import own_poses
 from ...scene.keyframes import action_curves, loops
+from ..manual import draw_manual_button
 from .armatures import target_armature
 from .pose_pictures import poses_folder
 from .settings import FACTS, moves_bones
@@ -25,6 +26,10 @@ class PRIMDIFFUSION_PT_motion(_InSidebar, bpy.types.Panel):
     bl_label = "Motion"
     bl_order = 3
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw_header_preset(self, _context: bpy.types.Context) -> None:
+        """The manual."""
+        draw_manual_button(self.layout, "motion")
 
     def draw(self, context: bpy.types.Context) -> None:
         """Reads the scene; changes nothing."""
@@ -83,6 +88,10 @@ class PRIMDIFFUSION_PT_poses(_InSidebar, bpy.types.Panel):
     bl_parent_id = "PRIMDIFFUSION_PT_human"
     bl_order = 1
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw_header_preset(self, _context: bpy.types.Context) -> None:
+        """The manual."""
+        draw_manual_button(self.layout, "posing")
 
     def draw(self, context: bpy.types.Context) -> None:
         """Reads the scene; changes nothing."""
