@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -20,6 +21,7 @@ from blender_primdiffusion.scene.shape import betas_of, generated_betas, reshape
 from blender_primdiffusion.scene.shape_measures import measure
 from blender_primdiffusion.scene.shape_names import slider_names
 from blender_primdiffusion.ui.human.panel import PRIMDIFFUSION_MT_people, PRIMDIFFUSION_PT_human
+from blender_primdiffusion.ui.human.shape_operators import PRIMDIFFUSION_OT_random_shape
 from blender_primdiffusion.ui.human.shape_panel import PRIMDIFFUSION_PT_details, PRIMDIFFUSION_PT_shape
 
 ops = bpy.ops.primdiffusion
@@ -138,6 +140,13 @@ def test_a_random_shape_is_the_same_for_the_same_seed(person):
     np.testing.assert_array_equal(betas_of(person), first)
     ops.random_shape(seed=5, spread=0.0)
     assert not betas_of(person).any()
+
+
+def test_each_press_of_random_is_another_body(person, addon):
+    pressed = [SimpleNamespace(seed=0, execute=lambda _: {"FINISHED"}) for _ in range(2)]
+    for press in pressed:  # background mode has no window to press a button in
+        assert PRIMDIFFUSION_OT_random_shape.invoke(press, addon, None) == {"FINISHED"}
+    assert pressed[0].seed != pressed[1].seed
 
 
 def test_a_shape_is_copied_from_the_other_person(person, other):

@@ -1,0 +1,74 @@
+"""What a move of a shape slider takes on a person of 1024 volumes.
+
+`python benchmarks/reshape.py --json reshape.json`, or `--quick` with fewer moves. Milliseconds are medians of wall
+time: reshape_ms of setting the betas (bones, body mesh and volumes get new places), reshape_evaluate_ms of what Blender
+does before it can draw again, most of it building its graph of dependencies anew because the bones have moved.
+body_file_mb is what is kept on disk for all people on one body; human_npz_mb what the backend hands over.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_benchmark_"))
+
+import bpy
+import numpy as np
+from march_people import checkered_human
+from primdiffusion.human_file import export_for_blender
+from record import tell
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from blender_primdiffusion.scene.human import build_human
+from blender_primdiffusion.scene.shape import reshape, shape_model_of
+
+MOVES, QUICK_MOVES = 30, 5
+
+
+def milliseconds(does: Callable[[], object]) -> float:
+    """Of one call."""
+    began = time.perf_counter()
+    does()
+    return 1000 * (time.perf_counter() - began)
+
+
+def main() -> None:
+    """Build a person, move their sliders, tell the figures."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--quick", action="store_true")
+    given = parser.parse_args()
+    folder = Path(tempfile.mkdtemp(prefix="primdiffusion_reshape_"))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
+    export_for_blender(folder / "human.npz", checkered_human(0))
+    person = build_human(bpy.context, folder / "human.npz")
+    bpy.context.view_layer.update()
+    model, rng = shape_model_of(person), np.random.default_rng(0)
+    setting, evaluating, resting = [], [], []
+    for _ in range(QUICK_MOVES if given.quick else MOVES):
+        betas = rng.normal(size=10)
+        resting.append(milliseconds(lambda betas=betas: model.rest(betas)))
+        setting.append(milliseconds(lambda betas=betas: reshape(person, betas)))
+        evaluating.append(milliseconds(bpy.context.view_layer.update))
+    (body,) = (folder / "shot_humans").glob("body_*.npz")
+    figures = {
+        "reshape_rest_ms": statistics.median(resting),
+        "reshape_ms": statistics.median(setting),
+        "reshape_evaluate_ms": statistics.median(evaluating),
+        "reshape_volumes": sum(thing.type == "VOLUME" for thing in person.all_objects),
+        "body_file_mb": body.stat().st_size / 1e6,
+        "human_npz_mb": (folder / "human.npz").stat().st_size / 1e6,
+    }
+    tell(figures, given.json)
+
+
+if __name__ == "__main__":
+    main()
