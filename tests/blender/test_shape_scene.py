@@ -237,3 +237,15 @@ def test_a_shape_nobody_has_chosen_follows_the_edit(person, tmp_path):
     np.testing.assert_allclose(betas_of(person), SHAPE)
     np.testing.assert_allclose(heads(person), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
     assert not keeps_own_shape(person)
+
+
+def test_an_edit_gives_people_of_an_earlier_version_a_shape_to_change(saved_scene, tmp_path):
+    keep = tmp_path / "first" / "person.human.safetensors"
+    keep.parent.mkdir()
+    keep.write_bytes(b"first")
+    old = build_human(saved_scene, synthetic_shape.write(tmp_path / "old.npz", format_version=np.array(1)), keep=[keep])
+    with pytest.raises(ValueError, match="earlier version"):
+        reshape(old, SHAPE)
+    replace_person(old, *edited_file(tmp_path, generated_betas(old)))
+    reshape(old, SHAPE)
+    np.testing.assert_allclose(heads(old), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
