@@ -57,7 +57,7 @@ def posed_people(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | 
         owner = owners.get(thing.original) if thing.type == "ARMATURE" else None
         matrix = np.array(instance.matrix_world, np.float64)
         if owner is not None and not abs(np.linalg.det(matrix[:3, :3])) < SMALLEST_SCALE**3:
-            people.append(_posed(thing, matrix, owner))
+            people.append(posed(thing, matrix, owner))
     return people
 
 
@@ -71,7 +71,8 @@ def _armatures() -> Iterator[tuple[bpy.types.Object, bpy.types.Collection]]:
                 yield thing, collection
 
 
-def _posed(armature: bpy.types.Object, matrix: NDArray, owner: bpy.types.Collection) -> Posed:
+def posed(armature: bpy.types.Object, matrix: NDArray, owner: bpy.types.Collection) -> Posed:
+    """A person as their armature is posed, its object at `matrix` [4, 4]. Raises as `posed_people` does."""
     bones = armature.pose.bones
     posed = np.array([bones[name].matrix for name in JOINT_NAMES], np.float64)
     rest = np.array([bones[name].bone.matrix_local for name in JOINT_NAMES], np.float64)

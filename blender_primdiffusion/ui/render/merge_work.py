@@ -1,0 +1,179 @@
+"""What the child is asked for by renderers that are not ours: merged grids and the density gain."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import time
+from pathlib import Path
+from typing import Any, ClassVar
+
+import bpy
+import numpy as np
+
+from ...engine.people import posed
+from ...scene.attachment import set_attachment
+from ...scene.gain import set_density_gain
+from ...scene.human import armature_of
+from ...scene.human_file import JOINT_NAMES
+from ...scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
+from ..jobs.target import Target
+from ..jobs.work import Work
+
+_POLL_S = 0.05
+
+
+@dataclasses.dataclass(frozen=True)
+class Moment:
+    """A person in one pose."""
+
+    params: dict[str, Any]
+    """As the child wants them, with the armature's object at the origin: what is merged moves with that object."""
+    digest: str
+    """See `pose_digest`."""
+
+    @classmethod
+    def now(cls, person: bpy.types.Collection, armature: bpy.types.Object | None = None) -> Moment:
+        """As the person, or the evaluated `armature` that stands for them, is posed now.
+
+        Raises ValueError for a renamed bone or a pose that holds NaN, FileNotFoundError where the person's file is
+        missing.
+        """
+        armature = armature_of(person) if armature is None else armature
+        missing = [name for name in JOINT_NAMES if name not in armature.pose.bones]
+        if missing:
+            raise ValueError(f"the armature {armature.name!r} has no bone {missing[0]!r}: give it this name again")
+        pose = posed(armature, np.eye(4), person)
+        return cls(pose.params(), pose_digest(person, pose.joints, pose.betas))
+
+
+class MergeWork(Work):
+    """A person in one pose as one volume."""
+
+    kind = method = "merge"
+    undo = "Merge Human"
+
+    def __init__(self, person: bpy.types.Collection, moment: Moment, voxel: float):
+        """Raises ValueError for a person that cannot be edited."""
+        self.target, self.moment, self.voxel = Target.of(person), moment, voxel
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return f"Merge {self.target.name}"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        """Of the child's method."""
+        bpy.utils.expose_bundled_modules()
+        return {"people": [self.moment.params], "voxel": self.voxel, "out": str(folder / "grid.npz")}
+
+    def finish(self, _context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
+        """Show the merged volume in the place of the others."""
+        person = self.target.found()
+        digest = write_grid(read_grid(Path(result["out"])), folder / "grid.vdb")
+        files = publish([folder / "grid.vdb"], [digest], merged_folder(person))
+        show_merged(person, files, MergedState((self.moment.digest,), self.voxel))
+        set_attachment(person, "MERGED")
+        size = files[0].stat().st_size / 1e6
+        return f"Merged {person.name} at {self.voxel * 1e3:.3g} mm in {result['seconds']:.1f} s, {size:.1f} MB"
+
+
+class MergeFramesWork(Work):
+    """A person as one volume, another one for each frame."""
+
+    kind = method = "merge_frames"
+    undo = "Merge Frames"
+
+    def __init__(self, person: bpy.types.Collection, moments: list[Moment], start: int, voxel: float):
+        """Raises ValueError for a person that cannot be edited."""
+        self.target, self.moments, self.start, self.voxel = Target.of(person), moments, start, voxel
+        self._writer: _Writer | None = None
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return f"Merge {self.target.name}, {len(self.moments)} frames"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        """Of the child's method; its grids are taken in beside it as they appear."""
+        bpy.utils.expose_bundled_modules()
+        self._writer = _Writer(folder, len(self.moments))
+        self._writer.start()
+        people = [moment.params for moment in self.moments]
+        return {"people": people, "voxel": self.voxel, "out_dir": str(folder)}
+
+    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+        """Show the sequence in the place of the volumes."""
+        person = self.target.found()
+        files = publish(*self._writer.written(), merged_folder(person))
+        show_merged(person, files, MergedState(tuple(m.digest for m in self.moments), self.voxel, self.start))
+        set_attachment(person, "MERGED")
+        size = sum(path.stat().st_size for path in files) / 1e6
+        return f"Merged {len(files)} frames of {person.name} in {result['seconds']:.1f} s, {size:.0f} MB"
+
+
+class FitGainWork(Work):
+    """The density gain of a person in one pose."""
+
+    kind = method = "fit_gain"
+    undo = "Fit Density Gain"
+    decimals: ClassVar[int] = 2
+
+    def __init__(self, person: bpy.types.Collection, moment: Moment):
+        """Raises ValueError for a person that cannot be edited."""
+        self.target, self.moment = Target.of(person), moment
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return f"Fit Density Gain: {self.target.name}"
+
+    def params(self, _folder: Path) -> dict[str, Any]:
+        """Of the child's method."""
+        return {"people": [self.moment.params]}
+
+    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+        """Give the person the gain."""
+        person, gain = self.target.found(), round(result["gain"], self.decimals)
+        set_density_gain(person, gain)
+        return (
+            f"Density gain {gain:g} for {person.name}: opacity is off by {100 * result['error']:.1f} % on average, by "
+            f"{100 * result['error_before']:.1f} % with {result['gain_before']:g}"
+        )
+
+
+class _Writer(threading.Thread):
+    """Turns the child's grids into VDB files as they appear, beside Blender; ends when its folder goes."""
+
+    def __init__(self, folder: Path, count: int):
+        super().__init__(name="merged frames", daemon=True)
+        self._folder, self._count = folder, count
+        self._digests: list[str] = []
+        self._error: OSError | ValueError | None = None
+
+    def run(self) -> None:
+        """Frame after frame."""
+        try:
+            for index in range(self._count):
+                grid = self._folder / f"{index:04d}.npz"
+                while not grid.is_file():
+                    if not self._folder.is_dir():
+                        return
+                    time.sleep(_POLL_S)
+                self._digests.append(write_grid(read_grid(grid), self._vdb(index)))
+                grid.unlink()
+        except (OSError, ValueError) as error:
+            self._error = error
+
+    def written(self) -> tuple[list[Path], list[str]]:
+        """The files and their digests, once the child has made all grids. Raises what a frame has failed with."""
+        self.join()
+        if self._error is not None:
+            raise self._error
+        return [self._vdb(index) for index in range(self._count)], self._digests
+
+    def _vdb(self, index: int) -> Path:
+        return self._folder / f"{index:04d}.vdb"
+
+
+KINDS = (MergeWork, MergeFramesWork, FitGainWork)
