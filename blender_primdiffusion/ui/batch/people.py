@@ -14,8 +14,8 @@ from ...engine.engine import ENGINE
 from ...motion.files import read_motion
 from ...motion.motion import Motion
 from ...scene.armature import pose_from_joint_rotations
-from ...scene.human import PERSON, armature_of, build_human, humans
 from ...scene.human import PERSON_FILE as PERSON_FILE
+from ...scene.human import armature_of, build_human, humans
 from ...scene.keyframes import keyframe_poses
 from ...scene.preview import frame_box, people_extent, setup_cycles_preview
 
@@ -79,8 +79,6 @@ def build_person(
 ) -> bpy.types.Collection:
     """The person of two files in the open file, moved, before a camera and in front of nothing."""
     collection = build_human(context, npz, name, [person])
-    if person.name != PERSON_FILE:
-        collection[PERSON] = person.name
     if movement is not None:
         movement.apply(context, collection)
     scene = context.scene

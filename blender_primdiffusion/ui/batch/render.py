@@ -163,11 +163,12 @@ class _Drawing:
         new_file()
         shutil.rmtree(humans_folder(""), ignore_errors=True)
         with tempfile.TemporaryDirectory(dir=bpy.app.tempdir or None) as folder:
-            npz = source.path.with_name(NPZ_FILE)
+            npz, person = source.path.with_name(NPZ_FILE), source.path
             if not (source.has_npz and npz.is_file()):
                 asked = {"person": str(source.path), "out_dir": folder, "size": 16}
-                npz = Path(ask(self._backend, "human_npz", asked, self._stop)["human"])
-            build_person(bpy.context, npz, source.path, source.name, self._movement)
+                made = ask(self._backend, "human_npz", asked, self._stop)
+                npz, person = Path(made["human"]), Path(made["person"])
+            build_person(bpy.context, npz, person, source.name, self._movement)
         render = bpy.context.scene.render
         render.resolution_x, render.resolution_y = self._options.size or _PICTURE
         look_from(bpy.context.scene, self._options.yaw or 0.0, moving_extent(bpy.context.scene))

@@ -369,4 +369,124 @@ TOOLTIPS = (
         "Wie viele Menschen zur Auswahl stehen",
         "Combien de personnes au choix",
     ),
+    (
+        "Add a textured mesh of the selected person that follows the armature: fast in any viewport and engine",
+        "Ein texturiertes Netz der gewählten Person hinzufügen, das der Armatur folgt: überall schnell zu zeigen",
+        "Ajouter un maillage texturé de la personne choisie qui suit l'armature : rapide dans toute vue et tout moteur",
+    ),
+    (
+        "Copy what a bug report needs: versions, device, the last error and the log, without names and folders",
+        "Kopieren, was ein Fehlerbericht braucht: Versionen, Gerät, letzter Fehler, Protokoll, ohne Namen und Ordner",
+        "Copier ce qu'il faut à un rapport d'erreur : versions, périphérique, dernière erreur, journal, sans noms",
+    ),
+    (
+        "Forget the works that were left",
+        "Die übrigen Aufträge vergessen",
+        "Oublier les tâches qui restaient",
+    ),
+    (
+        "Export the selected person in the current pose as 3D Gaussians for splat viewers",
+        "Die gewählte Person in der aktuellen Pose als 3D-Gaußsche exportieren",
+        "Exporter la personne choisie dans la pose actuelle en gaussiennes 3D",
+    ),
+    (
+        "Export the selected person as a .human file, to be dropped into another scene or given to somebody else",
+        "Die gewählte Person als .human-Datei exportieren, für eine andere Szene oder jemand anderen",
+        "Exporter la personne choisie en fichier .human, à déposer dans une autre scène ou à donner",
+    ),
+    (
+        "Export the selected person as a textured mesh with their armature",
+        "Die gewählte Person als texturiertes Netz mit ihrer Armatur exportieren",
+        "Exporter la personne choisie en maillage texturé avec son armature",
+    ),
+    (
+        "Export the selected person as one volume file for each frame, for any renderer that reads OpenVDB",
+        "Die gewählte Person als eine Volumendatei je Bild exportieren, für jeden Renderer, der OpenVDB liest",
+        "Exporter la personne choisie en un fichier de volume par image, pour tout moteur qui lit OpenVDB",
+    ),
+    (
+        "Add the person of a .human file to the scene",
+        "Die Person einer .human-Datei in die Szene stellen",
+        "Ajouter à la scène la personne d'un fichier .human",
+    ),
+    (
+        "Make one volume for each frame of the scene's range; you can work on meanwhile",
+        "Für jedes Bild des Szenenbereichs ein Volumen machen; Sie können derweil weiterarbeiten",
+        "Faire un volume pour chaque image de la plage de la scène ; on peut continuer à travailler",
+    ),
+    (
+        "End the processes that generate and draw, and so give back what they hold; the next person starts them anew",
+        "Erzeugende und zeichnende Prozesse beenden, ihren Speicher zurückgeben; die nächste Person startet sie",
+        "Terminer les processus qui génèrent et dessinent, et rendre leur mémoire ; la prochaine personne les relance",
+    ),
+    (
+        "Remove the mesh proxy of the selected person and show the volumes",
+        "Das Ersatznetz der gewählten Person entfernen und die Volumen zeigen",
+        "Retirer le maillage de substitution de la personne choisie et montrer les volumes",
+    ),
+    (
+        "Put the works that were left in line again, for the scene that is open now",
+        "Die übrigen Aufträge für die jetzt offene Szene wieder einreihen",
+        "Remettre en file les tâches qui restaient, pour la scène ouverte",
+    ),
+    (
+        "Render with Cycles: people are approximated, shadows and lights on other objects are right",
+        "Mit Cycles rendern: Menschen sind genähert, Schatten und Licht auf anderen Objekten stimmen",
+        "Rendre avec Cycles : les personnes sont approchées, ombres et lumières des autres objets sont justes",
+    ),
+    (
+        "Render with PrimDiffusion: exact, seconds a picture; other objects are shaded simply",
+        "Mit PrimDiffusion rendern: genau, Sekunden je Bild; andere Objekte sind einfach schattiert",
+        "Rendre avec PrimDiffusion : exact, quelques secondes par image ; les autres objets sont ombrés simplement",
+    ),
+    (
+        "Choose what is seen of the selected person: the volumes, or the mesh proxy",
+        "Wählen, was von der gewählten Person zu sehen ist: die Volumen oder das Ersatznetz",
+        "Choisir ce qu'on voit de la personne choisie : les volumes, ou le maillage de substitution",
+    ),
+    (
+        "Ask for the same once more",
+        "Dasselbe noch einmal verlangen",
+        "Demander la même chose encore une fois",
+    ),
+    (
+        "Add a textured mesh of the selected person that follows the armature: fast in any viewport and engine",
+        "Ein texturiertes Mesh der gewählten Person hinzufügen, das der Armatur folgt: schnell in jeder Ansicht und Engine",
+        "Ajouter un maillage texturé de la personne choisie, qui suit l'armature : rapide dans toute vue et tout moteur",
+    ),
+    (
+        "Export the selected person in the current pose as 3D Gaussians for splat viewers",
+        "Die gewählte Person in der jetzigen Pose als 3D-Gauß-Punkte für Splat-Betrachter exportieren",
+        "Exporter la personne choisie dans la pose actuelle en gaussiennes 3D pour visionneuses de splats",
+    ),
+    (
+        "Export the selected person as a .human file, to be dropped into another scene or given to somebody else",
+        "Die gewählte Person als .human-Datei exportieren, für eine andere Szene oder für jemand anderen",
+        "Exporter la personne choisie en fichier .human, pour une autre scène ou pour quelqu'un d'autre",
+    ),
+    (
+        "Export the selected person as a textured mesh with their armature",
+        "Die gewählte Person als texturiertes Mesh mit Armatur exportieren",
+        "Exporter la personne choisie en maillage texturé avec son armature",
+    ),
+    (
+        "Export the selected person as one volume file for each frame, for any renderer that reads OpenVDB",
+        "Die gewählte Person als eine Volumendatei je Bild exportieren, für jeden Renderer, der OpenVDB liest",
+        "Exporter la personne choisie en un fichier de volume par image, pour tout moteur de rendu qui lit OpenVDB",
+    ),
+    (
+        "Add the person of a .human file to the scene",
+        "Die Person einer .human-Datei in die Szene stellen",
+        "Ajouter à la scène la personne d'un fichier .human",
+    ),
+    (
+        "Remove the mesh proxy of the selected person and show the volumes",
+        "Den Mesh-Stellvertreter der gewählten Person entfernen und die Volumen zeigen",
+        "Retirer le maillage de substitution de la personne choisie et montrer les volumes",
+    ),
+    (
+        "Choose what is seen of the selected person: the volumes, or the mesh proxy",
+        "Wählen, was von der gewählten Person zu sehen ist: die Volumen oder der Mesh-Stellvertreter",
+        "Choisir ce que l'on voit de la personne choisie : les volumes, ou le maillage de substitution",
+    ),
 )
