@@ -102,6 +102,11 @@ def decoded(model: DiffusionModel, x0: Float[Tensor, "1 c h w"]) -> Payload:
     return model.decode(x0[0]).to("cpu")
 
 
+def with_payload(model: DiffusionModel, human: Human, x0: Float[Tensor, "1 c h w"]) -> Human:
+    """The person with the looks of one clean sample of the model, on the CPU: what an edit amounts to so far."""
+    return dataclasses.replace(human.to("cpu"), payload=decoded(fitted(model, human), x0))
+
+
 def with_edit(human: Human, edit: Mapping[str, Any], payload: Payload, betas: Tensor | None = None) -> Human:
     """The person with a new payload (and body), and `edit` added to what their provenance says was done to them."""
     provenance = {**human.provenance, "edits": [*human.provenance.get("edits", []), dict(edit)]}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 import torch
@@ -45,17 +45,36 @@ def vary(
     Raises ValueError for an amount outside 0 ... 1, steps outside 1 ... T, a seed outside 0 ... 2^63-1 and attributes
     that the model does not know.
     """
-    generator = edit_generator(seed)
+    return vary_batch(model, human, amount, [seed], steps, on_step, attributes, guidance)[0]
+
+
+def vary_batch(
+    model: DiffusionModel,
+    human: Human,
+    amount: float,
+    seeds: Sequence[int],
+    steps: int = DEFAULT_STEPS,
+    on_step: OnStep | None = None,
+    attributes: Mapping[str, str | float] = MappingProxyType({}),
+    guidance: float = DEFAULT_GUIDANCE,
+) -> list[Human]:
+    """Variants of several seeds, who share the work; each as `vary` makes them, but for rounding. Errors likewise."""
+    generators = [edit_generator(seed) for seed in seeds]
     model = fitted(model, human)
     denoise = asked(model, attributes, guidance)
     chain = chain_down(model.schedule, amount, steps)
-    payload = human.payload.to("cpu")
+    payloads = [human.payload.to("cpu")] * len(seeds)
     if chain:
         x0 = encoded(model, human)
-        level = torch.tensor([chain[0]], device=x0.device)
-        x = model.schedule.q_sample(x0, level, gaussian_noise(x0, generator))
-        varied = last(ddim(denoise, model.schedule, x, chain, generator), on_step)
-        left_out = difference(payload, decoded(model, x0))
-        payload = added(decoded(model, varied), left_out, model.schedule.signal(chain[0]))
-    edit = {"edit": "vary", "amount": amount, "seed": seed, "steps": steps}
-    return with_edit(human, {**edit, "attributes": dict(attributes), "guidance": guidance, **made_by(model)}, payload)
+        left_out = difference(payloads[0], decoded(model, x0))
+        people = x0.expand(len(seeds), *x0.shape[1:])
+        level = torch.full((len(seeds),), chain[0], device=x0.device)
+        x = model.schedule.q_sample(people, level, gaussian_noise(people, generators))
+        varied = last(ddim(denoise, model.schedule, x, chain, generators), on_step)
+        signal = model.schedule.signal(chain[0])
+        payloads = [added(decoded(model, one[None]), left_out, signal) for one in varied]
+    edit = {"edit": "vary", "amount": amount}
+    same = {"steps": steps, "attributes": dict(attributes), "guidance": guidance, **made_by(model)}
+    return [
+        with_edit(human, {**edit, "seed": seed, **same}, payload) for seed, payload in zip(seeds, payloads, strict=True)
+    ]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.editing import inpaint, interpolate, transfer, vary
-from primdiffusion.editing.edit import OnStep, combined, decoded, fitted
+from primdiffusion.editing.edit import OnStep, combined, with_payload
 from primdiffusion.editing.painted import read_weights
 from primdiffusion.editing.regions import region_from_weights, region_of
 from primdiffusion.human import Human
@@ -40,7 +40,7 @@ class Editor:
 
         def edit(human: Human, folder: Path) -> Human:
             model = self._load_model(params.checkpoint)
-            with _sampling(params, report, folder, lambda x0: _guess(model, human, x0)) as on_step:
+            with _sampling(params, report, folder, lambda x0: with_payload(model, human, x0)) as on_step:
                 return vary.vary(
                     model, human, params.amount, params.seed, params.steps, on_step, params.attributes, params.guidance
                 )
@@ -56,7 +56,7 @@ class Editor:
 
             def show(x0: Tensor) -> Human | None:
                 ends_and_between = len(x0) == 3  # two on the way from the people to their noises
-                return _guess(model, human, x0[2:]) if ends_and_between else None
+                return with_payload(model, human, x0[2:]) if ends_and_between else None
 
             with _sampling(params, report, folder, show) as on_step:
                 return interpolate.interpolate(model, human, other, params.fraction, params.steps, on_step)
@@ -100,14 +100,9 @@ def _sampling(params: EditParams, report: Report, folder: Path, show: Show) -> I
         yield step_reporter(report, picture)
 
 
-def _guess(model: DiffusionModel, human: Human, x0: Tensor) -> Human:
-    """The person with what a guess stands for instead of their own looks."""
-    return dataclasses.replace(human.to("cpu"), payload=decoded(fitted(model, human), x0))
-
-
 def _guess_inside(model: DiffusionModel, human: Human, region: Bool[Tensor, "k"], x0: Tensor) -> Human:
     """The person with what a guess stands for in a region."""
-    guess = _guess(model, human, x0)
+    guess = with_payload(model, human, x0)
     return dataclasses.replace(guess, payload=combined(region, guess.payload, human.payload))
 
 

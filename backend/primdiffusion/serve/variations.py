@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import Step
-from primdiffusion.editing.vary import vary
+from primdiffusion.editing.edit import with_payload
+from primdiffusion.editing.vary import vary_batch
 from primdiffusion.human import Human, generate_batch, people_of
 from primdiffusion.human_file import export_for_blender, load_human, save_human
 from primdiffusion.machine import peak_memory_gb
@@ -25,10 +28,9 @@ LoadModel = Callable[[str | None], DiffusionModel]
 def variations(load_model: LoadModel, params: VariationsParams, report: Report) -> dict[str, Any]:
     """The people of all seeds in `out_dir`, or none of them; returns their paths and what it took.
 
-    New people are sampled in one batch, and their pictures become clearer with the steps, as far as time allows
-    (`Allowance`); variants of a person are made one after the other. Each picture is reported as it appears, with the
-    seed's index. Raises OSError before any work if the folder cannot be written to; what load_checkpoint,
-    generate_batch, load_human and vary raise.
+    All are sampled in one batch, and their pictures become clearer with the steps, as far as time allows (`Allowance`).
+    Each picture is reported as it appears, with the seed's index. Raises OSError before any work if the folder cannot
+    be written to; what load_checkpoint, generate_batch, load_human and vary_batch raise.
     """
     began = time.perf_counter()
     out, count = Path(params.out_dir), len(params.seeds)
@@ -36,8 +38,7 @@ def variations(load_model: LoadModel, params: VariationsParams, report: Report) 
         report("load", 0, params.steps, None)
         model = load_model(params.checkpoint)
         report("sample", 0, params.steps, None)
-        people = _new(model, params, folder, report) if params.person is None else _around(model, params, report)
-        for index, human in people:
+        for index, human in enumerate(_people(model, params, folder, report)):
             files = _files(folder, params.seeds[index])
             export_for_blender(files["human"], human)
             save_human(files["person"], human)
@@ -55,10 +56,15 @@ def _files(folder: Path, seed: int) -> dict[str, str]:
     return {name: str(folder / f"{seed}.{ending}") for name, ending in endings.items()}
 
 
-def _new(model: DiffusionModel, params: VariationsParams, folder: Path, report: Report) -> Iterator[tuple[int, Human]]:
-    """People of noise, with pictures of what they are so far, each in turn."""
-    seeds = params.seeds
+def _people(model: DiffusionModel, params: VariationsParams, folder: Path, report: Report) -> list[Human]:
+    """New people, or variants of one, in one batch, with pictures of what they are so far, each in turn."""
+    seeds, person = params.seeds, None if params.person is None else load_human(params.person)
     pace, allowance, turns = Pace(), Allowance(INTERVAL_S / len(seeds)), itertools.cycle(range(len(seeds)))
+
+    def guess(x0: Tensor, seed: int) -> Human:
+        if person is None:
+            return people_of(model, x0, [seed], params.attributes)[0]
+        return with_payload(model, person, x0)
 
     def on_step(step: Step) -> None:
         done = step.index + 1
@@ -69,23 +75,12 @@ def _new(model: DiffusionModel, params: VariationsParams, folder: Path, report: 
                 return
             index = next(turns)
             with allowance.spending():
-                (guess,) = people_of(model, step.x0[index : index + 1], [seeds[index]], params.attributes)
                 path = passing.next()
-                draw_front_and_back(path, guess, params.size)
+                draw_front_and_back(path, guess(step.x0[index : index + 1], seeds[index]), params.size)
             report("sample", done, step.total, left, picture=str(path), index=index)
 
     with PassingPictures(folder, 2 * len(seeds)) as passing:
-        people = generate_batch(model, seeds, params.steps, params.sampler, on_step, params.attributes, params.guidance)
-    yield from enumerate(people)
-
-
-def _around(model: DiffusionModel, params: VariationsParams, report: Report) -> Iterator[tuple[int, Human]]:
-    """Variants of a person."""
-    person, pace, count = load_human(str(params.person)), Pace(), len(params.seeds)
-    for index, seed in enumerate(params.seeds):
-
-        def on_step(step: Step, index: int = index) -> None:
-            done, total = index * step.total + step.index + 1, count * step.total
-            report("sample", done, total, pace.left(done, total))
-
-        yield index, vary(model, person, params.amount, seed, params.steps, on_step, params.attributes, params.guidance)
+        asked = (params.attributes, params.guidance)
+        if person is None:
+            return generate_batch(model, seeds, params.steps, params.sampler, on_step, *asked)
+        return vary_batch(model, person, params.amount, seeds, params.steps, on_step, *asked)

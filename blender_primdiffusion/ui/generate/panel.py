@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from .. import setup
-from ..jobs.drawing import draw_job
+from ..jobs.drawing import draw_job, draw_lines
 from ..jobs.memory import device_line
 from .attributes import draw_attributes
 from .presets import PRIMDIFFUSION_PT_generate_presets
@@ -43,7 +43,7 @@ class PRIMDIFFUSION_PT_generate(bpy.types.Panel):
             column.prop(settings, "steps")
             column.prop(settings, "sampler")
         draw_job(layout, "generate", "primdiffusion.generate", "OUTLINER_OB_ARMATURE")
-        layout.label(text=f"Device: {device_line()}", icon="MEMORY")
+        draw_lines(layout, f"Device: {device_line()}", "MEMORY")
 
 
 class PRIMDIFFUSION_PT_attributes(bpy.types.Panel):

@@ -21,7 +21,8 @@ class Icons:
             self._previews = bpy.utils.previews.new()
         name = str(path)
         if name not in self._previews:
-            self._previews.load(name, name, "IMAGE")
+            preview = self._previews.load(name, name, "IMAGE")
+            _ = preview.image_size[:]  # reads the file now: Blender would do so later, when it may be gone
         return self._previews[name].icon_id
 
     def free(self) -> None:

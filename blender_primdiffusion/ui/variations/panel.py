@@ -89,11 +89,12 @@ def _draw_picture(cell: bpy.types.UILayout, path: Path | None, units: float) -> 
 
 def _draw_choice(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
     number = sum(variation.chosen for variation in sheet.variations)
-    row = layout.row(align=True)
-    chosen = row.row(align=True)
+    chosen = layout.row()
     chosen.enabled = number > 0
     chosen.operator("primdiffusion.build_variation", text=f"Build Selected ({number})", icon="OUTLINER_OB_ARMATURE")
+    row = layout.row(align=True)
     row.operator("primdiffusion.build_variation", text="Build All").build_all = True
+    row.operator("primdiffusion.clear_variations", text="Clear", icon="TRASH")
     column = layout.column()
     column.enabled = number == 1
     row = column.row(align=True)
@@ -102,4 +103,3 @@ def _draw_choice(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) 
     seed.enabled = not sheet.around
     seed.operator("primdiffusion.use_variation_seed", icon="COPYDOWN")
     column.prop(settings, "amount")
-    layout.operator("primdiffusion.clear_variations", icon="TRASH")
