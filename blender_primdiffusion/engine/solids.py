@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..scene.body_mesh import MARK as BODY_MARK
 from ..scene.convention import points_to_backend
+from ..scene.exported_proxy import MARK as PROXY_MARK
 from .visible import visible_instances
 
 SOLID_TYPES = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})
@@ -106,7 +107,8 @@ def _parts(
     meshes: dict[object, tuple[NDArray, NDArray]] = {}
     for instance in visible_instances(depsgraph, space):
         thing = instance.object
-        if thing.type not in SOLID_TYPES or BODY_MARK in thing or not thing.visible_camera:
+        of_person = BODY_MARK in thing or PROXY_MARK in thing
+        if thing.type not in SOLID_TYPES or of_person or not thing.visible_camera:
             continue
         key = (thing.data.as_pointer(), thing.original.as_pointer())
         if key not in meshes:

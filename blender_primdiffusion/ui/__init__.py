@@ -5,9 +5,26 @@ from __future__ import annotations
 import bpy
 
 from ..scene.collect import collect_before_saving
-from . import assets, batch, captures, generate, human, jobs, manual, motion, render, setup, translations, variations
+from . import (
+    assets,
+    batch,
+    captures,
+    export,
+    generate,
+    human,
+    jobs,
+    manual,
+    motion,
+    render,
+    setup,
+    translations,
+    variations,
+)
 
-ROOMS = (translations, setup, jobs, generate, variations, human, motion, assets, render, captures, batch, manual)
+ROOMS = (
+    translations, setup, jobs, generate, variations, human, motion, assets, render,
+    captures, export, batch, manual,
+)  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 SAME = frozenset(
     {
         "-X", "-Y", "-Z", "X", "Y", "Z", "4", "8", "12", "16", "CPU", "GPU", "HDRI", "COLMAP", "NeRF", "OpenCV",
-        "512 px", "1024 px", "2048 px", "4096 px", "glTF", "FBX", "USD", "Cycles", "DDIM", "DDPM", "DPM-Solver++(2M)", "NVIDIA (CUDA)", "Apple", "PrimDiffusion",
+        "Cycles", "DDIM", "DDPM", "DPM-Solver++(2M)", "NVIDIA (CUDA)", "Apple", "PrimDiffusion",
+        "512 px", "1024 px", "2048 px", "4096 px", "glTF", "FBX", "USD",
     }
 )  # fmt: skip
 """Names and numbers that are the same in every language."""
@@ -252,11 +253,8 @@ LABELS = (
     ("Shard", "Teilmenge", "Part"),
     ("Shins", "Unterschenkel", "Tibias"),
     ("Shoes", "Schuhe", "Chaussures"),
-    ("Show Mesh in Viewport", "Mesh in der Ansicht zeigen", "Montrer le maillage dans la vue"),
-    ("Show Mesh", "Mesh zeigen", "Montrer le maillage"),
     ("Show Variations", "Varianten zeigen", "Montrer des variantes"),
     ("Show Volumes or Mesh", "Volumen oder Netz zeigen", "Montrer les volumes ou le maillage"),
-    ("Show Volumes", "Volumen zeigen", "Montrer les volumes"),
     ("Show", "Zeigen", "Montrer"),
     ("Skin", "Haut", "Peau"),
     ("Solid Objects", "Feste Objekte", "Objets solides"),

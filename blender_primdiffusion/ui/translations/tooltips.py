@@ -372,7 +372,7 @@ TOOLTIPS = (
     (
         "Add a textured mesh of the selected person that follows the armature: fast in any viewport and engine",
         "Ein texturiertes Netz der gewählten Person hinzufügen, das der Armatur folgt: überall schnell zu zeigen",
-        "Ajouter un maillage texturé de la personne choisie qui suit l'armature : rapide dans toute vue et tout moteur",
+        "Ajouter un maillage texturé de la personne choisie qui suit l'armature : rapide dans tout moteur",
     ),
     (
         "Copy what a bug report needs: versions, device, the last error and the log, without names and folders",
@@ -448,45 +448,5 @@ TOOLTIPS = (
         "Ask for the same once more",
         "Dasselbe noch einmal verlangen",
         "Demander la même chose encore une fois",
-    ),
-    (
-        "Add a textured mesh of the selected person that follows the armature: fast in any viewport and engine",
-        "Ein texturiertes Mesh der gewählten Person hinzufügen, das der Armatur folgt: schnell in jeder Ansicht und Engine",
-        "Ajouter un maillage texturé de la personne choisie, qui suit l'armature : rapide dans toute vue et tout moteur",
-    ),
-    (
-        "Export the selected person in the current pose as 3D Gaussians for splat viewers",
-        "Die gewählte Person in der jetzigen Pose als 3D-Gauß-Punkte für Splat-Betrachter exportieren",
-        "Exporter la personne choisie dans la pose actuelle en gaussiennes 3D pour visionneuses de splats",
-    ),
-    (
-        "Export the selected person as a .human file, to be dropped into another scene or given to somebody else",
-        "Die gewählte Person als .human-Datei exportieren, für eine andere Szene oder für jemand anderen",
-        "Exporter la personne choisie en fichier .human, pour une autre scène ou pour quelqu'un d'autre",
-    ),
-    (
-        "Export the selected person as a textured mesh with their armature",
-        "Die gewählte Person als texturiertes Mesh mit Armatur exportieren",
-        "Exporter la personne choisie en maillage texturé avec son armature",
-    ),
-    (
-        "Export the selected person as one volume file for each frame, for any renderer that reads OpenVDB",
-        "Die gewählte Person als eine Volumendatei je Bild exportieren, für jeden Renderer, der OpenVDB liest",
-        "Exporter la personne choisie en un fichier de volume par image, pour tout moteur de rendu qui lit OpenVDB",
-    ),
-    (
-        "Add the person of a .human file to the scene",
-        "Die Person einer .human-Datei in die Szene stellen",
-        "Ajouter à la scène la personne d'un fichier .human",
-    ),
-    (
-        "Remove the mesh proxy of the selected person and show the volumes",
-        "Den Mesh-Stellvertreter der gewählten Person entfernen und die Volumen zeigen",
-        "Retirer le maillage de substitution de la personne choisie et montrer les volumes",
-    ),
-    (
-        "Choose what is seen of the selected person: the volumes, or the mesh proxy",
-        "Wählen, was von der gewählten Person zu sehen ist: die Volumen oder der Mesh-Stellvertreter",
-        "Choisir ce que l'on voit de la personne choisie : les volumes, ou le maillage de substitution",
     ),
 )

@@ -1,0 +1,131 @@
+""".human files: a person as the backend keeps them (safetensors), with the shape they have now and how they move.
+
+The file is the backend's own, which reads it as any other: what is added has names of its own (`motion.*`). Reading and
+writing needs numpy alone: eight bytes of length, a JSON header, then plain arrays.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+ENDING = ".human"
+ENDINGS = (".human", ".safetensors")
+"""What is read: the same format under either name."""
+_LARGEST_HEADER = 1 << 20
+_METADATA = "__metadata__"
+_DTYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U8": "|u1", "BF16": "<u2"}
+_MOTION = {"motion.frames": ("F",), "motion.rotations": ("F", 24, 3, 3), "motion.translations": ("F", 3)}
+_REMEDY = "choose a .human file, or export the person again"
+
+
+@dataclasses.dataclass(frozen=True)
+class HumanMotion:
+    """How the person moves; one frame is a pose."""
+
+    frames: NDArray[np.float32]
+    """Frame numbers [F], increasing."""
+    rotations: NDArray[np.float32]
+    """Of the joints [F, 24, 3, 3]; y up."""
+    translations: NDArray[np.float32]
+    """[F, 3], metres, y up."""
+    fps: float
+
+
+@dataclasses.dataclass(frozen=True)
+class HumanTensors:
+    """A .human file taken apart."""
+
+    metadata: dict[str, str]
+    arrays: dict[str, tuple[str, tuple[int, ...], bytes]]
+    """By name: safetensors' dtype, shape, bytes."""
+
+
+def read_tensors(path: Path) -> HumanTensors:
+    """Raises ValueError for a file of another kind or a damaged one, OSError."""
+    data = path.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    try:
+        if not 2 <= length <= min(_LARGEST_HEADER, len(data) - 8):
+            raise ValueError("it has no header")
+        header = json.loads(data[8 : 8 + length])
+        metadata = header.pop(_METADATA, {})
+        arrays = {}
+        for name, about in header.items():
+            begin, end = about["data_offsets"]
+            raw = data[8 + length + begin : 8 + length + end]
+            if len(raw) != end - begin:
+                raise ValueError("it is truncated")
+            arrays[name] = (str(about["dtype"]), tuple(about["shape"]), raw)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path.name!r} holds no person ({error}); {_REMEDY}") from error
+    if metadata.get("format") != "primdiffusion.human":
+        raise ValueError(f"{path.name!r} holds no person but something else; {_REMEDY}")
+    return HumanTensors(metadata, arrays)
+
+
+def with_now(human: HumanTensors, betas: NDArray | None, motion: HumanMotion | None) -> HumanTensors:
+    """The person with another shape [10] and a motion; None leaves the shape, and takes a motion away."""
+    metadata = {name: text for name, text in human.metadata.items() if name != "motion"}
+    arrays = {name: array for name, array in human.arrays.items() if name not in _MOTION}
+    if betas is not None:
+        arrays["betas"] = _stored(np.asarray(betas, np.float32))
+    if motion is not None:
+        metadata["motion"] = json.dumps({"fps": motion.fps})
+        for name, array in zip(_MOTION, (motion.frames, motion.rotations, motion.translations), strict=True):
+            arrays[name] = _stored(np.asarray(array, np.float32))
+    return HumanTensors(metadata, arrays)
+
+
+def motion_in(human: HumanTensors) -> HumanMotion | None:
+    """The motion that a file holds. Raises ValueError for one that is damaged."""
+    if "motion" not in human.metadata:
+        return None
+    try:
+        fps = float(json.loads(human.metadata["motion"])["fps"])
+        arrays = [_loaded(*human.arrays[name]) for name in _MOTION]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"the motion in the .human file is damaged ({error}); {_REMEDY}") from error
+    frames = len(arrays[0])
+    for array, shape in zip(arrays, _MOTION.values(), strict=True):
+        if array.shape != tuple(frames if s == "F" else s for s in shape) or not np.isfinite(array).all():
+            raise ValueError(f"the motion in the .human file is damaged; {_REMEDY}")
+    if frames == 0 or not 0 < fps < 1e4 or np.any(np.diff(arrays[0]) <= 0):
+        raise ValueError(f"the motion in the .human file has no order of frames; {_REMEDY}")
+    return HumanMotion(*arrays, fps)
+
+
+def write_tensors(path: Path, human: HumanTensors) -> None:
+    """Writes the file whole or not at all. Raises OSError."""
+    header: dict[str, object] = {_METADATA: human.metadata}
+    offset = 0
+    sizes = {name: np.dtype(_DTYPES.get(dtype, "u1")).itemsize for name, (dtype, _, _) in human.arrays.items()}
+    ordered = sorted(human.arrays, key=lambda name: (-sizes[name], name))  # the widest first: so all are aligned
+    for name in ordered:
+        dtype, shape, raw = human.arrays[name]
+        header[name] = {"dtype": dtype, "shape": list(shape), "data_offsets": [offset, offset + len(raw)]}
+        offset += len(raw)
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    unfinished = path.with_name(f".{path.name}.part")
+    try:
+        with unfinished.open("wb") as file:
+            file.write(len(text).to_bytes(8, "little") + text)
+            for name in ordered:
+                file.write(human.arrays[name][2])
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _stored(array: NDArray[np.float32]) -> tuple[str, tuple[int, ...], bytes]:
+    return "F32", array.shape, np.ascontiguousarray(array, "<f4").tobytes()
+
+
+def _loaded(dtype: str, shape: tuple[int, ...], raw: bytes) -> NDArray:
+    return np.frombuffer(raw, _DTYPES[dtype]).reshape(shape)

@@ -1,0 +1,135 @@
+"""The mesh proxy: a person's clothed surface, textured and skinned to their armature."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import tempfile
+import zlib
+from pathlib import Path
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from .body_mesh import MARK as BODY_MARK
+from .body_mesh import build_body_mesh
+from .convention import points_to_blender
+from .human import armature_of, person_file_name
+from .human_file import JOINT_NAMES
+
+MARK = "primdiffusion_proxy"
+"""Custom property of a proxy object: the person's file and shape that it was made of, as JSON."""
+_FORMAT_VERSION = 1
+_SHAPES = {"vertices": ("V", 3), "faces": ("F", 3), "uv_corner": ("F", 3, 2), "skin_weights": ("V", 24)}
+
+
+@dataclasses.dataclass(frozen=True)
+class ProxyMesh:
+    """The child's mesh in the T pose; y up, metres."""
+
+    vertices: NDArray[np.float64]
+    """[V, 3]"""
+    faces: NDArray[np.int64]
+    """[F, 3]"""
+    uv_corner: NDArray[np.float64]
+    """[F, 3, 2], v up."""
+    skin_weights: NDArray[np.float64]
+    """[V, 24]; rows sum to one."""
+
+
+def read_proxy(path: Path) -> ProxyMesh:
+    """Reads the child's proxy.npz. Raises ValueError for a damaged one, OSError."""
+    import zipfile  # slow to import, and not needed to register
+
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            version = int(stored["format_version"])
+            names = tuple(str(name) for name in stored["joint_names"])
+            arrays = {name: np.asarray(stored[name]) for name in _SHAPES}
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"the mesh {path.name!r} is damaged ({error}); export again") from error
+    if version != _FORMAT_VERSION or names != JOINT_NAMES:
+        raise ValueError(f"the mesh {path.name!r} is of another version: use an add-on and a backend of one release")
+    sizes: dict[str, int] = {}
+    for name, shape in _SHAPES.items():
+        given = arrays[name].shape
+        wanted = tuple(sizes.setdefault(s, n) if isinstance(s, str) else s for s, n in zip(shape, given, strict=False))
+        if given != wanted or len(given) != len(shape) or not np.isfinite(arrays[name]).all():
+            raise ValueError(
+                f"the field {name!r} of {path.name!r} is {given}, not {shape} finite numbers; export again"
+            )
+    if arrays["faces"].min(initial=0) < 0 or arrays["faces"].max(initial=-1) >= len(arrays["vertices"]):
+        raise ValueError(f"the faces of {path.name!r} have corners that do not exist; export again")
+    kinds = {name: np.int64 if name == "faces" else np.float64 for name in _SHAPES}
+    return ProxyMesh(**{name: value.astype(kinds[name]) for name, value in arrays.items()})
+
+
+def build_proxy(
+    collection: bpy.types.Collection, proxy: ProxyMesh, texture: Path, betas: NDArray | None
+) -> bpy.types.Object:
+    """The proxy as an object that follows the person's armature, shown and rendered, linked to no collection.
+
+    The texture is packed into the .blend. `betas` [10]: the shape it was made in.
+    """
+    name = f"{collection.name}_proxy"
+    vertices = points_to_blender(proxy.vertices)
+    made = build_body_mesh(name, armature_of(collection), vertices, proxy.faces, proxy.uv_corner, proxy.skin_weights)
+    del made[BODY_MARK]
+    made[MARK] = json.dumps(_origin(collection, betas))
+    made.hide_viewport = made.hide_render = False
+    made.data.materials.append(_material(name, texture))
+    return made
+
+
+def proxy_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
+    """The person's proxy that was added to the scene; None where there is none."""
+    return next((thing for thing in collection.all_objects if thing.type == "MESH" and MARK in thing), None)
+
+
+def is_outdated(collection: bpy.types.Collection, proxy: bpy.types.Object, betas: NDArray | None) -> bool:
+    """The person was edited or reshaped since."""
+    made_of, now = json.loads(proxy[MARK]), _origin(collection, betas)
+    same_shape = (made_of["betas"] is None) == (now["betas"] is None) and (
+        now["betas"] is None or np.allclose(made_of["betas"], now["betas"], atol=1e-4)
+    )
+    return made_of["file"] != now["file"] or not same_shape
+
+
+def remove_proxy(proxy: bpy.types.Object) -> None:
+    """Take a proxy out of the .blend with its mesh, material and texture."""
+    mesh = proxy.data
+    materials = [material for material in mesh.materials if material is not None]
+    nodes = [node for material in materials if material.node_tree for node in material.node_tree.nodes]
+    images = [node.image for node in nodes if node.type == "TEX_IMAGE" and node.image is not None]
+    bpy.data.objects.remove(proxy)
+    for thing in (mesh, *materials, *images):
+        if thing.users == 0:
+            bpy.data.batch_remove([thing])
+
+
+def _origin(collection: bpy.types.Collection, betas: NDArray | None) -> dict[str, object]:
+    rounded = None if betas is None else np.round(np.asarray(betas, np.float64), 5).tolist()
+    return {"file": person_file_name(collection), "betas": rounded}
+
+
+def _material(name: str, texture: Path) -> bpy.types.Material:
+    file = f"{bpy.path.clean_name(name)}.png"
+    with tempfile.TemporaryDirectory(dir=bpy.app.tempdir or None) as folder:
+        shutil.copyfile(texture, Path(folder) / file)  # exporters name textures after the file that was packed
+        image = bpy.data.images.load(str(Path(folder) / file))
+        image.name = name
+        image.pack()
+    image.filepath_raw = f"//{file}"  # `filepath` would look for the file at once
+    material = bpy.data.materials.new(name)
+    material.use_nodes = True
+    nodes = material.node_tree.nodes
+    shader = next(node for node in nodes if node.type == "BSDF_PRINCIPLED")
+    picture = nodes.new("ShaderNodeTexImage")
+    picture.image = image
+    picture.location = (shader.location.x - 300, shader.location.y)
+    material.node_tree.links.new(picture.outputs["Color"], shader.inputs["Base Color"])
+    shader.inputs["Roughness"].default_value = 0.9
+    shader.inputs["Metallic"].default_value = 0.0
+    return material

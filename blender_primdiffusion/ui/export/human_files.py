@@ -1,0 +1,46 @@
+"""The selected person as a .human file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...motion.skeleton import unchain
+from ...scene.exported_human import HumanMotion, read_tensors, with_now, write_tensors
+from ...scene.exported_model import Frames
+from ...scene.human import person_file
+from ...scene.shape import betas_of, keeps_own_shape
+from .posing import posed_frames
+
+
+def write_human(context: bpy.types.Context, person: bpy.types.Collection, path: Path, frames: Frames | None) -> None:
+    """Writes the person with the shape they have now, and their motion on `frames`. Raises ValueError or OSError.
+
+    The motion is that of the joints in the armature's space, constraints and layers included; where the object stands
+    is left out.
+    """
+    human = read_tensors(person_file(person))
+    betas = betas_of(person) if keeps_own_shape(person) else None
+    motion = None if frames is None else _motion(context, person, frames)
+    write_tensors(path, with_now(human, betas, motion))
+
+
+def _motion(context: bpy.types.Context, person: bpy.types.Collection, frames: Frames) -> HumanMotion:
+    from ...scene.convention import points_to_backend
+    from ...scene.human import armature_of
+
+    numbers = range(frames.first, frames.last + 1)
+    joints = np.array([entry["joints"] for entry in posed_frames(context, person, numbers)], np.float64)
+    pelvis = points_to_backend(np.array(armature_of(person).data.bones["pelvis"].head_local))
+    left, _, right = np.linalg.svd(joints[..., :3])
+    rotations = left @ right  # the nearest rotations: bones may be scaled
+    translations = joints[:, 0, :, :3] @ pelvis + joints[:, 0, :, 3] - pelvis
+    render = context.scene.render
+    return HumanMotion(
+        np.array(numbers, np.float32),
+        unchain(rotations).astype(np.float32),
+        translations.astype(np.float32),
+        render.fps / render.fps_base,
+    )

@@ -1,0 +1,104 @@
+"""Mesh proxies: made by the child, written by Blender's exporters or kept in the scene."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...scene.exported_model import Frames, check_ready, write_model
+from ...scene.exported_proxy import build_proxy, proxy_of, read_proxy, remove_proxy
+from ...scene.human import armature_of, person_file
+from ...scene.shape import betas_of
+from ..jobs.target import Target
+from ..jobs.work import Work
+from .showing import show
+
+
+@dataclasses.dataclass(frozen=True)
+class ProxyWork(Work):
+    """What works that need a proxy have in common."""
+
+    target: Target
+    texture_px: int
+    triangles: int
+
+    method = "proxy"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        """Of the child's method; the shape as it is now."""
+        person = self.target.found()
+        return {
+            "person": str(person_file(person)),
+            "out_dir": str(folder / "proxy"),
+            "betas": betas_of(person).tolist(),
+            "texture_px": self.texture_px,
+            "triangles": self.triangles,
+        }
+
+    def built(self, person: bpy.types.Collection, result: dict[str, Any]) -> bpy.types.Object:
+        """The proxy as an object, in no collection."""
+        return build_proxy(person, read_proxy(Path(result["proxy"])), Path(result["texture"]), betas_of(person))
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportMeshWork(ProxyWork):
+    """Armature and proxy as a file; nothing of it stays in the scene."""
+
+    kind = "export_mesh"
+
+    path: Path
+    format: str
+    frames: Frames
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return f"Export {self.target.name} to {self.path.name}"
+
+    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+        """Build, export, remove."""
+        person = self.target.found()
+        armature = armature_of(person)
+        check_ready(armature)
+        proxy = self.built(person, result)
+        try:
+            write_model(context, armature, proxy, self.path, self.format, self.frames)
+        finally:
+            remove_proxy(proxy)
+        size = self.path.stat().st_size / 1e6
+        frames = f", {self.frames.last - self.frames.first + 1} frames" if self.frames.animated else ""
+        return f"Exported {person.name} to {self.path.name}: {result['triangles']} triangles{frames}, {size:.1f} MB"
+
+
+@dataclasses.dataclass(frozen=True)
+class AddProxyWork(ProxyWork):
+    """The proxy as an object of the person, in the place of an earlier one."""
+
+    kind = "add_proxy"
+    undo = "Add Mesh Proxy"
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return f"Mesh Proxy of {self.target.name}"
+
+    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+        """Add it, shown in the viewport."""
+        person = self.target.found()
+        proxy = self.built(person, result)
+        earlier = proxy_of(person)
+        if earlier is not None:
+            remove_proxy(earlier)
+        person.objects.link(proxy)
+        show(person, "VIEWPORT")
+        return f"Mesh proxy of {result['triangles']} triangles for {person.name} in {result['seconds']:.1f} s"
+
+
+def scene_frames(scene: bpy.types.Scene, animated: bool) -> Frames:
+    """The scene's range, or the current frame alone."""
+    if animated:
+        return Frames(scene.frame_start, scene.frame_end)
+    return Frames(scene.frame_current, scene.frame_current)

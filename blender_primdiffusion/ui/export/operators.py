@@ -1,0 +1,285 @@
+"""Exports of the selected person, and .human files in. Not redoable: a redo slider must not start the work again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ...scene.exported_human import ENDING, ENDINGS, read_tensors
+from ...scene.exported_model import ENDINGS as MODEL_ENDINGS
+from ...scene.exported_model import check_ready
+from ...scene.exported_proxy import proxy_of, remove_proxy
+from ...scene.human import armature_of, humans
+from ..jobs.follow import submit
+from ..jobs.target import Target, named_person, selected_person
+from .destination import check_writable, destination
+from .mesh_work import AddProxyWork, ExportMeshWork, scene_frames
+from .person_work import ExportGaussiansWork, ExportVdbSequenceWork, ImportHumanWork
+from .settings import FORMATS, SHOWN
+from .showing import show
+
+_HUMAN = "Name of the person (of their collection); empty: the selected one"
+_PANELS = "Not given: the panel's"
+_SKIP = {"SKIP_SAVE"}
+
+
+class _OfPerson:
+    """What exports have in common."""
+
+    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO: those that change the scene make a step
+
+    human: bpy.props.StringProperty(name="Person", description=_HUMAN, options=_SKIP)
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """There is somebody in the scene."""
+        cls.poll_message_set("Nobody is in the scene: generate a person first")
+        return bool(humans(context.scene))
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Check all that can be checked, then put it in line; in background mode this waits for the end."""
+        try:
+            person = named_person(context, self.human) if self.human else selected_person(context)
+            return self.act(context, person)
+        except (ValueError, OSError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+
+    def chosen(self, context: bpy.types.Context, name: str):
+        """What the script gives, else what the panel holds."""
+        given = self.properties.is_property_set(name)
+        return getattr(self if given else context.scene.primdiffusion_export, name)
+
+
+class _ToFile(_OfPerson):
+    """Exports that ask for a file."""
+
+    filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH", options=_SKIP)
+    check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        """The file browser, at the person's name; it asks before it replaces a file."""
+        try:
+            person = named_person(context, self.human) if self.human else selected_person(context)
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        if not self.filepath:
+            self.filepath = bpy.path.clean_name(person.name) + self.endings(context)[0]
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def check(self, context: bpy.types.Context) -> bool:
+        """Keep the ending that belongs to the format."""
+        endings = self.endings(context)
+        if self.filepath and Path(self.filepath).suffix.lower() not in endings:
+            self.filepath = bpy.path.ensure_ext(self.filepath, endings[0])
+            return True
+        return False
+
+
+class PRIMDIFFUSION_OT_export_mesh(_ToFile, bpy.types.Operator):
+    """Export the selected person as a textured mesh with their armature"""
+
+    bl_idname = "primdiffusion.export_mesh"
+    bl_label = "Export Mesh"
+
+    format: bpy.props.EnumProperty(name="Format", items=FORMATS, description=_PANELS, options=_SKIP)
+    animation: bpy.props.BoolProperty(name="Animation", description=_PANELS, options=_SKIP)
+    texture_px: bpy.props.IntProperty(name="Texture", description=_PANELS, min=64, max=8192, options=_SKIP)
+    triangles: bpy.props.IntProperty(name="Triangles", description=_PANELS, min=500, max=1_000_000, options=_SKIP)
+
+    def endings(self, context: bpy.types.Context) -> tuple[str, ...]:
+        """Of the format."""
+        return MODEL_ENDINGS[self.chosen(context, "format")]
+
+    def act(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """A format that is not given follows the file's ending."""
+        kind = self.chosen(context, "format")
+        if not self.properties.is_property_set("format"):
+            ending = Path(self.filepath).suffix.lower()
+            kind = next((name for name, endings in MODEL_ENDINGS.items() if ending in endings), kind)
+        path = destination(self.filepath, MODEL_ENDINGS[kind])
+        target, frames = Target.of(person), scene_frames(context.scene, self.chosen(context, "animation"))
+        check_ready(armature_of(person))
+        px, triangles = int(self.chosen(context, "texture_px")), self.chosen(context, "triangles")
+        return submit(self, context, ExportMeshWork(target, px, triangles, path, kind, frames))
+
+
+class PRIMDIFFUSION_OT_add_proxy(_OfPerson, bpy.types.Operator):
+    """Add a textured mesh of the selected person that follows the armature: fast in any viewport and engine"""
+
+    bl_idname = "primdiffusion.add_proxy"
+    bl_label = "Add Mesh Proxy"
+
+    texture_px: bpy.props.IntProperty(name="Texture", description=_PANELS, min=64, max=8192, options=_SKIP)
+    triangles: bpy.props.IntProperty(name="Triangles", description=_PANELS, min=500, max=1_000_000, options=_SKIP)
+
+    def act(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """In line."""
+        target = Target.of(person)
+        check_ready(armature_of(person))
+        px, triangles = int(self.chosen(context, "texture_px")), self.chosen(context, "triangles")
+        return submit(self, context, AddProxyWork(target, px, triangles))
+
+
+class PRIMDIFFUSION_OT_show_proxy(_OfPerson, bpy.types.Operator):
+    """Choose what is seen of the selected person: the volumes, or the mesh proxy"""
+
+    bl_idname = "primdiffusion.show_proxy"
+    bl_label = "Show Volumes or Mesh"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    shown: bpy.props.EnumProperty(name="Show", description="What is seen of the person", items=SHOWN)
+
+    def act(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """At once."""
+        show(person, self.shown)
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_remove_proxy(_OfPerson, bpy.types.Operator):
+    """Remove the mesh proxy of the selected person and show the volumes"""
+
+    bl_idname = "primdiffusion.remove_proxy"
+    bl_label = "Remove Mesh Proxy"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    def act(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """At once."""
+        show(person, "VOLUMES")
+        remove_proxy(proxy_of(person))
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_export_gaussians(_ToFile, bpy.types.Operator):
+    """Export the selected person in the current pose as 3D Gaussians for splat viewers"""
+
+    bl_idname = "primdiffusion.export_gaussians"
+    bl_label = "Export Gaussians"
+
+    gaussians: bpy.props.IntProperty(name="Gaussians", description=_PANELS, min=1, options=_SKIP)
+
+    def endings(self, _context: bpy.types.Context) -> tuple[str, ...]:
+        """Of PLY."""
+        return (".ply",)
+
+    def act(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """In line, in the pose of now."""
+        from .posing import posed_now
+
+        path = destination(self.filepath, self.endings(context))
+        work = ExportGaussiansWork(
+            Target.of(person), path, posed_now(context, person), self.chosen(context, "gaussians")
+        )
+        return submit(self, context, work)
+
+
+class PRIMDIFFUSION_OT_export_vdb_sequence(_OfPerson, bpy.types.Operator):
+    """Export the selected person as one volume file for each frame, for any renderer that reads OpenVDB"""
+
+    bl_idname = "primdiffusion.export_vdb_sequence"
+    bl_label = "Export VDB Sequence"
+
+    directory: bpy.props.StringProperty(name="Folder", subtype="DIR_PATH", options=_SKIP)
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    first: bpy.props.IntProperty(name="First Frame", description="Not given: the scene's", options=_SKIP)
+    last: bpy.props.IntProperty(name="Last Frame", description="Not given: the scene's", options=_SKIP)
+    voxel: bpy.props.FloatProperty(name="Voxel", description=_PANELS, min=0.002, max=0.05, options=_SKIP)
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        """The file browser, for a folder."""
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def act(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """In line, with the poses of now."""
+        from .posing import posed_frames
+
+        if not self.directory:
+            raise ValueError("name a folder to export to")
+        folder = Path(bpy.path.abspath(self.directory))
+        check_writable(folder)
+        scene, given = context.scene, self.properties.is_property_set
+        first = self.first if given("first") else scene.frame_start
+        last = self.last if given("last") else scene.frame_end
+        if last < first:
+            raise ValueError(f"the last frame {last} is before the first, {first}: exchange them")
+        target, stem = Target.of(person), bpy.path.clean_name(person.name)
+        people = posed_frames(context, person, range(first, last + 1))
+        work = ExportVdbSequenceWork(target, folder, stem, people, first, self.chosen(context, "voxel"))
+        return submit(self, context, work)
+
+
+class PRIMDIFFUSION_OT_export_human(_ToFile, bpy.types.Operator):
+    """Export the selected person as a .human file, to be dropped into another scene or given to somebody else"""
+
+    bl_idname = "primdiffusion.export_human"
+    bl_label = "Export Human File"
+
+    motion: bpy.props.BoolProperty(name="With Motion", description=_PANELS, options=_SKIP)
+
+    def endings(self, _context: bpy.types.Context) -> tuple[str, ...]:
+        """Of people."""
+        return ENDINGS
+
+    def act(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """At once: it needs no backend."""
+        from .human_files import write_human
+
+        path = destination(self.filepath, ENDINGS)
+        write_human(
+            context, person, path, scene_frames(context.scene, True) if self.chosen(context, "motion") else None
+        )
+        self.report({"INFO"}, f"Exported {person.name} to {path.name}")
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
+    """Add the person of a .human file to the scene"""
+
+    bl_idname = "primdiffusion.import_human"
+    bl_label = "Import Human File"
+    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO (the result has one)
+
+    filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH", options=_SKIP)
+    filter_glob: bpy.props.StringProperty(default=f"*{ENDING};*.safetensors", options={"HIDDEN"})
+    location: bpy.props.FloatVectorProperty(
+        name="Location",
+        description="Not given: the world's origin",
+        subtype="XYZ",
+        options=_SKIP,
+    )
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        """A dropped file is taken at once; otherwise the file browser asks for one."""
+        if self.filepath:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Look into the file, then put it in line; in background mode this waits for the person."""
+        path = Path(bpy.path.abspath(self.filepath))
+        try:
+            if not self.filepath or not path.is_file():
+                raise FileNotFoundError(f"there is no file {str(path)!r}: choose a .human file")
+            read_tensors(path)
+        except (ValueError, OSError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        at = tuple(self.location) if self.properties.is_property_set("location") else None
+        return submit(self, context, ImportHumanWork(str(path), at))
+
+
+CLASSES = (
+    PRIMDIFFUSION_OT_export_mesh,
+    PRIMDIFFUSION_OT_add_proxy,
+    PRIMDIFFUSION_OT_show_proxy,
+    PRIMDIFFUSION_OT_remove_proxy,
+    PRIMDIFFUSION_OT_export_gaussians,
+    PRIMDIFFUSION_OT_export_vdb_sequence,
+    PRIMDIFFUSION_OT_export_human,
+    PRIMDIFFUSION_OT_import_human,
+)

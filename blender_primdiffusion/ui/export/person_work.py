@@ -1,0 +1,169 @@
+"""People as 3D Gaussians, as VDB files frame by frame, and out of .human files."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ...scene.armature import pose_from_joint_rotations
+from ...scene.exported_human import HumanMotion, motion_in, read_tensors
+from ...scene.human import armature_of
+from ...scene.keyframes import keyframe_poses
+from ...scene.merged import Grid, read_grid, write_grid
+from ..jobs.person import build_person
+from ..jobs.target import Target
+from ..jobs.work import Work
+
+_PICTURE_PX = 16
+"""The child's pictures of the imported person are of no use here."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportGaussiansWork(Work):
+    """A person in a pose as splats."""
+
+    kind = "export_gaussians"
+    method = "gaussians"
+
+    target: Target
+    path: Path
+    person: dict[str, Any]
+    """Whom, and in which pose: as of draw."""
+    limit: int
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return f"Export {self.target.name} to {self.path.name}"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        """Of the child's method."""
+        posed = {name: self.person[name] for name in ("object", "joints", "betas")}
+        return {"person": self.person["human"], **posed, "limit": self.limit, "out": str(folder / "gaussians.ply")}
+
+    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+        """Put the file in its place."""
+        put(Path(result["out"]), self.path)
+        size = self.path.stat().st_size / 1e6
+        return f"Exported {self.target.name} to {self.path.name}: {result['gaussians']} Gaussians, {size:.1f} MB"
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportVdbSequenceWork(Work):
+    """A person as one grid for each frame, in the world's place."""
+
+    kind = "export_vdb_sequence"
+    method = "merge_frames"
+
+    target: Target
+    folder: Path
+    stem: str
+    people: list[dict[str, Any]]
+    """As of draw, an entry for each frame."""
+    first: int
+    """The first frame's number."""
+    voxel: float
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return f"Export {len(self.people)} VDB files of {self.target.name}"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        """Of the child's method."""
+        return {"people": self.people, "voxel": self.voxel, "out_dir": str(folder)}
+
+    def finish(self, _context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
+        """Write all files aside, then put them in their places."""
+        bpy.utils.expose_bundled_modules()
+        written = []
+        for index, grid in enumerate(result["files"]):
+            name = f"{self.stem}_{self.first + index:04d}.vdb"
+            write_grid(_as_others_read_it(read_grid(Path(grid))), folder / name)
+            Path(grid).unlink()
+            written.append(folder / name)
+        size = sum(path.stat().st_size for path in written) / 1e6
+        for path in written:
+            put(path, self.folder / path.name)
+        return f"Exported {len(written)} frames of {self.target.name} to {self.folder.name}: {size:.0f} MB"
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportHumanWork(Work):
+    """The person of a .human file, with the motion that it may hold."""
+
+    kind = "import_human"
+    method = "human_npz"
+    undo = "Import Human"
+
+    path: str
+    at: tuple[float, float, float] | None = None
+    """Where to put the person, metres; None for the world's origin."""
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return f"Import {Path(self.path).name}"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        """Of the child's method."""
+        return {"person": self.path, "out_dir": str(folder), "size": _PICTURE_PX}
+
+    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+        """Build the person, and let them move."""
+        motion = motion_in(read_tensors(Path(self.path)))
+        person, notice = build_person(context, result, "Imported", name_of(self.path))
+        armature = armature_of(person)
+        if motion is not None:
+            _move(armature, motion)
+        if self.at is not None:
+            armature.location.xy = self.at[:2]
+            armature.location.z += self.at[2]
+        return notice
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, kept: dict[str, Any]) -> ImportHumanWork:
+        """What `to_json` gave."""
+        return cls(str(kept["path"]), None if kept["at"] is None else tuple(kept["at"]))
+
+
+def name_of(path: str) -> str:
+    """What a person from this file is called."""
+    name = Path(path).name
+    for ending in (".safetensors", ".human"):
+        name = name.removesuffix(ending)
+    return name or "Human"
+
+
+def put(source: Path, target: Path) -> None:
+    """Copies a finished file to its place; a reader never sees half of it. Raises OSError."""
+    unfinished = target.with_name(f".{target.name}.part")
+    try:
+        shutil.copyfile(source, unfinished)
+        unfinished.replace(target)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _as_others_read_it(grid: Grid) -> Grid:
+    """`write_grid` moves grids for old versions of Cycles by half a voxel; files for other programs must not be."""
+    shift = 0.5 * grid.voxel if bpy.app.version < (5, 0) else 0.0
+    return dataclasses.replace(grid, origin=grid.origin + shift)
+
+
+def _move(armature: bpy.types.Object, motion: HumanMotion) -> None:
+    if len(motion.frames) == 1:
+        pose_from_joint_rotations(armature, motion.rotations[0], motion.translations[0])
+        return
+    keyframe_poses(
+        armature, np.asarray(motion.frames, np.float64), motion.rotations, motion.translations, armature.name
+    )

@@ -1,0 +1,143 @@
+"""Armature and mesh proxy as glTF, FBX and USD: what was written is read back and compared."""
+
+from __future__ import annotations
+
+import bpy
+import exporting
+import numpy as np
+import pytest
+import synthetic
+
+from blender_primdiffusion.scene.exported_model import Frames, write_model
+from blender_primdiffusion.scene.exported_proxy import build_proxy, read_proxy, remove_proxy
+from blender_primdiffusion.scene.human import armature_of
+from blender_primdiffusion.scene.keyframes import keyframe_poses
+
+EXACT = 1e-4
+"""Metres."""
+
+
+@pytest.fixture
+def store(saved_scene, tmp_path):
+    folder = tmp_path / "store"
+    folder.mkdir()
+    exporting.write_store(folder)
+    return folder
+
+
+@pytest.fixture
+def moving(store):
+    """Somebody who moves on frames 1 to 4, away from the origin and turned."""
+    person = exporting.add_person(store)
+    armature = armature_of(person)
+    rng = np.random.default_rng(0)
+    turns, places = synthetic.axis_angle(rng.normal(0, 0.3, (4, 24, 3))), rng.normal(0, 0.1, (4, 3))
+    keyframe_poses(armature, np.arange(1, 5), turns, places)
+    armature.location.x, armature.rotation_euler.z = 1.5, 0.7
+    return person
+
+
+def joints_and_vertices(armature, mesh):
+    heads = [np.array(armature.matrix_world @ armature.pose.bones[name].head) for name in synthetic.NAMES]
+    evaluated = mesh.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    corners = [evaluated.matrix_world @ vertex.co for vertex in evaluated.data.vertices]
+    return np.array(heads), np.array(corners)
+
+
+def at_frames(armature, mesh, frames):
+    found = []
+    for frame in range(frames.first, frames.last + 1):
+        bpy.context.scene.frame_set(frame)
+        found.append(joints_and_vertices(armature, mesh))
+    return found
+
+
+def imported(path, kind):
+    before = set(bpy.data.objects)
+    if kind == "GLB":
+        bpy.ops.import_scene.gltf(filepath=str(path))
+    elif kind == "FBX":
+        bpy.ops.import_scene.fbx(filepath=str(path), anim_offset=0.0)
+    else:
+        bpy.ops.wm.usd_import(filepath=str(path))
+    new = [thing for thing in bpy.data.objects if thing not in before]
+    armature = next(thing for thing in new if thing.type == "ARMATURE")
+    mesh = next(thing for thing in new if thing.type == "MESH" and thing.vertex_groups)
+    return armature, mesh
+
+
+def textures(mesh):
+    nodes = [node for material in mesh.data.materials for node in material.node_tree.nodes]
+    return [node.image for node in nodes if node.type == "TEX_IMAGE" and node.image]
+
+
+@pytest.mark.parametrize("frames", [Frames(1, 4), Frames(3, 3)], ids=["animation", "pose"])
+@pytest.mark.parametrize(("kind", "ending"), [("GLB", ".glb"), ("FBX", ".fbx"), ("USD", ".usdc"), ("USD", ".usdz")])
+def test_joints_and_surface_are_where_they_were(moving, store, tmp_path, kind, ending, frames):
+    armature = armature_of(moving)
+    proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
+    bpy.context.scene.collection.objects.link(proxy)
+    bpy.context.scene.frame_set(3)
+    out = tmp_path / f"eine Frau ä{ending}"
+    write_model(bpy.context, armature, proxy, out, kind, frames)
+    wanted = at_frames(armature, proxy, frames)
+    remove_proxy(proxy)
+    armature, mesh = imported(out, kind)
+    found = at_frames(armature, mesh, frames)
+    for (joints, corners), (joints_back, corners_back) in zip(wanted, found, strict=True):
+        assert np.abs(joints - joints_back).max() < EXACT
+        near = np.linalg.norm(corners[:, None] - corners_back[None], axis=-1)
+        assert near.min(1).max() < EXACT  # vertices may be split and reordered
+    picture = textures(mesh)[0]
+    assert tuple(picture.size) == (16, 16)
+    assert picture.pixels[0] == pytest.approx(1.0)
+
+
+def test_exporting_leaves_the_scene_as_it_was(moving, store, tmp_path):
+    proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
+    armature = armature_of(moving)
+    armature.hide_viewport, armature.data.pose_position = True, "REST"
+    bpy.context.scene.frame_set(2)
+    kinds = ("scenes", "objects", "meshes", "armatures", "actions", "materials", "images", "collections")
+    before = {kind: {thing.name for thing in getattr(bpy.data, kind)} for kind in kinds}
+    write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", Frames(1, 4))
+    assert {kind: {thing.name for thing in getattr(bpy.data, kind)} for kind in kinds} == before
+    assert bpy.context.scene.frame_current == 2
+    assert armature.hide_viewport
+    assert armature.data.pose_position == "REST"
+
+
+def test_an_exporter_that_is_disabled_is_enabled_for_the_moment(moving, store, tmp_path):
+    import addon_utils
+
+    proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
+    addon_utils.disable("io_scene_fbx")
+    try:
+        write_model(bpy.context, armature_of(moving), proxy, tmp_path / "a.fbx", "FBX", Frames(1, 2))
+        assert (tmp_path / "a.fbx").is_file()
+        assert not addon_utils.check("io_scene_fbx")[1]
+    finally:
+        addon_utils.enable("io_scene_fbx")
+
+
+def test_an_armature_in_edit_mode_or_without_a_bone_is_refused(moving, store, tmp_path):
+    proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
+    armature = armature_of(moving)
+    armature.data.bones["head"].name = "skull"
+    with pytest.raises(ValueError, match="no bone 'head'"):
+        write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", Frames(1, 1))
+    armature.data.bones["skull"].name = "head"
+    bpy.ops.object.mode_set(mode="EDIT")
+    with pytest.raises(ValueError, match="Edit Mode"):
+        write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", Frames(1, 1))
+    assert not (tmp_path / "a.glb").exists()
+
+
+@pytest.mark.parametrize("field", ["faces", "skin_weights", "joint_names"])
+def test_a_damaged_proxy_is_refused(store, tmp_path, field):
+    with np.load(store / "proxy.npz") as archive:
+        arrays = dict(archive)
+    arrays[field] = arrays[field][:-1] if field != "faces" else arrays[field] + 10**6
+    np.savez(tmp_path / "damaged.npz", **arrays)
+    with pytest.raises(ValueError, match=r"again|release"):
+        read_proxy(tmp_path / "damaged.npz")
