@@ -28,6 +28,11 @@ def drawing_child() -> DrawingChild:
         return _child
 
 
+def child_pid() -> int | None:
+    """The process of the engine's child, None while there is none."""
+    return _child.pid if _child is not None else None
+
+
 @atexit.register
 def close() -> None:
     """Ends the child and frees the memory; the next picture starts anew."""

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import Protocol
 
-from .client import BackendClient
+from .client import BackendClient, Event
 
 
 class Job(Protocol):
@@ -55,6 +55,21 @@ class Backend:
                 client.shutdown()
                 raise RuntimeError("the backend was shut down while it was starting")
             return client
+
+    @property
+    def log(self) -> tuple[str, ...]:
+        """The last lines that the child, or the one before it, wrote to stderr."""
+        return self._client.stderr if self._client is not None else ()
+
+    def listen(self) -> list[Event]:
+        """What has happened while nobody is at work: the child's end, or its silence."""
+        return self._client.poll() if self._client is not None else []
+
+    def release(self) -> None:
+        """Ends the child that is kept warm, without waiting for it; the next job starts another."""
+        client, self._client = self._client, None
+        if client is not None:  # its farewell takes a moment, in which Blender would stand still
+            threading.Thread(target=client.shutdown, name="primdiffusion end", daemon=True).start()
 
     def shutdown(self) -> None:
         """Ends the child for good, also one that is just being started."""

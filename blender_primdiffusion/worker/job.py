@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from .backend import Backend
 from .client import BackendClient, Died, Event, Failure, Notification, Response, Silent
+from .memory_advice import memory_advice
 from .sentence import sentence
 
 State = Literal["starting", "running", "cancelling", "done", "failed", "cancelled"]
@@ -169,17 +170,19 @@ class Job:
             if event.code == CANCELLED_CODE:
                 self._end("cancelled", "Cancelled")
             else:
-                self._fail(JobError(event.message, event.remedy, event.kind, self._log()))
+                remedy = memory_advice(self._params) if event.kind == "out_of_memory" else event.remedy
+                self._fail(JobError(event.message, remedy, event.kind, self._log()))
         elif isinstance(event, Died):
             self._clear_leftovers()
             if self._cancel_asked_at is not None:
                 self._end("cancelled", "Cancelled")
             else:
-                self._fail(JobError(event.message, "Try again; the log tells more", "died", event.stderr))
+                remedy = f"Try again; if it was the memory, {memory_advice(self._params)}"
+                self._fail(JobError(event.message, remedy, "died", event.stderr))
         elif isinstance(event, Silent):
             self._kill()
             said = f"the backend hung: it said nothing for {event.seconds:.0f} s and was ended"
-            self._fail(JobError(said, "Try again; the log tells more", "hung", self._log()))
+            self._fail(JobError(said, "Try again", "hung", self._log()))
 
     def _take_progress(self, params: dict[str, Any]) -> None:
         if self._cancel_asked_at is not None:

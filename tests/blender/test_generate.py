@@ -107,14 +107,12 @@ def test_a_second_click_waits_in_line_and_does_not_disturb_the_first(addon):
 def test_the_timer_builds_the_person_and_the_panel_shows_progress_then_the_result(addon):
     assert "primdiffusion.generate" in panel_texts(addon)
     ask(addon, TAKES_LONG, 2)
-    seen = []
-    while follow() is not None:
-        seen += panel_texts(addon)
-        time.sleep(0.05)
-        if len(seen) > 100:
-            bpy.ops.primdiffusion.cancel()
+    until_running()
+    seen = panel_texts(addon)
     assert "primdiffusion.cancel" in seen
     assert any("step" in text for text in seen)
+    bpy.ops.primdiffusion.cancel()
+    drive()
     ask(addon, 7, 2)
     drive()
     assert len(humans(addon.scene)) == 1

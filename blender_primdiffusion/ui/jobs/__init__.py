@@ -5,29 +5,51 @@ from __future__ import annotations
 import bpy
 from bpy.app.handlers import persistent
 
-from . import follow, operators, queue, result_operator
+from . import diagnostics, follow, operators, panel, pictures, queue, result_operator
 
-CLASSES = (operators.PRIMDIFFUSION_OT_cancel, result_operator.PRIMDIFFUSION_OT_take_result)
+CLASSES = (
+    *operators.CLASSES,
+    result_operator.PRIMDIFFUSION_OT_take_result,
+    diagnostics.PRIMDIFFUSION_OT_copy_diagnostics,
+    panel.PRIMDIFFUSION_PT_jobs,
+)
+_TIMERS = (follow.follow, follow.watch, follow.look_for_left)
 
 
 @persistent
-def drop_works_before_loading(*_: object) -> None:
-    """Handler of load_pre: what was asked for in one file must not appear in another."""
-    queue.queue.close()
+def set_aside_before_loading(*_: object) -> None:
+    """Handler of load_pre: what was asked for in one file must not appear in another by itself."""
+    queue.queue.set_aside()
+    pictures.so_far.show(None)
+
+
+@persistent
+def watch_after_loading(*_: object) -> None:
+    """Handler of load_post, and of a load that failed: timers go on."""
+    follow.keep_watching()
 
 
 def register() -> None:
     """Make the room known to Blender."""
     for cls in CLASSES:
         bpy.utils.register_class(cls)
-    bpy.app.handlers.load_pre.append(drop_works_before_loading)
+    bpy.app.handlers.load_pre.append(set_aside_before_loading)
+    bpy.app.handlers.load_post.append(watch_after_loading)
+    bpy.app.handlers.load_post_fail.append(watch_after_loading)
+    if not bpy.app.background:
+        bpy.app.timers.register(follow.look_for_left, first_interval=follow.LOOK_AFTER_S, persistent=True)
+        follow.keep_watching()
 
 
 def unregister() -> None:
     """Undo `register`."""
     queue.queue.close()
-    if bpy.app.timers.is_registered(follow.follow):
-        bpy.app.timers.unregister(follow.follow)
-    bpy.app.handlers.load_pre.remove(drop_works_before_loading)
+    pictures.so_far.close()
+    for timer in _TIMERS:
+        if bpy.app.timers.is_registered(timer):
+            bpy.app.timers.unregister(timer)
+    bpy.app.handlers.load_post_fail.remove(watch_after_loading)
+    bpy.app.handlers.load_post.remove(watch_after_loading)
+    bpy.app.handlers.load_pre.remove(set_aside_before_loading)
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

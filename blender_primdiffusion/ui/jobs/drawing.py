@@ -1,4 +1,4 @@
-"""How works look in panels: button, progress, errors."""
+"""How works look in panels: button, progress, line, errors and what to do about them."""
 
 from __future__ import annotations
 
@@ -6,9 +6,15 @@ import textwrap
 
 import bpy
 
+from ...worker.job import JobError
+from .follow import in_the_way
+from .pictures import so_far
 from .queue import Entry, Outcome, queue
+from .remedies import remedy_for
 
 _LINE = 46
+_PICTURE_SCALE = 8.0
+_MINUTES_FROM_S = 90.0
 
 
 def draw_job(
@@ -19,14 +25,12 @@ def draw_job(
     Returns the button's properties, to be filled in.
     """
     props = layout.operator(operator_idname, icon=icon)
-    entry = queue.current
-    if entry is not None and entry.work.kind == kind:
-        _draw_progress(layout)
-    for waiting in queue.waiting:
-        if waiting.work.kind == kind:
-            _draw_waiting(layout, waiting)
+    if queue.current is not None and queue.current.work.kind == kind:
+        draw_progress(layout)
+    waiting = [entry for entry in queue.waiting if entry.work.kind == kind]
+    draw_waiting(layout, waiting)
     if (outcome := queue.outcomes.get(kind)) is not None:
-        _draw_outcome(layout, outcome)
+        draw_outcome(layout, outcome)
     return props
 
 
@@ -37,19 +41,54 @@ def draw_lines(layout: bpy.types.UILayout, text: str, icon: str) -> None:
         column.label(text=line, icon=icon if number == 0 else "BLANK1")
 
 
-def _draw_progress(layout: bpy.types.UILayout) -> None:
+def draw_progress(layout: bpy.types.UILayout) -> None:
+    """What is at work: its picture, how far it is, how long it will take, Cancel."""
     job = queue.job
-    left = f" ({job.eta_s:.0f} s left)" if job.eta_s else ""
-    layout.progress(factor=job.fraction, text=f"{job.message}{left}")
-    layout.operator("primdiffusion.cancel", icon="CANCEL").number = 0
-
-
-def _draw_waiting(layout: bpy.types.UILayout, entry: Entry) -> None:
+    if so_far.icon:
+        layout.template_icon(icon_value=so_far.icon, scale=_PICTURE_SCALE)
     row = layout.row(align=True)
-    row.label(text=f"In line: {entry.work.label}", icon="TIME")
-    row.operator("primdiffusion.cancel", text="", icon="X").number = entry.number
+    row.progress(factor=job.fraction, text=_progress_text())
+    row.operator("primdiffusion.cancel", text="", icon="CANCEL").number = 0
 
 
-def _draw_outcome(layout: bpy.types.UILayout, outcome: Outcome) -> None:
+def draw_waiting(layout: bpy.types.UILayout, entries: list[Entry]) -> None:
+    """What waits for its turn, each removable."""
+    if not entries:
+        return
+    column = layout.column(align=True)
+    column.label(text=f"In Line: {len(entries)}", icon="SORTTIME")
+    for entry in entries:
+        row = column.row(align=True)
+        row.label(text=entry.work.label, icon="BLANK1")
+        row.operator("primdiffusion.cancel", text="", icon="X").number = entry.number
+
+
+def draw_outcome(layout: bpy.types.UILayout, outcome: Outcome) -> None:
+    """News, or an error with what can be done about it."""
+    if outcome.error is None:
+        draw_lines(layout, outcome.notice, "INFO")
+        return
     draw_lines(layout, outcome.sentence, "ERROR")
-    draw_lines(layout, outcome.notice, "INFO")
+    row = layout.row(align=True)
+    _draw_remedy(row, outcome.error, outcome.entry.work.kind)
+    row.operator("primdiffusion.copy_diagnostics", icon="COPYDOWN")
+
+
+def _draw_remedy(layout: bpy.types.UILayout, error: JobError, kind: str) -> None:
+    remedy = remedy_for(error)
+    if remedy is None:
+        return
+    props = layout.operator(remedy.operator, text=remedy.label, icon=remedy.icon)
+    if remedy.operator == "primdiffusion.try_again":
+        props.kind = kind
+
+
+def _progress_text() -> str:
+    job = queue.job
+    if queue.ready:
+        waits_for = in_the_way()
+        return f"Done: waits for {waits_for}" if waits_for else "Putting it into the scene"
+    if not job.eta_s:
+        return job.message
+    left = f"{job.eta_s:.0f} s" if job.eta_s < _MINUTES_FROM_S else f"{job.eta_s / 60:.0f} min"
+    return f"{job.message} ({left} left)"

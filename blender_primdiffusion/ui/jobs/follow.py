@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
+import traceback
+from collections.abc import Iterator
 
 import bpy
 
 from ...worker.job import JobError
+from .memory import release_when_idle
+from .pictures import so_far
 from .queue import GONE, Entry, Outcome, queue
 from .work import Work
 
 TICK_S = 0.1
+WATCH_S = 0.5
+LOOK_AFTER_S = 1.0
+"""Registering reads no files; nor need Blender's start wait for it."""
 _TOLD_S = 1.0
 """Between lines of progress on the console in background mode."""
 _IN_THE_WAY = {"UNDO", "BLOCKING", "GRAB_CURSOR", "GRAB_CURSOR_X", "GRAB_CURSOR_Y"}
@@ -19,11 +27,11 @@ _IN_THE_WAY = {"UNDO", "BLOCKING", "GRAB_CURSOR", "GRAB_CURSOR_X", "GRAB_CURSOR_
 
 def submit(operator: bpy.types.Operator, context: bpy.types.Context, work: Work) -> set[str]:
     """Put `work` in line: with a window a timer sees it through, in background mode this waits for its end."""
-    entry = queue.add(context, work)
     if not bpy.app.background:
+        queue.add(context, work)
         keep_following()
         return {"FINISHED"}
-    outcome = _wait_for(entry)
+    outcome = _wait_for(queue.add_awaited(context, work))
     if outcome.error is not None:
         operator.report({"ERROR"}, outcome.sentence)
         return {"CANCELLED"}
@@ -42,12 +50,35 @@ def follow() -> float | None:
     if not queue.busy:
         return None
     changed = queue.tick()
-    if queue.ready and not _in_the_way():
+    if queue.ready and not in_the_way():
         _enter()
         changed = True
+    changed |= so_far.show(queue.job.picture if queue.job is not None else None)
     if changed:
         redraw()
     return TICK_S if queue.busy else None
+
+
+def watch() -> float:
+    """The timer between works: a child that died is noticed, one that nobody has needed for long is ended."""
+    if queue.busy:
+        keep_following()
+    elif queue.listen() or release_when_idle(time.monotonic()):
+        redraw()
+    return WATCH_S
+
+
+def look_for_left() -> None:
+    """The timer after registration: works that an earlier Blender has left are offered."""
+    queue.kept.look()
+    if queue.kept.left:
+        redraw()
+
+
+def keep_watching() -> None:
+    """Have Blender call `watch` from now on."""
+    if not bpy.app.background and not bpy.app.timers.is_registered(watch):
+        bpy.app.timers.register(watch, first_interval=WATCH_S, persistent=True)
 
 
 def redraw() -> None:
@@ -71,27 +102,51 @@ def _wait_for(entry: Entry) -> Outcome:
     return queue.last
 
 
-def _in_the_way() -> bool:
-    """Blender renders, or the user is moving something."""
+def in_the_way() -> str:
+    """What a result waits for, for people; empty when nothing keeps it from the scene."""
     if bpy.app.is_job_running("RENDER"):
-        return True
+        return "the render"
     windows = bpy.context.window_manager.windows
-    return any(_IN_THE_WAY & modal.bl_options for window in windows for modal in window.modal_operators)
+    for modal in (modal for window in windows for modal in window.modal_operators):
+        if _IN_THE_WAY & modal.bl_options:
+            return modal.name
+    return ""
 
 
 def _enter() -> None:
     """Hand the answer to the operator that puts it into the scene it was asked for."""
     entry = queue.current
-    windows = bpy.context.window_manager.windows
-    context: dict[str, object] = {}
-    if window := bpy.context.window or next(iter(windows), None):  # timers have no window of their own
-        context["window"] = window
-    if entry.work.undo:
-        scene = next((scene for scene in bpy.data.scenes if scene.session_uid == entry.scene_uid), None)
-        if scene is None:
-            queue.refuse(JobError(GONE.format(entry.scene), "", "scene"))
-            return
-        if window is None or window.scene != scene:
-            context |= {"scene": scene, "view_layer": scene.view_layers[0]}
-    with bpy.context.temp_override(**context):
-        bpy.ops.primdiffusion.take_result()
+    scene = next((scene for scene in bpy.data.scenes if scene.session_uid == entry.scene_uid), None)
+    if scene is None and entry.work.undo:
+        queue.refuse(JobError(GONE.format(entry.scene), "", "scene"))
+        return
+    try:
+        with _shown(scene):
+            bpy.ops.primdiffusion.take_result()
+    except RuntimeError as error:  # the timer must go on, whatever state Blender is in
+        traceback.print_exc()
+        if queue.current is entry:
+            queue.refuse(JobError(f"the result could not enter the scene: {error}", "", "scene"))
+
+
+@contextlib.contextmanager
+def _shown(scene: bpy.types.Scene | None) -> Iterator[None]:
+    """A context with this scene in a window: timers have none of their own.
+
+    Where no window shows the scene, one does for as long as this takes: a context of another scene than its window's
+    crashes operators (4.5, 5.0).
+    """
+    windows = list(bpy.context.window_manager.windows)
+    window = next((window for window in windows if window.scene == scene), windows[0] if windows else None)
+    if window is None:
+        yield
+        return
+    before = window.scene
+    if scene is not None and before != scene:
+        window.scene = scene
+    try:
+        with bpy.context.temp_override(window=window):
+            yield
+    finally:
+        if window.scene != before:
+            window.scene = before

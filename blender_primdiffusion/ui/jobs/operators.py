@@ -1,10 +1,12 @@
-"""Cancel."""
+"""What can be done with works: cancel, try again, resume after a restart, and give memory back."""
 
 from __future__ import annotations
 
 import bpy
 
-from .follow import redraw
+from . import memory
+from .follow import redraw, submit
+from .kept import work_of
 from .queue import queue
 
 
@@ -22,12 +24,118 @@ class PRIMDIFFUSION_OT_cancel(bpy.types.Operator):
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
         """Only while something is in line."""
+        cls.poll_message_set("Nothing is in line")
         return queue.busy
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
         """Ask; the timer sees it through."""
         if not queue.cancel(self.number):
-            self.report({"ERROR"}, f"there is no work {self.number} in line: it has ended")
+            which = f"work {self.number} is not in line any more" if self.number else "nothing is under way yet"
+            self.report({"ERROR"}, which)
             return {"CANCELLED"}
         redraw()
         return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_try_again(bpy.types.Operator):
+    """Ask for the same once more"""
+
+    bl_idname = "primdiffusion.try_again"
+    bl_label = "Try Again"
+    bl_options: set[str] = set()  # noqa: RUF012
+
+    kind: bpy.props.StringProperty(
+        name="Kind", description="Of work, like generate; empty: the last one that ended", options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        """Only after something has failed."""
+        cls.poll_message_set("Nothing has failed")
+        return any(outcome.error is not None for outcome in queue.outcomes.values())
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Put the failed work in line again, for the scene at hand."""
+        outcome = queue.outcomes.get(self.kind) if self.kind else queue.last
+        if outcome is None or outcome.error is None:
+            self.report({"ERROR"}, f"no work {self.kind!r} has failed" if self.kind else "the last work went well")
+            return {"CANCELLED"}
+        return submit(self, context, outcome.entry.work)
+
+
+class PRIMDIFFUSION_OT_resume_works(bpy.types.Operator):
+    """Put the works that were left in line again, for the scene that is open now"""
+
+    bl_idname = "primdiffusion.resume_works"
+    bl_label = "Resume"
+    bl_options: set[str] = set()  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        """Only where something was left."""
+        cls.poll_message_set("No work was left by an earlier Blender or file")
+        return bool(queue.kept.left)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """All of them, in the order in which they were asked for."""
+        unknown, works = [], []
+        for kept in queue.kept.take():
+            try:
+                works.append(work_of(kept))
+            except ValueError as error:
+                unknown.append(str(error))
+        if unknown:
+            self.report({"WARNING"}, "; ".join(unknown))
+        if not works:
+            self.report({"ERROR"}, "; ".join(unknown) or "another Blender has taken the works meanwhile")
+            return {"CANCELLED"}
+        states = [submit(self, context, work) for work in works]
+        return {"FINISHED"} if {"FINISHED"} in states else {"CANCELLED"}
+
+
+class PRIMDIFFUSION_OT_discard_works(bpy.types.Operator):
+    """Forget the works that were left"""
+
+    bl_idname = "primdiffusion.discard_works"
+    bl_label = "Discard"
+    bl_options: set[str] = set()  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        """Only where something was left."""
+        cls.poll_message_set("No work was left by an earlier Blender or file")
+        return bool(queue.kept.left)
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        """All of them."""
+        queue.kept.take()
+        redraw()
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_release_memory(bpy.types.Operator):
+    """End the processes that generate and draw, and so give back what they hold; the next person starts them anew"""
+
+    bl_idname = "primdiffusion.release_memory"
+    bl_label = "Release Memory"
+    bl_options: set[str] = set()  # noqa: RUF012
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        """Tell what was freed."""
+        try:
+            freed = memory.release()
+        except RuntimeError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, freed)
+        redraw()
+        return {"FINISHED"}
+
+
+CLASSES = (
+    PRIMDIFFUSION_OT_cancel,
+    PRIMDIFFUSION_OT_try_again,
+    PRIMDIFFUSION_OT_resume_works,
+    PRIMDIFFUSION_OT_discard_works,
+    PRIMDIFFUSION_OT_release_memory,
+)

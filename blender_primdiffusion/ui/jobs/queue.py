@@ -15,11 +15,14 @@ import bpy
 
 from ...places import new_backend, preference
 from ...worker.backend import Backend
+from ...worker.client import Died, Silent
 from ...worker.job import Job, JobError
+from ...worker.kept_works import KeptWork
 from ...worker.sentence import sentence
+from .kept import Kept, kept_work
+from .remedies import error_in_the_scene
 from .work import Work
 
-IN_LINE = "In line"
 GONE = "The scene {!r} was deleted meanwhile: nothing was added. Undo the deletion and try again."
 
 
@@ -37,6 +40,8 @@ class Entry:
     """Path of the file it was asked for in; empty for one never saved."""
     asked_at: float
     """time.monotonic()."""
+    kept: KeptWork | None
+    """What would re-create it; None where that is not wanted."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +73,10 @@ class Queue:
         self.outcomes: dict[str, Outcome] = {}
         """The last of each kind of work, for the panels."""
         self.last: Outcome | None = None
+        self.kept = Kept()
+        self.child_news = ""
+        """How the child ended between works; empty when it did not."""
+        self.idle_since = time.monotonic()
         self.info: dict[str, object] = {}
         """What the child said of itself; kept when it has ended."""
         self._numbers = itertools.count(1)
@@ -86,11 +95,16 @@ class Queue:
         return self.job is not None and self.job.state == "done"
 
     def add(self, context: bpy.types.Context, work: Work) -> Entry:
-        """Put `work` in line for the scene of `context`; nothing is asked of the child before the next `tick`."""
-        scene = context.scene
-        entry = Entry(next(self._numbers), work, scene.name, scene.session_uid, bpy.data.filepath, time.monotonic())
-        self.waiting.append(entry)
-        self.outcomes.pop(work.kind, None)
+        """Put `work` in line for the scene of `context`, for Blender to see through some time, even after a restart."""
+        entry = self._entry(context, work)
+        entry.kept = kept_work(work, entry.scene, entry.blend)
+        self._append(entry)
+        return entry
+
+    def add_awaited(self, context: bpy.types.Context, work: Work) -> Entry:
+        """Put `work` in line for a script that waits for it, and with which it ends."""
+        entry = self._entry(context, work)
+        self._append(entry)
         return entry
 
     def tick(self) -> bool:
@@ -102,7 +116,7 @@ class Queue:
             return True
         changed = self.job.tick()
         if self.job.info:
-            self.info = self.job.info
+            self.info, self.child_news = self.job.info, ""
         if self.job.state == "cancelled":
             self._end(Outcome(self.current, notice="Cancelled"))
         elif self.job.state == "failed":
@@ -118,10 +132,11 @@ class Queue:
         try:
             notice = entry.work.finish(context, self.job.result or {}, self._folder)
         except (ValueError, OSError, RuntimeError) as e:
-            error = JobError(sentence(e), "", "scene")
+            error = error_in_the_scene(e)
         except Exception as e:
             traceback.print_exc()
-            error = JobError(f"The result could not be put into the scene: {sentence(e)}", "", "scene")
+            trace = tuple(traceback.format_exc().splitlines())
+            error = JobError(f"the result could not be put into the scene: {sentence(e)}", "", "scene", trace)
         seconds = {"work": began - entry.asked_at, "finish": time.monotonic() - began}
         return self._end(Outcome(entry, notice, error, seconds))
 
@@ -137,16 +152,43 @@ class Queue:
         left = [entry for entry in self.waiting if entry.number != number]
         found = len(left) < len(self.waiting)
         self.waiting = collections.deque(left)
+        self._save()
         return found
 
+    def listen(self) -> bool:
+        """Between works: notice that the child has died or hangs; True when something visible changed. Never waits."""
+        if self._backend is None or self.job is not None:
+            return False
+        for event in self._backend.listen():
+            if isinstance(event, Died):
+                self.child_news = event.message
+                return True
+            if isinstance(event, Silent):
+                self.child_news = "the backend hung and was ended"
+                self.release()
+                return True
+        return False
+
+    def release(self) -> int | None:
+        """End the child that is kept warm; its process id, None where there was none or it is at work."""
+        pid = self.child_pid
+        if pid is None or self.job is not None:
+            return None
+        self._backend.release()
+        return pid
+
+    def set_aside(self) -> None:
+        """Drop all works and end the child, as another file is loaded; what is kept is offered from now on."""
+        if self.busy:
+            self.kept.set_aside()
+        self._drop()
+
     def close(self) -> None:
-        """Drop all works and end the child: the extension is going, or another file is loaded."""
-        self.waiting.clear()
-        self.current = self.job = None
-        self._clear_folder()
-        if self._backend is not None:
-            self._backend.shutdown()
-            self._backend = None
+        """Drop all works and end the child: the extension is going. What is kept stays on disk."""
+        self.kept.close()
+        self._drop()
+        self.outcomes.clear()
+        self.last = None
 
     @property
     def child_pid(self) -> int | None:
@@ -154,20 +196,48 @@ class Queue:
         client = self._backend.client if self._backend is not None else None
         return client.pid if client is not None else None
 
+    @property
+    def log(self) -> tuple[str, ...]:
+        """The last lines that the child wrote to stderr."""
+        return self._backend.log if self._backend is not None else ()
+
+    def _entry(self, context: bpy.types.Context, work: Work) -> Entry:
+        scene, number = context.scene, next(self._numbers)
+        return Entry(number, work, scene.name, scene.session_uid, bpy.data.filepath, time.monotonic(), None)
+
+    def _append(self, entry: Entry) -> None:
+        self.waiting.append(entry)
+        self.outcomes.pop(entry.work.kind, None)
+        self._save()
+
+    def _save(self) -> None:
+        in_line = [*([self.current] if self.current is not None else ()), *self.waiting]
+        self.kept.save(entry.kept for entry in in_line if entry.kept is not None)
+
+    def _drop(self) -> None:
+        self.waiting.clear()
+        self.current = self.job = None
+        self._clear_folder()
+        if self._backend is not None:
+            self._backend.shutdown()
+            self._backend = None
+
     def _begin(self, entry: Entry) -> None:
         self.current = entry
         try:
             self._folder = Path(tempfile.mkdtemp(prefix=f"{entry.work.kind}_", dir=bpy.app.tempdir or None))
             params = entry.work.params(self._folder)
         except (ValueError, OSError) as error:
-            self._end(Outcome(entry, error=JobError(sentence(error), "", "bad_input")))
+            self._end(Outcome(entry, error=error_in_the_scene(error)))
             return
         self.job = Job(self._backend_for(preference("backend_python")), entry.work.method, params)
 
     def _end(self, outcome: Outcome) -> Outcome:
         self.outcomes[outcome.entry.work.kind] = self.last = outcome
         self.current = self.job = None
+        self.idle_since = time.monotonic()
         self._clear_folder()
+        self._save()
         return outcome
 
     def _clear_folder(self) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
+IGNORES_CANCEL, NO_MEMORY = 105, 106
 BANDS = 4
 COLOUR, DEPTH = (0.25, 0.5, 0.75, 1.0), 3.0
 _lock = threading.Lock()
@@ -25,13 +26,19 @@ def generate(id: int, params: dict, cancelled: threading.Event) -> None:
     seed, steps, out = params["seed"], params["steps"], Path(params["out_dir"])
     for step in range(steps * (100 if seed == TAKES_LONG else 1)):
         progress = {"id": id, "stage": "sample", "step": min(step, steps), "total": steps, "eta_s": 1.0}
+        if params.get("picture_px"):
+            progress["picture"] = str(Path(__file__).with_name("picture.png"))
         say(method="progress", params=progress)
-        time.sleep(0.02)
+        time.sleep(60.0 if seed == IGNORES_CANCEL else 0.02)
         if cancelled.is_set():
             say(id=id, error={"code": -32001, "message": "cancelled"})
             return
     if seed == DIES:
         os._exit(9)
+    if seed == NO_MEMORY:
+        data = {"kind": "out_of_memory", "remedy": "close other programs"}
+        say(id=id, error={"code": -32002, "message": "the machine ran out of memory", "data": data})
+        return
     if seed == FAILS:
         data = {"kind": "CheckpointError", "remedy": "choose another checkpoint"}
         say(id=id, error={"code": -32002, "message": "the checkpoint is damaged", "data": data})

@@ -1,0 +1,60 @@
+"""The picture of what the child is making, as panels can draw it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy.utils.previews
+
+_NAME = "so far"
+
+
+class SoFar:
+    """One picture at a time; the one before it is given back."""
+
+    def __init__(self) -> None:
+        self._collection: bpy.utils.previews.ImagePreviewCollection | None = None
+        self._shown: tuple[Path, int] | None = None
+
+    def show(self, path: Path | None) -> bool:
+        """Show this PNG, or nothing; whether that is another picture than before.
+
+        It is read now: the child may replace the file. One that cannot be read leaves the picture that is shown.
+        """
+        if path is None:
+            changed, self._shown = self._shown is not None, None
+            if changed and self._collection is not None:
+                self._collection.clear()
+            return changed
+        try:
+            version = (path, path.stat().st_mtime_ns)
+        except OSError:
+            return False
+        if version == self._shown:
+            return False
+        if self._collection is None:
+            self._collection = bpy.utils.previews.new()
+        self._collection.clear()
+        preview = self._collection.load(_NAME, str(path), "IMAGE")
+        self._shown = version if preview.image_size[0] else None  # asking for the size reads the file
+        return True
+
+    @property
+    def icon(self) -> int:
+        """For `UILayout.template_icon`; 0 when there is none, and without a window."""
+        return self._collection[_NAME].icon_id if self._shown is not None else 0
+
+    @property
+    def shown(self) -> Path | None:
+        """The file of the picture."""
+        return self._shown[0] if self._shown is not None else None
+
+    def close(self) -> None:
+        """Give it back."""
+        if self._collection is not None:
+            bpy.utils.previews.remove(self._collection)
+        self._collection = self._shown = None
+
+
+so_far = SoFar()
+"""One work at a time: one picture."""

@@ -1,0 +1,59 @@
+"""What can be done about an error: one sentence, and a button that does it."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+
+import bpy
+
+from ...worker.job import JobError
+from ...worker.sentence import sentence
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
+
+
+@dataclasses.dataclass(frozen=True)
+class Remedy:
+    """A button."""
+
+    operator: str
+    label: str
+    icon: str
+
+
+_TRY_AGAIN = Remedy("primdiffusion.try_again", "Try Again", "FILE_REFRESH")
+_SAVE_AS = Remedy("wm.save_as_mainfile", "Save As...", "FILE_TICK")
+_REMEDIES = {
+    "environment": Remedy("primdiffusion.set_up_backend", "Set Up Backend", "IMPORT"),
+    "missing_volumes": Remedy("primdiffusion.find_missing_volumes", "Find Missing Volumes", "VIEWZOOM"),
+    "out_of_memory": Remedy("primdiffusion.release_memory", "Release Memory", "MEMORY"),
+    "unwritable": _SAVE_AS,
+    "file_system": _SAVE_AS,
+    "busy": _TRY_AGAIN,
+    "died": _TRY_AGAIN,
+    "hung": _TRY_AGAIN,
+}
+"""By the kind of the error."""
+
+
+def remedy_for(error: JobError) -> Remedy | None:
+    """The button for an error; None where the sentence must do, or this version has no such button."""
+    remedy = _REMEDIES.get(error.kind)
+    if remedy is None:
+        return None
+    room, name = remedy.operator.split(".")
+    return remedy if hasattr(bpy.types, f"{room.upper()}_OT_{name}") else None
+
+
+def error_in_the_scene(error: Exception) -> JobError:
+    """Why a result is not in the scene; an exception may name its kind itself, in an attribute `kind`."""
+    kind = getattr(error, "kind", "scene")
+    cause = error if isinstance(error, OSError) else error.__cause__
+    while cause is not None and not getattr(cause, "errno", None):
+        cause = cause.__cause__
+    if cause is not None and cause.errno in _NO_ROOM:
+        return JobError(
+            sentence(error), "Save the file where there is room and you may write, then try again", "unwritable"
+        )
+    return JobError(sentence(error), "", str(kind))
