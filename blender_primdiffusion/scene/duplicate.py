@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 from .human import armature_of
-from .rename import part_name
+from .rename import keep_surface, part_name
 from .shape import volumes_of
 
 
@@ -38,6 +38,7 @@ def duplicate_human(collection: bpy.types.Collection) -> bpy.types.Collection:
     for holder in _holders(collection):
         holder.children.link(twin)
     _name_parts(collection, twin, twins)
+    keep_surface(twin)
     return twin
 
 

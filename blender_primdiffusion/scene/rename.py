@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import bpy
 
 from .human import armature_of
+from .surface import build_surface, carrier_of
 
 LONGEST = 40
 """Characters; parts of people add to it, and Blender's names end at 63."""
@@ -31,6 +34,7 @@ def rename_human(collection: bpy.types.Collection, name: str) -> None:
         new = part_name(part.name, before, collection.name)
         if part.library is None and new != part.name:
             part.name = new
+    keep_surface(collection)
 
 
 def part_name(name: str, before: str, after: str) -> str:
@@ -38,3 +42,13 @@ def part_name(name: str, before: str, after: str) -> str:
     if name == before or name.startswith(f"{before}_"):
         return after + name[len(before) :]
     return name
+
+
+def keep_surface(collection: bpy.types.Collection) -> None:
+    """Have a person attached to their surface show the same volumes after names have changed: its nodes sort by name.
+
+    Where the body mesh or the body's file is gone nothing can be kept, and nothing is shown there either.
+    """
+    if carrier_of(collection) is not None:
+        with contextlib.suppress(ValueError, FileNotFoundError):
+            build_surface(collection)

@@ -12,12 +12,15 @@ import synthetic_shape
 from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.attachment import set_attachment
 from blender_primdiffusion.scene.body_mesh import body_of
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.edited import replace_person
 from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, build_human, humans
 from blender_primdiffusion.scene.keyframes import keyframe_poses
+from blender_primdiffusion.scene.rename import rename_human
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, keeps_own_shape, reshape
+from blender_primdiffusion.scene.surface import build_surface
 
 COUNT = 12
 SHAPE = np.array([2.0, -1.5, 1, 0, 0.5, 0, 0, -2, 0, 1])
@@ -249,3 +252,35 @@ def test_an_edit_gives_people_of_an_earlier_version_a_shape_to_change(saved_scen
     replace_person(old, *edited_file(tmp_path, generated_betas(old)))
     reshape(old, SHAPE)
     np.testing.assert_allclose(heads(old), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
+
+
+def shown_on_the_surface() -> dict[str, np.ndarray]:
+    """World matrices [4, 4] of the volumes that geometry nodes show, by the names of their files."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    return {
+        bpy.path.basename(one.object.data.filepath): np.array(one.matrix_world)
+        for one in depsgraph.object_instances
+        if one.is_instance and one.object.type == "VOLUME"
+    }
+
+
+def test_volumes_on_the_posed_surface_follow_the_shape_and_outlive_another_name(person):
+    set_attachment(person, "SURFACE")
+    reshape(person, SHAPE)
+    first = min((o for o in person.all_objects if o.type == "VOLUME"), key=lambda o: o.name)
+    first.name = (
+        "Mantle"  # behind the others, called Human_prim_0001 and so on; before them once they are called Zoe_prim_0001
+    )
+    build_surface(person)
+    before = shown_on_the_surface()
+    wanted = at(SHAPE)
+    for k, name in enumerate(sorted(before)):
+        place = wanted["position"][k] @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+        place[2] += armature_of(person).location.z
+        np.testing.assert_allclose(before[name][:3, 3], place, atol=1e-5)
+    assert len(before) == COUNT
+    rename_human(person, "Zoe")
+    after = shown_on_the_surface()
+    assert after.keys() == before.keys()
+    for name, matrix in before.items():
+        np.testing.assert_allclose(after[name], matrix, atol=1e-6)
