@@ -15,7 +15,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from . import shape_file, volumes
+from . import merged, shape_file, volumes
 from .human import MARK, PERSON, armature_of, folder_of, people_files, person_file, provenance, volume_path
 from .human_file import read_human
 from .shape import (
@@ -113,11 +113,11 @@ def unused(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         return []
-    used = {volume_path(volume).resolve() for volume in bpy.data.volumes if volume.filepath}
+    used = {path.resolve() for volume in bpy.data.volumes if volume.filepath for path in merged.sequence_files(volume)}
     kept = people_files() | body_files()
     found = []
     for path in sorted(folder.rglob("*")):
-        of_people = any(pattern.fullmatch(path.name) for pattern in (PRIMITIVE, _PERSON, shape_file.NAME))
+        of_people = any(pattern.fullmatch(path.name) for pattern in (PRIMITIVE, _PERSON, shape_file.NAME, merged.FILE))
         if of_people and path.name not in kept and path.resolve() not in used:
             found.append(path)
     return found

@@ -28,27 +28,40 @@ def set_density_gain(collection: bpy.types.Collection, gain: float) -> None:
 
     Raises ValueError for a person with a material that has no such factor, or a linked one.
     """
-    material, volumes = person_material(collection), _volumes(collection)
+    material = person_material(collection)
     if _gain_node(material) is None:
         raise ValueError(
             f"the material {material.name!r} of {collection.name!r} has no node {GAIN_NODE!r}: give the person's "
             f"volumes the material {volume_material().name!r} again"
         )
-    if material.library is not None or any(data.library is not None for data in volumes):
+    if material.library is not None or any(data.library is not None for data in _volumes(collection)):
         raise ValueError(f"the person {collection.name!r} is linked: make them local to change the density gain")
     current = _gain_node(material).outputs[0]
     if abs(current.default_value - gain) <= _SAME:
         return
+    shown_to_others = _keep_own_data(collection)
+    volumes = _volumes(collection)
     if abs(gain - DENSITY_GAIN) <= _SAME:
         _assign(volumes, volume_material())
         return
     shown_by = bpy.data.user_map(subset=[material])[material]
-    if material == volume_material() or not shown_by <= set(volumes):
+    if material == volume_material() or shown_to_others or not shown_by <= set(volumes):
         material = material.copy()
         material.name = f"{volume_material().name} {collection.name}"
         _assign(volumes, material)
         current = _gain_node(material).outputs[0]
     current.default_value = gain
+
+
+def _keep_own_data(collection: bpy.types.Collection) -> bool:
+    """Copy the data of volumes that objects of other people show too, as duplicates do; whether there were such."""
+    own = [thing for thing in collection.all_objects if thing.type == "VOLUME"]
+    mine = set(own)
+    others = {thing.data for thing in bpy.data.objects if thing.type == "VOLUME" and thing not in mine}
+    shared = [thing for thing in own if thing.data in others]
+    for thing in shared:
+        thing.data = thing.data.copy()
+    return bool(shared)
 
 
 def _volumes(collection: bpy.types.Collection) -> list[bpy.types.Volume]:

@@ -14,6 +14,7 @@ from oracle import Z_UP, blended_frames, blended_vertices, evaluated_matrices
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import ATTACHMENT, attachment_of, set_attachment
 from blender_primdiffusion.scene.body_mesh import body_of
+from blender_primdiffusion.scene.duplicate import duplicate_human
 from blender_primdiffusion.scene.human import armature_of, build_human, folder_of, humans
 from blender_primdiffusion.scene.shape import volumes_of
 from blender_primdiffusion.scene.surface import carrier_of
@@ -174,6 +175,23 @@ def test_two_people_share_the_nodes_and_keep_to_their_own_bodies(person, tmp_pat
     found = shown()
     own = [thing[0].name for _, thing in sorted(volumes_of(person[0]).items())]
     np.testing.assert_allclose(np.array([found[name] for name in own])[:, :3, 3], rest[:, :3, 3], atol=1e-5)
+
+
+def test_a_duplicate_on_the_surface_follows_its_own_bones(person):
+    collection, arrays = person
+    set_attachment(collection, "SURFACE")
+    twin = duplicate_human(collection)
+    rotations, translation = strong_pose(1)
+    pose_from_joint_rotations(armature_of(twin), rotations, translation)
+    found = shown()
+    assert len(found) == 2 * COUNT
+    for owner, turns, shift in (
+        (twin, rotations, translation),
+        (collection, np.tile(np.eye(3), (24, 1, 1)), np.zeros(3)),
+    ):
+        expected = on_the_surface(owner, arrays, turns, shift)
+        for k, objects in volumes_of(owner).items():
+            np.testing.assert_allclose(found[objects[0].name][:3, 3], expected[k, :3, 3], atol=1e-5)
 
 
 def test_a_person_of_an_earlier_version_is_refused(saved_scene, tmp_path):

@@ -9,6 +9,8 @@ import synthetic
 
 from blender_primdiffusion.scene.attachment import attachment_before_merge, attachment_of, set_attachment
 from blender_primdiffusion.scene.collect import collect_before_saving
+from blender_primdiffusion.scene.duplicate import duplicate_human
+from blender_primdiffusion.scene.edited import unused
 from blender_primdiffusion.scene.gain import density_gain, person_material, set_density_gain
 from blender_primdiffusion.scene.human import build_human, folder_of, volume_path
 from blender_primdiffusion.scene.material import DENSITY_GAIN, volume_material
@@ -155,6 +157,12 @@ def test_a_sequence_made_before_the_first_save_is_collected_whole(empty_scene, t
     assert [path.parent for path in sequence_files(volume)] == [tmp_path / "new" / "shot_humans" / "Human"] * 3
 
 
+def test_files_of_earlier_merges_are_unused_and_those_of_a_shown_sequence_are_not(person, tmp_path):
+    earlier = volume_path(merge(person, tmp_path, (7,)).data)
+    merge(person, tmp_path, (0, 1, 2))
+    assert unused(folder_of(person)) == [earlier]
+
+
 def test_a_folder_that_cannot_be_written_leaves_nothing(person, tmp_path):
     digest = write_grid(grid(), tmp_path / "grid.vdb")
     (tmp_path / "file").write_text("in the way")
@@ -191,6 +199,15 @@ def test_a_gain_of_one_s_own_is_a_material_of_one_s_own(person, tmp_path):
     assert len(bpy.data.materials) == 2
     set_density_gain(person, DENSITY_GAIN)
     assert person_material(person) == volume_material()
+
+
+def test_a_duplicate_s_gain_is_its_own(person):
+    twin = duplicate_human(person)
+    set_density_gain(person, 1.6)
+    set_density_gain(twin, 1.9)
+    assert density_gain(person) == pytest.approx(1.6)
+    assert density_gain(twin) == pytest.approx(1.9)
+    assert {volume_path(data) for data in bpy.data.volumes} == set(folder_of(person).glob("prim_*.vdb"))
 
 
 def test_a_material_without_the_factor_is_refused(person):

@@ -55,7 +55,9 @@ class PRIMDIFFUSION_OT_set_attachment(_OfPerson, bpy.types.Operator):
     bl_idname = "primdiffusion.set_attachment"
     bl_label = "Set Attachment"
 
-    mode: bpy.props.EnumProperty(name="Attachment", items=ATTACHMENT_ITEMS, default="ARMATURE")
+    mode: bpy.props.EnumProperty(
+        name="Attachment", description="How volumes follow the body", items=ATTACHMENT_ITEMS, default="ARMATURE"
+    )
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:

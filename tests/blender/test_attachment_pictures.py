@@ -1,0 +1,104 @@
+"""What is seen of a person in each mode: by Cycles, pixel for pixel, and by the engine, who draws armatures."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+import synthetic
+import synthetic_shape
+
+from blender_primdiffusion.engine.people import posed_people
+from blender_primdiffusion.engine.solids import scene_solids
+from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.attachment import MODES, set_attachment
+from blender_primdiffusion.scene.human import armature_of, build_human
+from blender_primdiffusion.scene.merged import Grid, MergedState, merged_folder, publish, show_merged, write_grid
+from blender_primdiffusion.scene.preview import setup_cycles_preview
+
+COUNT = 6
+SIZE = 64
+
+
+@pytest.fixture
+def person(saved_scene, tmp_path):
+    """A synthetic person of format version 2 in shot.blend."""
+    kept = tmp_path / "person.human.safetensors"
+    kept.write_bytes(b"kept")
+    return build_human(saved_scene, synthetic_shape.write(tmp_path / "human.npz", COUNT), keep=[kept])
+
+
+def render(path) -> np.ndarray:
+    """The picture [H, W, 4], linear and premultiplied, top row first."""
+    scene = bpy.context.scene
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(str(path))
+    return np.array(image.pixels[:]).reshape(image.size[1], image.size[0], 4)[::-1]
+
+
+def box_grid(voxel: float, low: tuple, high: tuple, density: float, colour: tuple) -> Grid:
+    """One even box [low, high] in the armature's space, metres, on voxel faces, with an empty rim."""
+    cells = np.round((np.array(high) - low) / voxel).astype(int)
+    filled = np.zeros(cells + 4, np.float16)
+    filled[2:-2, 2:-2, 2:-2] = density
+    origin = np.array(low) - 1.5 * voxel
+    return Grid(filled, np.broadcast_to(np.float16(colour), (*filled.shape, 3)), origin, voxel)
+
+
+def show_grid(person, grid: Grid, tmp_path) -> None:
+    digest = write_grid(grid, tmp_path / "grid.vdb")
+    files = publish([tmp_path / "grid.vdb"], [digest], merged_folder(person))
+    show_merged(person, files, MergedState(("",), grid.voxel))
+
+
+def test_cycles_sees_the_same_at_rest_by_the_armature_and_on_the_surface(person, tmp_path):
+    setup_cycles_preview(bpy.context.scene, size=SIZE, samples=2)
+    by_armature = render(tmp_path / "armature.exr")
+    set_attachment(person, "SURFACE")
+    on_surface = render(tmp_path / "surface.exr")
+    assert (by_armature[..., 3] > 0.1).sum() > 20
+    np.testing.assert_allclose(on_surface, by_armature, atol=0.02)
+    assert np.abs(on_surface - by_armature).mean() < 1e-3
+
+
+def test_a_merged_box_has_its_colour_opacity_size_and_place_in_cycles(person, tmp_path):
+    """By hand: 0.12 m of 10 / m through the usual gain of 2.2 is an alpha of 1 - exp(-2.64)."""
+    bpy.utils.expose_bundled_modules()
+    voxel, colour = 0.01, (0.6, 0.1, 0.05)
+    low, high = (-0.1, -0.06, 0.2), (0.06, 0.06, 0.32)
+    show_grid(person, box_grid(voxel, low, high, 10.0, colour), tmp_path)
+    set_attachment(person, "MERGED")
+    camera = setup_cycles_preview(bpy.context.scene, size=96, samples=8)
+    camera.data.type, camera.data.ortho_scale = "ORTHO", 0.32
+    lift = armature_of(person).location.z
+    camera.location = (0, -3, 0.26 + lift)
+    picture = render(tmp_path / "box.exr")
+    alpha, metres = picture[..., 3], 0.32 / 96
+    middle = alpha[44:52, 32:48]
+    np.testing.assert_allclose(middle, 1 - np.exp(-2.2 * 10 * 0.12), atol=0.01)
+    inside = alpha > 0.5
+    np.testing.assert_allclose(
+        picture[..., :3][inside] / alpha[inside][:, None], np.broadcast_to(colour, (inside.sum(), 3)), atol=0.01
+    )
+    rows, columns = np.nonzero(alpha > 0.45)
+    edges = np.array([columns.min(), columns.max() + 1, rows.min(), rows.max() + 1]) - 48
+    expected = np.array([low[0], high[0], -(high[2] - 0.26), -(low[2] - 0.26)]) / metres
+    np.testing.assert_allclose(edges, expected, atol=1.5)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_engine_draws_the_person_alone_in_every_mode(person, tmp_path, mode):
+    bpy.utils.expose_bundled_modules()
+    turns = np.zeros((24, 3))
+    turns[16, 2] = 0.5
+    pose_from_joint_rotations(armature_of(person), synthetic.axis_angle(turns))
+    bpy.context.view_layer.update()
+    expected = posed_people(bpy.context.evaluated_depsgraph_get())[0].params()
+    show_grid(person, box_grid(0.05, (-0.1, -0.1, 0.2), (0.1, 0.1, 0.4), 10.0, (0.5, 0.5, 0.5)), tmp_path)
+    set_attachment(person, mode)
+    bpy.context.view_layer.update()
+    graph = bpy.context.evaluated_depsgraph_get()
+    assert [one.params() for one in posed_people(graph)] == [expected]
+    assert len(scene_solids(graph, False).corners) == 0
