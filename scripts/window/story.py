@@ -43,9 +43,9 @@ def first_human(module: str) -> Steps:
     press("primdiffusion.generate")
     yield 4.0
     yield "first_progress"
-    session = import_module(f"{module}.ui.jobs.session").session
+    queue = import_module(f"{module}.ui.jobs.queue").queue
     began = time.monotonic()
-    while session.busy and time.monotonic() - began < 120:
+    while queue.busy and time.monotonic() - began < 120:
         yield 0.2
     yield 2.0
     yield "first_person"
