@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from ...scene.exported_human import ENDING, ENDINGS, read_tensors
+from ...scene.exported_human import ENDING, ENDINGS, motion_in, read_tensors
 from ...scene.exported_model import ENDINGS as MODEL_ENDINGS
 from ...scene.exported_model import check_ready
 from ...scene.exported_proxy import proxy_of, remove_proxy
@@ -265,7 +265,7 @@ class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
         try:
             if not self.filepath or not path.is_file():
                 raise FileNotFoundError(f"there is no file {str(path)!r}: choose a .human file")
-            read_tensors(path)
+            motion_in(read_tensors(path))
         except (ValueError, OSError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

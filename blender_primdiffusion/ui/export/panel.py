@@ -8,6 +8,7 @@ from ...scene.exported_proxy import is_outdated, proxy_of
 from ...scene.shape import betas_of
 from ..jobs.drawing import draw_job
 from ..jobs.target import selected_person
+from ..manual import draw_manual_button
 from .showing import shown
 
 
@@ -23,6 +24,10 @@ class PRIMDIFFUSION_PT_export(_InSidebar, bpy.types.Panel):
 
     bl_label = "Export"
     bl_order = 6
+
+    def draw_header_preset(self, _context: bpy.types.Context) -> None:
+        """The manual."""
+        draw_manual_button(self.layout, "export")
 
     def draw(self, context: bpy.types.Context) -> None:
         """Reads the scene; changes nothing."""

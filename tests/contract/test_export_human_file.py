@@ -1,0 +1,89 @@
+""".human files: the extension writes them with numpy alone, the backend reads them."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.append(str(Path(__file__).parents[1] / "backend"))
+
+from export_people import person
+from primdiffusion.human_file import load_human, save_human
+
+from blender_primdiffusion.scene.exported_human import (
+    HumanMotion,
+    motion_in,
+    read_tensors,
+    with_now,
+    write_tensors,
+)
+
+
+@pytest.fixture
+def saved(tmp_path):
+    save_human(tmp_path / "a.human", person())
+    return tmp_path / "a.human"
+
+
+def walk(frames=3):
+    turns = np.tile(np.eye(3, dtype=np.float32), (frames, 24, 1, 1))
+    return HumanMotion(np.arange(frames, dtype=np.float32), turns, np.ones((frames, 3), np.float32), 24.0)
+
+
+def test_a_file_taken_apart_and_written_again_is_the_same_person(saved, tmp_path):
+    write_tensors(tmp_path / "b.human", read_tensors(saved))
+    again = load_human(tmp_path / "b.human")
+    assert again.payload.density.equal(person().payload.density)
+    assert again.payload.rgb.equal(person().payload.rgb)
+    assert dict(again.provenance) == {"seed": 1}
+
+
+def test_the_backend_reads_the_new_shape_and_passes_over_the_motion(saved, tmp_path):
+    shape = np.linspace(-1, 1, 10)
+    write_tensors(tmp_path / "b.human", with_now(read_tensors(saved), shape, walk()))
+    again = load_human(tmp_path / "b.human")
+    assert again.betas.numpy() == pytest.approx(shape, abs=1e-6)
+    assert again.payload.delta_scale.equal(person().payload.delta_scale)
+
+
+def test_a_motion_comes_back_as_it_was_and_can_be_taken_away(saved, tmp_path):
+    write_tensors(tmp_path / "b.human", with_now(read_tensors(saved), None, walk()))
+    found = motion_in(read_tensors(tmp_path / "b.human"))
+    assert found is not None
+    assert found.fps == 24.0
+    assert np.array_equal(found.translations, walk().translations)
+    write_tensors(tmp_path / "c.human", with_now(read_tensors(tmp_path / "b.human"), None, None))
+    assert motion_in(read_tensors(tmp_path / "c.human")) is None
+
+
+@pytest.mark.parametrize("damage", ["fps", "order", "shape"])
+def test_a_damaged_motion_is_refused_with_a_sentence(saved, damage):
+    motion = walk()
+    if damage == "order":
+        motion = HumanMotion(motion.frames[::-1].copy(), motion.rotations, motion.translations, 24.0)
+    if damage == "shape":
+        motion = HumanMotion(motion.frames, motion.rotations[:2], motion.translations, 24.0)
+    human = with_now(read_tensors(saved), None, motion)
+    if damage == "fps":
+        human.metadata["motion"] = '{"fps": "fast"}'
+    with pytest.raises(ValueError, match="export the person again"):
+        motion_in(human)
+
+
+@pytest.mark.parametrize("data", [b"", b"\xff" * 40, b"\x02\0\0\0\0\0\0\0[]", b"\x02\0\0\0\0\0\0\0{}"])
+def test_what_is_no_person_is_refused_with_a_sentence(tmp_path, data):
+    path = tmp_path / "x.human"
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match="holds no person"):
+        read_tensors(path)
+
+
+def test_a_file_that_cannot_be_finished_leaves_the_old_one(saved, monkeypatch):
+    before = saved.read_bytes()
+    human = read_tensors(saved)
+    human.arrays["zzz"] = ("U8", (1,), None)  # type: ignore[assignment]
+    with pytest.raises(TypeError):
+        write_tensors(saved, human)
+    assert saved.read_bytes() == before
+    assert list(saved.parent.iterdir()) == [saved]
