@@ -1,0 +1,49 @@
+"""Variations and pictures of the steps over the wire."""
+
+from pathlib import Path
+
+import pytest
+from conversation import Conversation
+
+
+@pytest.fixture(scope="module")
+def child():
+    child = Conversation()
+    yield child
+    child.close()
+
+
+def test_variations_name_each_picture_as_it_appears_and_whom_it_shows(child, checkpoint, tmp_path):
+    out = tmp_path / "sheet ü"
+    child.send(1, "variations", seeds=[3, 4], out_dir=str(out), steps=2, checkpoint=str(checkpoint), size=32)
+    shown = []
+
+    def collect(message):
+        news = message.get("params", {})
+        if news.get("stage") == "write":
+            shown.append((news["index"], news["step"], news["total"], Path(news["picture"]).name))
+        return message.get("id") == 1 and "method" not in message
+
+    result = child.until(collect)["result"]
+    assert shown == [(0, 1, 2, "3.png"), (1, 2, 2, "4.png")]
+    for person in result["people"]:
+        assert all(Path(person[name]).is_file() for name in ("human", "person", "picture"))
+    assert len(list(out.iterdir())) == 6
+
+
+def test_wrong_seeds_are_refused_in_a_sentence(child, tmp_path):
+    error = child.ask(2, "variations", seeds=[1, 1], out_dir=str(tmp_path))["error"]
+    assert error["code"] == -32602
+    assert "two of the seeds are alike" in error["message"]
+    error = child.ask(3, "generate", seed=1, out_dir=str(tmp_path), picture_px=-5)["error"]
+    assert "picture_px is -5" in error["message"]
+
+
+def test_a_long_generation_shows_pictures_and_cancelling_removes_them(child, checkpoint, tmp_path):
+    out = tmp_path / "person"
+    child.send(4, "generate", seed=1, steps=1000, out_dir=str(out), checkpoint=str(checkpoint), picture_px=48)
+    news = child.until(lambda message: "picture" in message.get("params", {}))["params"]
+    assert Path(news["picture"]).read_bytes().startswith(b"\x89PNG")
+    child.send(5, "cancel", id=4)
+    assert child.answer(4)["error"]["code"] == -32001
+    assert not out.exists()
