@@ -133,7 +133,9 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
         """A dropped file asks for options at the cursor and goes to the person under it; else the file browser."""
         if self.filepath:
             self.person = person_under(context, event) or self.person
-        return self.invoke_popup(context)
+            title = f"Import {Path(self.filepath).name}"
+            return context.window_manager.invoke_props_dialog(self, width=420, title=title, confirm_text="Import")
+        return ImportHelper.invoke(self, context, event)
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
         """Read, fit, key."""
