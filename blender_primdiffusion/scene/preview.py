@@ -98,17 +98,37 @@ def new_camera(scene: bpy.types.Scene, focal_mm: float = 70.0) -> bpy.types.Obje
 
 
 def frame_box(
-    camera: bpy.types.Object, extent: tuple[NDArray, NDArray], yaw: float, size: tuple[int, int] = (1, 1)
+    camera: bpy.types.Object,
+    extent: tuple[NDArray, NDArray],
+    yaw: float,
+    size: tuple[int, int] = (1, 1),
+    distance: float | None = None,
 ) -> None:
-    """Look at the middle of the box from `yaw` radians, level, as near as a picture of `size` shows its corners."""
+    """Look at the middle of the box from `yaw` radians, level, as near as a picture of `size` shows its corners.
+
+    With a `distance` in metres, from so far: turntables want the same all round.
+    """
     low, high = extent
-    centre = (low + high) / 2
-    towards = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
+    if distance is None:
+        distance = framing_distance(camera, extent, yaw, size)
+    towards = _towards(yaw)
+    camera.location = (low + high) / 2 + towards * distance
+    camera.rotation_euler = Vector(-towards).to_track_quat("-Z", "Y").to_euler()
+    camera.data.clip_end = max(100.0, 2 * distance)
+
+
+def framing_distance(
+    camera: bpy.types.Object, extent: tuple[NDArray, NDArray], yaw: float, size: tuple[int, int] = (1, 1)
+) -> float:
+    """Metres from the middle of a box at which a picture of `size` just shows its eight corners."""
+    low, high = extent
     right = np.array([math.cos(yaw), math.sin(yaw), 0.0])
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * (high - low) / 2
     half = np.array(size) / max(size) * (_SENSOR_MM / 2 / camera.data.lens)  # tangents of the half angles of view
     aside = np.maximum(np.abs(corners @ right) / half[0], np.abs(corners[:, 2]) / half[1]) * _MARGIN
-    distance = float((aside + corners @ towards).max())
-    camera.location = centre + towards * distance
-    camera.rotation_euler = Vector(-towards).to_track_quat("-Z", "Y").to_euler()
-    camera.data.clip_end = max(100.0, 2 * distance)
+    return float((aside + corners @ _towards(yaw)).max())
+
+
+def _towards(yaw: float) -> NDArray[np.float64]:
+    """The level direction in which a camera at `yaw` stands."""
+    return np.array([math.sin(yaw), -math.cos(yaw), 0.0])

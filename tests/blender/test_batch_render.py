@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
+from bpy_extras.object_utils import world_to_camera_view
 from engine_stage import pixels
+from mathutils import Vector
 
 from blender_primdiffusion import places
 from blender_primdiffusion.console import DONE, FAILED, NO_BACKEND, UNUSABLE
 from blender_primdiffusion.ui.batch.command import execute
+from blender_primdiffusion.ui.batch.people import go_round, moving_extent
 from blender_primdiffusion.worker.environment import BackendNotFound
 
 SMALL = ("--size", "24x16")
@@ -62,6 +66,23 @@ def test_what_is_there_is_not_drawn_again(people, out):
 def test_a_turntable_goes_all_round(people, out):
     assert render(people / "person_000007", out, *SMALL, "--turntable", 3) == DONE
     assert pictures(out) == [f"person_000007/turn_{turn:02d}.png" for turn in range(3)]
+
+
+def test_a_turntable_keeps_its_distance_and_shows_everything(people):
+    bpy.ops.wm.open_mainfile(filepath=str(people / "person_000007" / "person.blend"))
+    scene = bpy.context.scene
+    scene.render.resolution_x, scene.render.resolution_y = 300, 400
+    low, high = extent = moving_extent(scene)
+    distances = []
+    for degrees in (0, 40, 90, 200):
+        go_round(scene, degrees, extent)
+        bpy.context.view_layer.update()
+        distances.append((scene.camera.location - Vector((low + high) / 2)).length)
+        for corner in itertools.product(*zip(low, high, strict=True)):
+            seen = world_to_camera_view(scene, scene.camera, Vector(corner))
+            assert 0 < seen.x < 1
+            assert 0 < seen.y < 1
+    np.testing.assert_allclose(distances, distances[0], rtol=1e-5)
 
 
 def test_a_motion_is_drawn_frame_by_frame(people, out, tmp_path):

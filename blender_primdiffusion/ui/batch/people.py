@@ -17,7 +17,7 @@ from ...scene.armature import pose_from_joint_rotations
 from ...scene.human import PERSON_FILE as PERSON_FILE
 from ...scene.human import armature_of, build_human, humans
 from ...scene.keyframes import keyframe_poses
-from ...scene.preview import frame_box, people_extent, setup_cycles_preview
+from ...scene.preview import frame_box, framing_distance, people_extent, setup_cycles_preview
 
 NPZ_FILE = "human.npz"
 """The person for Blender, beside `PERSON_FILE`."""
@@ -103,9 +103,19 @@ def moving_extent(scene: bpy.types.Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def look_from(scene: bpy.types.Scene, degrees: float, extent: tuple[np.ndarray, np.ndarray]) -> None:
-    """Turn the scene's camera to people's left of the front by so much."""
-    render = scene.render
-    frame_box(scene.camera, extent, math.radians(degrees), (render.resolution_x, render.resolution_y))
+    """Turn the scene's camera to people's left of the front by so much, as near as shows them all."""
+    frame_box(scene.camera, extent, math.radians(degrees), _size(scene))
+
+
+def go_round(scene: bpy.types.Scene, degrees: float, extent: tuple[np.ndarray, np.ndarray]) -> None:
+    """As `look_from`, from the same distance on all sides."""
+    camera, size = scene.camera, _size(scene)
+    farthest = max(framing_distance(camera, extent, yaw, size) for yaw in np.linspace(0, 2 * math.pi, 72))
+    frame_box(camera, extent, math.radians(degrees), size, farthest)
+
+
+def _size(scene: bpy.types.Scene) -> tuple[int, int]:
+    return scene.render.resolution_x, scene.render.resolution_y
 
 
 def _save(blend: Path) -> None:

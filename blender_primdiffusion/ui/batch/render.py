@@ -26,7 +26,17 @@ from ...scene.preview import fit_cycles_to_volumes, new_camera
 from ...scene.volumes import humans_folder
 from ...worker.backend import Backend
 from .asking import NoBackend, Stopped, ask, backend_of, check_backend, everywhere
-from .people import NPZ_FILE, Movement, build_person, look_from, motion_name, movement_of, moving_extent, new_file
+from .people import (
+    NPZ_FILE,
+    Movement,
+    build_person,
+    go_round,
+    look_from,
+    motion_name,
+    movement_of,
+    moving_extent,
+    new_file,
+)
 from .running import Clock, Say, reason, run, write_report
 from .sources import Source, sources
 from .staging import claim
@@ -124,7 +134,7 @@ class _Drawing:
                 raise Stopped
             scene.frame_set(shot.frame)
             if extent is not None and shot.yaw is not None:
-                look_from(scene, shot.yaw, extent)
+                (go_round if self._options.turntable else look_from)(scene, shot.yaw, extent)
             _draw(scene, shot.path)
             if len(shots) > 1:
                 self.say(f"{source.name}: picture {number + 1} of {len(shots)}")
