@@ -1,0 +1,32 @@
+"""docs/manual/api.md tells of what is registered, and of nothing else."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "scripts" / "operators_page"))
+
+import page  # noqa: E402
+
+PAGE = ROOT / "docs" / "manual" / "api.md"
+
+
+def test_the_page_is_what_its_script_writes_now(addon):
+    current = PAGE.read_text(encoding="utf-8") == page.page()
+    assert current, "docs/manual/api.md is out of date: run `python scripts/operators_page`"
+
+
+def test_every_operator_and_setting_has_its_place(addon):
+    text = page.page()
+    for operator in page.operators():
+        assert f"\n### {operator.bl_idname.partition('.')[2]}\n" in text
+    assert "`bpy.context.scene.primdiffusion`" in text
+    assert "| `seed` | int, -1 or more | `-1` |" in text
+    assert "### take_result" not in text
+
+
+def test_what_poll_wants_is_told(addon):
+    vary = page.page().split("\n### vary\n")[1].split("\n### ")[0]
+    assert "Needs: there is somebody" in vary
