@@ -22,11 +22,15 @@ class _Whole:
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Reports why it cannot be done."""
         try:
-            self.do(context, named_person(context, self.human) if self.human else selected_person(context))
+            self.do(context, self.meant(context))
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return {"FINISHED"}
+
+    def meant(self, context: bpy.types.Context) -> bpy.types.Collection:
+        """Whom this is about. Raises ValueError."""
+        return named_person(context, self.human) if self.human else selected_person(context)
 
     def do(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
         """Raises ValueError with a sentence."""
@@ -88,8 +92,12 @@ class PRIMDIFFUSION_OT_delete_human(_Whole, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Ask first."""
+        try:
+            title = f"Delete {self.meant(context).name}?"
+        except ValueError:
+            return self.execute(context)
         message = "Their files stay on disk for Undo: Files > Remove Unused Files deletes them"
-        return context.window_manager.invoke_confirm(self, event, title="Delete Human?", message=message)
+        return context.window_manager.invoke_confirm(self, event, title=title, message=message)
 
     def do(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
         """Linked people are unlinked by the Outliner, not here: they belong to another file."""
