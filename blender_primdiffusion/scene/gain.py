@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from .material import DENSITY_GAIN, GAIN_NODE, volume_material
+from .material import GAIN_NODE, volume_material
 
 _SAME = 1e-4
 
@@ -41,7 +41,8 @@ def set_density_gain(collection: bpy.types.Collection, gain: float) -> None:
         return
     shown_to_others = _keep_own_data(collection)
     volumes = _volumes(collection)
-    if abs(gain - DENSITY_GAIN) <= _SAME:
+    usual = _gain_node(volume_material()).outputs[0].default_value
+    if abs(gain - usual) <= _SAME:
         _assign(volumes, volume_material())
         return
     shown_by = bpy.data.user_map(subset=[material])[material]

@@ -64,7 +64,7 @@ def test_cycles_sees_the_same_at_rest_by_the_armature_and_on_the_surface(person,
 
 
 def test_a_merged_box_has_its_colour_opacity_size_and_place_in_cycles(person, tmp_path):
-    """By hand: 0.12 m of 10 / m through the usual gain of 2.2 is an alpha of 1 - exp(-2.64)."""
+    """By hand: 0.12 m of 10 / m through the usual gain of 1.6 is an alpha of 1 - exp(-1.92)."""
     bpy.utils.expose_bundled_modules()
     voxel, colour = 0.01, (0.6, 0.1, 0.05)
     low, high = (-0.1, -0.06, 0.2), (0.06, 0.06, 0.32)
@@ -77,7 +77,7 @@ def test_a_merged_box_has_its_colour_opacity_size_and_place_in_cycles(person, tm
     picture = render(tmp_path / "box.exr")
     alpha, metres = picture[..., 3], 0.32 / 96
     middle = alpha[44:52, 32:48]
-    np.testing.assert_allclose(middle, 1 - np.exp(-2.2 * 10 * 0.12), atol=0.01)
+    np.testing.assert_allclose(middle, 1 - np.exp(-1.6 * 10 * 0.12), atol=0.025)
     inside = alpha > 0.5
     np.testing.assert_allclose(
         picture[..., :3][inside] / alpha[inside][:, None], np.broadcast_to(colour, (inside.sum(), 3)), atol=0.01

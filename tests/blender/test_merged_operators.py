@@ -27,6 +27,7 @@ from blender_primdiffusion.scene.human import (
     volume_path,
 )
 from blender_primdiffusion.scene.keyframes import keyframe_poses
+from blender_primdiffusion.scene.material import DENSITY_GAIN
 from blender_primdiffusion.scene.merged import merged_of, merged_state, sequence_files
 from blender_primdiffusion.ui.jobs.queue import queue
 from blender_primdiffusion.ui.render import panel
@@ -196,11 +197,11 @@ def test_a_fitted_gain_is_the_person_s_and_the_slider_changes_it(person):
     assert ops.fit_density_gain() == {"FINISHED"}
     assert density_gain(person) == pytest.approx(1.54)
     assert "1.54" in notice_of("fit_gain")
-    assert "1.4 % with 2.2" in notice_of("fit_gain")
+    assert "1.4 % with 1.6" in notice_of("fit_gain")
     person.primdiffusion_density_gain = 3.0
     assert density_gain(person) == person.primdiffusion_density_gain == 3.0
     bpy.ops.ed.undo()
-    assert density_gain(humans(bpy.context.scene)[0]) == pytest.approx(2.2)
+    assert density_gain(humans(bpy.context.scene)[0]) == pytest.approx(DENSITY_GAIN)
 
 
 def test_set_attachment_reports_what_stands_in_the_way(person):

@@ -18,7 +18,7 @@ FAINT = 1e-4
 MET = 1e-3
 """Rays with less opacity than this miss the person."""
 SMALLEST_GAIN, LARGEST_GAIN = 0.1, 20.0
-DEFAULT_GAIN = 2.2
+DEFAULT_GAIN = 1.6
 """What the extension's material starts with."""
 
 
