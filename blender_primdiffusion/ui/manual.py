@@ -25,7 +25,7 @@ class PRIMDIFFUSION_OT_open_manual(bpy.types.Operator):
         """The user's browser shows the file."""
         import webbrowser  # slow to import, and not needed to register
 
-        path = page_file(self.page)
+        path = page_file(self.page) or page_file("index")
         if path is None:
             self.report({"ERROR"}, MISSING.format(self.page))
             return {"CANCELLED"}

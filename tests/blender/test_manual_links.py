@@ -28,9 +28,15 @@ def test_the_button_opens_the_page_from_disk_at_its_section(addon, opened):
 
 
 @pytest.mark.parametrize("page", ["no_such_page", "../captures", ""])
-def test_a_page_that_is_not_there_is_named(addon, opened, page):
-    with pytest.raises(RuntimeError, match=rf"page '{page}' is not there: install"):
-        bpy.ops.primdiffusion.open_manual(page=page)
+def test_for_a_page_that_is_not_there_the_list_of_pages_is_shown(addon, opened, page):
+    assert bpy.ops.primdiffusion.open_manual(page=page) == {"FINISHED"}
+    assert opened[0].endswith("/docs/manual/index.md")
+
+
+def test_an_installation_without_its_manual_is_said_to_be_so(addon, opened, monkeypatch):
+    monkeypatch.setattr(manual, "page_file", lambda _page: None)
+    with pytest.raises(RuntimeError, match="page 'batch' is not there: install"):
+        bpy.ops.primdiffusion.open_manual(page="batch")
     assert opened == []
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import bpy
 
+from ..manual import draw_manual_button
 from .operators import RIG
 from .session import captures
 
@@ -25,6 +26,10 @@ class PRIMDIFFUSION_PT_captures(_InSidebar, bpy.types.Panel):
     """From where to where, the button, and how far it is."""
 
     bl_label = "Render Captures"
+
+    def draw_header_preset(self, _context: bpy.types.Context) -> None:
+        """The manual's page."""
+        draw_manual_button(self.layout, "captures")
 
     def draw(self, context: bpy.types.Context) -> None:
         """Reads the session; starts nothing."""

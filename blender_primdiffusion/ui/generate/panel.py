@@ -7,6 +7,7 @@ import bpy
 from .. import setup
 from ..jobs.drawing import draw_job, draw_lines
 from ..jobs.memory import device_line
+from ..manual import draw_manual_button
 from .attributes import draw_attributes
 from .presets import PRIMDIFFUSION_PT_generate_presets
 
@@ -21,8 +22,9 @@ class PRIMDIFFUSION_PT_generate(bpy.types.Panel):
     bl_order = 0
 
     def draw_header_preset(self, _context: bpy.types.Context) -> None:
-        """The menu of presets."""
+        """The menu of presets, and the manual's page."""
         PRIMDIFFUSION_PT_generate_presets.draw_panel_header(self.layout)
+        draw_manual_button(self.layout, "first_human")
 
     def draw(self, context: bpy.types.Context) -> None:
         """Reads what is in line; starts nothing."""

@@ -7,6 +7,7 @@ import bpy
 from ...scene.human import armature_of, humans
 from ..jobs.drawing import draw_lines
 from ..jobs.target import selected_person
+from ..manual import draw_manual_button
 
 
 class PRIMDIFFUSION_MT_people(bpy.types.Menu):
@@ -29,6 +30,10 @@ class PRIMDIFFUSION_PT_human(bpy.types.Panel):
     bl_region_type = "UI"
     bl_category = "PrimDiffusion"
     bl_order = 2
+
+    def draw_header_preset(self, _context: bpy.types.Context) -> None:
+        """The manual's page."""
+        draw_manual_button(self.layout, "editing")
 
     def draw(self, context: bpy.types.Context) -> None:
         """Reads the scene; changes nothing."""

@@ -8,6 +8,7 @@ import bpy
 
 from ..jobs.drawing import draw_job
 from ..jobs.queue import queue
+from ..manual import draw_manual_button
 from .icons import icons
 from .sheet import sheet
 from .work import VariationsWork
@@ -30,6 +31,10 @@ class PRIMDIFFUSION_PT_variations(bpy.types.Panel):
     bl_category = "PrimDiffusion"
     bl_order = 1
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw_header_preset(self, _context: bpy.types.Context) -> None:
+        """The manual's page."""
+        draw_manual_button(self.layout, "first_human", "variations")
 
     def draw(self, context: bpy.types.Context) -> None:
         """Reads the sheet and what is in line; starts nothing."""
