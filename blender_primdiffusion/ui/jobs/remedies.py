@@ -43,7 +43,11 @@ def remedy_for(error: JobError) -> Remedy | None:
     if remedy is None:
         return None
     room, name = remedy.operator.split(".")
-    return remedy if hasattr(bpy.types, f"{room.upper()}_OT_{name}") else None
+    try:
+        getattr(getattr(bpy.ops, room), name).get_rna_type()
+    except KeyError:
+        return None
+    return remedy
 
 
 def error_in_the_scene(error: Exception) -> JobError:
