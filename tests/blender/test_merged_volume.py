@@ -191,8 +191,8 @@ def test_a_grid_is_read_as_the_child_wrote_it(tmp_path):
 def test_a_gain_of_one_s_own_is_a_material_of_one_s_own(person, tmp_path):
     other = build_human(bpy.context, synthetic.write(tmp_path / "second.npz", 3, seed=1), "Second")
     merged = merge(person, tmp_path)
-    set_density_gain(person, 1.6)
-    assert density_gain(person) == pytest.approx(1.6)
+    set_density_gain(person, 2.0)
+    assert density_gain(person) == pytest.approx(2.0)
     assert density_gain(other) == pytest.approx(DENSITY_GAIN)
     assert merged.data.materials[0] == person_material(person) != volume_material()
     set_density_gain(person, 1.8)
@@ -203,9 +203,9 @@ def test_a_gain_of_one_s_own_is_a_material_of_one_s_own(person, tmp_path):
 
 def test_a_duplicate_s_gain_is_its_own(person):
     twin = duplicate_human(person)
-    set_density_gain(person, 1.6)
+    set_density_gain(person, 2.0)
     set_density_gain(twin, 1.9)
-    assert density_gain(person) == pytest.approx(1.6)
+    assert density_gain(person) == pytest.approx(2.0)
     assert density_gain(twin) == pytest.approx(1.9)
     assert {volume_path(data) for data in bpy.data.volumes} == set(folder_of(person).glob("prim_*.vdb"))
 
