@@ -176,7 +176,7 @@ def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_o
     assert drawn() == ["count", "quality"]
     panel_settings.quality = "CUSTOM"
     assert drawn() == ["count", "quality", "steps", "sampler"]
-    monkeypatch.setattr(panel.setup, "draw_set_up", lambda layout: layout.label(text="not set up"), raising=False)
+    monkeypatch.setattr(panel.setup, "draw_set_up", lambda layout: layout.label(text="not set up"))
     texts = shown(panel.PRIMDIFFUSION_PT_generate, addon)
     assert texts[0] == "not set up"
     assert {"primdiffusion.random_seed", "primdiffusion.generate"} <= set(texts)

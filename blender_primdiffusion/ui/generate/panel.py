@@ -31,8 +31,7 @@ class PRIMDIFFUSION_PT_generate(bpy.types.Panel):
         layout, settings = self.layout, context.scene.primdiffusion
         layout.use_property_split = True
         layout.use_property_decorate = False
-        if hasattr(setup, "draw_set_up"):
-            setup.draw_set_up(layout)
+        setup.draw_set_up(layout)
         column = layout.column()
         row = column.row(align=True)
         row.prop(settings, "seed")
