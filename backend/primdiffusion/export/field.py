@@ -79,7 +79,7 @@ def weights_at(field: Field, points: Float[Array, "n 3"], box_weights: Float[Arr
     return _weights(field, np.ascontiguousarray(points, np.float64), np.ascontiguousarray(box_weights, np.float32))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _listed(first, last, cells):  # pragma: no cover (compiled)
     start = np.zeros(cells[0] * cells[1] * cells[2] + 1, np.int64)
     for fill in range(2):
@@ -100,7 +100,7 @@ def _listed(first, last, cells):  # pragma: no cover (compiled)
     return start, box
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _cell_of(field, x, y, z):  # pragma: no cover (compiled)
     i = math.floor((x - field.low[0]) / CELL)
     j = math.floor((y - field.low[1]) / CELL)
@@ -111,7 +111,7 @@ def _cell_of(field, x, y, z):  # pragma: no cover (compiled)
     return (i * n[1] + j) * n[2] + k
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _in_box(field, k, x, y, z, value):  # pragma: no cover (compiled)
     """Writes colour, and density times window, of box k at a point; False where the point is outside it."""
     dx, dy, dz = x - field.position[k, 0], y - field.position[k, 1], z - field.position[k, 2]
@@ -137,7 +137,7 @@ def _in_box(field, k, x, y, z, value):  # pragma: no cover (compiled)
     return True
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _density(field, points):  # pragma: no cover (compiled)
     out = np.zeros(len(points), np.float32)
     value = np.empty(4)
@@ -154,7 +154,7 @@ def _density(field, points):  # pragma: no cover (compiled)
     return out
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _look(field, origins, directions, steps, step):  # pragma: no cover (compiled)
     rgb = np.zeros((len(origins), 3), np.float32)
     alpha = np.zeros(len(origins), np.float32)
@@ -188,7 +188,7 @@ def _look(field, origins, directions, steps, step):  # pragma: no cover (compile
     return rgb, alpha
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _weights(field, points, box_weights):  # pragma: no cover (compiled)
     out = np.zeros((len(points), box_weights.shape[1]), np.float32)
     value = np.empty(4)
@@ -215,6 +215,6 @@ def _weights(field, points, box_weights):  # pragma: no cover (compiled)
     return out
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _squared(position, x, y, z):  # pragma: no cover (compiled)
     return (x - position[0]) ** 2 + (y - position[1]) ** 2 + (z - position[2]) ** 2

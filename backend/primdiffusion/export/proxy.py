@@ -11,7 +11,9 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from primdiffusion.body.model import JOINT_NAMES
+from primdiffusion.export.apart import apart
 from primdiffusion.export.field import Field, look_along, pack_field, weights_at
+from primdiffusion.export.simplify import simplified, unwrapped
 from primdiffusion.export.surface import Surface, outside_surface
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
@@ -29,12 +31,9 @@ SMOOTHING = 6
 """How often skin weights are averaged with their neighbours' along the mesh."""
 INFLUENCES = 4
 """Joints that may move a vertex: what glTF and game engines take."""
-SEAM = 4
-"""Texels between charts."""
-CHART_COST = 8.0
-"""xatlas's largest cost of a chart: its 2 cuts this noisy surface into three times as many."""
+RAYS_AT_ONCE = 2**16
 OnStage = Callable[[str, int, int], None]
-"""Told what comes next: a name, how many of the stages are done, and how many there are."""
+"""Told now and then what is done: a name, how many of the stages are behind, and how many there are."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,12 +99,15 @@ def mesh_proxy(human: Human, settings: ProxySettings = DEFAULT_PROXY, on_stage: 
     body, anchors = body_of(human)
     field = pack_field(place(human))
     on_stage("surface", 0, 3)
-    surface = outside_surface(field, settings.spacing, settings.triangles)
+
+    def meanwhile() -> None:
+        on_stage("surface", 0, 3)
+
+    fine = outside_surface(field, settings.spacing, meanwhile)
+    surface = Surface(*apart(simplified, *fine, settings.triangles, meanwhile=meanwhile))
     weights = skin_weights(field, surface, anchor_skin_weights(anchors, body))
-    on_stage("unwrap", 1, 3)
-    corner_uv = unwrap(surface, settings.texture_px)
-    on_stage("texture", 2, 3)
-    texture = baked(field, surface, corner_uv, settings.texture_px)
+    corner_uv = apart(unwrapped, *surface, settings.texture_px, meanwhile=lambda: on_stage("unwrap", 1, 3))
+    texture = baked(field, surface, corner_uv, settings.texture_px, lambda: on_stage("texture", 2, 3))
     joints = body.shape(human.betas).joints.detach().double().numpy()
     skeleton = Skeleton(JOINT_NAMES, body.parents.tolist(), joints)
     return MeshProxy(surface.vertices, surface.faces, corner_uv, weights, texture, skeleton)
@@ -129,20 +131,13 @@ def skin_weights(field: Field, surface: Surface, box_weights: Float[Tensor, "k 2
     return (weights / weights.sum(1, keepdims=True)).astype(np.float32)
 
 
-def unwrap(surface: Surface, texture_px: int) -> Float64[Array, "f 3 2"]:
-    """Texture coordinates of every corner, in charts that do not overlap (xatlas)."""
-    import xatlas
-
-    atlas, charts, packing = xatlas.Atlas(), xatlas.ChartOptions(), xatlas.PackOptions()
-    charts.max_cost = CHART_COST
-    packing.resolution, packing.padding, packing.bilinear = texture_px, SEAM, True
-    atlas.add_mesh(surface.vertices.astype(np.float32), surface.faces.astype(np.uint32))
-    atlas.generate(charts, packing)
-    _, corners, uv = atlas[0]
-    return np.asarray(uv, np.float64)[np.asarray(corners, np.int64)]
-
-
-def baked(field: Field, surface: Surface, corner_uv: Float[Array, "f 3 2"], texture_px: int) -> UInt8[Array, "h w 3"]:
+def baked(
+    field: Field,
+    surface: Surface,
+    corner_uv: Float[Array, "f 3 2"],
+    texture_px: int,
+    meanwhile: Callable[[], None] = lambda: None,
+) -> UInt8[Array, "h w 3"]:
     """What the marcher sees along the normal of every texel, from outside; texels of no chart take the nearest's."""
     from scipy import ndimage
 
@@ -152,7 +147,12 @@ def baked(field: Field, surface: Surface, corner_uv: Float[Array, "f 3 2"], text
     points = np.einsum("nc,nci->ni", share, surface.vertices[corners])
     normals = np.einsum("nc,nci->ni", share, vertex_normals(surface)[corners])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    colour, alpha = look_along(field, points + OUTSIDE * normals, -normals, OUTSIDE + INSIDE, STEP)
+    colour, alpha = np.empty((len(points), 3), np.float32), np.empty(len(points), np.float32)
+    for first in range(0, len(points), RAYS_AT_ONCE):
+        some = slice(first, first + RAYS_AT_ONCE)
+        starts = points[some] + OUTSIDE * normals[some]
+        colour[some], alpha[some] = look_along(field, starts, -normals[some], OUTSIDE + INSIDE, STEP)
+        meanwhile()
     seen = alpha > 0.1
     picture = np.zeros((texture_px, texture_px, 3), np.float32)
     picture[row[seen], column[seen]] = encode_srgb(np.clip(colour[seen], 0, 1))

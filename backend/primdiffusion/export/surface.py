@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ SMALLEST_PIECE = 5e-5
 """Volume below which a loose piece is dropped, cubic metres."""
 GAP = 0.012
 """Openings narrower than this are closed before the inside is filled, metres."""
-POINTS_AT_ONCE = 2**21
+POINTS_AT_ONCE = 2**19
 THIN = "nothing of this person is dense enough to have a surface: generate them again"
 
 
@@ -42,14 +43,15 @@ class DensityGrid(NamedTuple):
     spacing: float
 
 
-def outside_surface(field: Field, spacing: float, triangles: int) -> Surface:
-    """The surface that is seen from outside, in at most `triangles` triangles; cavities are filled, crumbs dropped.
+def outside_surface(field: Field, spacing: float, meanwhile: Callable[[], None] = lambda: None) -> Surface:
+    """The surface that is seen from outside, as fine as the grid; cavities are filled, crumbs dropped.
 
-    Marching cubes on a grid of `spacing` metres, then quadric edge collapses, both libigl's. Raises NoSurface.
+    Marching cubes (libigl's) on a grid of `spacing` metres. `meanwhile` is called now and then, and what it raises ends
+    the work. Raises NoSurface.
     """
     import igl  # 16 MB, and only this needs it
 
-    grid = density_grid(field, spacing)
+    grid = density_grid(field, spacing, meanwhile)
     solid = filled(grid.density > LEVEL, spacing)
     if not solid.any():
         raise NoSurface(THIN)
@@ -57,15 +59,12 @@ def outside_surface(field: Field, spacing: float, triangles: int) -> Surface:
     values = np.where(solid, np.minimum(values, 2 * LEVEL), np.minimum(grid.density, LEVEL * 0.999))
     corners, cubes = _cubes_across(solid)
     places = grid.origin + spacing * np.stack(np.unravel_index(corners, solid.shape), -1)
+    meanwhile()
     vertices, faces, _ = igl.marching_cubes(values.ravel()[corners].astype(np.float64), places, cubes, LEVEL)
-    surface = _large_pieces(np.asarray(vertices), np.asarray(faces)[:, ::-1])
-    if len(surface.faces) <= triangles:
-        return surface
-    vertices, faces, *_ = igl.qslim(surface.vertices, surface.faces, triangles)
-    return Surface(np.asarray(vertices), np.asarray(faces))
+    return _large_pieces(np.asarray(vertices), np.asarray(faces)[:, ::-1])
 
 
-def density_grid(field: Field, spacing: float) -> DensityGrid:
+def density_grid(field: Field, spacing: float, meanwhile: Callable[[], None] = lambda: None) -> DensityGrid:
     """The field on a grid around all of it, three empty points on every side."""
     margin = 3 * spacing
     reach = np.abs(np.linalg.inv(field.to_local)).sum(-1)
@@ -77,6 +76,7 @@ def density_grid(field: Field, spacing: float) -> DensityGrid:
         index = np.arange(first, min(first + POINTS_AT_ONCE, total))
         points = low + spacing * np.stack(np.unravel_index(index, tuple(shape)), -1)
         density[first : first + len(index)] = density_at(field, points)
+        meanwhile()
     return DensityGrid(density.reshape(shape), low, spacing)
 
 

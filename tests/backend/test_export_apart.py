@@ -1,0 +1,34 @@
+"""Work in a process of its own."""
+
+import math
+import os
+import time
+
+import pytest
+from primdiffusion.export.apart import EndedEarly, apart
+
+
+def nothing():
+    pass
+
+
+def test_answers_and_errors_come_back():
+    assert apart(math.hypot, 3.0, 4.0, meanwhile=nothing) == 5.0
+    with pytest.raises(ValueError, match="domain"):
+        apart(math.sqrt, -1.0, meanwhile=nothing)
+
+
+def test_a_process_that_dies_is_an_error():
+    with pytest.raises(EndedEarly, match="try again"):
+        apart(os._exit, 3, meanwhile=nothing)
+
+
+def test_what_is_raised_meanwhile_ends_it_at_once():
+    began = time.monotonic()
+
+    def cancel():
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        apart(time.sleep, 60, meanwhile=cancel)
+    assert time.monotonic() - began < 10
