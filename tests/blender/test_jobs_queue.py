@@ -16,7 +16,7 @@ from blender_primdiffusion.scene.human import humans, person_file
 from blender_primdiffusion.ui.generate.work import GenerateWork
 from blender_primdiffusion.ui.jobs import follow as follow_module
 from blender_primdiffusion.ui.jobs.follow import follow, watch
-from blender_primdiffusion.ui.jobs.panel import PRIMDIFFUSION_PT_jobs
+from blender_primdiffusion.ui.jobs.panel import PRIMDIFFUSION_PT_jobs, PRIMDIFFUSION_PT_jobs_left
 from blender_primdiffusion.ui.jobs.queue import queue
 
 DIES, FAILS, TAKES_LONG, IGNORES_CANCEL, NO_MEMORY = 1, 2, 4, 105, 106
@@ -198,7 +198,16 @@ def test_a_result_waits_for_the_user_to_let_go_of_what_is_being_moved(addon, mon
         follow()
     assert not humans(bpy.context.scene)
     assert "Done: waits for Move" in shown(PRIMDIFFUSION_PT_jobs, addon)
-    monkeypatch.undo()
+    assert ops.cancel() == {"FINISHED"}
+    drive()
+    assert not humans(bpy.context.scene)
+    ask(12)
+    monkeypatch.setattr(follow_module, "in_the_way", lambda: "")
+    drive()
+    assert seeds() == [12]
+
+
+def test_nothing_is_in_the_way_when_the_user_does_nothing(addon):
     assert follow_module.in_the_way() == ""
 
 
@@ -213,8 +222,7 @@ def test_loading_a_file_ends_the_child_and_offers_what_was_in_line(addon):
     assert follow() is None
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
-    texts = shown(PRIMDIFFUSION_PT_jobs, addon)
-    assert "2 Jobs were Left" in texts
+    texts = shown(PRIMDIFFUSION_PT_jobs_left, addon)
     assert "Generate Human, seed 12 (shot.blend, Scene)" in texts
     assert not humans(bpy.context.scene)
     assert ops.discard_works() == {"FINISHED"}

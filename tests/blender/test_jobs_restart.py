@@ -17,7 +17,7 @@ from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui.generate.work import GenerateWork
 from blender_primdiffusion.ui.jobs import kept as kept_module
 from blender_primdiffusion.ui.jobs.follow import look_for_left
-from blender_primdiffusion.ui.jobs.panel import PRIMDIFFUSION_PT_jobs
+from blender_primdiffusion.ui.jobs.panel import PRIMDIFFUSION_PT_jobs, PRIMDIFFUSION_PT_jobs_left
 from blender_primdiffusion.ui.jobs.queue import queue
 from blender_primdiffusion.worker.kept_works import KeptWork, Shelf
 
@@ -72,8 +72,8 @@ def test_works_in_line_of_a_killed_blender_are_offered_to_the_next_and_resumed(f
         assert not queue.kept.left, "those of a living Blender are its own"
         other.kill()
     look_for_left()
-    texts = shown(PRIMDIFFUSION_PT_jobs, bpy.context)
-    assert "2 Jobs were Left" in texts
+    assert PRIMDIFFUSION_PT_jobs_left.poll(bpy.context)
+    texts = shown(PRIMDIFFUSION_PT_jobs_left, bpy.context)
     assert "Generate Human, seed 21 (fïlm 1.blend, Scene)" in texts
     assert not queue.busy, "nothing runs by itself"
     assert ops.resume_works() == {"FINISHED"}

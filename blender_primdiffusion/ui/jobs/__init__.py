@@ -11,6 +11,7 @@ CLASSES = (
     *operators.CLASSES,
     result_operator.PRIMDIFFUSION_OT_take_result,
     diagnostics.PRIMDIFFUSION_OT_copy_diagnostics,
+    panel.PRIMDIFFUSION_PT_jobs_left,
     panel.PRIMDIFFUSION_PT_jobs,
 )
 _TIMERS = (follow.follow, follow.watch, follow.look_for_left)

@@ -26,6 +26,8 @@ def draw_job(
     """
     props = layout.operator(operator_idname, icon=icon)
     if queue.current is not None and queue.current.work.kind == kind:
+        if so_far.icon:
+            layout.template_icon(icon_value=so_far.icon, scale=_PICTURE_SCALE)
         draw_progress(layout)
     waiting = [entry for entry in queue.waiting if entry.work.kind == kind]
     draw_waiting(layout, waiting)
@@ -42,10 +44,8 @@ def draw_lines(layout: bpy.types.UILayout, text: str, icon: str) -> None:
 
 
 def draw_progress(layout: bpy.types.UILayout) -> None:
-    """What is at work: its picture, how far it is, how long it will take, Cancel."""
+    """What is at work: how far it is, how long it will take, Cancel."""
     job = queue.job
-    if so_far.icon:
-        layout.template_icon(icon_value=so_far.icon, scale=_PICTURE_SCALE)
     row = layout.row(align=True)
     row.progress(factor=job.fraction, text=_progress_text())
     row.operator("primdiffusion.cancel", text="", icon="CANCEL").number = 0

@@ -147,7 +147,10 @@ class Queue:
     def cancel(self, number: int = 0) -> bool:
         """Take a work out of the line, or ask the child to stop; 0: what is at work. Whether there was such a one."""
         if self.current is not None and number in (0, self.current.number):
-            self.job.cancel()
+            if self.ready:  # and waits to enter the scene
+                self._end(Outcome(self.current, notice="Cancelled"))
+            else:
+                self.job.cancel()
             return True
         left = [entry for entry in self.waiting if entry.number != number]
         found = len(left) < len(self.waiting)
