@@ -1,0 +1,84 @@
+"""Merging and the gain from the operator to what is shown, with the real child and a person of a small model."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+import blender_primdiffusion
+from blender_primdiffusion import places
+from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.attachment import attachment_of, set_attachment
+from blender_primdiffusion.scene.gain import density_gain
+from blender_primdiffusion.scene.human import armature_of, humans, volume_path
+from blender_primdiffusion.scene.merged import merged_of, sequence_files
+from blender_primdiffusion.ui.jobs import work
+from blender_primdiffusion.worker.client import BackendClient
+from blender_primdiffusion.worker.environment import BackendPython
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+ops = bpy.ops.primdiffusion
+
+
+@pytest.fixture
+def person(saved_scene, tmp_path, monkeypatch):
+    from tiny_model import save_tiny_checkpoint
+
+    checkpoint = save_tiny_checkpoint(tmp_path / "tiny.safetensors")
+    python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
+    monkeypatch.setattr(places, "find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr(work, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
+    # With a cache in Blender's temporary folder the child would compile its marcher anew for each test.
+    monkeypatch.setattr(places, "BackendClient", lambda python, module, cache_dir: BackendClient(python, module))
+    blender_primdiffusion.register()
+    try:
+        ops.generate(seed=1, steps=2)
+        yield humans(saved_scene.scene)[0]
+    finally:
+        blender_primdiffusion.unregister()
+
+
+def filled_box(path: Path) -> np.ndarray:
+    """Lowest and highest corner [2, 3] of what is not empty, metres in the armature's space."""
+    import openvdb
+
+    grid = openvdb.read(str(path), "density")
+    low, high = grid.evalActiveVoxelBoundingBox()
+    shift = 0.5 * grid.transform.voxelSize()[0] if bpy.app.version < (5, 0) else 0.0
+    return np.array([grid.transform.indexToWorld(corner) for corner in (low, high)]) + shift
+
+
+def test_a_merged_person_fills_the_space_of_the_volumes_on_the_surface(person):
+    turns = np.tile(np.eye(3), (24, 1, 1))
+    turns[16] = [[np.cos(1.2), np.sin(1.2), 0], [-np.sin(1.2), np.cos(1.2), 0], [0, 0, 1]]
+    pose_from_joint_rotations(armature_of(person), turns)
+    assert ops.merge(voxel=0.02) == {"FINISHED"}
+    box = filled_box(volume_path(merged_of(person).data))
+    set_attachment(person, "SURFACE")
+    bpy.context.view_layer.update()
+    graph = bpy.context.evaluated_depsgraph_get()
+    lift = np.array(armature_of(person).matrix_world)[:3, 3]
+    places_of = [np.array(i.matrix_world)[:3, 3] - lift for i in graph.object_instances if i.is_instance]
+    assert len(places_of) == 1024
+    centres = np.array([np.min(places_of, 0), np.max(places_of, 0)])
+    assert (box[0] < centres[0] + 0.02).all()
+    assert (box[1] > centres[1] - 0.02).all()
+    np.testing.assert_allclose(box, centres, atol=0.15)
+
+
+def test_frames_and_the_gain_come_from_the_child(person):
+    ops.merge_frames(frame_start=1, frame_end=3, voxel=0.03)
+    assert attachment_of(person) == "MERGED"
+    assert len(sequence_files(merged_of(person).data)) == 3
+    assert ops.fit_density_gain() == {"FINISHED"}
+    assert 0.1 <= density_gain(person) <= 20
+
+
+def test_voxels_too_small_for_the_machine_are_refused_with_a_size_to_choose(person):
+    with pytest.raises(RuntimeError, match=r"choose .* mm or more"):
+        ops.merge(voxel=0.0005)
+    assert merged_of(person) is None
