@@ -35,7 +35,8 @@ class Machine:
     @property
     def described(self) -> str:
         """What was found, for people."""
-        chip = NAMES["apple"] if self.platform == "macos_arm64" else self.platform.replace("_", " ", 1)
+        owner, _, chip = self.platform.partition("_")
+        chip = NAMES["apple"] if self.platform == "macos_arm64" else f"{owner.title()} {chip}"
         card = f", NVIDIA driver{f' {self.driver}' if self.driver else ''}" if self.nvidia else ""
         return f"{chip}{card}, Python {self.python[0]}.{self.python[1]}"
 
@@ -78,7 +79,7 @@ def chosen_compute(machine: Machine, wish: str, available: Iterable[str]) -> tup
         version = ".".join(map(str, machine.python))
         raise ValueError(
             f"there are no packages for {machine.platform} with Python {version}: "
-            "make an environment by hand and name its Python below"
+            "make an environment by hand and name its Python in the preferences"
         )
     if wish == "automatic":
         return _automatic(machine, available)

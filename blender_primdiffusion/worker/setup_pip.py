@@ -22,8 +22,8 @@ _WHEELS_ONLY = ("--no-deps", "--require-hashes", "--only-binary", ":all:", "--pr
 _WHAT_WENT_WRONG = (
     (
         r"DO NOT MATCH THE HASHES.*?\n\s+(\S+)[^\n]*\n\s+Expected sha256",
-        "{0} is not the file it should be (its hash differs), and was not installed: try again, or ask who runs your "
-        "package mirror",
+        "the downloaded file of {0} is not the right one (its hash differs) and was not installed: try again, or ask "
+        "who runs your package mirror",
     ),
     (r"No space left on device|\[Errno 28\]|WinError 112", "the disk is full: free some space, then try again"),
     (

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
 
+from .sentence import sentence
 from .setup_folder import SetUpFolder
 from .setup_group import end_group, guarded
 from .setup_pip import SetUpFailed
@@ -62,8 +63,8 @@ def _say(message: dict[str, object]) -> None:
     sys.stdout.buffer.flush()
 
 
-def _fail(sentence: str) -> int:
-    _say({"error": sentence})
+def _fail(reason: str) -> int:
+    _say({"error": sentence(reason)})
     return 1
 
 

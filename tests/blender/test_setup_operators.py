@@ -138,7 +138,7 @@ def test_without_online_access_set_up_is_refused_and_says_how_to_allow_it(wheels
 
 
 def test_a_failure_raises_and_stays_in_the_panel(online):
-    with pytest.raises(RuntimeError, match="the package index cannot be reached"):
+    with pytest.raises(RuntimeError, match="The package index cannot be reached"):
         press.set_up_backend()
     layout = Layout()
     drawing.draw_set_up(layout)
@@ -216,7 +216,7 @@ def test_a_machine_without_packages_is_told_what_to_do(online, monkeypatch):
         press.set_up_backend()
     layout = Layout()
     drawing.draw_set_up(layout)
-    assert "there are no packages for" in layout.said
+    assert "There are no packages for" in layout.said
 
 
 def test_set_up_is_refused_while_a_person_is_made(online, monkeypatch):

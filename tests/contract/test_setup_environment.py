@@ -89,7 +89,7 @@ def test_a_wheel_that_is_not_the_locked_one_is_refused_and_nothing_is_ready(plan
     with served(tmp_path / "räder") as (index, _):
         own_index(monkeypatch, index)
         said = refused("set_up", dataclasses.replace(plan, offline=""))
-    assert said.startswith("torch is not the file it should be (its hash differs)")
+    assert said.startswith("The downloaded file of torch is not the right one (its hash differs)")
     assert state_of(plan.folder)[0] == "half"
     assert not list(plan.folder.environment.rglob("torch.py"))
 
@@ -160,7 +160,7 @@ def test_an_environment_whose_blender_is_gone_is_recognised(plan, tmp_path):
 def test_an_environment_that_fails_its_self_test_is_not_ready(plan, tmp_path):
     wheels = write_packages(tmp_path / "räder", problem="the graphics card is on fire")
     write_lock(Path(plan.lock), wheels)
-    assert refused("set_up", plan) == "the self-test failed: the graphics card is on fire"
+    assert refused("set_up", plan) == "The self-test failed: the graphics card is on fire."
     assert state_of(plan.folder)[0] == "half"
 
 
@@ -174,12 +174,12 @@ def test_another_python_can_be_tried_alone(plan, tmp_path):
 
 def test_no_network_is_a_sentence(two_groups, monkeypatch):
     own_index(monkeypatch)
-    assert refused("set_up", two_groups).startswith("the package index cannot be reached: check the network")
+    assert refused("set_up", two_groups).startswith("The package index cannot be reached: check the network")
 
 
 def test_no_online_access_is_a_sentence_also_where_repairing_needs_it(two_groups):
     said = refused("repair", dataclasses.replace(two_groups, online=False))
-    assert said == f"2 packages have to be downloaded: {OFFLINE}"
+    assert said == f"2 packages have to be downloaded: {OFFLINE}."
 
 
 def test_too_little_disk_is_said_before_anything_is_made(plan, tmp_path):
@@ -227,7 +227,7 @@ def test_either_ensurepip_or_a_pip_of_the_hosts_own_is_enough(plan, tmp_path, la
 def test_two_blenders_do_not_set_up_the_same_folder(plan):
     plan.folder.root.mkdir(parents=True)
     with guarded(plan.folder.guard):
-        assert refused("set_up", plan).startswith("another Blender is setting up the backend in")
+        assert refused("set_up", plan).startswith("Another Blender is setting up the backend in")
     assert not plan.folder.environment.exists()
 
 

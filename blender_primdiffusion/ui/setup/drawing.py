@@ -6,6 +6,7 @@ import textwrap
 
 import bpy
 
+from ...worker.sentence import sentence
 from .known import chosen, cost, known
 from .session import session
 
@@ -49,7 +50,7 @@ def draw_cost(layout: bpy.types.UILayout, width: int) -> None:
     try:
         _, lock, note = chosen()
     except (ValueError, OSError) as error:
-        draw_text(layout, str(error), "ERROR", width)
+        draw_text(layout, sentence(error), "ERROR", width)
         return
     draw_text(layout, cost(lock), "BLANK1", width)
     if note:

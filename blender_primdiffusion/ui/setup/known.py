@@ -7,15 +7,17 @@ import functools
 import importlib.util
 import os
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import bpy
 
 from ...places import EXTENSION, preference, set_up_folder
 from ...worker.environment import VARIABLE
 from ...worker.setup_folder import state_of
-from ...worker.setup_locks import Lock, locks_for, read_lock
-from ...worker.setup_machine import Machine, chosen_compute, this_machine
+
+if TYPE_CHECKING:
+    from ...worker.setup_locks import Lock
+    from ...worker.setup_machine import Machine
 
 LOCKS = Path(__file__).resolve().parents[2] / "requirements"
 OWN_LOCK = "requirements.txt"
@@ -24,9 +26,6 @@ _LINE_BYTES_PER_S = 50e6 / 8
 """Of the network, for the estimate: 50 Mbit/s."""
 _UNPACKED_BYTES_PER_S = 30e6
 _SELF_TEST_S = 30.0
-
-machine = functools.cache(this_machine)
-read_once = functools.lru_cache(maxsize=16)(read_lock)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,8 +74,26 @@ def _made_of_another_lock(about: dict[str, Any]) -> bool:
 
 
 @functools.cache
+def machine() -> Machine:
+    """The machine we run on."""
+    from ...worker.setup_machine import this_machine
+
+    return this_machine()
+
+
+@functools.lru_cache(maxsize=16)
+def read_once(path: Path) -> Lock:
+    """The lock in a file. Raises OSError, ValueError."""
+    from ...worker.setup_locks import read_lock
+
+    return read_lock(path)
+
+
+@functools.cache
 def available() -> dict[str, Path]:
     """The locks for this machine, by what they compute on."""
+    from ...worker.setup_locks import locks_for
+
     return locks_for(LOCKS, machine().platform, machine().python)
 
 
@@ -91,8 +108,9 @@ def chosen() -> tuple[str, Lock, str]:
 
     Raises ValueError in a sentence.
     """
-    found: Machine = machine()
-    compute, note = chosen_compute(found, wished_compute(), available())
+    from ...worker.setup_machine import chosen_compute
+
+    compute, note = chosen_compute(machine(), wished_compute(), available())
     return compute, read_once(available()[compute]), note
 
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ...places import set_up_folder
+from ...worker.sentence import sentence
 from . import known
-from .session import see_through, session
+from .session import redraw, see_through, session
 
 if TYPE_CHECKING:
     from ...worker.setup_job import Kind
@@ -25,7 +26,7 @@ def _begin(operator: bpy.types.Operator, kind: Kind, make_plan: Callable[[], Pla
             _release_environment()
         session.start(kind, plan)
     except (ValueError, OSError) as error:
-        operator.report({"ERROR"}, str(error))
+        operator.report({"ERROR"}, sentence(error))
         return {"CANCELLED"}
     return see_through(operator)
 
@@ -57,7 +58,7 @@ class PRIMDIFFUSION_OT_set_up_backend(bpy.types.Operator):
         try:
             compute = known.chosen()[0]
         except (ValueError, OSError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
         now = known.known()
         if now.state == "ready" and now.about.get("compute") == compute:
@@ -113,6 +114,7 @@ class PRIMDIFFUSION_OT_cancel_set_up(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """End the process with all it has started."""
         session.cancel()
+        redraw()
         return {"FINISHED"}
 
 

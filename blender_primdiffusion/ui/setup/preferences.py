@@ -63,14 +63,14 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
             layout.prop(self, name)
 
     def _draw_backend(self, box: bpy.types.UILayout) -> None:
+        if session.busy:
+            draw_progress(box)
+            return
         now, folder = known(), set_up_folder()
         draw_text(box, now.line, "CHECKMARK" if now.usable else "ERROR", _WIDTH)
         if folder.environment.is_dir():
             size = f"{gigabytes(now.about['bytes'])} in " if "bytes" in now.about else ""
             draw_text(box, f"{size}{folder.environment}", "FILE_FOLDER", _WIDTH)
-        if session.busy:
-            draw_progress(box)
-            return
         row = box.row()
         row.prop(self, "compute", expand=True)
         draw_text(box, f"Found: {machine().described}", "SYSTEM", _WIDTH)
