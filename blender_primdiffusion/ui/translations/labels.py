@@ -129,6 +129,7 @@ LABELS = (
     ("Input", "Eingabe", "Entrée"),
     ("Install from Folder", "Aus Ordner installieren", "Installer depuis un dossier"),
     ("Into", "Nach", "Vers"),
+    ("Jobs", "Aufträge", "Tâches"),
     ("Jobs Left", "Übrige Aufträge", "Tâches restantes"),
     ("Key Pose", "Pose als Keyframe", "Clé de la pose"),
     ("Keys", "Schlüsselbilder", "Clés"),
