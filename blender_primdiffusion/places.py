@@ -60,6 +60,8 @@ def new_backend(python: str) -> Backend:
 
     def make_client() -> BackendClient:
         found = find_backend_python(python or None, own_environment, module_path, cache_dir=cache)
-        return BackendClient(found.path, module_path, cache_dir=cache)
+        client = BackendClient(found.path, module_path, cache_dir=cache)
+        client.info["torch"] = found.torch  # which the child does not tell
+        return client
 
     return Backend(make_client)

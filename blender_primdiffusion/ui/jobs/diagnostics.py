@@ -30,7 +30,8 @@ def _lines() -> Iterator[str]:
     yield f"PrimDiffusion {_version()} ({'extension' if EXTENSION.startswith('bl_ext.') else 'from source'})"
     yield f"Blender {bpy.app.version_string} ({bpy.app.build_hash.decode(errors='replace')}), {_window()}"
     yield f"System {platform.platform()}, {platform.machine()}, {os.cpu_count()} processors"
-    yield f"Backend {info.get('version', 'not started yet')}, Python {info.get('python', '?')}, torch {_torch()}"
+    python, torch = info.get("python", "?"), info.get("torch", "?")
+    yield f"Backend {info.get('version', 'not started yet')}, Python {python}, torch {torch}"
     yield f"Backend found: {'yes' if backend_module_path() else 'no'}"
     yield "Set in the preferences: " + (", ".join(filter(preference, _PATHS)) or "nothing")
     yield f"Device {device_line()}"
@@ -59,10 +60,6 @@ def _version() -> str:
             return tomllib.load(file)["version"]
     except (OSError, ValueError, KeyError):
         return "of unknown version"
-
-
-def _torch() -> str:
-    return str(queue.info.get("torch", "?"))
 
 
 def _window() -> str:

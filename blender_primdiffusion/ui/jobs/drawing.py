@@ -12,7 +12,8 @@ from .pictures import so_far
 from .queue import Entry, Outcome, queue
 from .remedies import remedy_for
 
-_LINE = 46
+_LINE = 34
+"""Letters that fit a sidebar as wide as Blender makes it, beside an icon."""
 _PICTURE_SCALE = 8.0
 _MINUTES_FROM_S = 90.0
 

@@ -16,7 +16,7 @@ from .queue import GONE, Entry, Outcome, queue
 from .work import Work
 
 TICK_S = 0.1
-WATCH_S = 0.5
+WATCH_S = 0.25
 LOOK_AFTER_S = 1.0
 """Registering reads no files; nor need Blender's start wait for it."""
 _TOLD_S = 1.0

@@ -34,7 +34,8 @@ class PRIMDIFFUSION_PT_jobs_left(_InSidebar, bpy.types.Panel):
         left = queue.kept.left
         column = self.layout.column(align=True)
         for kept in left[:_SHOWN_LEFT]:
-            column.label(text=f"{kept.label} ({meant_for(kept)})")
+            column.label(text=kept.label, icon="TIME")
+            column.label(text=f"for {meant_for(kept)}", icon="BLANK1")
         if len(left) > _SHOWN_LEFT:
             column.label(text=f"and {len(left) - _SHOWN_LEFT} more")
         row = self.layout.row(align=True)

@@ -220,6 +220,7 @@ class Queue:
     def _drop(self) -> None:
         self.waiting.clear()
         self.current = self.job = None
+        self.child_news = ""
         self._clear_folder()
         if self._backend is not None:
             self._backend.shutdown()
