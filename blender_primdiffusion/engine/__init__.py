@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import sys
+
 import bpy
 
-from . import studio, viewport
 from .engine import ENGINE, PRIMDIFFUSION_RenderEngine
 from .settings import PRIMDIFFUSION_PG_render
 
@@ -20,8 +21,9 @@ def register() -> None:
 
 def unregister() -> None:
     """All of `register` undone, the child ended; scenes that used the engine go back to Blender's default."""
-    viewport.stop()
-    studio.close()
+    for module, ending in (("viewport", "stop"), ("studio", "close")):
+        if (drawn := sys.modules.get(f"{__package__}.{module}")) is not None:  # imported by the first picture
+            getattr(drawn, ending)()
     _leave_scenes()
     del bpy.types.Scene.primdiffusion_render
     for cls in reversed(CLASSES):

@@ -1,11 +1,16 @@
-"""The render engine as Blender calls it."""
+"""The render engine as Blender calls it.
+
+What draws is imported when something is drawn: Blender registers the engine at each start.
+"""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import bpy
 
-from . import final
-from .viewport import Viewport
+if TYPE_CHECKING:
+    from .viewport import Viewport
 
 ENGINE = "PRIMDIFFUSION"
 
@@ -32,6 +37,8 @@ class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
 
     def render(self, depsgraph: bpy.types.Depsgraph) -> None:
         """One view layer of one frame; runs beside Blender's window, or in it under -b. An error ends the render."""
+        from . import final
+
         try:
             final.render_layer(self, depsgraph)
         except (final.RenderFailed, ValueError, OSError) as error:
@@ -42,14 +49,13 @@ class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
 
     def view_update(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """The scene has changed."""
-        if self._viewport is None:
-            self._viewport = Viewport()
+        self._viewport = self._viewport or _new_viewport()
         self._viewport.update(context, depsgraph)
 
     def view_draw(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """Draw the newest picture there is; never waits for one."""
         if self._viewport is None:
-            self._viewport = Viewport()
+            self._viewport = _new_viewport()
             self._viewport.update(context, depsgraph)
         self._viewport.draw(self, context, depsgraph)
 
@@ -57,3 +63,9 @@ class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
         sentence = f"PrimDiffusion: {sentence}"
         self.update_stats("", sentence)
         self.report({"ERROR"}, sentence)  # ends the render, animations too; error_set would let them go on
+
+
+def _new_viewport() -> Viewport:
+    from .viewport import Viewport
+
+    return Viewport()
