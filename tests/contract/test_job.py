@@ -163,3 +163,19 @@ def test_a_child_that_hangs_is_ended_and_fails_the_job(checkpoint, tmp_path):
     assert job.error.kind == "hung"
     assert backend.client is None
     assert not (tmp_path / "out").exists()
+
+
+def test_a_cancel_while_torch_is_loaded_ends_within_a_second_and_keeps_the_child(checkpoint, tmp_path):
+    backend = Backend(lambda: BackendClient(PYTHON))
+    job = generate_job(backend, seed=1, steps=1, out_dir=tmp_path / "out", checkpoint=checkpoint)
+    follow(job, lambda job: job._request is not None)
+    assert not job.info.get("ready")
+    job.cancel()
+    began = time.monotonic()
+    assert follow(job)[-1] == "cancelled"
+    assert time.monotonic() - began < 1.0
+    first = backend.connect()
+    again = generate_job(backend, seed=1, steps=1, out_dir=tmp_path / "again", checkpoint=checkpoint)
+    assert follow(again)[-1] == "done"
+    assert backend.connect() is first
+    backend.shutdown()
