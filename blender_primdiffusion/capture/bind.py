@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..scene.armature import build_armature
 from ..scene.convention import points_to_backend, points_to_blender
-from ..scene.human_file import JOINT_NAMES
+from ..scene.joints import JOINT_NAMES
 from .body import Body, blend
 from .fit import fit_surface, vertex_normals
 from .parameters import Parameters, read_parameters

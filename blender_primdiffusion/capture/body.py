@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..motion.arrays import ArrayFileError, read_npz
 from ..motion.skeleton import chain, joint_positions
 from ..places import backend_module_path
-from ..scene.human_file import PARENTS
+from ..scene.joints import PARENTS
 
 BETAS = 10
 """Shape components in use."""

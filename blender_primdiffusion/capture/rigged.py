@@ -10,7 +10,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
-from ..scene.human_file import JOINT_NAMES
+from ..scene.joints import JOINT_NAMES
 from .scan_files import ScanError, ScanFile
 from .skeleton import Skeleton
 

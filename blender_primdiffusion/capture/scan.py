@@ -13,7 +13,7 @@ from ..motion.bones import BoneMap, map_bones
 from ..motion.rest_alignment import facing, rig_from_smpl
 from ..motion.rotation import to_axis_angle
 from ..scene.convention import points_to_blender
-from ..scene.human_file import JOINT_NAMES
+from ..scene.joints import JOINT_NAMES
 from ..scene.quaternion import matrix_to_quaternion
 from .belongings import Belongings
 from .bind import bind_static

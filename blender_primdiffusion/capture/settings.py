@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from ..scene.human_file import JOINT_NAMES
+from ..scene.joints import JOINT_NAMES
 from .layout import ENDINGS
 from .picture_files import DEPTH_UNIT
 from .rig import Rig, View

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..motion.skeleton import chain
-from ..scene.human_file import JOINT_NAMES, PARENTS
+from ..scene.joints import JOINT_NAMES, PARENTS
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..scene.convention import transforms_to_backend
 from ..scene.human import BETAS, MARK, person_file
-from ..scene.human_file import JOINT_NAMES
+from ..scene.joints import JOINT_NAMES
 from .visible import visible_instances
 
 SMALLEST_SCALE = 1e-4

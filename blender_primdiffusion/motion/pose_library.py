@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..scene.armature import bone_bases, rest_rotations
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
-from ..scene.human_file import JOINT_NAMES
+from ..scene.joints import JOINT_NAMES
 from ..scene.quaternion import matrix_to_quaternion
 from .adjust import leg_ratio, slerp
 from .library_poses import LIBRARY

@@ -11,7 +11,7 @@ from mathutils import Vector
 from numpy.typing import NDArray
 
 from .convention import points_to_blender, rotations_to_blender
-from .human_file import JOINT_NAMES, PARENTS
+from .joints import JOINT_NAMES, PARENTS
 from .quaternion import matrix_to_quaternion
 
 _TOWARDS = {"pelvis": "spine1", "spine3": "neck"}

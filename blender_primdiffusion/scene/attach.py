@@ -10,7 +10,7 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from .human_file import JOINT_NAMES
+from .joints import JOINT_NAMES
 from .quaternion import matrix_to_quaternion
 from .volumes import stored_path
 

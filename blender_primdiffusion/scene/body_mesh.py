@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .human_file import JOINT_NAMES
+from .joints import JOINT_NAMES
 
 MARK = "primdiffusion_body"
 """Custom property of a body mesh: the engine leaves it out, shown or hidden."""

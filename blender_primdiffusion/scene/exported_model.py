@@ -15,7 +15,7 @@ from pathlib import Path
 
 import bpy
 
-from .human_file import JOINT_NAMES
+from .joints import JOINT_NAMES
 
 ENDINGS = {"GLB": (".glb",), "FBX": (".fbx",), "USD": (".usdc", ".usda", ".usd", ".usdz")}
 """Of each format; the first is the usual one."""

@@ -17,7 +17,7 @@ from .body_mesh import MARK as BODY_MARK
 from .body_mesh import build_body_mesh
 from .convention import points_to_blender
 from .human import armature_of, person_file_name
-from .human_file import JOINT_NAMES
+from .joints import JOINT_NAMES
 
 MARK = "primdiffusion_proxy"
 """Custom property of a proxy object: the person's file and shape that it was made of, as JSON."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .armature import bone_bases, rest_rotations
-from .human_file import JOINT_NAMES
+from .joints import JOINT_NAMES
 from .quaternion import continuous_quaternions
 
 _LINEAR = 1

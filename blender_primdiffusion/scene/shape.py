@@ -19,7 +19,7 @@ from .armature import move_rest_joints
 from .body_mesh import body_of
 from .convention import frames_to_blender, points_to_blender
 from .human import BETAS, MARK, armature_of, folders_of, volume_path
-from .human_file import JOINT_NAMES
+from .joints import JOINT_NAMES
 from .quaternion import matrix_to_quaternion
 from .shape_measures import LARGEST_BETA
 from .shape_model import BETAS as COUNT

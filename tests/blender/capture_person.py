@@ -13,7 +13,7 @@ from synthetic import axis_angle
 from blender_primdiffusion.capture.body import Body, read_body
 from blender_primdiffusion.motion.motion import Motion
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.human_file import JOINT_NAMES
+from blender_primdiffusion.scene.joints import JOINT_NAMES
 
 FACES = 1500
 

@@ -27,7 +27,7 @@ from blender_primdiffusion.capture.shots import shoot_centres, shoot_colours
 from blender_primdiffusion.capture.stage import Stage
 from blender_primdiffusion.capture.surfaces import mark_parts, prepare_materials
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.human_file import JOINT_NAMES
+from blender_primdiffusion.scene.joints import JOINT_NAMES
 
 SIZE = 64
 POSES = two_poses()

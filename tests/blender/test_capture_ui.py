@@ -24,7 +24,7 @@ from blender_primdiffusion.capture.options import MARK, UsageError, parse, setti
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.human_file import JOINT_NAMES
+from blender_primdiffusion.scene.joints import JOINT_NAMES
 from blender_primdiffusion.ui.captures.operators import RIG
 from blender_primdiffusion.ui.captures.session import captures
 from blender_primdiffusion.ui.captures.settings import words_of

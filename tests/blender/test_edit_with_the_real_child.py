@@ -14,7 +14,7 @@ import blender_primdiffusion
 from blender_primdiffusion import places
 from blender_primdiffusion.scene.body_mesh import body_of
 from blender_primdiffusion.scene.human import MARK, armature_of, humans, person_file
-from blender_primdiffusion.scene.human_file import JOINT_NAMES
+from blender_primdiffusion.scene.joints import JOINT_NAMES
 from blender_primdiffusion.ui.jobs import work
 from blender_primdiffusion.worker.client import BackendClient
 from blender_primdiffusion.worker.environment import BackendPython

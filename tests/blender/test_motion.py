@@ -18,7 +18,7 @@ from blender_primdiffusion.motion.rotation import (
     to_axis_angle,
 )
 from blender_primdiffusion.motion.skeleton import FLOOR, REST_JOINTS, chain, joint_positions, unchain
-from blender_primdiffusion.scene.human_file import JOINT_NAMES
+from blender_primdiffusion.scene.joints import JOINT_NAMES
 
 RNG = np.random.default_rng(7)
 

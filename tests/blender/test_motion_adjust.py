@@ -12,7 +12,7 @@ from blender_primdiffusion.motion.files import MotionFileError, read_motion
 from blender_primdiffusion.motion.motion import Motion
 from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, to_axis_angle
 from blender_primdiffusion.motion.skeleton import REST_JOINTS
-from blender_primdiffusion.scene.human_file import JOINT_NAMES
+from blender_primdiffusion.scene.joints import JOINT_NAMES
 
 REST = np.tile(np.eye(3), (24, 1, 1))
 

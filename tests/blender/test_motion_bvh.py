@@ -15,7 +15,7 @@ from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, t
 from blender_primdiffusion.motion.skeleton import REST_JOINTS, chain, joint_positions
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.human_file import JOINT_NAMES, PARENTS
+from blender_primdiffusion.scene.joints import JOINT_NAMES, PARENTS
 from blender_primdiffusion.scene.keyframes import keyframe_poses
 
 Rotation = pytest.importorskip("scipy.spatial.transform").Rotation

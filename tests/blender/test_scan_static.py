@@ -14,7 +14,7 @@ from blender_primdiffusion.capture.bind import join_surface, surface_weights, un
 from blender_primdiffusion.capture.body import skin
 from blender_primdiffusion.capture.scan import ScanError
 from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, to_axis_angle
-from blender_primdiffusion.scene.human_file import JOINT_NAMES
+from blender_primdiffusion.scene.joints import JOINT_NAMES
 
 SCANNED = scan_fixtures.a_pose() @ from_axis_angle(np.random.default_rng(5).normal(0, 0.12, (24, 3)))
 PLACE = np.array([0.4, 1.1, 0.3])

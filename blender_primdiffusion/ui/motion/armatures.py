@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...scene.human import armature_of, human_of, humans
-from ...scene.human_file import JOINT_NAMES
+from ...scene.joints import JOINT_NAMES
 from ..jobs.target import named_person, selected_person
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 from bpy_extras.io_utils import ImportHelper
 
-from ...scene.human_file import JOINT_NAMES
+from ...scene.joints import JOINT_NAMES
 from .armatures import OnArmature, target_armature
 from .options import WhereTo
 from .under_cursor import person_under

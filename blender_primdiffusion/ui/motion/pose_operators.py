@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...motion.own_poses import load_pose, own_poses, save_pose
-from ...scene.human_file import JOINT_NAMES
+from ...scene.joints import JOINT_NAMES
 from .armatures import OnArmature, warn_of_rest
 from .pose_pictures import poses_folder
 

@@ -16,7 +16,7 @@ from ...motion.skeleton import unchain
 from ...scene.armature import rest_rotations
 from ...scene.convention import BLENDER_FROM_BACKEND, points_to_backend
 from ...scene.human import BETAS
-from ...scene.human_file import JOINT_NAMES
+from ...scene.joints import JOINT_NAMES
 from .armatures import scene_fps
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...scene.human import armature_of, humans
-from ...scene.human_file import JOINT_NAMES
+from ...scene.joints import JOINT_NAMES
 
 _MARGIN = 0.12
 """How far around the joints' rectangle still counts as the person, of its height."""

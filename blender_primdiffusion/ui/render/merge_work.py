@@ -15,7 +15,7 @@ from ...engine.people import posed
 from ...scene.attachment import set_attachment
 from ...scene.gain import set_density_gain
 from ...scene.human import armature_of
-from ...scene.human_file import JOINT_NAMES
+from ...scene.joints import JOINT_NAMES
 from ...scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
 from ..jobs.target import Target
 from ..jobs.work import Work
