@@ -1,4 +1,4 @@
-"""The sidebar panel Render Captures: 3D View > N > PrimDiffusion."""
+"""The sidebar panel Captures: 3D View > N > PrimDiffusion."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ class _InSidebar:
 class PRIMDIFFUSION_PT_captures(_InSidebar, bpy.types.Panel):
     """From where to where, the button, and how far it is."""
 
-    bl_label = "Render Captures"
+    bl_label = "Captures"
+    bl_order = 5
 
     def draw_header_preset(self, _context: bpy.types.Context) -> None:
         """The manual's page."""
