@@ -115,7 +115,7 @@ class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
     bl_label = "Re-dress Region"
     work = RedressWork
 
-    attributes: bpy.props.StringProperty(name="Attributes", description=f"Like outfit=dress. {_PANELS}", options=_SKIP)
+    attributes: bpy.props.StringProperty(name="Attributes", description=f"Like outfit=suit. {_PANELS}", options=_SKIP)
     guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=_PANELS, options=_SKIP)
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
