@@ -8,7 +8,6 @@ states whose files all stay. `unused` finds those that no state of this .blend a
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import re
 from pathlib import Path
 
@@ -16,8 +15,19 @@ import bpy
 import numpy as np
 
 from . import merged, shape_file, volumes
-from .human import MARK, PERSON, armature_of, folder_of, people_files, person_file, provenance, volume_path
+from .human import (
+    MARK,
+    PERSON,
+    armature_of,
+    folder_of,
+    folders_of,
+    people_files,
+    person_file_name,
+    provenance,
+    volume_path,
+)
 from .human_file import read_human
+from .placing_files import named_by_content
 from .shape import (
     PRIMITIVE,
     SAME_BETAS,
@@ -85,10 +95,10 @@ def replace_person(collection: bpy.types.Collection, human_npz: Path, person: Pa
     if reshaped:
         check_shapeable(collection)
     grids = volumes.bake(human.density, human.rgb, human.half_extent)
-    home, files = _home(collection), {}
+    home, files = home_of(collection), {}
     for k in shown:
         files[k] = home / volumes.file_name(grids, k, bpy.app.version)
-    name = f"person_{hashlib.sha256(person.read_bytes()).hexdigest()[:12]}.human.safetensors"
+    name = named_by_content(person)
     missing = [k for k, path in files.items() if not path.is_file()]
     with volumes.written(grids, home, {name: person}, missing), body_kept(collection, human.shape_model, home.parent):
         pass
@@ -123,13 +133,14 @@ def unused(folder: Path) -> list[Path]:
     return found
 
 
-def _home(collection: bpy.types.Collection) -> Path:
+def home_of(collection: bpy.types.Collection) -> Path:
     """The folder of the person's files, if it belongs to this .blend.
 
     Else (saved under another name, appended from another .blend) a folder of its own, into which all of the person
     goes, so that nobody is ever in two places.
     """
-    home = person_file(collection).parent
+    folders = folders_of(collection)
+    home = next((folder for folder in folders if (folder / person_file_name(collection)).is_file()), folders[0])
     for own in (volumes.humans_folder(), volumes.humans_folder("")):
         if home.resolve().is_relative_to(own.resolve()):
             return home

@@ -18,6 +18,7 @@ from .convention import frames_to_blender, points_to_blender
 from .human_file import HumanFile, read_human
 from .material import volume_material
 from .overlap import CYCLES_LIMIT, most_overlapping
+from .placing_files import free_name
 from .shape_file import body_kept
 
 MARK = "primdiffusion_human"
@@ -29,8 +30,18 @@ PERSON_FILE = "person.human.safetensors"
 PERSON = "primdiffusion_person_file"
 """Custom property of a person's collection: the name of the backend's file since the person was edited. It goes back
 and forth with undo, as the paths of the volumes do."""
+HOME = "primdiffusion_folder"
+"""Custom property of a person's collection: the absolute folder of their files when the .blend was last saved. Paths
+of volumes are relative to the .blend, which may be moved alone, or opened as a copy in a temporary folder."""
 _NAME_LENGTH = 40
 _KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials")
+
+
+class MissingPersonFile(FileNotFoundError):
+    """The backend's file of a person is not where it should be."""
+
+    kind = "missing_volumes"
+    """By which panels find the remedy."""
 
 
 def build_human(
@@ -59,10 +70,11 @@ def build_human(
         collection.children.link(primitives)
         rotation = frames_to_blender(human.rotation)
         grids = volumes.bake(human.density, human.rgb, human.half_extent)
-        kept = {path.name: path for path in keep}
+        home = folder_of(collection)
+        kept = {free_name(path, home, path.name): path for path in keep}
         with (
-            volumes.written(grids, folder_of(collection), kept) as files,
-            body_kept(collection, human.shape_model, folder_of(collection).parent),
+            volumes.written(grids, home, kept) as files,
+            body_kept(collection, human.shape_model, home.parent),
         ):
             attach_volumes(
                 label,
@@ -75,6 +87,10 @@ def build_human(
                 volume_material(),
             )
             collection[MARK] = provenance(human, grids)
+            collection[HOME] = str(home)
+            for name, path in kept.items():
+                if name != path.name:  # the usual name is taken by somebody who was deleted
+                    collection[PERSON] = name
             context.scene.collection.children.link(collection)
     return collection
 
@@ -94,9 +110,9 @@ def person_file(collection: bpy.types.Collection) -> Path:
     for folder in folders:
         if (folder / name).is_file():
             return folder / name
-    raise FileNotFoundError(
+    raise MissingPersonFile(
         f"the file of the person {collection.name!r} is missing: {str(folders[0] / name)!r}; put it back beside "
-        "the person's volumes, or generate the person again"
+        "the person's volumes, press Find Missing Volumes in the panel Human, or generate the person again"
     )
 
 

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from .human_file import VOXELS
 
+TEMPORARY = "primdiffusion_humans"
+"""Folder of the people of a .blend that was never saved, among Blender's temporary files."""
 WINDOW_EXPONENT = 8
 FAINTEST = 0.05
 """Opacity per metre below which a voxel counts as empty; half a percent of alpha over a whole box. The window leaves
@@ -197,7 +199,7 @@ def humans_folder(blend_path: str | None = None) -> Path:
     blend = Path(blend_path if blend_path is not None else bpy.data.filepath)
     if blend.name:
         return blend.resolve().parent / f"{blend.stem}_humans"
-    return Path(bpy.app.tempdir) / "primdiffusion_humans"
+    return Path(bpy.app.tempdir) / TEMPORARY
 
 
 def stored_path(path: Path) -> str:

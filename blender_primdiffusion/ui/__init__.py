@@ -10,6 +10,7 @@ from . import (
     batch,
     captures,
     export,
+    files,
     generate,
     human,
     jobs,
@@ -22,7 +23,7 @@ from . import (
 )
 
 ROOMS = (
-    translations, setup, jobs, generate, variations, human, motion, assets, render,
+    translations, setup, jobs, generate, variations, human, files, motion, assets, render,
     captures, export, batch, manual,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
@@ -37,6 +38,7 @@ def register() -> None:
 
 def unregister() -> None:
     """All of `register` undone, the children ended."""
-    bpy.app.handlers.save_pre.remove(collect_before_saving)
+    if collect_before_saving in bpy.app.handlers.save_pre:  # 5.2 clears them before it disables extensions at exit
+        bpy.app.handlers.save_pre.remove(collect_before_saving)
     for room in reversed(ROOMS):
         room.unregister()

@@ -69,7 +69,9 @@ def _draw_blend(layout: bpy.types.UILayout, settings, _context) -> None:
 
 
 def _draw_files(layout: bpy.types.UILayout, _settings, _context) -> None:
-    """What edits have left on disk."""
+    """People's files on disk: beside the .blend, and those that edits have left."""
+    layout.operator("primdiffusion.collect_files", icon="PACKAGE")
+    layout.operator("primdiffusion.find_volumes_in_folder", icon="VIEWZOOM")
     layout.operator("primdiffusion.remove_unused_files", icon="TRASH")
 
 

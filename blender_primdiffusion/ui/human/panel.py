@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...scene.human import armature_of, humans
+from ..files.drawing import draw_missing
 from ..jobs.drawing import draw_lines
 from ..jobs.target import selected_person
 from ..manual import draw_manual_button
@@ -37,6 +38,7 @@ class PRIMDIFFUSION_PT_human(bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         """Reads the scene; changes nothing."""
+        draw_missing(self.layout)
         row = self.layout.row(align=True)
         if humans(context.scene):
             row.menu("PRIMDIFFUSION_MT_people", text="", icon="OUTLINER_OB_ARMATURE")

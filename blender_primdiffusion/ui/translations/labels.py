@@ -311,4 +311,8 @@ LABELS = (
     ("Weight", "Gewicht", "Poids"),
     ("Width", "Breite", "Largeur"),
     ("With Motion", "Mit Bewegung", "Avec le mouvement"),
+    ("Collect Files", "Dateien sammeln", "Rassembler les fichiers"),
+    ("Find Missing Volumes", "Fehlende Volumen suchen", "Chercher les volumes manquants"),
+    ("Find Volumes in Folder", "Volumen in Ordner suchen", "Chercher les volumes dans un dossier"),
+    ("Generate Again", "Nochmals erzeugen", "Générer à nouveau"),
 )

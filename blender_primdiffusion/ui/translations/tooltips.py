@@ -449,4 +449,24 @@ TOOLTIPS = (
         "Dasselbe noch einmal verlangen",
         "Demander la même chose encore une fois",
     ),
+    (
+        "Look for files of people that are missing, and make those again that cannot be found",
+        "Nach fehlenden Dateien der Menschen suchen und neu machen, was nicht zu finden ist",
+        "Chercher les fichiers de personnes qui manquent, et refaire ceux qui sont introuvables",
+    ),
+    (
+        "Choose a folder to look in for files of people that are missing",
+        "Einen Ordner wählen, in dem nach fehlenden Dateien der Menschen gesucht wird",
+        "Choisir un dossier où chercher les fichiers de personnes qui manquent",
+    ),
+    (
+        "Generate this person once more from their seed, where all of their files are lost",
+        "Diesen Menschen nochmals aus seinem Startwert erzeugen, wenn alle seine Dateien verloren sind",
+        "Générer à nouveau cette personne à partir de sa graine, quand tous ses fichiers sont perdus",
+    ),
+    (
+        "Copy all files of this file's people beside it, so that it can be moved or sent with one folder",
+        "Alle Dateien der Menschen neben diese Datei kopieren, damit beide zusammen verschoben werden können",
+        "Copier tous les fichiers des personnes à côté de ce fichier, pour les déplacer ensemble",
+    ),
 )

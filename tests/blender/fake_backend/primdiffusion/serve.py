@@ -159,10 +159,20 @@ def render(id: int, params: dict, cancelled: threading.Event) -> None:
     say(id=id, result={"out": str(out), "seconds": 0.0})
 
 
+def human_npz(id: int, params: dict, cancelled: threading.Event) -> None:
+    """Whoever is asked for, they are FAKE_HUMAN's."""
+    out = Path(params["out_dir"])
+    shutil.copyfile(os.environ["FAKE_HUMAN"], out / "human.npz")
+    shutil.copyfile(params["person"], out / "person.human.safetensors")
+    files = {"human": str(out / "human.npz"), "person": str(out / "person.human.safetensors")}
+    say(id=id, result={**files, "seconds": 0.1})
+
+
 EDITS = dict.fromkeys(("vary", "interpolate", "inpaint", "transfer"), edit)
 WORK = {
     **EDITS,
     "generate": generate,
+    "human_npz": human_npz,
     "variations": variations,
     "reconstruct": reconstruct,
     "draw": draw,

@@ -1,0 +1,74 @@
+"""Whether files of people are missing: looked up after loading, saving and undo, and by a slow timer."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..jobs.follow import redraw
+
+SOON_S = 0.5
+OFTEN_S = 15.0
+
+
+@dataclasses.dataclass
+class State:
+    """What was found when it was last looked."""
+
+    told: str = ""
+    """Like: 12 volumes of 'Human'; empty when nobody misses anything."""
+    without_person_file: tuple[str, ...] = ()
+    """People who cannot be made again from their file: their names."""
+
+
+state = State()
+
+
+def look() -> None:
+    """Find out now."""
+    from ...scene.missing import find_person, missing_files
+
+    lost = missing_files()
+    before = state.told
+    state.told = "; ".join(one.told() for one in lost)
+    state.without_person_file = tuple(
+        one.person.name for one in lost if one.person_file and not one.linked and find_person(one) is None
+    )
+    if state.told != before:
+        redraw()
+
+
+@persistent
+def look_after(*_: object) -> None:
+    """Handler of load_post and save_post."""
+    look()
+
+
+@persistent
+def look_soon(*_: object) -> None:
+    """Handler of undo_post and redo_post: several may follow on each other quickly."""
+    if bpy.app.background:
+        look()
+    else:
+        start()
+
+
+def start() -> None:
+    """Have Blender call `look` soon and now and then."""
+    if bpy.app.background:
+        return
+    stop()
+    bpy.app.timers.register(_tick, first_interval=SOON_S, persistent=True)
+
+
+def stop() -> None:
+    """Undo `start`."""
+    if bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.unregister(_tick)
+
+
+def _tick() -> float:
+    look()
+    return OFTEN_S
