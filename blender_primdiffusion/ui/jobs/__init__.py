@@ -49,8 +49,13 @@ def unregister() -> None:
     for timer in _TIMERS:
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
-    bpy.app.handlers.load_post_fail.remove(watch_after_loading)
-    bpy.app.handlers.load_post.remove(watch_after_loading)
-    bpy.app.handlers.load_pre.remove(set_aside_before_loading)
+    handlers = bpy.app.handlers
+    for listening, handler in (
+        (handlers.load_post_fail, watch_after_loading),
+        (handlers.load_post, watch_after_loading),
+        (handlers.load_pre, set_aside_before_loading),
+    ):
+        if handler in listening:  # Blender 5.2 clears them before it disables extensions at exit
+            listening.remove(handler)
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -38,7 +38,8 @@ def register() -> None:
 
 def unregister() -> None:
     """Undo `register`."""
-    bpy.app.handlers.load_pre.remove(clear_before_loading)
+    if clear_before_loading in bpy.app.handlers.load_pre:  # 5.2 clears them before it disables extensions at exit
+        bpy.app.handlers.load_pre.remove(clear_before_loading)
     clear_before_loading()
     unregister_kind(work.VariationsWork)
     del bpy.types.Scene.primdiffusion_variations
