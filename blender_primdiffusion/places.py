@@ -33,6 +33,15 @@ def own_folder() -> Path:
         return Path(bpy.app.tempdir) / "primdiffusion"
 
 
+def cache_folder() -> Path:
+    """Where children keep byte code and compiled kernels.
+
+    The environment variable `PRIMDIFFUSION_CACHE` names another folder, for several Blenders to share.
+    """
+    named = os.environ.get("PRIMDIFFUSION_CACHE", "")
+    return Path(named).absolute() if named else own_folder() / "cache"
+
+
 def set_up_folder() -> SetUpFolder:
     """Where the private environment is, or would be: lasting, and short enough for Windows."""
     try:
@@ -55,7 +64,7 @@ def new_backend(python: str) -> Backend:
 
     What Blender knows is read here: the thread that starts the child must not touch bpy.
     """
-    module_path, cache = backend_module_path(), own_folder() / "cache"
+    module_path, cache = backend_module_path(), cache_folder()
     own_environment = set_up_folder().environment
 
     def make_client() -> BackendClient:

@@ -86,6 +86,7 @@ def child_environment(module_path: Path | None, cache_dir: Path | None, extra: M
     if module_path is not None:
         environment["PYTHONPATH"] = str(module_path)
     if cache_dir is not None:
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)  # torch would be compiled anew at every start
         environment.update(PYTHONPYCACHEPREFIX=str(cache_dir / "bytecode"), NUMBA_CACHE_DIR=str(cache_dir / "numba"))
     environment.update(extra)
     return environment

@@ -224,8 +224,10 @@ def test_the_bundled_package_goes_before_an_installed_one(fake_child):
 def test_the_environment_leads_the_childs_python_nowhere_else(monkeypatch, tmp_path):
     monkeypatch.setenv("PYTHONHOME", "/blender/python")
     monkeypatch.setenv("PYTHONPATH", "/blender/scripts")
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
     environment = child_environment(tmp_path, tmp_path / "cache", {"EXTRA": "1"})
     assert "PYTHONHOME" not in environment
+    assert "PYTHONDONTWRITEBYTECODE" not in environment
     assert environment["PYTHONPATH"] == str(tmp_path)
     assert Path(environment["NUMBA_CACHE_DIR"]).is_relative_to(tmp_path / "cache")
     assert Path(environment["PYTHONPYCACHEPREFIX"]).is_relative_to(tmp_path / "cache")

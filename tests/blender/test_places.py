@@ -1,0 +1,12 @@
+"""Where the extension keeps things."""
+
+from __future__ import annotations
+
+from blender_primdiffusion import places
+
+
+def test_caches_are_our_own_unless_a_folder_is_named(monkeypatch, tmp_path):
+    monkeypatch.delenv("PRIMDIFFUSION_CACHE")
+    assert places.cache_folder().is_relative_to(places.own_folder())
+    monkeypatch.setenv("PRIMDIFFUSION_CACHE", str(tmp_path))
+    assert places.cache_folder() == tmp_path
