@@ -1,12 +1,14 @@
 """Runs inside Blender's window: installs the zip, then plays the scenes of `story.py` from a timer, a step at a time.
 
-A scene is a generator: it yields seconds to wait, or the name of a picture to take of the whole window.
+A scene is a generator. It yields seconds to wait, the name of a picture to take of the whole window, or what the hand
+is to do: {"point": [x, y], "click": True} or {"key": "Escape"}.
 """
 
 from __future__ import annotations
 
+import json
+import os
 import sys
-import time
 import traceback
 from collections.abc import Iterator
 from importlib import import_module
@@ -24,42 +26,74 @@ def play() -> Iterator[float]:
     import story
 
     yield 2.0
-    bpy.context.preferences.view.show_splash = False
     install()
     yield 0.5
-    scenes = [(name, scene) for name, scene in story.SCENES.items() if not SCENES or name in SCENES]
-    for name, scene in scenes:
+    for name, scene in story.SCENES.items():
+        if SCENES and name not in SCENES:
+            continue
         print(f"scene {name}", flush=True)
-        for step in scene(MODULE):
-            if isinstance(step, str):
-                yield from photograph(step)
-            else:
-                yield step
+        try:
+            yield from perform(scene(MODULE, PYTHON))
+        except Exception:  # the others may still be seen; the exit code tells
+            traceback.print_exc()
+            FAILED.append(name)
+
+
+def perform(steps: Iterator) -> Iterator[float]:
+    """A scene, step by step."""
+    for step in steps:
+        if isinstance(step, str):
+            yield from photograph(step)
+        elif isinstance(step, dict):
+            yield from ask(step)
+        else:
+            yield step
 
 
 def install() -> None:
     """As dragging the zip into the window does."""
     with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
         bpy.ops.extensions.package_install_files(filepath=ARCHIVE, repo="user_default", enable_on_install=True)
-    bpy.context.preferences.addons[MODULE].preferences.backend_python = PYTHON
     import_module(MODULE)
 
 
 def photograph(name: str) -> Iterator[float]:
-    """Draw the window anew, then save what it shows."""
+    """Draw the windows anew, then save what the screen shows."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             area.tag_redraw()
     yield 0.6
+    yield from ask({"picture": name, "where": where()})
+
+
+def where() -> dict[str, list[int]]:
+    """Left, top, right, bottom in pixels of the screen: the sidebar, and each window."""
+    places = {}
+    windows = bpy.context.window_manager.windows
+    full = windows[0].height
+    for number, window in enumerate(windows):
+        top = full - window.y - window.height
+        places[f"window {number}"] = [window.x, top, window.x + window.width, top + window.height]
+    for area in windows[0].screen.areas:
+        for region in area.regions:
+            if area.type == "VIEW_3D" and region.type == "UI":
+                top = full - region.y - region.height
+                places["sidebar"] = [region.x, top, region.x + region.width, top + region.height]
+    return places
+
+
+def ask(what: dict) -> Iterator[float]:
+    """Wait until it is done."""
     wanted = Path(WANTED)
-    wanted.with_suffix(".part").write_text(name)
+    wanted.with_suffix(".part").write_text(json.dumps(what))
     wanted.with_suffix(".part").rename(wanted)
     while wanted.exists():
         yield 0.1
 
 
 STEPS = play()
-LAST = [time.monotonic()]
+FAILED: list[str] = []
+"""Names of scenes."""
 
 
 def tick() -> float | None:
@@ -67,15 +101,13 @@ def tick() -> float | None:
     try:
         return next(STEPS)
     except StopIteration:
-        print("the story is over", flush=True)
-        code = 0
+        print(f"the story is over; failed: {', '.join(FAILED) or 'nothing'}", flush=True)
+        code = 1 if FAILED else 0
     except Exception:
         traceback.print_exc()
         code = 1
     sys.stdout.flush()
     if code:
-        import os
-
         os._exit(code)  # an operator cannot give Blender an exit code
     bpy.ops.wm.quit_blender()
     return None

@@ -4,14 +4,15 @@
     python scripts/window/look.py --chroot DEBIAN_FOLDER --out window_out      # Blender of a distribution in a folder
 
 Builds the zip, starts Xvfb (Debian's package xvfb) and Blender with software OpenGL, and runs `drive.py` in it, which
-plays the scenes of `story.py` and asks for pictures of the whole screen, which ImageMagick's import takes. The exit
-code is Blender's: not 0 when a scene went wrong. A chroot needs /proc, /dev, /tmp/.X11-unix and this checkout mounted
-at their own paths.
+plays the scenes of `story.py` and asks for pictures of the whole screen, which ImageMagick's import takes, and for
+clicks, which xdotool makes. Beside each NAME.png stands NAME.json: where the sidebar was. The exit code is Blender's:
+not 0 when a scene went wrong. A chroot needs /proc, /dev, /tmp/.X11-unix and this checkout mounted at their own paths.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import shutil
 import subprocess
@@ -23,7 +24,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).resolve().parent
 WANTED = "wanted"
-"""File in which drive.py names the picture it waits for."""
+"""File in which drive.py says what it waits for: a picture, a click, a key."""
+_QUIET = "import bpy; bpy.context.preferences.view.show_splash = False; bpy.ops.wm.save_userpref()"
+"""A first start would show the splash with its quick set-up over everything."""
 
 
 def free_display() -> str:
@@ -38,32 +41,45 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--blender", default="blender", help="the program, inside --chroot if that is given")
     parser.add_argument("--chroot", type=Path, help="folder of a system that has Blender (debootstrap)")
     parser.add_argument("--out", type=Path, default=ROOT / "window_out", help="folder for the pictures")
-    parser.add_argument("--size", default="1600x1000", help="of the screen, pixels")
+    parser.add_argument("--size", default="1600x1400", help="of the screen, pixels")
     parser.add_argument("--scenes", nargs="*", default=[], help="names of scenes to play; none: all")
     parser.add_argument("--python", type=Path, default=ROOT / ".venv/bin/python", help="interpreter of the backend")
-    parser.add_argument("--time", type=float, default=1500.0, help="seconds after which Blender is ended")
+    parser.add_argument("--time", type=float, default=3000.0, help="seconds after which Blender is ended")
     return parser.parse_args()
 
 
-def photograph(blender: subprocess.Popen, scratch: Path, out: Path, display: str, time_s: float) -> int:
-    """Take the pictures that `drive.py` asks for until Blender ends; its exit code.
-
-    Blender's own screenshots are black with software OpenGL.
-    """
+def serve(blender: subprocess.Popen, scratch: Path, out: Path, display: str, time_s: float) -> int:
+    """Do what `drive.py` asks for until Blender ends; its exit code."""
     began = time.monotonic()
+    wanted = scratch / WANTED
     while blender.poll() is None:
         if time.monotonic() - began > time_s:
             blender.kill()
             print(f"Blender was ended after {time_s:.0f} s", file=sys.stderr)
-        wanted = scratch / WANTED
-        if wanted.is_file() and (name := wanted.read_text()):
-            subprocess.run(
-                ["import", "-display", f":{display}", "-window", "root", str(out / f"{name}.png")], check=True
-            )
-            print(f"saved {name}.png", flush=True)
+        if wanted.is_file():
+            do(json.loads(wanted.read_text()), out, display)
             wanted.unlink()
         time.sleep(0.05)
     return blender.returncode
+
+
+def do(asked: dict, out: Path, display: str) -> None:
+    """A picture, a click, or a key. Blender's own screenshots are black with software OpenGL."""
+    hand = ["xdotool"]
+    environment = {**os.environ, "DISPLAY": f":{display}"}
+    if "picture" in asked:
+        path = out / f"{asked['picture']}.png"
+        subprocess.run(["import", "-display", f":{display}", "-window", "root", str(path)], check=True)
+        path.with_suffix(".json").write_text(json.dumps(asked["where"]))
+        print(f"saved {path.name}", flush=True)
+    if "point" in asked:
+        x, y = map(str, asked["point"])
+        subprocess.run([*hand, "mousemove", x, y], check=True, env=environment)
+    if asked.get("click"):
+        time.sleep(0.3)
+        subprocess.run([*hand, "click", "1"], check=True, env=environment)
+    if "key" in asked:
+        subprocess.run([*hand, "key", asked["key"]], check=True, env=environment)
 
 
 def main() -> int:
@@ -84,13 +100,14 @@ def main() -> int:
             "LIBGL_ALWAYS_SOFTWARE": "1",
             "BLENDER_USER_RESOURCES": str(scratch / "user"),
         }
-        command = [asked.blender, "--gpu-backend", "opengl", "--window-geometry", "0", "0", *asked.size.split("x")]
+        environment.pop("PRIMDIFFUSION_PYTHON", None)
+        program = [] if asked.chroot is None else ["chroot", str(asked.chroot)]
+        program.append(asked.blender)
+        subprocess.run([*program, "-b", "--python-expr", _QUIET], env=environment, check=True, capture_output=True)
+        command = [*program, "--gpu-backend", "opengl", "--window-geometry", "0", "0", *asked.size.split("x")]
         command += ["--python-exit-code", "1", "--python", str(HERE / "drive.py"), "--"]
         command += [str(archive), str(scratch / WANTED), str(asked.python), *asked.scenes]
-        if asked.chroot is not None:
-            command = ["chroot", str(asked.chroot), *command]
-        time.sleep(1.0)  # until the screen is there
-        return photograph(subprocess.Popen(command, env=environment), scratch, asked.out, display, asked.time)
+        return serve(subprocess.Popen(command, env=environment), scratch, asked.out, display, asked.time)
     finally:
         screen.terminate()
         shutil.rmtree(scratch, ignore_errors=True)

@@ -1,54 +1,403 @@
-"""What is looked at: each scene a generator of pictures' names and of seconds to wait (see `drive.py`)."""
+"""What is looked at: each scene a generator of pictures' names, of seconds to wait, of clicks (see `drive.py`).
+
+Every scene is told the name of the extension's module and the backend's Python, and brings about what it needs.
+"""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from importlib import import_module
+from pathlib import Path
 
 import bpy
+from panels import show, sidebar, view, wide_view
+from press import Steps, invoke, press, wait
 
-Steps = Iterator[float | str]
-
-
-def view() -> tuple[bpy.types.Window, bpy.types.Area]:
-    """The window and its 3D view."""
-    window = bpy.context.window_manager.windows[0]
-    return window, next(area for area in window.screen.areas if area.type == "VIEW_3D")
+FIRST_SEED, SECOND_SEED = 3, 53
 
 
-def sidebar() -> Iterator[float]:
-    """Show the extension's tab."""
-    _, area = view()
-    area.spaces.active.show_region_ui = True
+def set_up(module: str, python: str) -> Steps:
+    """Preferences and sidebar without a backend; with one; tried."""
+    preferences = bpy.context.preferences.addons[module].preferences
+    yield from sidebar()
+    yield "set_up_sidebar"
+    bpy.ops.screen.userpref_show("INVOKE_DEFAULT")
+    window = bpy.context.window_manager.windows[-1]
+    with bpy.context.temp_override(window=window):
+        bpy.ops.preferences.addon_show(module=module)
     yield 1.0
-    region = next(region for region in area.regions if region.type == "UI")
-    region.active_panel_category = "PrimDiffusion"
+    yield "set_up_preferences"
+    preferences.backend_python = python
+    yield 0.5
+    press("primdiffusion.test_backend")
+    session = import_module(f"{module}.ui.setup.session").session
+    yield 2.0
+    yield "set_up_testing"
+    yield from wait(lambda: not session.busy, 240)
+    yield "set_up_tested"
+    with bpy.context.temp_override(window=window):
+        bpy.ops.wm.window_close()
     yield 0.5
 
 
-def press(operator: str, **given: object) -> set[str]:
-    """A button: the operator is invoked in the 3D view, as a click does."""
-    window, area = view()
-    region = next(region for region in area.regions if region.type == "WINDOW")
-    room, name = operator.split(".")
-    with bpy.context.temp_override(window=window, area=area, region=region):
-        return getattr(getattr(bpy.ops, room), name)("INVOKE_DEFAULT", **given)
-
-
-def first_human(module: str) -> Steps:
-    """The empty panel, a person in the making, the person."""
+def first_human(module: str, python: str) -> Steps:
+    """The sidebar as it opens, a true click on Generate Human, denoising, the person."""
+    yield from begin(module, python)
     yield from sidebar()
-    yield "first_panel"
-    press("primdiffusion.generate")
-    yield 4.0
-    yield "first_progress"
-    queue = import_module(f"{module}.ui.jobs.queue").queue
-    began = time.monotonic()
-    while queue.busy and time.monotonic() - began < 120:
-        yield 0.2
+    yield "first_sidebar"
+    yield from click_generate()
+    queue = queue_of(module)
+    yield from wait(lambda: queue.busy, 5)
+    if not queue.busy:
+        raise RuntimeError("the click on Generate Human did not reach it")
+    so_far = import_module(f"{module}.ui.jobs.pictures").so_far
+    yield 1.0
+    yield "first_starting"
+    yield from wait(lambda: bool(so_far.icon) or not queue.busy, 120)
+    yield "first_denoising"
+    yield from wait(lambda: not queue.busy, 240)
     yield 2.0
+    bpy.ops.wm.save_as_mainfile(filepath=str(people_file(module)))
+    yield from rendered_view()
     yield "first_person"
 
 
-SCENES = {"first_human": first_human}
+def generate(module: str, python: str) -> Steps:
+    """A line of three, an error with its remedy, a notice, attributes."""
+    yield from with_people(module, python, FIRST_SEED)
+    yield from show("PRIMDIFFUSION_PT_generate", "PRIMDIFFUSION_PT_jobs")
+    yield "generate_notice"
+    settings = bpy.context.scene.primdiffusion
+    settings.count = 3
+    press("primdiffusion.generate")
+    yield 4.0
+    yield "generate_in_line"
+    yield from cancel_all(module)
+    settings.count = 1
+    yield "generate_cancelled"
+    preferences = bpy.context.preferences.addons[module].preferences
+    preferences.checkpoint = "/nowhere/model.safetensors"
+    press("primdiffusion.generate")
+    yield from wait(lambda: not queue_of(module).busy, 60)
+    yield "generate_error"
+    preferences.checkpoint = ""
+    attributes = settings.attributes
+    attributes.sex, attributes.outfit, attributes.hair = "female", "blouse and skirt", "braid"
+    attributes.use_height = True
+    yield from show("PRIMDIFFUSION_PT_generate", "PRIMDIFFUSION_PT_attributes")
+    yield "generate_attributes"
+    for name in ("sex", "outfit", "hair"):
+        setattr(attributes, name, "ANY")
+    attributes.use_height = False
+
+
+def variations(module: str, python: str) -> Steps:
+    """Eight in the making, the sheet, two selected."""
+    yield from begin(module, python)
+    yield from show("PRIMDIFFUSION_PT_variations")
+    bpy.context.scene.primdiffusion_variations.seeds = "CONSECUTIVE"
+    bpy.context.scene.primdiffusion.seed = 40
+    yield "variations_empty"
+    press("primdiffusion.variations")
+    queue = queue_of(module)
+    yield from wait(lambda: queue.job is not None and bool(queue.job.pictures), 120)
+    yield 0.5
+    yield "variations_denoising"
+    yield from wait(lambda: not queue.busy, 120)
+    yield "variations_sheet"
+    for index in (1, 5):
+        bpy.ops.primdiffusion.select_variation(index=index)
+    yield "variations_selected"
+    press("primdiffusion.clear_variations")
+
+
+def human(module: str, python: str) -> Steps:
+    """Shape before and after, details, edits, another person."""
+    yield from with_people(module, python, FIRST_SEED)
+    armature = armatures()[0]
+    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_shape")
+    yield from rendered_view()
+    yield "human_shape_before"
+    settings = armature.primdiffusion_human
+    settings.betas[0], settings.betas[1] = 1.5, -2.0
+    yield 6.0
+    yield "human_shape_after"
+    press("primdiffusion.reset_shape")
+    yield 4.0
+    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_details", "PRIMDIFFUSION_PT_edit_files")
+    yield "human_details"
+    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_poses")
+    bpy.context.scene.primdiffusion_motion.pose = "Waving"
+    yield 1.0
+    press("primdiffusion.apply_pose")
+    yield 6.0
+    yield "human_poses"
+    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_assets")
+    yield "human_assets"
+
+
+def edits(module: str, python: str) -> Steps:
+    """Vary, re-dress with parts and painted, transfer, blend."""
+    yield from with_people(module, python, FIRST_SEED, SECOND_SEED)
+    first, second = armatures()
+    select(first)
+    asked = bpy.context.scene.primdiffusion_edit
+    asked.other = next(c for c in second.users_collection if "primdiffusion_human" in c)
+    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_edit_transfer", "PRIMDIFFUSION_PT_edit_blend")
+    yield "edit_two_people"
+    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_edit_vary", "PRIMDIFFUSION_PT_edit_redress")
+    asked.parts = {"top"}
+    asked.attributes.outfit = "suit"
+    yield "edit_parts"
+    press("primdiffusion.redress")
+    queue = queue_of(module)
+    so_far = import_module(f"{module}.ui.jobs.pictures").so_far
+    yield from wait(lambda: bool(so_far.icon) or not queue.busy, 120)
+    yield "edit_working"
+    yield from wait(lambda: not queue.busy, 180)
+    yield from rendered_view()
+    yield "edit_redressed"
+    asked.region = "PAINTED"
+    press("primdiffusion.paint_region")
+    yield 1.0
+    paint(first)
+    _, area = view()
+    area.spaces.active.shading.type = "SOLID"
+    yield 2.0
+    yield "edit_painting"
+    press("primdiffusion.finish_painting")
+    asked.region = "PARTS"
+
+
+def motion(module: str, python: str) -> Steps:
+    """Nothing yet, the dialog with what was found in a file, after the import."""
+    yield from with_people(module, python, FIRST_SEED)
+    yield from show("PRIMDIFFUSION_PT_motion")
+    yield "motion_empty"
+    path = Path(bpy.app.tempdir) / "walk_01.npz"
+    press("primdiffusion.add_motion", motion="WALK", rounds=3)
+    press("primdiffusion.export_motion", "EXEC_DEFAULT", filepath=str(path))
+    press("primdiffusion.clear_motion")
+    yield 1.0
+    yield {"point": [500, 500]}
+    invoke("primdiffusion.import_motion", filepath=str(path))
+    yield 1.0
+    yield "motion_dialog"
+    yield {"key": "Escape"}
+    yield 0.5
+    press("primdiffusion.import_motion", "EXEC_DEFAULT", filepath=str(path))
+    yield from rendered_view()
+    bpy.context.scene.frame_set(14)
+    yield 5.0
+    yield "motion_imported"
+
+
+def render(module: str, python: str) -> Steps:
+    """Engine and Cycles, attachment, merging, gain, memory."""
+    yield from with_people(module, python, FIRST_SEED)
+    names = ("render", "attachment", "merge", "cycles_look", "memory")
+    yield from show(*(f"PRIMDIFFUSION_PT_{name}" for name in names))
+    press("primdiffusion.set_up_cycles")
+    yield "render_cycles"
+    press("primdiffusion.set_attachment", mode="SURFACE")
+    yield 1.0
+    yield "render_surface"
+    queue = queue_of(module)
+    press("primdiffusion.merge")
+    yield 3.0
+    yield "render_merging"
+    yield from wait(lambda: not queue.busy, 240)
+    yield "render_merged"
+    press("primdiffusion.apply_pose", pose_name="Waving")
+    press("primdiffusion.fit_density_gain")
+    yield from wait(lambda: not queue.busy, 240)
+    press("primdiffusion.set_up_engine")
+    yield "render_outdated"
+
+
+def captures(module: str, python: str) -> Steps:
+    """Render Captures with its cameras, Human from Captures."""
+    yield from begin(module, python)
+    yield from show("PRIMDIFFUSION_PT_captures", "PRIMDIFFUSION_PT_captures_cameras", "PRIMDIFFUSION_PT_captures_poses")
+    bpy.context.scene.primdiffusion_captures.people = "//scans"
+    bpy.context.scene.primdiffusion_captures.out = "//captures"
+    press("primdiffusion.preview_rig")
+    yield 1.0
+    yield "captures_cameras"
+    press("primdiffusion.preview_rig")
+    yield from show(
+        "PRIMDIFFUSION_PT_captures", *(f"PRIMDIFFUSION_PT_captures_{name}" for name in ("input", "cycles", "output"))
+    )
+    yield "captures_output"
+    yield from show("PRIMDIFFUSION_PT_captures", "PRIMDIFFUSION_PT_human_from_captures")
+    bpy.context.scene.primdiffusion_reconstruct.capture = "/nowhere/captures"
+    press("primdiffusion.human_from_captures")
+    yield from wait(lambda: not queue_of(module).busy, 60)
+    yield "captures_human"
+
+
+def export(module: str, python: str) -> Steps:
+    """All of Export; the mesh proxy in the scene."""
+    yield from with_people(module, python, FIRST_SEED)
+    yield from show(*(f"PRIMDIFFUSION_PT_export{name}" for name in ("", "_mesh", "_volumes")))
+    yield "export_before"
+    press("primdiffusion.add_proxy")
+    queue = queue_of(module)
+    yield 3.0
+    yield "export_working"
+    yield from wait(lambda: not queue.busy, 300)
+    _, area = view()
+    area.spaces.active.shading.type = "MATERIAL"
+    yield 4.0
+    yield "export_proxy"
+
+
+def left(module: str, python: str) -> Steps:
+    """Another file is opened while works are in line."""
+    yield from begin(module, python)
+    bpy.context.scene.primdiffusion.count = 3
+    press("primdiffusion.generate")
+    yield 3.0
+    yield from begin(module, python)
+    yield from sidebar()
+    yield "left_offered"
+    press("primdiffusion.discard_works")
+
+
+def missing(module: str, python: str) -> Steps:
+    """The person's files are away."""
+    yield from with_people(module, python, FIRST_SEED)
+    folder = people_file(module).with_name(people_file(module).stem + "_humans")
+    away = folder.with_name("elsewhere")
+    folder.rename(away)
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(people_file(module)), load_ui=False)
+        yield 2.0
+        yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_edit_files")
+        yield "missing_files"
+        yield from show(None)
+        yield "missing_all"
+    finally:
+        away.rename(folder)
+
+
+def languages(module: str, python: str) -> Steps:
+    """The interface in German and French."""
+    yield from with_people(module, python, FIRST_SEED)
+    names = ("generate", "attributes", "variations", "human", "shape", "motion")
+    for language in ("de_DE", "fr_FR"):
+        bpy.context.preferences.view.language = language
+        bpy.context.preferences.view.use_translate_interface = True
+        yield from show(*(f"PRIMDIFFUSION_PT_{name}" for name in names))
+        yield f"language_{language[:2]}"
+    bpy.context.preferences.view.language = "en_US"
+
+
+def begin(module: str, python: str) -> Steps:
+    """A new file, a backend."""
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    yield 1.5
+    bpy.context.preferences.addons[module].preferences.backend_python = python
+    for thing in list(bpy.data.objects):
+        if thing.type == "MESH":
+            bpy.data.objects.remove(thing)
+
+
+def with_people(module: str, python: str, *seeds: int) -> Steps:
+    """A file with these people, made once."""
+    yield from begin(module, python)
+    path = people_file(module, len(seeds))
+    if path.is_file():
+        bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False)
+    else:
+        for seed in seeds:
+            press("primdiffusion.generate", seed=seed)
+        yield from wait(lambda: not queue_of(module).busy, 400)
+        bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    yield 1.0
+    select(armatures()[0])
+
+
+def people_file(module: str, count: int = 1) -> Path:
+    """Beside the installed extension: gone with it."""
+    folder = Path(import_module(module).__file__).parents[3]
+    return folder / f"people_{count}.blend"
+
+
+def queue_of(module: str):
+    """The line of works."""
+    return import_module(f"{module}.ui.jobs.queue").queue
+
+
+def cancel_all(module: str) -> Steps:
+    """Empty the line."""
+    queue = queue_of(module)
+    while queue.busy:
+        press("primdiffusion.cancel")
+        yield 0.3
+
+
+def armatures() -> list[bpy.types.Object]:
+    """Of the people, in the order of their making."""
+    return sorted((thing for thing in bpy.context.scene.objects if thing.type == "ARMATURE"), key=lambda t: t.name)
+
+
+def select(armature: bpy.types.Object) -> None:
+    """The person of whom the panels tell."""
+    for thing in bpy.context.view_layer.objects:
+        thing.select_set(False)
+    armature.select_set(True)
+    bpy.context.view_layer.objects.active = armature
+
+
+def paint(armature: bpy.types.Object) -> None:
+    """A chest of the body mesh, by weights: a brush's strokes need a hand."""
+    body = bpy.context.view_layer.objects.active
+    group = body.vertex_groups.active
+    mode = body.mode
+    bpy.ops.object.mode_set(mode="OBJECT")
+    rest = armature.data.bones
+    low, high = rest["spine1"].head_local.z, rest["neck"].head_local.z
+    wanted = [v.index for v in body.data.vertices if low < (body.matrix_local @ v.co).z < high and abs(v.co.x) < 0.17]
+    group.add(wanted, 1.0, "REPLACE")
+    bpy.ops.object.mode_set(mode=mode)
+
+
+def rendered_view() -> Steps:
+    """The engine in the viewport, the person large in it."""
+    scene = bpy.context.scene
+    scene.render.engine = "PRIMDIFFUSION"
+    scene.view_settings.view_transform = "Standard"
+    wide_view()
+    yield 8.0
+
+
+def click_generate() -> Steps:
+    """With the mouse, where the button is."""
+    window, area = view()
+    region = next(region for region in area.regions if region.type == "UI")
+    x = region.x + region.width // 2 - 20
+    top = window.height - region.y - region.height
+    yield {"point": [x, top + GENERATE_BUTTON_PX], "click": True}
+    yield 0.5
+    yield {"point": [x - 400, top + 300]}
+
+
+GENERATE_BUTTON_PX = 118
+"""Below the top of the sidebar, in the panel as it opens."""
+
+SCENES: dict[str, Callable[[str, str], Steps]] = {
+    "set_up": set_up,
+    "first_human": first_human,
+    "generate": generate,
+    "variations": variations,
+    "human": human,
+    "edits": edits,
+    "motion": motion,
+    "render": render,
+    "captures": captures,
+    "export": export,
+    "left": left,
+    "missing": missing,
+    "languages": languages,
+}

@@ -1,0 +1,101 @@
+"""A scene to take pictures in: Blender as a module with the extension, people, a tiled floor, a camera."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import bpy
+from mathutils import Vector
+
+BACKGROUND = (0.32, 0.36, 0.42)
+_TILES = ((0.20, 0.22, 0.25, 1.0), (0.25, 0.27, 0.30, 1.0))
+_FLOOR_TILES = 64
+
+
+def empty_file(blend: Path) -> bpy.types.Scene:
+    """A saved file with nothing in it, the extension registered and its backend this interpreter."""
+    if not hasattr(bpy.types, "PRIMDIFFUSION_OT_generate"):
+        import blender_primdiffusion
+
+        blender_primdiffusion.register()
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(blend))
+    scene = bpy.context.scene
+    scene.render.engine = "PRIMDIFFUSION"
+    scene.view_settings.view_transform = "Standard"
+    scene.world = bpy.data.worlds.new("World")
+    scene.world.color = BACKGROUND
+    if scene.world.node_tree is not None:
+        background = next(node for node in scene.world.node_tree.nodes if node.type == "BACKGROUND")
+        background.inputs["Color"].default_value = (*BACKGROUND, 1.0)
+    return scene
+
+
+def generate(seed: int, place: tuple[float, float] = (0.0, 0.0), attributes: str = "") -> bpy.types.Collection:
+    """A person standing at x, y, selected."""
+    before = set(bpy.data.collections)
+    bpy.ops.primdiffusion.generate(seed=seed, steps=30, attributes=attributes)
+    person = next(c for c in set(bpy.data.collections) - before if "primdiffusion_human" in c)
+    armature = armature_of(person)
+    armature.location.xy = place
+    bpy.context.view_layer.objects.active = armature
+    return person
+
+
+def armature_of(person: bpy.types.Collection) -> bpy.types.Object:
+    """What is posed and placed."""
+    return next(thing for thing in person.objects if thing.type == "ARMATURE")
+
+
+def pose(person: bpy.types.Collection, name: str) -> None:
+    """From the library."""
+    bpy.context.view_layer.objects.active = armature_of(person)
+    bpy.ops.primdiffusion.apply_pose(pose_name=name)
+
+
+def tiled_floor(scene: bpy.types.Scene, tile: float) -> bpy.types.Object:
+    """Tiles of two greys, `tile` metres a side; the pattern repeats after two."""
+    half = _FLOOR_TILES * tile / 2
+    corners = [
+        (x * tile - half, y * tile - half, 0.0) for y in range(_FLOOR_TILES + 1) for x in range(_FLOOR_TILES + 1)
+    ]
+    row = _FLOOR_TILES + 1
+    starts = [y * row + x for y in range(_FLOOR_TILES) for x in range(_FLOOR_TILES)]
+    mesh = bpy.data.meshes.new("Floor")
+    mesh.from_pydata(corners, [], [(i, i + 1, i + row + 1, i + row) for i in starts])
+    for number, colour in enumerate(_TILES):
+        material = bpy.data.materials.new(f"Tile {number}")
+        material.diffuse_color = colour
+        if material.node_tree is not None:
+            principled = next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
+            principled.inputs["Base Color"].default_value = colour
+        mesh.materials.append(material)
+    for start, polygon in zip(starts, mesh.polygons, strict=True):
+        polygon.material_index = (start // row + start % row) % 2
+    floor = bpy.data.objects.new("Floor", mesh)
+    scene.collection.objects.link(floor)
+    return floor
+
+
+def look(scene: bpy.types.Scene, stand: tuple, at: tuple, lens: float = 50.0) -> bpy.types.Object:
+    """A camera at `stand` that looks at `at`."""
+    data = bpy.data.cameras.new("Camera")
+    data.lens = lens
+    camera = bpy.data.objects.new("Camera", data)
+    scene.collection.objects.link(camera)
+    camera.location = stand
+    camera.rotation_euler = (Vector(at) - Vector(stand)).to_track_quat("-Z", "Y").to_euler()
+    scene.camera = camera
+    return camera
+
+
+def render(scene: bpy.types.Scene, path: Path, size: tuple[int, int]) -> Path:
+    """A PNG."""
+    scene.render.resolution_x, scene.render.resolution_y = size
+    scene.render.resolution_percentage = 100
+    scene.render.image_settings.file_format = "PNG"
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+    print(f"rendered {path.name}", file=sys.stderr, flush=True)
+    return path

@@ -1,0 +1,117 @@
+"""Stills of the manual: the engine and Cycles, a group, somebody re-dressed and reshaped, the poses of the library."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import bpy
+from PIL import Image
+
+from .shrink import save_png
+from .stage import armature_of, empty_file, generate, look, pose, render, tiled_floor
+
+SIZE = (360, 480)
+_STAND, _AT, _LENS = (1.1, -5.2, 1.25), (0.0, 0.0, 0.88), 78.0
+_TILE = 0.5
+
+
+def stills(scratch: Path, out: Path, only: list[str]) -> None:
+    """All of them, or those named."""
+    for name, still in STILLS.items():
+        if not only or name in only:
+            folder = scratch / name
+            folder.mkdir()
+            save_png(_row(still(folder)), out / f"{name}.png")
+
+
+def engine_and_cycles(folder: Path) -> list[Path]:
+    """One person by the engine, and merged in Cycles with an object that mirrors them."""
+    scene = _stage(folder, 3, "Hands on Hips")
+    exact = render(scene, folder / "engine.png", SIZE)
+    bpy.ops.primdiffusion.merge(voxel=0.005)
+    bpy.ops.primdiffusion.set_up_cycles()
+    sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
+    sun.rotation_euler = (0.6, 0.3, 0.4)
+    sun.data.energy = 2.5
+    scene.collection.objects.link(sun)
+    return [exact, render(scene, folder / "cycles.png", SIZE)]
+
+
+def group(folder: Path) -> list[Path]:
+    """Six people in poses of the library."""
+    scene = empty_file(folder / "group.blend")
+    people = (
+        (12, "Waving"),
+        (53, "Arms Crossed"),
+        (3, "Hands on Hips"),
+        (23, "Cheering"),
+        (34, "Thinking"),
+        (0, "Relaxed"),
+    )
+    for number, (seed, name) in enumerate(people):
+        row = number % 2
+        pose(generate(seed, ((number - 2.5) * 0.62, 0.35 - row * 0.7)), name)
+    tiled_floor(scene, _TILE)
+    look(scene, (1.0, -8.2, 1.6), (0.0, 0.0, 0.93), 70)
+    return [render(scene, folder / "group.png", (840, 480))]
+
+
+def redressed(folder: Path) -> list[Path]:
+    """One person, in a tee instead of the jacket, then in shorts too."""
+    scene = _stage(folder, 0, "Contrapposto")
+    pictures = [render(scene, folder / "before.png", SIZE)]
+    for part, outfit in (("top", "tee and jeans"), ("bottom", "tee and shorts")):
+        bpy.ops.primdiffusion.redress(parts={part}, attributes=f"outfit={outfit}", seed=5)
+        pictures.append(render(scene, folder / f"{part}.png", SIZE))
+    return pictures
+
+
+def reshaped(folder: Path) -> list[Path]:
+    """One person, shorter and heavier, taller and lighter."""
+    scene = _stage(folder, 12, "Relaxed")
+    pictures = []
+    for number, (height, weight) in enumerate(((1.55, 80.0), (1.72, 68.0), (1.9, 75.0))):
+        bpy.ops.primdiffusion.reshape(height=height, weight=weight)
+        pictures.append(render(scene, folder / f"{number}.png", SIZE))
+    return pictures
+
+
+def views(folder: Path) -> list[Path]:
+    """Colour, depth, alpha and primitives of the engine."""
+    scene = _stage(folder, 23, "Walking")
+    pictures = []
+    for name in ("COLOUR", "DEPTH", "ALPHA", "BOXES"):
+        scene.primdiffusion_render.view = name
+        pictures.append(render(scene, folder / f"{name}.png", (300, 480)))
+    return pictures
+
+
+def _stage(folder: Path, seed: int, name: str) -> bpy.types.Scene:
+    scene = empty_file(folder / "still.blend")
+    person = generate(seed)
+    pose(person, name)
+    tiled_floor(scene, _TILE)
+    look(scene, _STAND, _AT, _LENS)
+    bpy.context.view_layer.objects.active = armature_of(person)
+    return scene
+
+
+def _row(paths: list[Path]) -> Image.Image:
+    """Side by side."""
+    pictures = [Image.open(path).convert("RGB") for path in paths]
+    row = Image.new("RGB", (sum(p.width for p in pictures), max(p.height for p in pictures)))
+    x = 0
+    for picture in pictures:
+        row.paste(picture, (x, 0))
+        x += picture.width
+    return row
+
+
+STILLS: dict[str, Callable[[Path], list[Path]]] = {
+    "engine_and_cycles": engine_and_cycles,
+    "group": group,
+    "redressed": redressed,
+    "reshaped": reshaped,
+    "views": views,
+}

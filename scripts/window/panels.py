@@ -1,0 +1,86 @@
+"""The sidebar: all of it as it opens, or some panels alone, opened."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import bpy
+from mathutils import Euler, Vector
+
+_OURS = "PrimDiffusion"
+_shown: set[str] | None = None
+"""Panels to show; None: all there are."""
+
+
+def view() -> tuple[bpy.types.Window, bpy.types.Area]:
+    """The window and its 3D view."""
+    window = bpy.context.window_manager.windows[0]
+    return window, next(area for area in window.screen.areas if area.type == "VIEW_3D")
+
+
+def sidebar() -> Iterator[float]:
+    """Show the extension's tab."""
+    _, area = view()
+    area.spaces.active.show_region_ui = True
+    yield 1.0
+    _, area = view()
+    region = next(region for region in area.regions if region.type == "UI")
+    region.active_panel_category = _OURS
+    yield 0.5
+
+
+def show(*names: str | None) -> Iterator[float]:
+    """These panels alone, opened; all for None.
+
+    Blender opens and closes panels for hands alone. So they are registered anew, open unless told otherwise, and
+    what is not wanted polls False.
+    """
+    global _shown
+    _shown = None if names == (None,) else {name for name in names if name}
+    opened = bpy.types.PRIMDIFFUSION_PT_generate.__dict__.get("window_story")
+    if not opened:
+        _open_all()
+    yield from sidebar()
+
+
+def _open_all() -> None:
+    classes = [cls for cls in bpy.types.Panel.__subclasses__() if _is_ours(cls)]
+    classes.sort(key=lambda cls: bool(getattr(cls, "bl_parent_id", "")))
+    for cls in reversed(classes):
+        bpy.utils.unregister_class(cls)
+    for cls in classes:
+        cls.bl_idname = getattr(cls, "bl_idname", cls.__name__)
+        cls.bl_options = {*getattr(cls, "bl_options", ())} - {"DEFAULT_CLOSED"}
+        cls.poll = _polled(cls, getattr(cls, "poll", None))
+        cls.window_story = True
+        bpy.utils.register_class(cls)
+
+
+def _polled(cls: type, before) -> classmethod:
+    def poll(_cls, context: bpy.types.Context) -> bool:
+        if _shown is not None and _cls.bl_idname not in _shown:
+            return False
+        return before is None or before(context)
+
+    return classmethod(poll)
+
+
+def _is_ours(cls: type) -> bool:
+    return (
+        cls.__name__.startswith("PRIMDIFFUSION_PT_") and getattr(cls, "bl_category", "") == _OURS and cls.is_registered
+    )
+
+
+def wide_view() -> None:
+    """The 3D view rendered, from the front, at people's height, without a grid over them."""
+    _, area = view()
+    space = area.spaces.active
+    space.shading.type = "RENDERED"
+    space.overlay.show_overlays = True
+    space.overlay.show_bones = False
+    region = space.region_3d
+    region.view_perspective = "PERSP"
+    region.view_location = Vector((0.25, 0.0, 0.85))
+    region.view_rotation = Euler((1.5, 0.0, 0.35)).to_quaternion()
+    region.view_distance = 3.6
+    space.overlay.show_floor = True

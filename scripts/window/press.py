@@ -1,0 +1,36 @@
+"""Buttons, and waiting for what they do."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import bpy
+from panels import view
+
+Steps = Iterator[float | str | dict]
+
+
+def press(operator: str, how: str = "INVOKE_DEFAULT", **given: object) -> set[str]:
+    """A button: the operator is invoked in the 3D view, as a click does; it may refuse, as buttons do."""
+    window, area = view()
+    region = next(region for region in area.regions if region.type == "WINDOW")
+    room, name = operator.split(".")
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        try:
+            return getattr(getattr(bpy.ops, room), name)(how, **given)
+        except RuntimeError as error:
+            print(f"{operator}: {error}", flush=True)
+            return {"CANCELLED"}
+
+
+def invoke(operator: str, **given: object) -> set[str]:
+    """The same, for operators that open a dialog."""
+    return press(operator, "INVOKE_DEFAULT", **given)
+
+
+def wait(over: Callable[[], bool], most_s: float) -> Steps:
+    """Until something is over."""
+    began = time.monotonic()
+    while not over() and time.monotonic() - began < most_s:
+        yield 0.1
