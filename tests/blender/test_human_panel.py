@@ -15,7 +15,8 @@ from oracle import evaluated_matrices
 
 from blender_primdiffusion.scene.attachment import set_attachment
 from blender_primdiffusion.scene.body_mesh import body_of
-from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, build_human, folder_of, humans, person_file
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, folder_of, humans, person_file
 from blender_primdiffusion.scene.keyframes import keyframe_poses
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, reshape, shape_model_of
 from blender_primdiffusion.scene.shape_measures import measure
@@ -202,7 +203,7 @@ def test_an_empty_name_is_refused_and_a_taken_one_gets_a_number(person, other, c
 def test_choosing_a_person_makes_their_armature_active(person, other, addon):
     with pytest.raises(RuntimeError, match="2 people are in the scene"):
         ops.select_human()
-    assert "Nobody is selected" in shown(PRIMDIFFUSION_PT_human, addon)
+    assert "2 people are in the scene: select" in shown(PRIMDIFFUSION_PT_human, addon)
     assert shown(PRIMDIFFUSION_MT_people, addon).count("primdiffusion.select_human") == 2
     ops.select_human(human="Ötzi")
     assert addon.view_layer.objects.active == armature_of(other)

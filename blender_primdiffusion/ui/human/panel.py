@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...scene.human import armature_of, humans
+from ...worker.sentence import sentence
 from ..files.drawing import draw_missing
 from ..jobs.drawing import draw_lines
 from ..jobs.target import selected_person
@@ -45,8 +46,7 @@ class PRIMDIFFUSION_PT_human(bpy.types.Panel):
         try:
             settings = armature_of(selected_person(context)).primdiffusion_human
         except ValueError as error:
-            row.label(text="Nobody is selected")
-            draw_lines(self.layout, str(error), "INFO")
+            draw_lines(self.layout, sentence(error), "INFO")
             return
         row.prop(settings, "person", text="")
         row.operator("primdiffusion.select_human", text="", icon="RESTRICT_SELECT_OFF")

@@ -10,8 +10,8 @@ from ...worker.sentence import sentence
 from .known import chosen, cost, known
 from .session import session
 
-_SIDEBAR = 46
-"""Characters in a line of a sidebar of ordinary width."""
+_SIDEBAR = 30
+"""Characters that fit a box in a sidebar as wide as Blender makes it, beside an icon."""
 ONLINE = "Blender may not use the network: allow it in System > Network > Allow Online Access, or install from a folder"
 
 
