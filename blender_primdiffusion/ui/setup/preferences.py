@@ -72,20 +72,11 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
             size = f"{gigabytes(now.about['bytes'])} in " if "bytes" in now.about else ""
             draw_text(box, f"{size}{folder.environment}", "FILE_FOLDER", _WIDTH)
         if now.state != "named":
-            self._draw_private(box)
+            _draw_private(self, box)
         self._draw_buttons(box, now.state, folder.environment.is_dir())
         draw_news(box, _WIDTH)
         if session.error and folder.log.is_file():
             box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(folder.log)
-
-    def _draw_private(self, box: bpy.types.UILayout) -> None:
-        row = box.row()
-        row.prop(self, "compute", expand=True)
-        draw_text(box, f"Found: {machine().described}", "SYSTEM", _WIDTH)
-        draw_cost(box, _WIDTH)
-        row = box.row()
-        row.operator("primdiffusion.set_up_backend", icon="IMPORT")
-        row.operator("primdiffusion.install_from_folder", icon="FILE_FOLDER")
 
     def _draw_buttons(self, box: bpy.types.UILayout, state: str, private: bool) -> None:
         row = box.row()
@@ -93,3 +84,14 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         if private or state not in {"absent", "own Python", "named"}:
             row.operator("primdiffusion.repair_backend", icon="TOOL_SETTINGS")
             row.operator("primdiffusion.remove_backend", icon="TRASH")
+
+
+def _draw_private(preferences: PRIMDIFFUSION_AP_preferences, box: bpy.types.UILayout) -> None:
+    """Of the private environment: for what, at which cost, the buttons."""
+    row = box.row()
+    row.prop(preferences, "compute", expand=True)
+    draw_text(box, f"Found: {machine().described}", "SYSTEM", _WIDTH)
+    draw_cost(box, _WIDTH)
+    row = box.row()
+    row.operator("primdiffusion.set_up_backend", icon="IMPORT")
+    row.operator("primdiffusion.install_from_folder", icon="FILE_FOLDER")
