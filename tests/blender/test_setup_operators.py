@@ -90,7 +90,7 @@ def draw_preferences() -> Layout:
     layout = Layout()
     fake = type("Preferences", (), {"layout": layout})()
     fake._draw_backend = lambda box: preferences.PRIMDIFFUSION_AP_preferences._draw_backend(fake, box)
-    fake._draw_buttons = lambda box, state: preferences.PRIMDIFFUSION_AP_preferences._draw_buttons(fake, box, state)
+    fake._draw_buttons = lambda box, *told: preferences.PRIMDIFFUSION_AP_preferences._draw_buttons(fake, box, *told)
     preferences.PRIMDIFFUSION_AP_preferences.draw(fake, bpy.context)
     return layout
 
