@@ -37,7 +37,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import blender_primdiffusion
 from blender_primdiffusion.engine import final
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.human import armature_of, build_human
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.human import armature_of
 
 SIZE = 512
 WARM_UP, FRAMES = 3, 15

@@ -28,7 +28,8 @@ from walk import walk_and_wave
 
 import blender_primdiffusion
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.human import armature_of, build_human
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.human import armature_of
 
 ROOT = Path(__file__).resolve().parents[1]
 WIDTH, HEIGHT = 300, 420

@@ -37,7 +37,8 @@ def register(_arguments: argparse.Namespace) -> dict[str, float]:
 def person(arguments: argparse.Namespace) -> dict[str, float | None]:
     """One person: building, memory, frames, motion, errors of both attachments."""
     _enable(arguments)
-    from blender_primdiffusion.scene.human import armature_of, build_human
+    from blender_primdiffusion.scene.build import build_human
+    from blender_primdiffusion.scene.human import armature_of
 
     context = bpy.context
     _trim()
@@ -71,7 +72,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float | None]:
 def merged(arguments: argparse.Namespace) -> dict[str, float]:
     """The same Cycles frame with 1024 volumes and with one."""
     _enable(arguments)
-    from blender_primdiffusion.scene.human import build_human
+    from blender_primdiffusion.scene.build import build_human
     from blender_primdiffusion.scene.preview import setup_cycles_preview
 
     folder = arguments.folder / "person"

@@ -37,8 +37,9 @@ import blender_primdiffusion
 from blender_primdiffusion.scene import merged as merging
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import set_attachment
+from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.gain import set_density_gain
-from blender_primdiffusion.scene.human import armature_of, build_human
+from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.keyframes import keyframe_poses
 from blender_primdiffusion.scene.memory import person_memory
 from blender_primdiffusion.scene.preview import setup_cycles_preview

@@ -26,7 +26,7 @@ from primdiffusion.human_file import export_for_blender
 from record import tell
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from blender_primdiffusion.scene.human import build_human
+from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.shape import reshape, shape_model_of
 
 MOVES, QUICK_MOVES = 30, 5

@@ -10,9 +10,9 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
+from .folders import stored_path
 from .joints import JOINT_NAMES
 from .quaternion import matrix_to_quaternion
-from .volumes import stored_path
 
 
 def attach_volumes(

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import bpy
 
-from .edited import check_editable
-from .merged import merged_of
-from .surface import build_surface, carrier_of, primitives_of
-
 ATTACHMENT = "primdiffusion_attachment"
 """Custom property of a person's collection: one of MODES; ARMATURE where it is missing."""
 MODES = ("ARMATURE", "SURFACE", "MERGED")
@@ -28,6 +24,10 @@ def set_attachment(collection: bpy.types.Collection, mode: str) -> None:
     `merged.show_merged` in one pose. Raises ValueError or FileNotFoundError, with what to do, before anything changes;
     makes no undo step, its caller does.
     """
+    from .edited import check_editable
+    from .merged import merged_of
+    from .surface import build_surface, carrier_of, primitives_of
+
     if mode not in MODES:
         raise ValueError(f"there is no attachment {mode!r}: choose from {', '.join(MODES)}")
     check_editable(collection)

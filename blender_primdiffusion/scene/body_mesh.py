@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import bpy
-import numpy as np
-from numpy.typing import NDArray
 
 from .joints import JOINT_NAMES
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 MARK = "primdiffusion_body"
 """Custom property of a body mesh: the engine leaves it out, shown or hidden."""
@@ -25,6 +28,8 @@ def build_body_mesh(
     Vertex groups carry skin_weights [V, 24]; the Armature modifier blends matrices linearly (preserve volume off), as
     SMPL does. It is hidden in renders and in the viewport: the volumes are what one looks at.
     """
+    import numpy as np  # not for those who ask for `body_of` alone: Blender starts without it
+
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(vertices))
     mesh.vertices.foreach_set("co", np.asarray(vertices, np.float32).ravel())

@@ -13,11 +13,12 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
+from .folders import TEMPORARY, humans_folder
 from .human import HOME, MARK, PERSON, folders_of, person_file_name, volume_path
 from .merged import sequence_files
 from .placing_files import free_name, put_copy
 from .shape_file import BODY_FILE
-from .volumes import TEMPORARY, VolumeWriteError, humans_folder
+from .volumes import VolumeWriteError
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,17 +15,9 @@ import bpy
 import numpy as np
 
 from . import merged, shape_file, volumes
-from .human import (
-    MARK,
-    PERSON,
-    armature_of,
-    folder_of,
-    folders_of,
-    people_files,
-    person_file_name,
-    provenance,
-    volume_path,
-)
+from .build import provenance
+from .folders import humans_folder, stored_path
+from .human import MARK, PERSON, armature_of, folder_of, folders_of, people_files, person_file_name, volume_path
 from .human_file import read_human
 from .placing_files import named_by_content
 from .shape import (
@@ -108,7 +100,7 @@ def replace_person(collection: bpy.types.Collection, human_npz: Path, person: Pa
     for k, objects in shown.items():
         for thing in objects:
             if volume_path(thing.data) != files[k]:
-                own_data(thing, collection).filepath = volumes.stored_path(files[k])
+                own_data(thing, collection).filepath = stored_path(files[k])
                 changed += 1
     collection[MARK] = provenance(human, grids)
     collection[PERSON] = name
@@ -141,7 +133,7 @@ def home_of(collection: bpy.types.Collection) -> Path:
     """
     folders = folders_of(collection)
     home = next((folder for folder in folders if (folder / person_file_name(collection)).is_file()), folders[0])
-    for own in (volumes.humans_folder(), volumes.humans_folder("")):
+    for own in (humans_folder(), humans_folder("")):
         if home.resolve().is_relative_to(own.resolve()):
             return home
     return folder_of(collection)

@@ -16,9 +16,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from .folders import stored_path
 from .gain import person_material
 from .human import armature_of, folders_of, person_file_name, volume_path
-from .volumes import VolumeWriteError, stored_path
+from .volumes import VolumeWriteError
 
 MARK = "primdiffusion_merged"
 """Custom property of a merged object: its `MergedState` as JSON."""

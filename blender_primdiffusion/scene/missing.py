@@ -15,8 +15,9 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from . import merged, shape_file, volumes
+from . import merged, shape_file
 from .exported_human import read_tensors
+from .folders import humans_folder, stored_path
 from .human import HOME, MARK, PERSON_FILE, folder_of, folders_of, person_file_name, volume_path
 from .listing import Listing
 from .placing_files import put_copy
@@ -114,13 +115,13 @@ def repair(lost: Sequence[Lost], found: dict[str, Path]) -> int:
         for volume in one.volumes:
             path = found.get(volume_path(volume).name)
             if path is not None and volume.library is None:
-                volume.filepath = volumes.stored_path(path)
+                volume.filepath = stored_path(path)
                 repaired += 1
         for volume in one.merged:
             path = found.get(volume_path(volume).name)
             whole = path is not None and all((path.parent / name).is_file() for name in _sequence_names(volume))
             if whole and volume.library is None:
-                volume.filepath = volumes.stored_path(path)
+                volume.filepath = stored_path(path)
                 repaired += 1
     return repaired
 
@@ -185,7 +186,7 @@ def _likely() -> Iterator[Path]:
     yield from homes
     shown = {volume_path(volume).parent for volume in bpy.data.volumes if volume.filepath}
     yield from sorted(shown)
-    roots = [volumes.humans_folder(), *(folder.parent for folder in (*homes, *sorted(shown)))]
+    roots = [humans_folder(), *(folder.parent for folder in (*homes, *sorted(shown)))]
     blend = Path(bpy.data.filepath)
     if blend.name:
         roots += _folders_in(blend.resolve().parent, "_humans")  # of a .blend that had another name

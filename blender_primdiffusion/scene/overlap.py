@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-CYCLES_LIMIT = 31
-
 
 def most_overlapping(centre: NDArray, rotation: NDArray, half: NDArray) -> int:
     """The largest number of boxes (centre, axes in columns, half sides) over one point; 27 points of each are tried."""

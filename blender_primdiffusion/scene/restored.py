@@ -8,6 +8,7 @@ import bpy
 
 from . import volumes
 from .edited import check_editable, home_of
+from .folders import stored_path
 from .human import PERSON, person_file_name, volume_path
 from .human_file import read_human
 from .placing_files import free_name
@@ -40,7 +41,7 @@ def restore_volumes(collection: bpy.types.Collection, human_npz: Path, person: P
         pass
     for k, objects in shown.items():
         for thing in lost.intersection(objects):
-            thing.data.filepath = volumes.stored_path(files[k])
+            thing.data.filepath = stored_path(files[k])
     if name != person_file_name(collection):
         collection[PERSON] = name
     for thing in lost:

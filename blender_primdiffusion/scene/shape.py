@@ -21,9 +21,9 @@ from .convention import frames_to_blender, points_to_blender
 from .human import BETAS, MARK, armature_of, folders_of, volume_path
 from .joints import JOINT_NAMES
 from .quaternion import matrix_to_quaternion
-from .shape_measures import LARGEST_BETA
-from .shape_model import BETAS as COUNT
 from .shape_model import Rest, ShapeModel
+from .shape_names import BETAS as COUNT
+from .shape_names import LARGEST_BETA
 
 PRIMITIVE = re.compile(r"prim_(\d{4,})_[0-9a-f]{12}\.vdb")
 """Names of the files of volumes."""

@@ -8,10 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .shape_model import BETAS, ShapeModel
+from .shape_model import ShapeModel
+from .shape_names import BETAS, LARGEST_BETA
 
-LARGEST_BETA = 5.0
-"""Beyond, bodies of linear shape models fall apart."""
 DENSITY = 985.0
 """kg/m^3 of a living person with air in the lungs."""
 MOST_CORRECTIONS = 20

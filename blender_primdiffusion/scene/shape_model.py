@@ -8,8 +8,8 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-BETAS = 10
-"""Shape components."""
+from .shape_names import BETAS
+
 _TINY = 1e-12
 """What the backend divides by at least when it normalises."""
 

@@ -1,9 +1,16 @@
-"""What the sliders of a shape are called."""
+"""What is known of shapes without numbers: how many coefficients, how far they go, what their sliders are called."""
 
 from __future__ import annotations
 
-from .shape_model import BETAS, ShapeModel
+from typing import TYPE_CHECKING
 
+if TYPE_CHECKING:
+    from .shape_model import ShapeModel
+
+BETAS = 10
+"""Shape components."""
+LARGEST_BETA = 5.0
+"""Beyond, bodies of linear shape models fall apart."""
 DEFAULT_BODY_VERTICES = 12196
 """Only the body that comes with the extension has as many."""
 _CLEAR = {0: "Stature", 1: "Shoulders", 3: "Waist", 5: "Girth"}

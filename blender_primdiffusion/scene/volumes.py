@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from .human_file import VOXELS
 
-TEMPORARY = "primdiffusion_humans"
-"""Folder of the people of a .blend that was never saved, among Blender's temporary files."""
 WINDOW_EXPONENT = 8
 FAINTEST = 0.05
 """Opacity per metre below which a voxel counts as empty; half a percent of alpha over a whole box. The window leaves
@@ -192,21 +190,3 @@ def _remove_empty(folder: Path, existing: Path) -> None:
         if path == existing or not path.is_dir() or any(path.iterdir()):
             return
         path.rmdir()
-
-
-def humans_folder(blend_path: str | None = None) -> Path:
-    """Where the people of a .blend live: `<blendname>_humans` beside it, a temporary folder while it is unsaved."""
-    blend = Path(blend_path if blend_path is not None else bpy.data.filepath)
-    if blend.name:
-        return blend.resolve().parent / f"{blend.stem}_humans"
-    return Path(bpy.app.tempdir) / TEMPORARY
-
-
-def stored_path(path: Path) -> str:
-    """A path as a .blend should hold it: relative (`//`) when the .blend is saved, else absolute."""
-    if not bpy.data.filepath:
-        return str(path)
-    try:
-        return bpy.path.relpath(str(path))
-    except ValueError:  # another drive on Windows
-        return str(path)

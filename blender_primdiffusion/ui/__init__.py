@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import bpy
-
-from ..scene.collect import collect_before_saving
 from . import (
     assets,
     batch,
@@ -30,15 +27,12 @@ ROOMS = (
 
 
 def register() -> None:
-    """All rooms and handlers."""
+    """All rooms."""
     for room in ROOMS:
         room.register()
-    bpy.app.handlers.save_pre.append(collect_before_saving)
 
 
 def unregister() -> None:
     """All of `register` undone, the children ended."""
-    if collect_before_saving in bpy.app.handlers.save_pre:  # 5.2 clears them before it disables extensions at exit
-        bpy.app.handlers.save_pre.remove(collect_before_saving)
     for room in reversed(ROOMS):
         room.unregister()

@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 import synthetic
 
-from blender_primdiffusion.scene.human import build_human
+from blender_primdiffusion.scene.build import build_human
 
 
 def write_store(folder: Path) -> None:

@@ -91,7 +91,8 @@ def test_register_and_unregister_twice_leave_no_trace(empty_scene):
 def test_people_survive_the_extensions_absence(saved_scene, tmp_path):
     import synthetic
 
-    from blender_primdiffusion.scene.human import build_human, humans
+    from blender_primdiffusion.scene.build import build_human
+    from blender_primdiffusion.scene.human import humans
 
     blender_primdiffusion.register()
     build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 4))

@@ -10,7 +10,7 @@ import pytest
 from engine_stage import PYTHON, Oracle, cube, material, pixels, render_exr, thinned
 
 import blender_primdiffusion
-from blender_primdiffusion.scene.human import build_human
+from blender_primdiffusion.scene.build import build_human
 
 SIDE = 96
 BEFORE, BEHIND, TORSO = (37, 48), (37, 60), (44, 43)

@@ -11,7 +11,7 @@ from engine_stage import PYTHON, Oracle, cube, material, render_exr, render_png,
 
 import blender_primdiffusion
 from blender_primdiffusion.engine.solids import base_colour, changed_by, scene_solids, stored
-from blender_primdiffusion.scene.human import build_human
+from blender_primdiffusion.scene.build import build_human
 
 
 @pytest.fixture(scope="module")

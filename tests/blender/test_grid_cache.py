@@ -6,8 +6,8 @@ import bpy
 import psutil
 import synthetic
 
+from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.grid_cache import free_unused_grids
-from blender_primdiffusion.scene.human import build_human
 
 
 def _resident_mb() -> float:

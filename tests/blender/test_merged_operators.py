@@ -16,16 +16,9 @@ from jobs_driven import drive, error_of, notice_of, shown, until_running
 from blender_primdiffusion import places
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import attachment_of
+from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.gain import density_gain
-from blender_primdiffusion.scene.human import (
-    MARK,
-    armature_of,
-    build_human,
-    folder_of,
-    humans,
-    remove_human,
-    volume_path,
-)
+from blender_primdiffusion.scene.human import MARK, armature_of, folder_of, humans, remove_human, volume_path
 from blender_primdiffusion.scene.keyframes import keyframe_poses
 from blender_primdiffusion.scene.material import DENSITY_GAIN
 from blender_primdiffusion.scene.merged import merged_of, merged_state, sequence_files

@@ -8,11 +8,12 @@ import pytest
 import synthetic
 
 from blender_primdiffusion.scene.attachment import attachment_before_merge, attachment_of, set_attachment
+from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving
 from blender_primdiffusion.scene.duplicate import duplicate_human
 from blender_primdiffusion.scene.edited import unused
 from blender_primdiffusion.scene.gain import density_gain, person_material, set_density_gain
-from blender_primdiffusion.scene.human import build_human, folder_of, volume_path
+from blender_primdiffusion.scene.human import folder_of, volume_path
 from blender_primdiffusion.scene.material import DENSITY_GAIN, volume_material
 from blender_primdiffusion.scene.memory import person_memory
 from blender_primdiffusion.scene.merged import (

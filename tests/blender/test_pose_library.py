@@ -20,7 +20,8 @@ from blender_primdiffusion.motion.pose_library import (
 )
 from blender_primdiffusion.motion.rotation import from_axis_angle, to_axis_angle
 from blender_primdiffusion.motion.skeleton import joint_positions
-from blender_primdiffusion.scene.human import armature_of, build_human
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.joints import JOINT_NAMES
 from blender_primdiffusion.scene.keyframes import action_curves
 from blender_primdiffusion.ui.motion import pose_pictures

@@ -8,7 +8,8 @@ import pytest
 import synthetic
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.human import armature_of, build_human
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.material import GAIN_NODE, MATERIAL_NAME
 from blender_primdiffusion.scene.preview import posed_extent, setup_cycles_preview
 

@@ -13,18 +13,11 @@ import synthetic
 from mathutils import Vector
 from oracle import TOLERANCE_M, blended_frames, evaluated_matrices
 
-from blender_primdiffusion.scene import human as human_module
+from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving
-from blender_primdiffusion.scene.human import (
-    MARK,
-    armature_of,
-    build_human,
-    folder_of,
-    humans,
-    overlap_warning,
-    remove_human,
-)
+from blender_primdiffusion.scene.human import MARK, armature_of, folder_of, humans, overlap_warning, remove_human
 from blender_primdiffusion.scene.human_file import HumanFileError
 from blender_primdiffusion.scene.keyframes import keyframe_poses
 from blender_primdiffusion.scene.volumes import VolumeWriteError
@@ -202,7 +195,7 @@ def test_a_failure_in_the_middle_of_building_leaves_scene_and_disk_as_they_were(
     def failing(*_):
         raise MemoryError("no memory for the volumes")
 
-    monkeypatch.setattr(human_module, "provenance", failing)
+    monkeypatch.setattr(build, "provenance", failing)
     with pytest.raises(MemoryError):
         build_human(saved_scene, synthetic.write(tmp_path / "second.npz", 8, seed=3))
     assert datablocks() == before

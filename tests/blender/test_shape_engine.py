@@ -13,7 +13,8 @@ from engine_stage import PYTHON, STEP, Z_UP, Oracle, camera_by_hand, eight_bit, 
 
 import blender_primdiffusion
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.human import armature_of, build_human
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.shape import betas_of
 
 SIZE = (120, 90)

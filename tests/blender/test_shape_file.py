@@ -8,10 +8,11 @@ import pytest
 import synthetic
 import synthetic_shape
 
-from blender_primdiffusion.scene import human as human_module
+from blender_primdiffusion.scene import build
+from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving
 from blender_primdiffusion.scene.edited import unused
-from blender_primdiffusion.scene.human import build_human, folder_of, humans, remove_human
+from blender_primdiffusion.scene.human import folder_of, humans, remove_human
 from blender_primdiffusion.scene.human_file import HumanFileError, read_human
 from blender_primdiffusion.scene.shape import shape_model_of
 from blender_primdiffusion.scene.shape_file import read
@@ -99,7 +100,7 @@ def test_a_failure_while_building_leaves_no_file(saved_scene, tmp_path, monkeypa
     def failing(*_):
         raise MemoryError("no memory for the volumes")
 
-    monkeypatch.setattr(human_module, "provenance", failing)
+    monkeypatch.setattr(build, "provenance", failing)
     with pytest.raises(MemoryError):
         build_human(saved_scene, synthetic_shape.write(tmp_path / "human.npz"))
     assert not (tmp_path / "shot_humans").exists()

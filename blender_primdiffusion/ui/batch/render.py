@@ -21,9 +21,9 @@ from ...capture.layout import replacing
 from ...capture.report import Report
 from ...engine import studio
 from ...engine.engine import ENGINE
+from ...scene.folders import humans_folder
 from ...scene.human import humans, volume_path
 from ...scene.preview import fit_cycles_to_volumes, new_camera
-from ...scene.volumes import humans_folder
 from ...worker.backend import Backend
 from .asking import NoBackend, Stopped, ask, backend_of, check_backend, everywhere
 from .people import (

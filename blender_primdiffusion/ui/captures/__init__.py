@@ -11,7 +11,6 @@ from . import (
     reconstruct_operators,
     reconstruct_panel,
     reconstruct_settings,
-    reconstruct_work,
     settings,
 )
 from .session import captures
@@ -38,13 +37,13 @@ def register() -> None:
     bpy.types.Scene.primdiffusion_reconstruct = bpy.props.PointerProperty(
         type=reconstruct_settings.PRIMDIFFUSION_PG_reconstruct
     )
-    register_kind(reconstruct_work.ReconstructWork)
+    register_kind("reconstruct", f"{__name__}.reconstruct_work:ReconstructWork")
 
 
 def unregister() -> None:
     """Undo `register`."""
     captures.close()
-    unregister_kind(reconstruct_work.ReconstructWork)
+    unregister_kind("reconstruct")
     if bpy.app.timers.is_registered(operators.follow):
         bpy.app.timers.unregister(operators.follow)
     del bpy.types.Scene.primdiffusion_reconstruct

@@ -5,7 +5,6 @@ from __future__ import annotations
 import bpy
 
 from ..jobs.follow import submit
-from .reconstruct_work import ReconstructWork
 
 
 class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
@@ -32,6 +31,8 @@ class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Put it in line; in background mode this waits for the person."""
+        from .reconstruct_work import ReconstructWork
+
         asked = context.scene.primdiffusion_reconstruct
         folder = bpy.path.abspath(self.directory or asked.capture)
         subject = self.subject or ("" if self.directory else asked.subject)  # the panel's is somebody of its folder

@@ -6,7 +6,6 @@ import bpy
 
 from ..jobs.work import register_kind, unregister_kind
 from . import file_handler, operators, panel, settings
-from .person_work import ImportHumanWork
 
 CLASSES = (
     settings.PRIMDIFFUSION_PG_export,
@@ -23,12 +22,12 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion_export = bpy.props.PointerProperty(type=settings.PRIMDIFFUSION_PG_export)
-    register_kind(ImportHumanWork)
+    register_kind("import_human", f"{__name__}.person_work:ImportHumanWork")
 
 
 def unregister() -> None:
     """Undo `register`."""
-    unregister_kind(ImportHumanWork)
+    unregister_kind("import_human")
     del bpy.types.Scene.primdiffusion_export
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import bpy
 
 from ..jobs.work import register_kind, unregister_kind
-from . import operators, watching, works
+from . import operators, saving, watching
 
 _HANDLERS = (
+    ("save_pre", saving.collect_before_saving),
     ("load_post", watching.look_after),
     ("save_post", watching.look_after),
     ("undo_post", watching.look_soon),
@@ -15,12 +16,16 @@ _HANDLERS = (
 )
 
 
+WORKS = {"restore_volumes": "RestoreWork", "regenerate": "RegenerateWork"}
+"""Of works, by kind."""
+
+
 def register() -> None:
     """Make the room known to Blender."""
     for cls in operators.CLASSES:
         bpy.utils.register_class(cls)
-    for kind in works.KINDS:
-        register_kind(kind)
+    for kind, work in WORKS.items():
+        register_kind(kind, f"{__name__}.works:{work}")
     for name, handler in _HANDLERS:
         getattr(bpy.app.handlers, name).append(handler)
     watching.start()
@@ -32,7 +37,7 @@ def unregister() -> None:
     for name, handler in _HANDLERS:
         if handler in getattr(bpy.app.handlers, name):  # Blender 5.2 clears them before it disables extensions at exit
             getattr(bpy.app.handlers, name).remove(handler)
-    for kind in works.KINDS:
+    for kind in WORKS:
         unregister_kind(kind)
     for cls in reversed(operators.CLASSES):
         bpy.utils.unregister_class(cls)

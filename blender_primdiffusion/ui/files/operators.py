@@ -9,7 +9,6 @@ import bpy
 from ..jobs.follow import submit
 from ..jobs.target import Target, named_person, selected_person
 from .watching import look
-from .works import RegenerateWork, RestoreWork, made_from_seed
 
 
 class _Find:
@@ -54,6 +53,7 @@ class _Find:
     def _restore(self, context: bpy.types.Context, directory: Path | None) -> tuple[int, list[str]]:
         """Works put in line for people whose files are nowhere, and sentences on those who cannot be helped."""
         from ...scene.missing import find_person, missing_files
+        from .works import RestoreWork
 
         works, left = [], []
         for one in missing_files():
@@ -113,6 +113,7 @@ class PRIMDIFFUSION_OT_generate_again(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Put it in line; in background mode this waits for the person."""
         from ...scene.human import person_file
+        from .works import RegenerateWork, made_from_seed
 
         try:
             person = named_person(context, self.human) if self.human else selected_person(context)
@@ -138,7 +139,7 @@ class PRIMDIFFUSION_OT_collect_files(bpy.types.Operator):
     def execute(self, _context: bpy.types.Context) -> set[str]:
         """Tell what was copied."""
         from ...scene.collect import collect_files
-        from ...scene.volumes import humans_folder
+        from ...scene.folders import humans_folder
 
         try:
             done = collect_files()

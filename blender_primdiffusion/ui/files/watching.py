@@ -7,6 +7,7 @@ import dataclasses
 import bpy
 from bpy.app.handlers import persistent
 
+from ...scene.human import anybody
 from ..jobs.follow import redraw
 
 SOON_S = 0.5
@@ -28,16 +29,18 @@ state = State()
 
 def look() -> None:
     """Find out now."""
+    before = state.told
+    state.told, state.without_person_file = _found() if anybody() else ("", ())
+    if state.told != before:
+        redraw()
+
+
+def _found() -> tuple[str, tuple[str, ...]]:
     from ...scene.missing import find_person, missing_files
 
     lost = missing_files()
-    before = state.told
-    state.told = "; ".join(one.told() for one in lost)
-    state.without_person_file = tuple(
-        one.person.name for one in lost if one.person_file and not one.linked and find_person(one) is None
-    )
-    if state.told != before:
-        redraw()
+    alone = [one.person.name for one in lost if one.person_file and not one.linked and find_person(one) is None]
+    return "; ".join(one.told() for one in lost), tuple(alone)
 
 
 @persistent

@@ -122,6 +122,3 @@ def _look() -> None:
     from .watching import look
 
     look()
-
-
-KINDS = (RestoreWork, RegenerateWork)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..jobs.work import register_kind, unregister_kind
-from . import attributes, operators, panel, presets, settings, work
+from . import attributes, operators, panel, presets, settings
 
 CLASSES = (
     attributes.PRIMDIFFUSION_PG_attributes,
@@ -25,12 +25,12 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion = bpy.props.PointerProperty(type=settings.PRIMDIFFUSION_PG_settings)
-    register_kind(work.GenerateWork)
+    register_kind("generate", f"{__name__}.work:GenerateWork")
 
 
 def unregister() -> None:
     """Undo `register`."""
-    unregister_kind(work.GenerateWork)
+    unregister_kind("generate")
     del bpy.types.Scene.primdiffusion
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import re
-import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 
 from ...places import backend_module_path, preference
-from ...worker.vocabulary import Vocabulary, read_vocabulary
+
+if TYPE_CHECKING:
+    from ...worker.vocabulary import Vocabulary
 
 ANY = "ANY"
 CATEGORIES = ("sex", "outfit", "pattern", "shoes", "hair", "hat")
@@ -29,6 +31,8 @@ _items: dict[tuple[str, ...], list[Item]] = {}
 
 def known() -> Vocabulary:
     """Of the checkpoint that will be used; an empty one where it cannot be read, which generating will explain."""
+    from ...worker.vocabulary import Vocabulary, read_vocabulary
+
     chosen, bundled = preference("checkpoint"), backend_module_path()
     if chosen:
         path = Path(chosen)
@@ -48,6 +52,8 @@ def known() -> Vocabulary:
 def menu(name: str) -> list[Item]:
     """The items of the menu of a category. Their numbers, which a .blend keeps, depend on the value alone, so another
     checkpoint that knows the same value shows it."""
+    import zlib
+
     values = known().categories.get(name, ())
     if values not in _items:
         numbered = [

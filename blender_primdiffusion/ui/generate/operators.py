@@ -8,7 +8,6 @@ from ..jobs.follow import submit
 from ..jobs.queue import queue
 from .asking import Asking, last_seed
 from .settings import random_seed
-from .work import GenerateWork
 
 
 class PRIMDIFFUSION_OT_generate(Asking, bpy.types.Operator):
@@ -23,6 +22,8 @@ class PRIMDIFFUSION_OT_generate(Asking, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Put them in line; in background mode this waits for all."""
+        from .work import GenerateWork
+
         settings = context.scene.primdiffusion
         from_panel = self.seed < 0
         # a script that names the seed means this one person, whatever the panel's number is
@@ -59,4 +60,4 @@ class PRIMDIFFUSION_OT_random_seed(bpy.types.Operator):
 def _seeds_in_line() -> set[int]:
     """Of people who are asked for already: a second press of the button means somebody else."""
     entries = [*queue.waiting, *([queue.current] if queue.current is not None else [])]
-    return {entry.work.seed for entry in entries if isinstance(entry.work, GenerateWork)}
+    return {entry.work.seed for entry in entries if entry.work.kind == "generate"}

@@ -10,7 +10,6 @@ from . import (
     edit_painting,
     edit_panel,
     edit_settings,
-    edit_work,
     panel,
     people_operators,
     shape_operators,
@@ -34,6 +33,8 @@ CLASSES = (
     shape_panel.PRIMDIFFUSION_PT_details,
     *edit_panel.SUB_PANELS,
 )
+WORKS = {"vary": "VaryWork", "inpaint": "RedressWork", "transfer": "TransferWork", "interpolate": "BlendWork"}
+"""Of edit_work, by kind."""
 
 
 def register() -> None:
@@ -42,13 +43,13 @@ def register() -> None:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion_edit = bpy.props.PointerProperty(type=edit_settings.PRIMDIFFUSION_PG_edit)
     bpy.types.Object.primdiffusion_human = bpy.props.PointerProperty(type=shape_settings.PRIMDIFFUSION_PG_human)
-    for kind in edit_work.KINDS:
-        register_kind(kind)
+    for kind, work in WORKS.items():
+        register_kind(kind, f"{__name__}.edit_work:{work}")
 
 
 def unregister() -> None:
     """Undo `register`."""
-    for kind in edit_work.KINDS:
+    for kind in WORKS:
         unregister_kind(kind)
     del bpy.types.Object.primdiffusion_human
     del bpy.types.Scene.primdiffusion_edit

@@ -6,18 +6,19 @@ again; the result makes one undo step.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import bpy
 
 from ...scene.body_mesh import body_of
 from ...scene.human import humans, person_file
-from ...scene.painted import painted_weights
 from ..generate.attributes import asked, parsed
 from ..jobs.follow import submit
 from ..jobs.target import named_person, selected_person
 from .edit_settings import TRANSFER_ITEMS, parts_property
-from .edit_work import BlendWork, EditWork, RedressWork, TransferWork, VaryWork
+
+if TYPE_CHECKING:
+    from .edit_work import EditWork
 
 _HUMAN = "Name of the person to edit (of their collection); empty: the selected one"
 _PANELS = "Not given: the panel's"
@@ -28,9 +29,6 @@ class _Edit:
     """What the edits have in common."""
 
     bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO (the result has one)
-    work: type[EditWork]
-    """What is put in line."""
-
     human: bpy.props.StringProperty(name="Person", description=_HUMAN, options=_SKIP)
     seed: bpy.props.IntProperty(name="Seed", min=0, description=_PANELS, options=_SKIP)
     steps: bpy.props.IntProperty(name="Steps", min=1, max=1000, default=30, description=_PANELS, options=_SKIP)
@@ -46,7 +44,7 @@ class _Edit:
         try:
             person = named_person(context, self.human) if self.human else selected_person(context)
             steps = self.chosen("steps", context.scene.primdiffusion)
-            work = self.work.of(person, steps, self.params(context, person))
+            work = self.work().of(person, steps, self.params(context, person))
         except (OSError, ValueError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -54,6 +52,10 @@ class _Edit:
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
         """Of the child's method, with the edit's own ones only (see `EditWork.asked`)."""
+        raise NotImplementedError
+
+    def work(self) -> type[EditWork]:
+        """What is put in line."""
         raise NotImplementedError
 
     def chosen(self, name: str, settings: bpy.types.PropertyGroup) -> Any:
@@ -73,6 +75,8 @@ class _Region:
         self, settings: bpy.types.PropertyGroup, person: bpy.types.Collection
     ) -> list[str] | dict[str, list[float]]:
         """Names of parts, or painted weights [V]."""
+        from ...scene.painted import painted_weights
+
         given = self.properties.is_property_set
         if given("vertex_group") or (not given("parts") and settings.region == "PAINTED"):
             body = body_of(person)
@@ -90,13 +94,18 @@ class PRIMDIFFUSION_OT_vary(_Edit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.vary"
     bl_label = "Vary"
-    work = VaryWork
 
     amount: bpy.props.FloatProperty(name="Amount", min=0.0, max=1.0, description=_PANELS, options=_SKIP)
     attributes: bpy.props.StringProperty(
         name="Attributes", description="Like sex=female, height=1.7; empty: whatever comes", options=_SKIP
     )
     guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=_PANELS, options=_SKIP)
+
+    def work(self) -> type[EditWork]:
+        """Vary."""
+        from .edit_work import VaryWork
+
+        return VaryWork
 
     def params(self, context: bpy.types.Context, _person: bpy.types.Collection) -> dict[str, Any]:
         """Of the child's method vary."""
@@ -113,10 +122,15 @@ class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.redress"
     bl_label = "Re-dress Region"
-    work = RedressWork
 
     attributes: bpy.props.StringProperty(name="Attributes", description=f"Like outfit=suit. {_PANELS}", options=_SKIP)
     guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=_PANELS, options=_SKIP)
+
+    def work(self) -> type[EditWork]:
+        """Re-dress Region."""
+        from .edit_work import RedressWork
+
+        return RedressWork
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
         """Of the child's method inpaint."""
@@ -134,11 +148,16 @@ class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.transfer_texture"
     bl_label = "Transfer Texture"
-    work = TransferWork
 
     source: bpy.props.StringProperty(name="Source", description=f"Name of the other person. {_PANELS}", options=_SKIP)
     what: bpy.props.EnumProperty(name="Transfer", items=TRANSFER_ITEMS, description=_PANELS, options=_SKIP)
     harmonise: bpy.props.FloatProperty(name="Harmonise", min=0.0, max=1.0, description=_PANELS, options=_SKIP)
+
+    def work(self) -> type[EditWork]:
+        """Transfer Texture."""
+        from .edit_work import TransferWork
+
+        return TransferWork
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
         """Of the child's method transfer."""
@@ -157,10 +176,15 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.blend"
     bl_label = "Blend"
-    work = BlendWork
 
     other: bpy.props.StringProperty(name="Other", description=f"Name of the other person. {_PANELS}", options=_SKIP)
     fraction: bpy.props.FloatProperty(name="Fraction", min=0.0, max=1.0, description=_PANELS, options=_SKIP)
+
+    def work(self) -> type[EditWork]:
+        """Blend."""
+        from .edit_work import BlendWork
+
+        return BlendWork
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
         """Of the child's method interpolate."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import bpy
 
 from ...scene.body_mesh import MARK, body_of
-from ...scene.painted import end_painting, start_painting
 from ..jobs.target import selected_person
 
 
@@ -18,6 +17,8 @@ class PRIMDIFFUSION_OT_paint_region(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """To Weight Paint mode, with the panel's vertex group, made if there is none."""
+        from ...scene.painted import start_painting
+
         settings = context.scene.primdiffusion_edit
         try:
             person = selected_person(context)
@@ -47,6 +48,8 @@ class PRIMDIFFUSION_OT_finish_painting(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """The active object is the body mesh."""
+        from ...scene.painted import end_painting
+
         end_painting(context, context.view_layer.objects.active)
         return {"FINISHED"}
 

@@ -104,6 +104,3 @@ class BlendWork(EditWork):
 
     kind = method = "interpolate"
     undo, made = "Blend Humans", "Blended"
-
-
-KINDS = (VaryWork, RedressWork, TransferWork, BlendWork)

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ...scene.edited import check_editable
 from ...scene.human import armature_of, remove_human
-from ...scene.painted import leave_mode
 from ..jobs.target import named_person, selected_person
 
 _HUMAN = "Name of the person (of their collection); empty: the selected one"
@@ -74,6 +72,8 @@ class PRIMDIFFUSION_OT_duplicate_human(_Whole, bpy.types.Operator):
         """The new person is selected."""
         from ...scene.beside import stand_beside_others
         from ...scene.duplicate import duplicate_human
+        from ...scene.edited import check_editable
+        from ...scene.painted import leave_mode
 
         check_editable(person)
         leave_mode(context)
@@ -101,6 +101,8 @@ class PRIMDIFFUSION_OT_delete_human(_Whole, bpy.types.Operator):
 
     def do(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
         """Linked people are unlinked by the Outliner, not here: they belong to another file."""
+        from ...scene.painted import leave_mode
+
         if person.library is not None:
             raise ValueError(f"the person {person.name!r} is linked: remove them in the Outliner, by Unlink")
         leave_mode(context)
@@ -109,6 +111,8 @@ class PRIMDIFFUSION_OT_delete_human(_Whole, bpy.types.Operator):
 
 def select(context: bpy.types.Context, person: bpy.types.Collection) -> None:
     """Make a person's armature active. Raises ValueError for one that cannot be selected in this view layer."""
+    from ...scene.painted import leave_mode
+
     armature = armature_of(person)
     if context.view_layer.objects.get(armature.name) != armature:
         raise ValueError(f"the armature of {person.name!r} is not in this view layer: enable their collection first")

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-import bpy
-import numpy as np
+import random
+from typing import TYPE_CHECKING
 
-from ...scene.shape import betas_of, generated_betas, reshape, shape_model_of
-from ...scene.shape_measures import betas_of_measures
-from ...scene.shape_model import BETAS
+import bpy
+
+from ...scene.shape_names import BETAS
 from ..jobs.target import named_person, selected_person
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 _HUMAN = "Name of the person (of their collection); empty: the selected one"
 _FARTHEST = 3.0
@@ -23,6 +26,8 @@ class _Shape:
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Reports why it cannot be done, and what could not follow."""
+        from ...scene.shape import reshape
+
         try:
             person = named_person(context, self.human) if self.human else selected_person(context)
             warning = reshape(person, self.betas_for(context, person))
@@ -33,7 +38,7 @@ class _Shape:
             self.report({"WARNING"}, warning)
         return {"FINISHED"}
 
-    def betas_for(self, context: bpy.types.Context, person: bpy.types.Collection) -> np.ndarray:
+    def betas_for(self, context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
         """The new shape [10]."""
         raise NotImplementedError
 
@@ -50,8 +55,13 @@ class PRIMDIFFUSION_OT_reshape(_Shape, bpy.types.Operator):
     height: bpy.props.FloatProperty(name="Height (m)", description="Not given: any", options={"SKIP_SAVE"})
     weight: bpy.props.FloatProperty(name="Weight (kg)", description="Not given: any", options={"SKIP_SAVE"})
 
-    def betas_for(self, _context: bpy.types.Context, person: bpy.types.Collection) -> np.ndarray:
+    def betas_for(self, _context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
         """Those given, then moved to the measures."""
+        import numpy as np
+
+        from ...scene.shape import betas_of, shape_model_of
+        from ...scene.shape_measures import betas_of_measures
+
         given = self.properties.is_property_set
         betas = np.array(self.betas) if given("betas") else betas_of(person)
         height, weight = (getattr(self, name) if given(name) else None for name in ("height", "weight"))
@@ -64,8 +74,10 @@ class PRIMDIFFUSION_OT_reset_shape(_Shape, bpy.types.Operator):
     bl_idname = "primdiffusion.reset_shape"
     bl_label = "Reset Shape"
 
-    def betas_for(self, _context: bpy.types.Context, person: bpy.types.Collection) -> np.ndarray:
+    def betas_for(self, _context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
         """From the person's provenance."""
+        from ...scene.shape import generated_betas
+
         return generated_betas(person)
 
 
@@ -86,11 +98,13 @@ class PRIMDIFFUSION_OT_random_shape(_Shape, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         """Each press of the button is another body."""
-        self.seed = int(np.random.default_rng().integers(2**31))
+        self.seed = random.randrange(2**31)
         return self.execute(context)
 
-    def betas_for(self, _context: bpy.types.Context, _person: bpy.types.Collection) -> np.ndarray:
+    def betas_for(self, _context: bpy.types.Context, _person: bpy.types.Collection) -> NDArray:
         """Normal, kept within what looks like people."""
+        import numpy as np
+
         drawn = np.random.default_rng(self.seed).normal(0.0, self.spread, BETAS)
         return np.clip(drawn, -_FARTHEST, _FARTHEST)
 
@@ -105,8 +119,10 @@ class PRIMDIFFUSION_OT_copy_shape(_Shape, bpy.types.Operator):
         name="Source", description="Name of the other person. Not given: the panel's", options={"SKIP_SAVE"}
     )
 
-    def betas_for(self, context: bpy.types.Context, person: bpy.types.Collection) -> np.ndarray:
+    def betas_for(self, context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
         """As the engine draws the other person now."""
+        from ...scene.shape import betas_of, shape_model_of
+
         picked = context.scene.primdiffusion_edit.other
         if not self.source and picked is None:
             raise ValueError("choose the other person in the panel first")

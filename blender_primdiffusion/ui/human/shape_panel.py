@@ -7,8 +7,6 @@ import json
 import bpy
 
 from ...scene.human import BETAS, MARK, armature_of
-from ...scene.shape import check_shapeable, keeps_own_shape, shape_model_of
-from ...scene.shape_names import slider_names
 from ..jobs.drawing import draw_lines
 from ..jobs.target import selected_person
 
@@ -41,6 +39,9 @@ class PRIMDIFFUSION_PT_shape(_InHuman, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         """Reads the scene; changes nothing."""
+        from ...scene.shape import check_shapeable, keeps_own_shape, shape_model_of
+        from ...scene.shape_names import slider_names
+
         layout = self.layout
         layout.use_property_split = True
         layout.use_property_decorate = False

@@ -4,17 +4,16 @@ done at once."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import bpy
-import numpy as np
 
 from ...scene.human import MARK
-from ...scene.rename import rename_human
-from ...scene.shape import betas_of, reshape, shape_model_of
-from ...scene.shape_measures import LARGEST_BETA, Measures, betas_of_measures, measure
-from ...scene.shape_model import BETAS
+from ...scene.shape_names import BETAS, LARGEST_BETA
 
-_NOBODY = Measures(0.0, 0.0)
+if TYPE_CHECKING:
+    from ...scene.shape_measures import Measures
+
 _NOT_ANIMATED: set[str] = set()
 """Options: each frame would move the bones' rest; the custom property with the betas may be animated instead."""
 
@@ -29,6 +28,9 @@ def person_of(armature: bpy.types.Object) -> bpy.types.Collection:
 
 def measures_of(armature: bpy.types.Object) -> Measures:
     """Height and weight as the sliders set them. Raises ValueError or FileNotFoundError where these are not known."""
+    from ...scene.shape import betas_of, shape_model_of
+    from ...scene.shape_measures import measure
+
     person = person_of(armature)
     return measure(shape_model_of(person), betas_of(person))
 
@@ -41,10 +43,14 @@ def _name(self: PRIMDIFFUSION_PG_human) -> str:
 
 
 def _rename(self: PRIMDIFFUSION_PG_human, name: str) -> None:
+    from ...scene.rename import rename_human
+
     _said(lambda: rename_human(person_of(self.id_data), name))
 
 
 def _betas(self: PRIMDIFFUSION_PG_human) -> Sequence[float]:
+    from ...scene.shape import betas_of
+
     try:
         return betas_of(person_of(self.id_data)).tolist()
     except ValueError:
@@ -52,14 +58,20 @@ def _betas(self: PRIMDIFFUSION_PG_human) -> Sequence[float]:
 
 
 def _set_betas(self: PRIMDIFFUSION_PG_human, betas: Sequence[float]) -> None:
+    import numpy as np
+
+    from ...scene.shape import reshape
+
     _said(lambda: reshape(person_of(self.id_data), np.clip(list(betas), -LARGEST_BETA, LARGEST_BETA)))
 
 
 def _measure(self: PRIMDIFFUSION_PG_human) -> Measures:
+    from ...scene.shape_measures import Measures
+
     try:
         return measures_of(self.id_data)
     except (OSError, ValueError):
-        return _NOBODY
+        return Measures(0.0, 0.0)
 
 
 def _height(self: PRIMDIFFUSION_PG_human) -> float:
@@ -83,6 +95,9 @@ def set_measures(person: bpy.types.Collection, height: float | None = None, weig
 
     Raises ValueError where no body does, and as `reshape`.
     """
+    from ...scene.shape import betas_of, reshape, shape_model_of
+    from ...scene.shape_measures import betas_of_measures
+
     return reshape(person, betas_of_measures(shape_model_of(person), betas_of(person), height, weight))
 
 

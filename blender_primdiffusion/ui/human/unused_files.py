@@ -8,9 +8,6 @@ from __future__ import annotations
 
 import bpy
 
-from ...scene.edited import unused
-from ...scene.volumes import humans_folder
-
 
 class PRIMDIFFUSION_OT_remove_unused_files(bpy.types.Operator):
     """Delete files in the folder of people beside this file that nobody shows now. Undo of edits, and other .blend \
@@ -26,6 +23,9 @@ files that share the folder, will miss them"""
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
         """Delete them and say how many and how large they were."""
+        from ...scene.edited import unused
+        from ...scene.folders import humans_folder
+
         removed = size = 0
         for path in unused(humans_folder()):
             try:

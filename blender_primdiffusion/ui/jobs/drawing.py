@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import textwrap
+from typing import TYPE_CHECKING
 
 import bpy
 
-from ...worker.job import JobError
 from .follow import in_the_way
 from .pictures import so_far
 from .queue import Entry, Outcome, queue
 from .remedies import remedy_for
+
+if TYPE_CHECKING:
+    from ...worker.job import JobError
 
 _LINE = 34
 """Letters that fit a sidebar as wide as Blender makes it, beside an icon."""

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 
 import bpy
 
-from ...worker.job import JobError
 from .memory import release_when_idle
 from .pictures import so_far
 from .queue import GONE, Entry, Outcome, queue
+from .remedies import refusal_of_the_scene
 from .work import Work
 
 TICK_S = 0.1
@@ -118,7 +118,7 @@ def _enter() -> None:
     entry = queue.current
     scene = next((scene for scene in bpy.data.scenes if scene.session_uid == entry.scene_uid), None)
     if scene is None and entry.work.undo:
-        queue.refuse(JobError(GONE.format(entry.scene), "", "scene"))
+        queue.refuse(refusal_of_the_scene(GONE.format(entry.scene)))
         return
     try:
         with _shown(scene):
@@ -126,7 +126,7 @@ def _enter() -> None:
     except RuntimeError as error:  # the timer must go on, whatever state Blender is in
         traceback.print_exc()
         if queue.current is entry:
-            queue.refuse(JobError(f"the result could not enter the scene: {error}", "", "scene"))
+            queue.refuse(refusal_of_the_scene(f"the result could not enter the scene: {error}"))
 
 
 @contextlib.contextmanager

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import bpy
 
 from ...places import own_folder
-from ...worker.kept_works import KeptWork, Shelf
 from .work import Work, registered_kind
+
+if TYPE_CHECKING:
+    from ...worker.kept_works import KeptWork, Shelf
 
 
 class Kept:
@@ -57,12 +60,16 @@ class Kept:
 
     def _shelf_of_now(self) -> Shelf:
         if self._shelf is None:
+            from ...worker.kept_works import Shelf
+
             self._shelf = Shelf(own_folder() / "queue")
         return self._shelf
 
 
 def kept_work(work: Work, scene: str, blend: str) -> KeptWork | None:
     """`work` as it is kept; None for one that is not."""
+    from ...worker.kept_works import KeptWork
+
     content = work.to_json()
     return None if content is None else KeptWork(work.kind, work.label, content, scene, blend)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import bpy
 
 from ...places import EXTENSION
-from ...worker.process_memory import resident_bytes
 from .queue import queue
 
 IDLE_MINUTES = 10.0
@@ -47,6 +46,7 @@ def release() -> str:
     Raises RuntimeError while one of them is at work.
     """
     from ...engine import studio
+    from ...worker.process_memory import resident_bytes
 
     if queue.busy:
         raise RuntimeError("the backend is at work: wait for it, or cancel it first")

@@ -9,7 +9,8 @@ from typing import Any
 import bpy
 
 from ...scene.beside import stand_beside_others
-from ...scene.human import build_human, overlap_warning
+from ...scene.build import build_human
+from ...scene.human import overlap_warning
 from ...worker.sentence import sentence
 
 

@@ -10,18 +10,19 @@ import tempfile
 import time
 import traceback
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 
 from ...places import new_backend, preference
-from ...worker.backend import Backend
-from ...worker.client import Died, Silent
-from ...worker.job import Job, JobError
-from ...worker.kept_works import KeptWork
-from ...worker.sentence import sentence
 from .kept import Kept, kept_work
-from .remedies import error_in_the_scene
+from .remedies import defect_in_the_scene, error_in_the_scene
 from .work import Work
+
+if TYPE_CHECKING:
+    from ...worker.backend import Backend
+    from ...worker.job import Job, JobError
+    from ...worker.kept_works import KeptWork
 
 GONE = "The scene {!r} was deleted meanwhile: nothing was added. Undo the deletion and try again."
 
@@ -135,8 +136,7 @@ class Queue:
             error = error_in_the_scene(e)
         except Exception as e:
             traceback.print_exc()
-            trace = tuple(traceback.format_exc().splitlines())
-            error = JobError(f"the result could not be put into the scene: {sentence(e)}", "", "scene", trace)
+            error = defect_in_the_scene(e)
         seconds = {"work": began - entry.asked_at, "finish": time.monotonic() - began}
         return self._end(Outcome(entry, notice, error, seconds))
 
@@ -162,6 +162,8 @@ class Queue:
         """Between works: notice that the child has died or hangs; True when something visible changed. Never waits."""
         if self._backend is None or self.job is not None:
             return False
+        from ...worker.client import Died, Silent
+
         for event in self._backend.listen():
             if isinstance(event, Died):
                 self.child_news = event.message
@@ -227,6 +229,8 @@ class Queue:
             self._backend = None
 
     def _begin(self, entry: Entry) -> None:
+        from ...worker.job import Job
+
         self.current = entry
         try:
             self._folder = Path(tempfile.mkdtemp(prefix=f"{entry.work.kind}_", dir=bpy.app.tempdir or None))

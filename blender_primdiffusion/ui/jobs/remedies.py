@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import traceback
+from typing import TYPE_CHECKING
 
 import bpy
 
-from ...worker.job import JobError
 from ...worker.sentence import sentence
+
+if TYPE_CHECKING:
+    from ...worker.job import JobError
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
 
@@ -52,6 +56,8 @@ def remedy_for(error: JobError) -> Remedy | None:
 
 def error_in_the_scene(error: Exception) -> JobError:
     """Why a result is not in the scene; an exception may name its kind itself, in an attribute `kind`."""
+    from ...worker.job import JobError
+
     kind = getattr(error, "kind", "scene")
     cause = error if isinstance(error, OSError) else error.__cause__
     while cause is not None and not getattr(cause, "errno", None):
@@ -61,3 +67,18 @@ def error_in_the_scene(error: Exception) -> JobError:
             sentence(error), "Save the file where there is room and you may write, then try again", "unwritable"
         )
     return JobError(sentence(error), "", str(kind))
+
+
+def defect_in_the_scene(error: Exception) -> JobError:
+    """As `error_in_the_scene`, of an exception that is being handled and that nobody foresaw: with its traceback."""
+    from ...worker.job import JobError
+
+    trace = tuple(traceback.format_exc().splitlines())
+    return JobError(f"the result could not be put into the scene: {sentence(error)}", "", "scene", trace)
+
+
+def refusal_of_the_scene(message: str) -> JobError:
+    """Why a result could not even begin to enter the scene."""
+    from ...worker.job import JobError
+
+    return JobError(message, "", "scene")

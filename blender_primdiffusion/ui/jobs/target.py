@@ -6,7 +6,6 @@ import dataclasses
 
 import bpy
 
-from ...scene.edited import check_editable
 from ...scene.human import human_of, humans, person_file_name
 
 
@@ -23,11 +22,15 @@ class Target:
     @classmethod
     def of(cls, person: bpy.types.Collection) -> Target:
         """Raises ValueError for a person that cannot be edited."""
+        from ...scene.edited import check_editable
+
         check_editable(person)
         return cls(person.session_uid, person.name, person_file_name(person))
 
     def found(self) -> bpy.types.Collection:
         """The person, if still in a scene and the one it was; else ValueError with a sentence."""
+        from ...scene.edited import check_editable
+
         people = [person for scene in bpy.data.scenes for person in humans(scene)]
         person = next((person for person in people if self._is(person)), None)
         if person is None or not any(thing.type == "ARMATURE" for thing in person.objects):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import importlib
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -49,23 +50,31 @@ class Work(abc.ABC):
         raise ValueError(f"{cls.kind} is not kept")
 
 
-_kinds: dict[str, type[Work]] = {}
+_kinds: dict[str, str] = {}
+"""Kind -> module:class."""
 
 
-def register_kind(cls: type[Work]) -> None:
-    """Make kept works of this class known. For a room's `register`."""
-    if _kinds.setdefault(cls.kind, cls) is not cls:
-        raise ValueError(f"there are two kinds of work {cls.kind!r}: give one another name")
+def register_kind(kind: str, where: str) -> None:
+    """Make kept works of this kind known. For a room's `register`.
+
+    `where` is the module and the class, "package.room.work:GenerateWork": it is imported when such a work is taken up
+    again, for what works need would slow Blender's start.
+    """
+    if _kinds.setdefault(kind, where) != where:
+        raise ValueError(f"there are two kinds of work {kind!r}: give one another name")
 
 
-def unregister_kind(cls: type[Work]) -> None:
+def unregister_kind(kind: str) -> None:
     """Undo `register_kind`."""
-    _kinds.pop(cls.kind, None)
+    _kinds.pop(kind, None)
 
 
 def registered_kind(kind: str) -> type[Work] | None:
     """The class of a kind of work; None for one that this version does not know."""
-    return _kinds.get(kind)
+    if kind not in _kinds:
+        return None
+    module, _, name = _kinds[kind].partition(":")
+    return getattr(importlib.import_module(module), name)
 
 
 def chosen_checkpoint(name: str) -> str:

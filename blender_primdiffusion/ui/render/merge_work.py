@@ -174,6 +174,3 @@ class _Writer(threading.Thread):
 
     def _vdb(self, index: int) -> Path:
         return self._folder / f"{index:04d}.vdb"
-
-
-KINDS = (MergeWork, MergeFramesWork, FitGainWork)

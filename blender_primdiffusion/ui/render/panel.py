@@ -8,12 +8,9 @@ from ...engine.engine import ENGINE
 from ...scene.attachment import MODES, attachment_of
 from ...scene.gain import density_gain
 from ...scene.human import humans, overlap_warning
-from ...scene.memory import person_memory
-from ...scene.merged import merged_of, merged_state
 from ..jobs.drawing import draw_job, draw_lines
 from ..jobs.target import selected_person
 from ..manual import draw_manual_button
-from .merge_work import Moment
 from .person_operators import ATTACHMENT_ITEMS
 
 
@@ -70,6 +67,8 @@ class PRIMDIFFUSION_PT_attachment(_OfPerson, bpy.types.Panel):
 
     def draw_person(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
         """A button for each mode; merged where there is something merged."""
+        from ...scene.merged import merged_of
+
         now = attachment_of(person)
         row = self.layout.row(align=True)
         for mode, label, _ in ATTACHMENT_ITEMS:
@@ -84,6 +83,8 @@ class PRIMDIFFUSION_PT_merge(_OfPerson, bpy.types.Panel):
 
     def draw_person(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
         """Voxel size, a pose, frames; whether what is merged is still the person."""
+        from ...scene.merged import merged_of
+
         layout = self.layout
         layout.prop(context.scene.primdiffusion_merging, "voxel")
         draw_job(layout, "merge", "primdiffusion.merge", "VOLUME_DATA")
@@ -120,6 +121,8 @@ class PRIMDIFFUSION_PT_memory(_OfPerson, bpy.types.Panel):
 
     def draw_person(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
         """On disk, and in memory where drawn as volumes; the engine needs none of it."""
+        from ...scene.memory import person_memory
+
         memory = person_memory(person)
         column = self.layout.column(align=True)
         column.label(text=f"Files: {memory.files / 1e6:.0f} MB", icon="DISK_DRIVE")
@@ -128,6 +131,9 @@ class PRIMDIFFUSION_PT_memory(_OfPerson, bpy.types.Panel):
 
 def outdated(person: bpy.types.Collection, scene: bpy.types.Scene) -> bool:
     """Whether the merged volume shows another pose, shape or person than the armature as it is now."""
+    from ...scene.merged import merged_of, merged_state
+    from .merge_work import Moment
+
     try:
         return not merged_state(merged_of(person)).shows(Moment.now(person).digest, scene.frame_current)
     except (ValueError, OSError):  # broken bones or files are other panels' to tell

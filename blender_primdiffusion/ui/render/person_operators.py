@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import bpy
 
 from ...scene.attachment import attachment_before_merge, attachment_of, set_attachment
 from ...scene.human import humans
-from ...scene.merged import merged_of, remove_merged
 from ..jobs.follow import submit
 from ..jobs.target import named_person, selected_person
-from .merge_work import FitGainWork, MergeFramesWork, MergeWork, Moment
+
+if TYPE_CHECKING:
+    from .merge_work import Moment
 
 ATTACHMENT_ITEMS = (
     ("ARMATURE", "Armature", "Each volume is an object that follows the bones; quick, and the default"),
@@ -95,6 +98,8 @@ class PRIMDIFFUSION_OT_merge(_Merging, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """Put it in line; in background mode this waits for the merged volume."""
+        from .merge_work import MergeWork
+
         moment = _moment(person, context.evaluated_depsgraph_get())
         return submit(self, context, MergeWork(person, moment, self.chosen_voxel(context)))
 
@@ -110,6 +115,8 @@ class PRIMDIFFUSION_OT_merge_frames(_Merging, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """Put it in line; in background mode this waits for the merged volumes."""
+        from .merge_work import MergeFramesWork
+
         given = self.properties.is_property_set
         start, end = (getattr(self if given(name) else context.scene, name) for name in ("frame_start", "frame_end"))
         if not 1 < end - start + 1 <= _MOST_FRAMES:
@@ -128,6 +135,8 @@ class PRIMDIFFUSION_OT_unmerge(_OfPerson, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """Files stay, for undo."""
+        from ...scene.merged import merged_of, remove_merged
+
         if merged_of(person) is None:
             raise ValueError(f"{person.name!r} has no merged volume")
         if attachment_of(person) == "MERGED":
@@ -145,11 +154,15 @@ class PRIMDIFFUSION_OT_fit_density_gain(_OfPerson, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """Put it in line; in background mode this waits for the gain."""
+        from .merge_work import FitGainWork
+
         graph = context.evaluated_depsgraph_get()
         return submit(self, context, FitGainWork(person, _moment(person, graph)))
 
 
 def _moment(person: bpy.types.Collection, graph: bpy.types.Depsgraph) -> Moment:
+    from .merge_work import Moment
+
     armature = next(thing for thing in person.objects if thing.type == "ARMATURE")
     return Moment.now(person, armature.evaluated_get(graph))
 

@@ -9,7 +9,6 @@ from mathutils import Euler, Vector
 
 from ...engine.engine import ENGINE
 from ...scene.human import human_of
-from ...scene.preview import fit_cycles_to_volumes, frame_box, new_camera, people_extent, posed_extent
 
 _SAMPLES = 4
 _YAW = math.radians(20)
@@ -38,6 +37,8 @@ class PRIMDIFFUSION_OT_set_up_cycles(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Settings fit for a thousand volumes; camera, world, film and bounces of light between objects stay."""
+        from ...scene.preview import fit_cycles_to_volumes
+
         scene = context.scene
         if not hasattr(scene, "cycles"):
             self.report({"ERROR"}, "Cycles is switched off: enable the add-on Cycles Render Engine in the preferences")
@@ -59,6 +60,8 @@ class PRIMDIFFUSION_OT_add_camera(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """The camera becomes the scene's."""
+        from ...scene.preview import frame_box, new_camera, people_extent, posed_extent
+
         scene = context.scene
         person = human_of(context.view_layer.objects.active, scene)
         try:

@@ -7,8 +7,7 @@ from typing import Any
 
 import bpy
 
-from ...scene.beside import stand_beside_others
-from ...scene.human import build_human, overlap_warning
+from ...scene.human import overlap_warning
 from ...worker.sentence import sentence
 from ..generate.asking import Asking, last_seed
 from ..generate.quality import STEPS_AND_SAMPLER
@@ -16,7 +15,6 @@ from ..generate.settings import LARGEST_SEED
 from ..jobs.follow import redraw, submit
 from .icons import icons
 from .sheet import Variation, sheet
-from .work import VariationsWork
 
 _SELECTED = "Which one, counted from 0; -1: those that are selected"
 _SKIP = {"SKIP_SAVE"}
@@ -61,7 +59,7 @@ class PRIMDIFFUSION_OT_variations(_Variations, bpy.types.Operator):
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        return submit(self, context, VariationsWork(seeds, **sampling))
+        return _submit(self, context, seeds, sampling)
 
 
 class PRIMDIFFUSION_OT_more_like_variation(_Variations, bpy.types.Operator):
@@ -94,7 +92,7 @@ class PRIMDIFFUSION_OT_more_like_variation(_Variations, bpy.types.Operator):
         amount = self.amount if self.given("amount") else context.scene.primdiffusion_variations.amount
         title = f"Like seed {around[0].seed}"
         person = str(around[0].person)
-        return submit(self, context, VariationsWork(seeds, **sampling, person=person, amount=amount, title=title))
+        return _submit(self, context, seeds, sampling | {"person": person, "amount": amount, "title": title})
 
 
 class PRIMDIFFUSION_OT_select_variation(bpy.types.Operator):
@@ -218,12 +216,23 @@ def _poll_sheet(cls: type[bpy.types.Operator]) -> bool:
     return bool(sheet.variations)
 
 
+def _submit(
+    operator: bpy.types.Operator, context: bpy.types.Context, seeds: tuple[int, ...], fields: dict[str, Any]
+) -> set[str]:
+    from .work import VariationsWork
+
+    return submit(operator, context, VariationsWork(seeds, **fields))
+
+
 def _targets(index: int) -> list[Variation]:
     return sheet.chosen() if index < 0 else [sheet.at(index)]
 
 
 def _build(context: bpy.types.Context, wanted: list[Variation]) -> tuple[list[bpy.types.Collection], str]:
     """Whom it could build before something went wrong, and that in a sentence; empty when nothing did."""
+    from ...scene.beside import stand_beside_others
+    from ...scene.build import build_human
+
     built: list[bpy.types.Collection] = []
     context.window_manager.progress_begin(0, len(wanted))
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 
@@ -11,7 +12,9 @@ from ..jobs.queue import queue
 from ..manual import draw_manual_button
 from .icons import icons
 from .sheet import sheet
-from .work import VariationsWork
+
+if TYPE_CHECKING:
+    from .work import VariationsWork
 
 CELL_PX = 110
 """Width of a picture at which a sidebar of ordinary width holds two or three."""
@@ -47,7 +50,7 @@ class PRIMDIFFUSION_PT_variations(bpy.types.Panel):
         column.prop(settings, "quality")
         draw_job(layout, "variations", "primdiffusion.variations", "LIGHTPROBE_VOLUME")
         work = queue.current.work if queue.current is not None else None
-        if isinstance(work, VariationsWork):
+        if work is not None and work.kind == "variations":
             _draw_coming(layout, _columns(context), work)
         elif sheet.variations:
             _draw_sheet(layout, _columns(context))
