@@ -90,6 +90,13 @@ def command(*words: str, **changes) -> subprocess.CompletedProcess:
     )
 
 
+def first_message(child: subprocess.Popen) -> dict:
+    """Before it, 5.2 tells where a child has its colours from."""
+    assert child.stdout is not None
+    line = next(line for line in child.stdout if line.startswith(MARK))
+    return json.loads(line[len(MARK) :])
+
+
 def follow(until=lambda: False, seconds: float = 120) -> None:
     """Tick as Blender's timer does."""
     end = time.monotonic() + seconds
@@ -232,9 +239,7 @@ def test_a_child_whose_parent_is_gone_stops(only_good, tmp_path):
         [sys.executable, launch.__file__, "--", *words, "--size", "256", "256"],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
     )  # fmt: skip
-    line = child.stdout.readline()
-    assert line.startswith(MARK)
-    assert json.loads(line[len(MARK) :])["total"] == 20 * 36
+    assert first_message(child)["total"] == 20 * 36
     child.stdin.close()
     assert child.wait(30) == CANCELLED
     child.stdout.close()
@@ -247,8 +252,7 @@ def test_a_polite_kill_in_the_midst_of_a_view_ends_the_command_after_it(only_goo
         [sys.executable, launch.__file__, "--", *words, "--size", "256", "256"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
-    assert child.stdout is not None
-    child.stdout.readline()
+    first_message(child)
     time.sleep(moment)
     child.send_signal(signal.SIGTERM)
     _, complaints = child.communicate(timeout=30)

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="the backend has another Python than this Blender")
+
 import torch
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture import rig as backend_rig

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
+pytest.importorskip("torch", reason="the backend has another Python than this Blender")
+
 import torch
 from primdiffusion.body.measures import betas_of_measures as backend_betas_of_measures
 from primdiffusion.body.measures import measure as backend_measure
