@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, NoReturn, get_args
 import numpy as np
 
 from .blender_camera import CameraError
+from .names import LAYOUTS, PASSES
 from .rig import Arrangement, Rig, View
-from .settings import LAYOUTS, PASSES, Background, CaptureSettings, Device, Light
+from .settings import Background, CaptureSettings, Device, Light
 
 if TYPE_CHECKING:
     import argparse  # takes a fifth of what registering may take; imported where it is used

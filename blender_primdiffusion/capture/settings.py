@@ -10,15 +10,13 @@ from typing import Any, Literal, get_args
 
 from ..scene.joints import JOINT_NAMES
 from .layout import ENDINGS
+from .names import LAYOUTS, PASSES
 from .picture_files import DEPTH_UNIT
 from .rig import Rig, View
 
 Light = Literal["uniform", "dome", "hdri"]
 Background = Literal["black", "transparent"]
 Device = Literal["auto", "cpu", "gpu"]
-PASSES = ("img", "mask", "depth", "normal", "part")
-LAYOUTS = ("nerf", "opencv", "colmap")
-"""Camera files of other projects; the released code's files are always written."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,9 +6,11 @@ import json
 import os
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 SUFFIX = ".pose.json"
 _LONGEST_NAME = 60
@@ -29,6 +31,8 @@ def save_pose(folder: Path, name: str, pose: NDArray, translation: NDArray) -> P
     Any pose-reading program of ours reads it too (`pose`, `transl`). Raises PoseFileError for a name that is empty or
     no file's, or taken, and where the folder cannot be written to.
     """
+    import numpy as np  # not for those who ask for names alone: Blender starts without it
+
     name = name.strip()
     if not name or len(name) > _LONGEST_NAME or re.search(r'[\\/:*?"<>|\x00-\x1f]', name) or name.startswith("."):
         raise PoseFileError(
@@ -51,6 +55,8 @@ def save_pose(folder: Path, name: str, pose: NDArray, translation: NDArray) -> P
 
 def load_pose(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The pose [24, 3] and the translation [3] in a file. Raises PoseFileError where there is none."""
+    import numpy as np
+
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         pose = np.asarray(content["pose"], np.float64)

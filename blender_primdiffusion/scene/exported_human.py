@@ -14,8 +14,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-ENDING = ".human"
-ENDINGS = (".human", ".safetensors")
 """What is read: the same format under either name."""
 _LARGEST_HEADER = 1 << 20
 _METADATA = "__metadata__"

@@ -17,9 +17,6 @@ import bpy
 
 from .joints import JOINT_NAMES
 
-ENDINGS = {"GLB": (".glb",), "FBX": (".fbx",), "USD": (".usdc", ".usda", ".usd", ".usdz")}
-"""Of each format; the first is the usual one."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Frames:
@@ -53,7 +50,7 @@ def write_model(
     kind: str,
     frames: Frames,
 ) -> None:
-    """Writes `kind` (of ENDINGS) with everything it needs; a reader never sees half a file.
+    """Writes `kind` (GLB, FBX or USD) with everything it needs; a reader never sees half a file.
 
     USD's textures go into a folder beside the file, except in .usdz. Raises ValueError or RuntimeError where an
     exporter is missing or fails, OSError.

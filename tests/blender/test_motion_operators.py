@@ -21,7 +21,7 @@ from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.joints import JOINT_NAMES
-from blender_primdiffusion.scene.keyframes import action_curves, last_key, loops
+from blender_primdiffusion.scene.actions import action_curves, last_key, loops
 from blender_primdiffusion.ui.motion.import_motion import PRIMDIFFUSION_OT_import_motion, look_at
 from blender_primdiffusion.ui.motion.panels import PRIMDIFFUSION_MT_actions, PRIMDIFFUSION_PT_motion
 from blender_primdiffusion.ui.motion.under_cursor import nearest_to

@@ -5,20 +5,18 @@ from __future__ import annotations
 import contextlib
 import shlex
 import time
+from typing import TYPE_CHECKING
 
 import bpy
-import numpy as np
 from mathutils import Vector
-from numpy.typing import NDArray
 
-from ...capture.blender_camera import aim
-from ...capture.options import parse, settings_of
-from ...capture.report import Report, report_path
-from ...capture.rig import bounding_sphere
-from ...scene.convention import points_to_backend
 from ..jobs.follow import redraw
 from .session import Busy, captures
 from .settings import words_of
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 RIG = "Capture Rig"
 _TICK_S = 0.1
@@ -40,6 +38,8 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """With a window a Blender of its own renders and a timer follows it; in background mode this one renders."""
+        from ...capture.options import parse, settings_of
+
         try:
             if captures.busy:
                 raise Busy("captures are being rendered; wait for them or press Cancel")
@@ -58,8 +58,10 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
         return {"FINISHED"}
 
     def _render_here(self, context: bpy.types.Context, words: list[str]) -> set[str]:
-        from ...capture.command import describe, scans_in  # the reading of scans and poses would slow Blender's start
+        from ...capture.command import describe, scans_in
         from ...capture.job import run
+        from ...capture.options import parse, settings_of
+        from ...capture.report import Report, report_path
 
         options = parse(words)
         settings, report, told = settings_of(options), Report(), 0.0
@@ -113,6 +115,7 @@ class PRIMDIFFUSION_OT_verify_captures(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """With a window in a Blender of its own; in background mode here, and it fails where something is wrong."""
+        from ...capture.options import parse
         from ...capture.verify import repair, verify
 
         out = bpy.path.abspath(self.out or context.scene.primdiffusion_captures.out)
@@ -146,6 +149,8 @@ class PRIMDIFFUSION_OT_preview_rig(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """A collection of camera objects; they are only for looking at."""
+        from ...capture.blender_camera import aim
+
         collection = context.scene.collection.children.get(RIG)
         if collection is not None:
             remove_rig(collection)
@@ -182,6 +187,11 @@ def follow() -> float | None:
 
 def _sphere_around(context: bpy.types.Context) -> tuple[NDArray[np.float64], float]:
     """Of the active object and what hangs on it; of a person at the origin where there is none."""
+    import numpy as np
+
+    from ...capture.rig import bounding_sphere
+    from ...scene.convention import points_to_backend
+
     active = context.active_object
     things = [active, *active.children_recursive] if active is not None and active.type != "CAMERA" else []
     depsgraph = context.evaluated_depsgraph_get()

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import bpy
 
-from ...capture.layout import LIST_FILE
-
 _CAMERAS_FILE = "cameras.json"
 
 
 def subjects_in(folder: Path) -> list[str]:
     """Names of the people in a dataset of captures; none where the folder is one subject's own, or cannot be read."""
+    from ...capture.layout import LIST_FILE
+
     try:
         if (folder / _CAMERAS_FILE).is_file():
             return []

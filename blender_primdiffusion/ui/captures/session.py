@@ -19,10 +19,6 @@ from typing import IO
 
 import bpy
 
-from ...capture import launch
-from ...capture.options import MARK
-from ...console import CANCELLED, DONE
-
 PATIENCE_S = 0.7
 """After this a child that was asked to stop is ended: its views are written whole or not at all."""
 _KEPT_LINES = 200
@@ -130,6 +126,8 @@ class CaptureSession:
                 self._take(self._heard.get_nowait())
 
     def _take(self, line: str) -> None:
+        from ...capture.options import MARK
+
         if not line.startswith(MARK):
             return  # Blender's own
         progress = json.loads(line[len(MARK) :])
@@ -142,6 +140,8 @@ class CaptureSession:
             self.message = f"{progress['subject']}: view {progress['done']} of {progress['total']}"
 
     def _finish(self, code: int) -> None:
+        from ...console import CANCELLED, DONE
+
         self.exit_code, stopped = code, self._asked_to_stop_at is not None
         for stream in (self._process.stdout, self._process.stderr, self._process.stdin):
             with contextlib.suppress(OSError):
@@ -165,6 +165,8 @@ class CaptureSession:
 
 def child_command() -> list[str]:
     """What starts a Blender for captures; the extension's words follow."""
+    from ...capture import launch
+
     script = str(Path(launch.__file__).resolve())
     if bpy.app.binary_path:
         return [bpy.app.binary_path, "-b", "--factory-startup", "--python", script, "--"]

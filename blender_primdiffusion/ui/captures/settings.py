@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
-import numpy as np
 
-from ...capture.blender_camera import CameraError, view_of
-from ...capture.rig import Rig
-from ...capture.settings import LAYOUTS, PASSES
+from ...capture.names import LAYOUTS, PASSES
+
+if TYPE_CHECKING:
+    from ...capture.rig import Rig
 
 _PASS_NAMES = {
     "img": ("Colour", "What the camera sees, over black"),
@@ -143,11 +144,14 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     def elevations(self) -> list[float]:
         """Of the rings, degrees."""
         lowest, highest = math.degrees(self.lowest), math.degrees(self.highest)
-        values = np.linspace(lowest, highest, self.rings) if self.rings > 1 else np.array([(lowest + highest) / 2])
-        return [round(float(value), 4) for value in values]
+        if self.rings == 1:
+            return [round((lowest + highest) / 2, 4)]
+        return [round(lowest + (highest - lowest) * ring / (self.rings - 1), 4) for ring in range(self.rings)]
 
     def rig(self) -> Rig:
         """The rig asked for. Raises ValueError where it is the scene's cameras, or impossible."""
+        from ...capture.rig import Rig
+
         if self.arrangement == "custom":
             raise ValueError("the scene's cameras are no rig: they stand where they stand")
         return Rig(
@@ -193,6 +197,8 @@ def _rig_words(rig: Rig) -> list[str]:
 
 
 def _custom_words(asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, folder: Path) -> list[str]:
+    from ...capture.blender_camera import CameraError, view_of
+
     depsgraph, render = context.evaluated_depsgraph_get(), context.scene.render
     aspect = (render.pixel_aspect_x, render.pixel_aspect_y)
     things = asked.cameras.all_objects if asked.cameras is not None else context.selected_objects

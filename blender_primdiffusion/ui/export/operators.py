@@ -6,18 +6,11 @@ from pathlib import Path
 
 import bpy
 
-from ...scene.exported_human import ENDING, ENDINGS, motion_in, read_tensors
-from ...scene.exported_model import ENDINGS as MODEL_ENDINGS
-from ...scene.exported_model import check_ready
-from ...scene.exported_proxy import proxy_of, remove_proxy
 from ...scene.human import armature_of, humans
 from ..jobs.follow import submit
 from ..jobs.target import Target, named_person, selected_person
 from .destination import check_writable, destination
-from .mesh_work import AddProxyWork, ExportMeshWork, scene_frames
-from .person_work import ExportGaussiansWork, ExportVdbSequenceWork, ImportHumanWork
-from .settings import FORMATS, SHOWN
-from .showing import show
+from .settings import FORMATS, HUMAN_ENDINGS, MODEL_ENDINGS, SHOWN
 
 _HUMAN = "Name of the person (of their collection); empty: the selected one"
 _PANELS = "Not given: the panel's"
@@ -96,6 +89,9 @@ class PRIMDIFFUSION_OT_export_mesh(_ToFile, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """A format that is not given follows the file's ending."""
+        from ...scene.exported_model import check_ready
+        from .mesh_work import ExportMeshWork, scene_frames
+
         kind = self.chosen(context, "format")
         if not self.properties.is_property_set("format"):
             ending = Path(self.filepath).suffix.lower()
@@ -118,6 +114,9 @@ class PRIMDIFFUSION_OT_add_proxy(_OfPerson, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """In line."""
+        from ...scene.exported_model import check_ready
+        from .mesh_work import AddProxyWork
+
         target = Target.of(person)
         check_ready(armature_of(person))
         px, triangles = int(self.chosen(context, "texture_px")), self.chosen(context, "triangles")
@@ -135,6 +134,8 @@ class PRIMDIFFUSION_OT_show_proxy(_OfPerson, bpy.types.Operator):
 
     def act(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """At once."""
+        from .showing import show
+
         show(person, self.shown)
         return {"FINISHED"}
 
@@ -148,6 +149,9 @@ class PRIMDIFFUSION_OT_remove_proxy(_OfPerson, bpy.types.Operator):
 
     def act(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """At once."""
+        from ...scene.exported_proxy import proxy_of, remove_proxy
+        from .showing import show
+
         show(person, "VOLUMES")
         remove_proxy(proxy_of(person))
         return {"FINISHED"}
@@ -167,6 +171,7 @@ class PRIMDIFFUSION_OT_export_gaussians(_ToFile, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """In line, in the pose of now."""
+        from .person_work import ExportGaussiansWork
         from .posing import posed_now
 
         path = destination(self.filepath, self.endings(context))
@@ -195,6 +200,7 @@ class PRIMDIFFUSION_OT_export_vdb_sequence(_OfPerson, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """In line, with the poses of now."""
+        from .person_work import ExportVdbSequenceWork
         from .posing import posed_frames
 
         if not self.directory:
@@ -222,13 +228,14 @@ class PRIMDIFFUSION_OT_export_human(_ToFile, bpy.types.Operator):
 
     def endings(self, _context: bpy.types.Context) -> tuple[str, ...]:
         """Of people."""
-        return ENDINGS
+        return HUMAN_ENDINGS
 
     def act(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """At once: it needs no backend."""
         from .human_files import write_human
+        from .mesh_work import scene_frames
 
-        path = destination(self.filepath, ENDINGS)
+        path = destination(self.filepath, HUMAN_ENDINGS)
         write_human(
             context, person, path, scene_frames(context.scene, True) if self.chosen(context, "motion") else None
         )
@@ -244,7 +251,9 @@ class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
     bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO (the result has one)
 
     filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH", options=_SKIP)
-    filter_glob: bpy.props.StringProperty(default=f"*{ENDING};*.safetensors", options={"HIDDEN"})
+    filter_glob: bpy.props.StringProperty(
+        default=";".join(f"*{ending}" for ending in HUMAN_ENDINGS), options={"HIDDEN"}
+    )
     location: bpy.props.FloatVectorProperty(
         name="Location",
         description="Not given: the world's origin",
@@ -261,6 +270,9 @@ class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Look into the file, then put it in line; in background mode this waits for the person."""
+        from ...scene.exported_human import motion_in, read_tensors
+        from .person_work import ImportHumanWork
+
         path = Path(bpy.path.abspath(self.filepath))
         try:
             if not self.filepath or not path.is_file():

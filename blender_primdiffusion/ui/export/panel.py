@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import bpy
 
-from ...scene.exported_proxy import is_outdated, proxy_of
-from ...scene.shape import betas_of
 from ..jobs.drawing import draw_job
 from ..jobs.target import selected_person
 from ..manual import draw_manual_button
-from .showing import shown
 
 
 class _InSidebar:
@@ -51,6 +48,13 @@ class PRIMDIFFUSION_PT_export_mesh(_InSidebar, bpy.types.Panel):
         draw_job(layout, "export_mesh", "primdiffusion.export_mesh", "EXPORT")
         layout.separator()
         draw_job(layout, "add_proxy", "primdiffusion.add_proxy", "OUTLINER_OB_MESH")
+        self._draw_proxy(context)
+
+    def _draw_proxy(self, context: bpy.types.Context) -> None:
+        from ...scene.exported_proxy import is_outdated, proxy_of
+        from ...scene.shape import betas_of
+        from .showing import shown
+
         try:
             person = selected_person(context)
             proxy = proxy_of(person)
@@ -59,11 +63,11 @@ class PRIMDIFFUSION_PT_export_mesh(_InSidebar, bpy.types.Panel):
             return
         if proxy is None:
             return
-        row = layout.row(align=True)
+        row = self.layout.row(align=True)
         row.operator_menu_enum("primdiffusion.show_proxy", "shown", text=_LABELS[shown(person)], icon="HIDE_OFF")
         row.operator("primdiffusion.remove_proxy", text="", icon="X")
         if outdated:
-            layout.label(text="Shape or clothes have changed: add it again", icon="INFO")
+            self.layout.label(text="Shape or clothes have changed: add it again", icon="INFO")
 
 
 class PRIMDIFFUSION_PT_export_volumes(_InSidebar, bpy.types.Panel):

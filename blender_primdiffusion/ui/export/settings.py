@@ -9,6 +9,9 @@ FORMATS = (
     ("FBX", "FBX", "One .fbx file with the texture in it"),
     ("USD", "USD", "A .usd file with its texture beside it, or one .usdz file"),
 )
+MODEL_ENDINGS = {"GLB": (".glb",), "FBX": (".fbx",), "USD": (".usdc", ".usda", ".usd", ".usdz")}
+"""Of files, by the format; the first is the usual one."""
+HUMAN_ENDINGS = (".human", ".safetensors")
 SHOWN = (
     ("VOLUMES", "Volumes", "Show and render the volumes; the mesh proxy is hidden"),
     ("VIEWPORT", "Mesh in Viewport", "Show the mesh proxy while working, and render the volumes"),

@@ -5,13 +5,14 @@ from __future__ import annotations
 import bpy
 
 from ...scene.attachment import attachment_of, set_attachment
-from ...scene.exported_proxy import proxy_of
-from ...scene.merged import merged_of
-from ...scene.surface import carrier_of, primitives_of
 
 
 def show(person: bpy.types.Collection, what: str) -> None:
     """Switch to `what` of `settings.SHOWN`. Raises ValueError where there is no proxy; makes no undo step."""
+    from ...scene.exported_proxy import proxy_of
+    from ...scene.merged import merged_of
+    from ...scene.surface import carrier_of, primitives_of
+
     proxy = proxy_of(person)
     if proxy is None:
         raise ValueError(f"{person.name!r} has no mesh proxy yet: press Add Mesh Proxy")
@@ -25,6 +26,8 @@ def show(person: bpy.types.Collection, what: str) -> None:
 
 def shown(person: bpy.types.Collection) -> str:
     """Which of `settings.SHOWN` holds now."""
+    from ...scene.exported_proxy import proxy_of
+
     proxy = proxy_of(person)
     if proxy is None or proxy.hide_viewport:
         return "VOLUMES"

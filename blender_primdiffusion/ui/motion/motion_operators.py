@@ -79,7 +79,7 @@ class PRIMDIFFUSION_OT_loop_motion(OnArmature, bpy.types.Operator):
 
     def on(self, _context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
         """Cycles modifiers on all curves, or none."""
-        from ...scene.keyframes import action_curves, end_repeat, loops, repeat
+        from ...scene.actions import action_curves, end_repeat, loops, repeat
 
         if action_curves(armature) is None:
             raise ValueError(f"{armature.name!r} has no action to loop: import or add a motion first")

@@ -7,7 +7,7 @@ import json
 import bpy
 
 from ...motion.own_poses import own_poses
-from ...scene.keyframes import action_curves, loops
+from ...scene.actions import action_curves, loops
 from ..manual import draw_manual_button
 from .armatures import target_armature
 from .pose_pictures import poses_folder

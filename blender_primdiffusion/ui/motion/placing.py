@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from ...motion.adjust import cut, from_origin, in_place, leg_ratio, on_floor, resample, scale_places
 from ...motion.motion import Motion
 from ...motion.pose_library import check_posable, rest_joints
-from ...scene.keyframes import append_poses, keyframe_poses, last_key, push_to_strip
+from ...scene.actions import last_key, push_to_strip
+from ...scene.keyframes import append_poses, keyframe_poses
 from .armatures import scene_fps
 from .settings import FACTS
 

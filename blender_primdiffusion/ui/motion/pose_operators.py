@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import bpy
-import numpy as np
-from numpy.typing import NDArray
 
 from ...motion.own_poses import load_pose, own_poses, save_pose
 from ...scene.joints import JOINT_NAMES
 from .armatures import OnArmature, warn_of_rest
 from .pose_pictures import poses_folder
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 _SKIP = {"SKIP_SAVE"}
 
@@ -128,6 +131,8 @@ class PRIMDIFFUSION_OT_reset_pose(_Posing, bpy.types.Operator):
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
         """No turn and no move."""
+        import numpy as np
+
         return self.pose(context, armature, np.zeros((len(JOINT_NAMES), 3)), np.zeros(3), 1.0)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ...scene.keyframes import action_curves
+from ...scene.actions import action_curves
 from .armatures import target_armature
 from .pose_pictures import pose_items
 

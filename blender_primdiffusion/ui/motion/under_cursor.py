@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import bpy
-import numpy as np
-from numpy.typing import NDArray
 
 from ...scene.human import armature_of, humans
 from ...scene.joints import JOINT_NAMES
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 _MARGIN = 0.12
 """How far around the joints' rectangle still counts as the person, of its height."""
@@ -15,6 +18,7 @@ _MARGIN = 0.12
 
 def person_under(context: bpy.types.Context, event: bpy.types.Event) -> str:
     """Name of the person under the mouse in the 3D view; empty where there is none."""
+    import numpy as np
     from bpy_extras.view3d_utils import location_3d_to_region_2d
 
     region, view = context.region, context.region_data
@@ -34,6 +38,8 @@ def person_under(context: bpy.types.Context, event: bpy.types.Event) -> str:
 
 def nearest_to(mouse: tuple[float, float], seen: dict[str, NDArray]) -> str:
     """Of people's joints in the picture [n, 2], pixels, the name of those around the mouse; the closest of several."""
+    import numpy as np
+
     best, name = np.inf, ""
     for person, spots in seen.items():
         if len(spots) == 0:

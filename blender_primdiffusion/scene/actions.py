@@ -1,0 +1,58 @@
+"""The action an armature has: its curves, its end, its repetition, and its way into a strip."""
+
+from __future__ import annotations
+
+import bpy
+
+
+def push_to_strip(armature: bpy.types.Object) -> bpy.types.NlaStrip:
+    """The armature's action becomes a strip on a new track above those there are (the NLA's Push Down)."""
+    animation = armature.animation_data
+    action, slot = animation.action, animation.action_slot
+    track = animation.nla_tracks.new()
+    track.name = action.name
+    strip = track.strips.new(action.name, round(action.frame_range[0]), action)
+    strip.action_slot = slot
+    animation.action = None
+    return strip
+
+
+def action_curves(armature: bpy.types.Object) -> bpy.types.bpy_prop_collection | None:
+    """The curves that the armature's own slot of its action has; None without."""
+    animation = armature.animation_data
+    if animation is None or animation.action is None or animation.action_slot is None:
+        return None
+    for layer in animation.action.layers:
+        for strip in layer.strips:
+            bag = strip.channelbag(animation.action_slot)
+            if bag is not None:
+                return bag.fcurves
+    return None
+
+
+def last_key(armature: bpy.types.Object) -> float:
+    """Frame of the last key of the armature's action; minus infinity where it has none."""
+    ends = [curve.keyframe_points[-1].co[0] for curve in action_curves(armature) or () if len(curve.keyframe_points)]
+    return max(ends, default=float("-inf"))
+
+
+def loops(armature: bpy.types.Object) -> bool:
+    """Whether `repeat` is on."""
+    return any(modifier.type == "CYCLES" for curve in action_curves(armature) or () for modifier in curve.modifiers)
+
+
+def repeat(armature: bpy.types.Object) -> None:
+    """Let the action go on for ever, before and after: turns begin again, places go on from where they are."""
+    for curve in action_curves(armature) or ():
+        if not any(modifier.type == "CYCLES" for modifier in curve.modifiers):
+            cycles = curve.modifiers.new("CYCLES")
+            cycles.mode_before = cycles.mode_after = (
+                "REPEAT_OFFSET" if curve.data_path.endswith("location") else "REPEAT"
+            )
+
+
+def end_repeat(armature: bpy.types.Object) -> None:
+    """Undo `repeat`."""
+    for curve in action_curves(armature) or ():
+        for modifier in [modifier for modifier in curve.modifiers if modifier.type == "CYCLES"]:
+            curve.modifiers.remove(modifier)
