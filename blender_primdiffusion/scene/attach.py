@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from .folders import stored_path
 from .joints import JOINT_NAMES
 from .quaternion import matrix_to_quaternion
+from .relationship_lines import hide_relationship_lines
 
 
 def attach_volumes(
@@ -29,8 +30,10 @@ def attach_volumes(
 
     Parented to the armature, with an Armature constraint of one target per non-zero weight [K, 24] and preserve volume
     off: the evaluated matrix is A (sum_j w_j G_j) [rotation | position], with the armature object's matrix A and SMPL's
-    skinning transforms G_j. It shears where joints bend, as linear blending does.
+    skinning transforms G_j. It shears where joints bend, as linear blending does. Turns off the viewports' relationship
+    lines, of which there would be some thousand.
     """
+    hide_relationship_lines()
     quaternions = matrix_to_quaternion(rotation)
     objects = []
     for k, path in enumerate(files):

@@ -14,7 +14,6 @@ import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 import blender_primdiffusion
-from blender_primdiffusion import places
 from blender_primdiffusion.scene.human import folder_of, humans
 from blender_primdiffusion.ui.captures import reconstruct_operators, reconstruct_settings, reconstruct_work
 from blender_primdiffusion.ui.captures.reconstruct_panel import PRIMDIFFUSION_PT_human_from_captures
@@ -161,7 +160,7 @@ def test_the_real_child_makes_a_person_of_real_captures(saved_scene, tmp_path, m
     encoder = save_tiny_encoder(tmp_path / "encoder.safetensors")
     folder = captured(tmp_path / "made", people=2, frames=1, passes=("img", "mask"))
     python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
-    monkeypatch.setattr(places, "find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", lambda *_, **__: python)
     monkeypatch.setattr(work, "preference", lambda name: str(encoder) if name == "encoder" else "")
     blender_primdiffusion.register()
     try:

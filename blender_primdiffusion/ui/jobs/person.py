@@ -25,6 +25,8 @@ def build_person(
     keep = [Path(result["person"])] if "person" in result else []  # for the exact marcher, later
     collection = build_human(context, Path(result["human"]), name, keep)
     stand_beside_others(context, collection)
-    warnings = [sentence(text) for text in (*result.get("warnings", ()), overlap_warning(collection)) if text]
+    warnings = list(result.get("warnings", ()))
+    if context.scene.render.engine == "CYCLES" and (overlap := overlap_warning(collection)):
+        warnings.append(overlap)
     notice = f"{made} in {result['seconds']:.1f} s, built in {time.monotonic() - began:.1f} s"
-    return collection, " ".join(warnings) or notice
+    return collection, " ".join([sentence(notice), *map(sentence, warnings)])
