@@ -72,7 +72,10 @@ def volume_path(volume: bpy.types.Volume) -> Path:
 
 def overlap_warning(collection: bpy.types.Collection) -> str | None:
     """A sentence for the user when Cycles will drop volumes of this person, else None."""
-    most = int(json.loads(collection[MARK])["most_overlapping"])
+    try:
+        most = int(json.loads(collection[MARK])["most_overlapping"])
+    except (ValueError, KeyError, TypeError):  # changed by hand
+        return None
     if most <= CYCLES_LIMIT:
         return None
     return (

@@ -35,7 +35,7 @@ SAME_BETAS = 1e-5
 def betas_of(collection: bpy.types.Collection) -> NDArray[np.float64]:
     """The person's shape [10] as the engine draws it now. Raises ValueError where it is no list of ten numbers."""
     armature = armature_of(collection)
-    given = armature.get(BETAS, generated_betas(collection))
+    given = armature[BETAS] if BETAS in armature else generated_betas(collection)
     try:
         betas = np.array(list(given), np.float64)
     except (TypeError, ValueError):
@@ -49,8 +49,18 @@ def betas_of(collection: bpy.types.Collection) -> NDArray[np.float64]:
 
 
 def generated_betas(collection: bpy.types.Collection) -> NDArray[np.float64]:
-    """The shape [10] that the person was generated with, or got from their last edit."""
-    return np.array(json.loads(collection[MARK])["betas"], np.float64)
+    """The shape [10] that the person was generated with, or got from their last edit. Raises ValueError where the
+    collection's note of that is damaged."""
+    try:
+        betas = np.array(json.loads(collection[MARK])["betas"], np.float64)
+    except (ValueError, KeyError, TypeError):
+        betas = np.empty(0)
+    if betas.shape != (COUNT,):
+        raise ValueError(
+            f"the custom property {MARK!r} of {collection.name!r} was changed by hand and tells no shape: undo that, "
+            "or generate the person again"
+        )
+    return betas
 
 
 def keeps_own_shape(collection: bpy.types.Collection) -> bool:

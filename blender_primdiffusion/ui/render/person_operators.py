@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ...scene.attachment import attachment_before_merge, attachment_of, set_attachment
-from ...scene.human import humans
+from ...scene.human import armature_of, humans
 from ..jobs.follow import submit
 from ..jobs.target import named_person, selected_person
 
@@ -163,8 +163,7 @@ class PRIMDIFFUSION_OT_fit_density_gain(_OfPerson, bpy.types.Operator):
 def _moment(person: bpy.types.Collection, graph: bpy.types.Depsgraph) -> Moment:
     from .merge_work import Moment
 
-    armature = next(thing for thing in person.objects if thing.type == "ARMATURE")
-    return Moment.now(person, armature.evaluated_get(graph))
+    return Moment.now(person, armature_of(person).evaluated_get(graph))
 
 
 def _moments(context: bpy.types.Context, person: bpy.types.Collection, frames: range) -> list[Moment]:

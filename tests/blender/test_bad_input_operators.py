@@ -1,0 +1,278 @@
+"""Everything a user can press in a wrong order: each operator works, or says in one sentence what is wrong."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import re
+import shutil
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from unittest.mock import MagicMock
+
+import bpy
+import pytest
+import synthetic
+import synthetic_shape
+from test_missing_volumes import write_person
+
+from blender_primdiffusion.scene.body_mesh import body_of
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.human import armature_of, humans
+
+ELSEWHERE = {"open_manual", "repair_backend", "test_backend", "set_up_backend", "make_pose_assets", "take_result"}
+"""Open a browser, set up, or write a library, whatever is in the scene; `take_result` is for the queue alone."""
+_BLENDER_LISTS = {"window_managers", "workspaces", "screens", "texts", "palettes", "brushes", "libraries"}
+"""Blender's own, or where an operator says something. A linked person's library is one of theirs."""
+
+
+def operators() -> list[str]:
+    return [name for name in dir(bpy.ops.primdiffusion) if name not in ELSEWHERE]
+
+
+def everything() -> dict[str, set[str]]:
+    kinds = [prop.identifier for prop in bpy.data.bl_rna.properties if prop.type == "COLLECTION"]
+    return {
+        kind: {thing.name_full for thing in getattr(bpy.data, kind)} for kind in kinds if kind not in _BLENDER_LISTS
+    }
+
+
+def state() -> tuple:
+    """What a refusal must leave as it was."""
+    active = bpy.context.view_layer.objects.active
+    selected = sorted(thing.name for thing in bpy.context.view_layer.objects.selected)
+    places = {thing.name: [list(row) for row in thing.matrix_basis] for thing in bpy.data.objects}
+    paths = {volume.name: volume.filepath for volume in bpy.data.volumes}
+    marks = {c.name: {key: str(c[key]) for key in c.keys()} for c in bpy.data.collections}  # noqa: SIM118
+    return everything(), active and (active.name, active.mode), selected, places, paths, marks
+
+
+def fault(name: str) -> str:
+    """What is wrong about the operator's answer; empty when nothing is."""
+    before = state()
+    try:
+        answer = getattr(bpy.ops.primdiffusion, name)()
+    except RuntimeError as error:
+        text = str(error).strip()
+        if "Traceback" in text:
+            return f"{name}: {text.splitlines()[-1]}\n{text}"
+        if "context is incorrect" in text:
+            return f"{name}: poll without a reason"
+        said = re.sub(r"^(Error: |Operator bpy\.ops\.primdiffusion\.\w+\.poll\(\) )", "", text)
+        if "\n" in said or len(said.split()) < 3:
+            return f"{name}: no sentence: {said!r}"
+        changes = [(a, b) for a, b in zip(before, state(), strict=True) if a != b]
+        return f"{name}: refused ({said}) after changing {changes}" if changes else ""
+    return "" if answer == {"FINISHED"} else f"{name}: {answer} without a word"
+
+
+def empty(_person) -> None:
+    bpy.data.batch_remove([*bpy.data.objects, *bpy.data.collections])
+
+
+def nothing_active(_person) -> None:
+    bpy.context.view_layer.objects.active = None
+    for thing in bpy.context.view_layer.objects:
+        thing.select_set(False)
+
+
+def _enter(thing: bpy.types.Object, mode: str) -> None:
+    thing.hide_viewport = False
+    bpy.context.view_layer.objects.active = thing
+    bpy.ops.object.mode_set(mode=mode)
+
+
+def armature_in_edit_mode(person) -> None:
+    _enter(armature_of(person), "EDIT")
+
+
+def armature_in_pose_mode(person) -> None:
+    _enter(armature_of(person), "POSE")
+
+
+def body_in_edit_mode(person) -> None:
+    _enter(body_of(person), "EDIT")
+
+
+def body_being_painted(person) -> None:
+    _enter(body_of(person), "WEIGHT_PAINT")
+
+
+def armature_deleted(person) -> None:
+    bpy.data.objects.remove(armature_of(person))
+
+
+def armature_data_deleted(person) -> None:
+    bpy.data.armatures.remove(armature_of(person).data)
+
+
+def volumes_deleted(_person) -> None:
+    bpy.data.batch_remove(list(bpy.data.volumes))
+
+
+def body_deleted(person) -> None:
+    bpy.data.objects.remove(body_of(person))
+
+
+def bones_renamed(person) -> None:
+    armature_of(person).data.bones["spine2"].name = "Wirbelsäule"
+
+
+def mark_damaged(person) -> None:
+    person["primdiffusion_human"] = "{}"
+
+
+def linked(_person) -> None:
+    path = bpy.data.filepath
+    bpy.ops.wm.read_homefile(use_empty=True)
+    with bpy.data.libraries.load(path, link=True) as (_, wanted):
+        wanted.collections = ["Anna"]
+    bpy.context.scene.collection.children.link(wanted.collections[0])
+
+
+def overridden(person) -> None:
+    linked(person)
+    made = bpy.data.collections["Anna"].override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
+    assert made is not None
+
+
+def instanced(person) -> None:
+    linked(person)
+    bpy.context.scene.collection.children.unlink(bpy.data.collections["Anna"])
+    empty = bpy.data.objects.new("Anna here", None)
+    empty.instance_type, empty.instance_collection = "COLLECTION", bpy.data.collections["Anna"]
+    bpy.context.scene.collection.objects.link(empty)
+    bpy.context.view_layer.objects.active = empty
+
+
+def excluded(person) -> None:
+    bpy.context.view_layer.layer_collection.children[person.name].exclude = True
+
+
+def hidden(person) -> None:
+    bpy.context.view_layer.layer_collection.children[person.name].hide_viewport = True
+    person.hide_viewport = True
+
+
+def files_missing(_person) -> None:
+    shutil.move(Path(bpy.data.filepath).with_name("shot_humans"), Path(bpy.data.filepath).with_name("gone"))
+
+
+def never_saved(person) -> None:
+    bpy.ops.wm.read_homefile(use_empty=True)
+    build_human(bpy.context, SOURCE["npz"], "Anna", [SOURCE["file"]])
+
+
+def backend_missing(_person) -> None:
+    from blender_primdiffusion.worker import environment
+    from blender_primdiffusion.worker.environment import BackendNotFound
+
+    def nowhere(*_, **__):
+        raise BackendNotFound("the preferences name the Python '/nowhere/python', which does not exist: set it up")
+
+    environment.find_backend_python = nowhere
+
+
+def two_people(_person) -> None:
+    build_human(bpy.context, SOURCE["npz"], "Berta", [SOURCE["file"]])
+    nothing_active(None)
+
+
+def tiny_units(person) -> None:
+    bpy.context.scene.unit_settings.scale_length = 0.01
+    armature_of(person).scale = (100, 100, 100)
+
+
+SITUATIONS: list[Callable] = [
+    empty, nothing_active, armature_in_edit_mode, armature_in_pose_mode, body_in_edit_mode, body_being_painted,
+    armature_deleted, armature_data_deleted, volumes_deleted, body_deleted, bones_renamed, mark_damaged, linked,
+    overridden, instanced, excluded, hidden, files_missing, never_saved, backend_missing, two_people, tiny_units,
+]  # fmt: skip
+SOURCE: dict[str, Path] = {}
+
+
+@pytest.fixture
+def anna(addon, tmp_path, monkeypatch):
+    from blender_primdiffusion.worker import environment
+
+    monkeypatch.setattr(environment, "find_backend_python", environment.find_backend_python)  # after `backend_missing`
+    npz = synthetic_shape.write(tmp_path / "human.npz", 8)
+    monkeypatch.setenv("FAKE_HUMAN", str(npz))
+    (tmp_path / "first").mkdir()
+    write_person(tmp_path / "first" / "person.human.safetensors", synthetic.arrays(8)["betas"])
+    SOURCE.update(npz=npz, file=tmp_path / "first" / "person.human.safetensors")
+    person = build_human(addon, npz, "Anna", [SOURCE["file"]])
+    bpy.context.view_layer.objects.active = armature_of(person)
+    bpy.context.scene.frame_end = 2
+    bpy.ops.wm.save_mainfile()
+    (tmp_path / "for the child").mkdir()
+    shutil.copytree(tmp_path / "shot_humans", tmp_path / "kept_aside")
+    return tmp_path
+
+
+def _asked(monkeypatch, folder: Path) -> None:
+    """Works are asked for their parameters, and then end well: what the child does is for other tests."""
+    from blender_primdiffusion.ui.jobs import follow
+    from blender_primdiffusion.ui.jobs.queue import Outcome, queue
+    from blender_primdiffusion.ui.jobs.remedies import error_in_the_scene
+
+    def wait_for(entry):
+        queue.waiting.remove(entry)
+        try:
+            entry.work.params(folder)
+        except (ValueError, OSError) as error:
+            return Outcome(entry, error=error_in_the_scene(error))
+        return Outcome(entry, "done")
+
+    monkeypatch.setattr(follow, "_wait_for", wait_for)
+
+
+@pytest.mark.parametrize("situation", SITUATIONS, ids=lambda one: one.__name__)
+def test_every_operator_works_or_says_what_is_wrong(anna, situation, monkeypatch):
+    if situation is not backend_missing:
+        _asked(monkeypatch, anna / "for the child")
+    faults = []
+    again = True
+    for name in operators():
+        if again:
+            shutil.rmtree(anna / "shot_humans", ignore_errors=True)
+            shutil.rmtree(anna / "gone", ignore_errors=True)
+            shutil.copytree(anna / "kept_aside", anna / "shot_humans")
+            bpy.ops.wm.open_mainfile(filepath=str(anna / "shot.blend"))
+            situation(humans(bpy.context.scene)[0])
+        before = state()
+        wrong = fault(name)
+        again = before != state()
+        if wrong:
+            faults.append(wrong)
+    assert not faults, "\n".join(faults)
+
+
+class _Drawn:
+    """A panel that is drawn into nothing."""
+
+    def __init__(self, cls: type) -> None:
+        self._cls, self.layout = cls, MagicMock()
+        self.layout.panel.side_effect = lambda *_, **__: (MagicMock(), MagicMock())
+
+    def __getattr__(self, name: str):
+        found = getattr(self._cls, name)
+        return functools.partial(found, self) if inspect.isfunction(found) else found
+
+
+@pytest.mark.parametrize("situation", SITUATIONS, ids=lambda one: one.__name__)
+def test_every_panel_is_drawn(anna, situation):
+    situation(humans(bpy.context.scene)[0])
+    drawn, faults = 0, []
+    for cls in bpy.types.Panel.__subclasses__():
+        if not (cls.__name__.startswith("PRIMDIFFUSION_PT_") and cls.is_registered):
+            continue
+        try:
+            if not hasattr(cls, "poll") or cls.poll(bpy.context):
+                drawn += 1
+                cls.draw(_Drawn(cls), bpy.context)
+        except Exception:
+            faults.append(f"{cls.__name__}: {traceback.format_exc()}")
+    assert not faults, "\n".join(faults)
+    assert drawn > 5
