@@ -23,10 +23,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("blender")
 
 
+GRIDS_KEPT_MB = 64
+"""Blender keeps grids of files that are long deleted, up to 4 GB of them in each worker."""
+
+
 @pytest.fixture
 def empty_scene():
     """A context with an empty, unsaved file."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.context.preferences.system.memory_cache_limit = GRIDS_KEPT_MB
     return bpy.context
 
 
@@ -49,7 +54,7 @@ def addon(saved_scene, tmp_path, monkeypatch):
 
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic.write(tmp_path / "prepared.npz", 8)))
     python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-    monkeypatch.setattr(places, "find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", lambda *_, **__: python)
     monkeypatch.setattr(places, "backend_module_path", lambda: Path(__file__).parent / "fake_backend")
     queue.outcomes.clear()
     queue.info = {}
