@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 
-from .worker.backend import Backend
-from .worker.client import BackendClient
-from .worker.environment import find_backend_python
-from .worker.setup_folder import SetUpFolder, short_root
+if TYPE_CHECKING:
+    from .worker.backend import Backend
+    from .worker.client import BackendClient
+    from .worker.setup_folder import SetUpFolder
 
 EXTENSION = str(__package__)
 """The extension's full module name; `bl_ext.<repository>.primdiffusion` once installed."""
@@ -44,12 +45,15 @@ def cache_folder() -> Path:
 
 def set_up_folder() -> SetUpFolder:
     """Where the private environment is, or would be: lasting, and short enough for Windows."""
+    from .worker import setup_folder
+
     try:
         own = Path(bpy.utils.extension_path_user(EXTENSION))
     except ValueError:  # not installed as an extension
         own = Path(bpy.utils.user_resource("DATAFILES", path="primdiffusion"))
     local = os.environ.get("LOCALAPPDATA") if os.name == "nt" else None
-    return SetUpFolder(short_root(own, Path(local) if local else None, "{}{}".format(*bpy.app.version)))
+    root = setup_folder.short_root(own, Path(local) if local else None, "{}{}".format(*bpy.app.version))
+    return setup_folder.SetUpFolder(root)
 
 
 def preference(name: str) -> str:
@@ -64,13 +68,16 @@ def new_backend(python: str) -> Backend:
 
     What Blender knows is read here: the thread that starts the child must not touch bpy.
     """
+    from .worker import client, environment
+    from .worker.backend import Backend
+
     module_path, cache = backend_module_path(), cache_folder()
     own_environment = set_up_folder().environment
 
     def make_client() -> BackendClient:
-        found = find_backend_python(python or None, own_environment, module_path, cache_dir=cache)
-        client = BackendClient(found.path, module_path, cache_dir=cache)
-        client.info["torch"] = found.torch  # which the child does not tell
-        return client
+        found = environment.find_backend_python(python or None, own_environment, module_path, cache_dir=cache)
+        made = client.BackendClient(found.path, module_path, cache_dir=cache)
+        made.info["torch"] = found.torch  # which the child does not tell
+        return made
 
     return Backend(make_client)

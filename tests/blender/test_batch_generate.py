@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import synthetic
 
-from blender_primdiffusion import places
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, NO_BACKEND, UNUSABLE
 from blender_primdiffusion.scene.human import armature_of, humans, person_file, volume_path
 from blender_primdiffusion.ui.batch.command import execute
@@ -134,7 +133,7 @@ def test_without_a_backend_everybody_is_spared_the_attempt(out, monkeypatch, cap
     def nowhere(*_, **__):
         raise BackendNotFound("No Python for the backend: /nowhere does not exist")
 
-    monkeypatch.setattr(places, "find_backend_python", nowhere)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", nowhere)
     assert generate(out, "--count", 3) == NO_BACKEND
     assert "/nowhere does not exist" in capfd.readouterr().err
     assert not list(out.glob("person*"))

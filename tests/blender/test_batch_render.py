@@ -13,7 +13,6 @@ from bpy_extras.object_utils import world_to_camera_view
 from engine_stage import pixels
 from mathutils import Vector
 
-from blender_primdiffusion import places
 from blender_primdiffusion.console import DONE, FAILED, NO_BACKEND, UNUSABLE
 from blender_primdiffusion.ui.batch.command import execute
 from blender_primdiffusion.ui.batch.people import go_round, moving_extent
@@ -132,7 +131,7 @@ def test_without_a_backend_it_says_so_at_once(people, out, monkeypatch, capfd):
     def nowhere(*_, **__):
         raise BackendNotFound("No Python for the backend: /nowhere does not exist")
 
-    monkeypatch.setattr(places, "find_backend_python", nowhere)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", nowhere)
     assert render(people, out, *SMALL) == NO_BACKEND
     assert "/nowhere does not exist" in capfd.readouterr().err
     assert pictures(out) == []

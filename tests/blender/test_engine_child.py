@@ -32,7 +32,7 @@ COLOUR = np.round(255 * np.array([0.5372549, 0.7372549, 0.88235295, 1.0]))
 def stage(saved_scene, tmp_path, monkeypatch):
     """The engine on the fake child, with a camera."""
     python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-    monkeypatch.setattr(places, "find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", lambda *_, **__: python)
     monkeypatch.setattr(places, "backend_module_path", lambda: FAKE)
     blender_primdiffusion.register()
     scene = saved_scene.scene
@@ -115,7 +115,7 @@ def test_a_cancel_does_not_wait_for_a_child_that_is_still_being_started(stage, m
         time.sleep(3.0)
         raise AssertionError
 
-    monkeypatch.setattr(places, "find_backend_python", slowly)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", slowly)
     began = time.monotonic()
     final.render_layer(Engine(stop_after_s=0.0), bpy.context.evaluated_depsgraph_get())
     assert time.monotonic() - began < 1.0
@@ -159,7 +159,7 @@ def test_an_error_of_the_child_keeps_its_remedy_and_ends_an_animation(stage, mon
 
 
 def test_without_a_backend_the_error_names_what_was_tried(stage, monkeypatch):
-    monkeypatch.setattr(places, "find_backend_python", find_nothing)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", find_nothing)
     with pytest.raises(RuntimeError, match="extension's preferences"):
         render()
 
@@ -250,8 +250,9 @@ import sys, os, threading, time
 from pathlib import Path
 import bpy, blender_primdiffusion as b
 from blender_primdiffusion import places
+from blender_primdiffusion.worker import environment
 from blender_primdiffusion.worker.environment import BackendPython
-places.find_backend_python = lambda *_, **__: BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
+environment.find_backend_python = lambda *_, **__: BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
 places.backend_module_path = lambda: Path(sys.argv[1])
 b.register()
 from blender_primdiffusion.engine import studio

@@ -33,7 +33,7 @@ def store(saved_scene, tmp_path, monkeypatch):
     exporting.write_store(folder)
     monkeypatch.setenv("EXPORT_FOLDER", str(folder))
     python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-    monkeypatch.setattr(places, "find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", lambda *_, **__: python)
     monkeypatch.setattr(places, "backend_module_path", lambda: Path(__file__).parent / "export_backend")
     blender_primdiffusion.register()
     yield folder

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import blender_primdiffusion
-from blender_primdiffusion import places
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import attachment_of, set_attachment
 from blender_primdiffusion.scene.gain import density_gain
@@ -30,10 +29,13 @@ def person(saved_scene, tmp_path, monkeypatch):
 
     checkpoint = save_tiny_checkpoint(tmp_path / "tiny.safetensors")
     python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
-    monkeypatch.setattr(places, "find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", lambda *_, **__: python)
     monkeypatch.setattr(work, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
     # With a cache in Blender's temporary folder the child would compile its marcher anew for each test.
-    monkeypatch.setattr(places, "BackendClient", lambda python, module, cache_dir: BackendClient(python, module))
+    monkeypatch.setattr(
+        "blender_primdiffusion.worker.client.BackendClient",
+        lambda python, module, cache_dir: BackendClient(python, module),
+    )
     blender_primdiffusion.register()
     try:
         ops.generate(seed=1, steps=2)

@@ -33,7 +33,7 @@ def wheels(empty_scene, tmp_path, monkeypatch) -> Path:
     lock = write_lock(tmp_path / "lock.txt", write_packages(folder))
     monkeypatch.delenv(VARIABLE, raising=False)
     own_index(monkeypatch)
-    monkeypatch.setattr(places, "short_root", lambda *_: tmp_path / "eigener ordner")
+    monkeypatch.setattr("blender_primdiffusion.worker.setup_folder.short_root", lambda *_: tmp_path / "eigener ordner")
     monkeypatch.setattr(places, "backend_module_path", lambda: BACKEND)
     monkeypatch.setattr("blender_primdiffusion.ui.setup.plans.backend_module_path", lambda: BACKEND)
     monkeypatch.setattr(known, "_has_torch", lambda: False)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import errno
-import traceback
 from typing import TYPE_CHECKING
 
 import bpy
@@ -71,6 +70,8 @@ def error_in_the_scene(error: Exception) -> JobError:
 
 def defect_in_the_scene(error: Exception) -> JobError:
     """As `error_in_the_scene`, of an exception that is being handled and that nobody foresaw: with its traceback."""
+    import traceback
+
     from ...worker.job import JobError
 
     trace = tuple(traceback.format_exc().splitlines())

@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import bpy
 
 from ...places import EXTENSION, preference, set_up_folder
-from ...worker.environment import VARIABLE
-from ...worker.setup_folder import state_of
 
 if TYPE_CHECKING:
     from ...worker.setup_locks import Lock
@@ -42,6 +40,9 @@ class Known:
 
 def known() -> Known:
     """Follows the order in which a Python is looked for when the backend starts."""
+    from ...worker.environment import VARIABLE
+    from ...worker.setup_folder import state_of
+
     if named := preference("backend_python"):
         return Known("named", True, f"Uses {named}")
     if named := os.environ.get(VARIABLE):

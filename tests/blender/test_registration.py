@@ -1,0 +1,69 @@
+"""What enabling the extension costs at each start of Blender."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+MOST_MODULES = 120
+"""Of ours. Each costs about half a millisecond; what works, as against what is drawn, is imported when asked for."""
+LATE = (
+    "scene.build", "scene.edited", "scene.merged", "scene.shape", "scene.shape_model", "scene.surface", "scene.volumes",
+    "scene.human_file", "scene.memory", "scene.collect", "scene.exported_human", "scene.exported_proxy",
+    "capture.settings", "capture.rig", "motion.poses", "engine.viewport", "engine.studio", "worker.client",
+    "worker.environment", "worker.job", "worker.kept_works", "ui.generate.work", "ui.human.edit_work",
+)  # fmt: skip
+"""Modules of ours that registering must not import: they bring others along, or numpy."""
+CHILD = """
+import bpy, sys, time
+for name in [name for name in sys.modules if name.partition(".")[0] == "numpy"]:
+    sys.modules[name] = None  # Blender has not imported it when it enables extensions: so importing it fails here
+start = time.process_time()
+import blender_primdiffusion
+blender_primdiffusion.register()
+print("TOOK", time.process_time() - start)
+print("HAS", *(name for name, module in sys.modules.items() if module is not None))
+"""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Seconds of the processor, and names of modules, of several Blenders; compiled before, as from the second on."""
+    environment = {**os.environ, "PYTHONPYCACHEPREFIX": str(tmp_path_factory.mktemp("compiled"))}
+    compiled = [sys.executable, "-m", "compileall", "-q", ROOT / "blender_primdiffusion"]
+    subprocess.run(compiled, env=environment, check=True)
+    found = []
+    for _ in range(5):
+        done = subprocess.run(
+            [sys.executable, "-c", CHILD], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+        )
+        assert "HAS" in done.stdout, done.stderr
+        told = dict(line.split(maxsplit=1) for line in done.stdout.splitlines() if line.startswith(("TOOK", "HAS")))
+        found.append((float(told["TOOK"]), set(told["HAS"].split())))
+    return found
+
+
+def test_registering_is_quick(runs):
+    assert min(seconds for seconds, _ in runs) < 0.1  # the best: other programs' use of the caches is not ours
+
+
+def test_registering_imports_few_modules_and_none_that_work(runs):
+    _, modules = runs[0]
+    ours = {name.removeprefix("blender_primdiffusion.") for name in modules if name.startswith("blender_primdiffusion")}
+    assert len(ours) <= MOST_MODULES
+    assert not ours & set(LATE)
+    assert not modules & {"numpy", "torch", "openvdb", "scipy", "primdiffusion"}
+
+
+def test_each_kind_of_work_is_found_where_it_is_registered(addon):
+    from blender_primdiffusion.ui.jobs import work
+
+    assert "generate" in work._kinds
+    for kind in work._kinds:
+        assert work.registered_kind(kind).kind == kind
+    assert work.registered_kind("of a later version") is None
