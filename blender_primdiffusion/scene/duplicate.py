@@ -8,6 +8,7 @@ from typing import Any
 import bpy
 
 from .human import armature_of
+from .node_inputs import node_inputs, set_node_input
 from .rename import keep_surface, part_name
 from .shape import volumes_of
 
@@ -78,11 +79,11 @@ def _point_to(pointing: Any, twins: dict[Any, Any]) -> None:
 
 
 def _point_sockets_to(modifier: Any, twins: dict[Any, Any]) -> None:
-    """The inputs of a Geometry Nodes modifier are custom properties of it."""
+    """The inputs of a Geometry Nodes modifier are no properties of its type."""
     if getattr(modifier, "type", "") == "NODES":
-        for key in list(modifier.keys()):
-            if isinstance(modifier[key], bpy.types.ID) and modifier[key] in twins:
-                modifier[key] = twins[modifier[key]]
+        for socket, value in node_inputs(modifier).items():
+            if isinstance(value, bpy.types.ID) and value in twins:
+                set_node_input(modifier, socket, twins[value])
 
 
 def _holders(collection: bpy.types.Collection) -> list[bpy.types.Collection]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from .body_mesh import body_of
 from .human import armature_of
+from .node_inputs import set_node_input
 from .shape import shape_model_of, volumes_of
 from .shape_model import ShapeModel
 from .surface_nodes import BODY, FIRST, PICK, PRIMITIVE, VERTEX, VOLUMES, WEIGHTS, surface_group
@@ -70,7 +71,8 @@ def build_surface(collection: bpy.types.Collection) -> bpy.types.Object:
     sockets = {
         item.name: item.identifier for item in modifier.node_group.interface.items_tree if item.in_out == "INPUT"
     }
-    modifier[sockets[BODY]], modifier[sockets[VOLUMES]] = body, primitives
+    set_node_input(modifier, sockets[BODY], body)
+    set_node_input(modifier, sockets[VOLUMES], primitives)
     return carrier
 
 

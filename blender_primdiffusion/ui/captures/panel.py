@@ -35,6 +35,8 @@ class PRIMDIFFUSION_PT_captures(_InSidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Reads the session; starts nothing."""
         layout, asked = self.layout, context.scene.primdiffusion_captures
+        layout.use_property_split = True
+        layout.use_property_decorate = False
         column = layout.column()
         column.enabled = not captures.busy
         column.prop(asked, "people")
