@@ -51,12 +51,15 @@ class PRIMDIFFUSION_PT_export_mesh(_InSidebar, bpy.types.Panel):
         self._draw_proxy(context)
 
     def _draw_proxy(self, context: bpy.types.Context) -> None:
+        try:
+            person = selected_person(context)
+        except ValueError:
+            return
         from ...scene.exported_proxy import is_outdated, proxy_of
         from ...scene.shape import betas_of
         from .showing import shown
 
         try:
-            person = selected_person(context)
             proxy = proxy_of(person)
             outdated = proxy is not None and is_outdated(person, proxy, betas_of(person))
         except ValueError:
