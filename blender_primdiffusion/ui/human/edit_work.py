@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 
 from ...scene.edited import replace_person
+from ...scene.grid_cache import free_unused_grids
 from ...scene.human import overlap_warning, person_file
 from ...worker.sentence import sentence
 from ..jobs.target import Target
@@ -58,10 +59,12 @@ class EditWork(Work):
         params["picture_px"] = _STEP_PICTURE_PX
         return {**params, **checkpoint, "out_dir": str(folder)}
 
-    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Show the edited person in the place of the one that was; in which scene does not matter."""
         person = self.target.found()
         done = replace_person(person, Path(result["human"]), Path(result["person"]))
+        context.view_layer.update()  # what is evaluated holds the grids of before
+        free_unused_grids()
         shape = ", the body's shape too" if done.reshaped else ""
         news = f"{self.made} in {result['seconds']:.1f} s; {done.volumes} of {done.of} volumes of {person.name} changed"
         warnings = (*result.get("warnings", ()), done.warning, overlap_warning(person))

@@ -101,12 +101,15 @@ class PRIMDIFFUSION_OT_delete_human(_Whole, bpy.types.Operator):
 
     def do(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
         """Linked people are unlinked by the Outliner, not here: they belong to another file."""
+        from ...scene.grid_cache import free_unused_grids
         from ...scene.painted import leave_mode
 
         if person.library is not None:
             raise ValueError(f"the person {person.name!r} is linked: remove them in the Outliner, by Unlink")
         leave_mode(context)
         remove_human(person)
+        context.view_layer.update()  # what is evaluated holds grids too
+        free_unused_grids()
 
 
 def select(context: bpy.types.Context, person: bpy.types.Collection) -> None:

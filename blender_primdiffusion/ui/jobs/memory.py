@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import bpy
 
 from ...places import EXTENSION
@@ -9,6 +11,8 @@ from .queue import queue
 
 IDLE_MINUTES = 10.0
 """Where the preferences do not say."""
+_WORTH_TELLING = 50e6
+"""Bytes."""
 
 
 def device_line() -> str:
@@ -41,11 +45,12 @@ def release_when_idle(now: float) -> bool:
 
 
 def release() -> str:
-    """End the children that generate and draw; what that gave back, in a sentence.
+    """End the children that generate and draw, and free grids that nothing shows; what that gave back.
 
     Raises RuntimeError while one of them is at work.
     """
     from ...engine import studio
+    from ...scene.grid_cache import free_unused_grids
     from ...worker.process_memory import resident_bytes
 
     if queue.busy:
@@ -53,11 +58,16 @@ def release() -> str:
     if bpy.app.is_job_running("RENDER"):
         raise RuntimeError("Blender is rendering: wait for it, or cancel it first")
     pids = [pid for pid in (queue.child_pid, studio.child_pid()) if pid is not None]
-    if not pids:
-        return "nothing was held: no backend runs"
     held = [size for size in map(resident_bytes, pids) if size is not None]
     queue.release()
     studio.close()
+    before = resident_bytes(os.getpid()) or 0
+    free_unused_grids()
+    grids = before - (resident_bytes(os.getpid()) or before)
+    freed = f"Blender gave back {grids / 1e9:.1f} GB of volumes that nothing shows" if grids > _WORTH_TELLING else ""
+    if not pids:
+        return freed or "nothing was held: no backend runs"
     card = f", and what they held of {queue.info['device_name']}" if queue.info.get("device_memory_gb") else ""
     size = f", {sum(held) / 1e9:.1f} GB of memory" if held else ""
-    return f"{len(pids)} {'process' if len(pids) == 1 else 'processes'} ended{size}{card}"
+    ended = f"{len(pids)} {'process' if len(pids) == 1 else 'processes'} ended{size}{card}"
+    return f"{ended}; {freed}" if freed else ended
