@@ -76,6 +76,9 @@ def _translated(word: str, language: str) -> bool:
 
 
 def test_register_and_unregister_twice_leave_no_trace(empty_scene):
+    for thread in threading.enumerate():  # of children that tests before this one have ended
+        if thread.name.startswith("primdiffusion"):
+            thread.join(20)
     blender_primdiffusion.register()  # what only the first import brings: modules, and Blender's own caches
     blender_primdiffusion.unregister()
     before = traces()

@@ -178,11 +178,9 @@ def test_a_wrong_line_exits_with_2_and_says_what_is_wrong(tmp_path):
 
 
 def test_shards_are_named_without_rendering(people, tmp_path):
-    names = [
-        command("--people", str(people), "--out", str(tmp_path / "a"), "--list", "--shard", shard).stdout.split()
-        for shard in ("0/2", "1/2")
-    ]
-    assert names == [["person_000000"], ["person_000001"]]
+    for shard, name in (("0/2", "person_000000"), ("1/2", "person_000001")):
+        told = command("--people", str(people), "--out", str(tmp_path / "a"), "--list", "--shard", shard).stdout
+        assert [line for line in told.splitlines() if "color_management" not in line] == [name]  # 5.2's own line
     assert not (tmp_path / "a").exists()
 
 
@@ -215,7 +213,7 @@ def test_with_a_window_a_child_renders_and_blender_stays_free(extension, only_go
 def test_cancelling_ends_the_child_within_a_second_and_the_next_run_goes_on(extension, only_good, tmp_path):
     asked = extension.scene.primdiffusion_captures
     asked.people, asked.out = str(only_good), str(tmp_path / "captures")
-    asked.pose_count, asked.camera_count, asked.width, asked.height, asked.samples = 2, 6, 400, 400, 30
+    asked.pose_count, asked.camera_count, asked.width, asked.height, asked.samples = 2, 3, 400, 400, 30
     captures.start(words_of(asked, extension, captures.new_folder()))
     follow(until=lambda: captures.fraction > 0)
     began = time.monotonic()
