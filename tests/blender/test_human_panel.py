@@ -18,6 +18,7 @@ from blender_primdiffusion.scene.body_mesh import body_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, folder_of, humans, person_file
 from blender_primdiffusion.scene.keyframes import keyframe_poses
+from blender_primdiffusion.scene.node_inputs import node_inputs
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, reshape, shape_model_of
 from blender_primdiffusion.scene.shape_measures import measure
 from blender_primdiffusion.scene.shape_names import slider_names
@@ -260,7 +261,7 @@ def test_a_duplicate_on_the_posed_surface_follows_its_own_body(person, addon):
     ops.duplicate_human()
     twin = bpy.data.collections["Human.001"]
     nodes = next(one for thing in twin.all_objects for one in thing.modifiers if one.type == "NODES")
-    pointed = {value for value in nodes.values() if isinstance(value, bpy.types.ID)}
+    pointed = {value for value in node_inputs(nodes).values() if isinstance(value, bpy.types.ID)}
     assert body_of(twin) in pointed
     assert pointed <= {*twin.all_objects, *twin.children_recursive}
 
