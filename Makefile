@@ -8,13 +8,45 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 ASSETS ?=
 TEST_ARGS ?=
 
-.PHONY: demo test test-all lint setup figures clean
+# Other versions of Blender, each a Python module in an environment of its own.
+VENV45 := .venv45
+VENV52 := .venv52
+PYTHON313 ?= $(shell for python in python3.13 "$${PYENV_ROOT:-$$HOME/.pyenv}"/versions/3.13*/bin/python3.13; do \
+	"$$python" -c "import sys, ensurepip; sys.exit(sys.version_info[:2] != (3, 13))" 2>/dev/null && echo "$$python" && break; done)
+
+# A worker for each core, each with one thread: more would fight over the cores.
+ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE
+PYTEST := -m pytest -n logical --maxprocesses 8 --dist worksteal
+PYTEST_BLENDER := $(PYTEST) tests/blender --confcutdir tests/blender
+
+# Containers set it, and hundreds of child processes would each compile the backend anew.
+unexport PYTHONDONTWRITEBYTECODE
+
+.PHONY: demo test test-5.0 test-4.5 test-5.2 test-all lint setup figures clean
 
 demo: $(READY)
 	$(BIN)/python benchmarks/demo.py --out demo_out
 
+# One after the other, also with -j: they share the cores.
 test: $(READY_TO_TEST)
-	$(BIN)/python -m pytest $(TEST_ARGS)
+	$(MAKE) test-5.0
+	$(MAKE) test-4.5
+	$(MAKE) test-5.2
+
+test-5.0: $(READY_TO_TEST)
+	$(ONE_THREAD) $(BIN)/python $(PYTEST) $(TEST_ARGS)
+
+test-4.5: $(VENV45)/ready
+	$(ONE_THREAD) $(VENV45)/bin/python $(PYTEST_BLENDER) $(TEST_ARGS)
+
+# Without torch, which has its builds for one version of Python each: the backend's own process runs in .venv.
+ifeq ($(PYTHON313),)
+test-5.2:
+	@echo "Blender 5.2 was not tested: its module needs Python 3.13. Install it, or name it: make test PYTHON313=/path/to/python3.13"
+else
+test-5.2: $(VENV52)/ready $(READY_TO_TEST)
+	$(ONE_THREAD) PRIMDIFFUSION_PYTHON=$(CURDIR)/$(BIN)/python $(VENV52)/bin/python $(PYTEST_BLENDER) $(TEST_ARGS)
+endif
 
 test-all: $(READY_TO_TEST)
 	$(BIN)/python -m pytest -m "not gpu" $(TEST_ARGS)
@@ -38,6 +70,18 @@ $(READY): pyproject.toml requirements.lock
 $(READY_TO_TEST): $(READY)
 	$(PIP_INSTALL) -e ".[training,blender,test]"
 	touch $(READY_TO_TEST)
+
+# Blender 4.5's module; all else is .venv's.
+$(VENV45)/ready: $(READY_TO_TEST) Makefile
+	test -x $(VENV45)/bin/python || $(BIN)/python -m venv --without-pip $(VENV45)
+	$(BIN)/python -m pip --python $(VENV45)/bin/python install --quiet --disable-pip-version-check --no-deps bpy==4.5.15
+	$(BIN)/python -c "import site; print('import site; site.addsitedir(%r)' % site.getsitepackages()[0])" > `echo $(VENV45)/lib/python3.*/site-packages`/zz_shared.pth
+	touch $@
+
+$(VENV52)/ready: requirements52.lock
+	test -x $(VENV52)/bin/python || $(PYTHON313) -m venv $(VENV52)
+	$(VENV52)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements52.lock
+	touch $@
 
 clean:
 	rm -rf demo_out build dist
