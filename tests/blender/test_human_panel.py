@@ -341,7 +341,7 @@ def test_the_panels_show_height_provenance_and_counts(person, addon):
     assert "In the scene: " in panel
     assert "'" in panel
     details = " ".join(shown(PRIMDIFFUSION_PT_details, addon))
-    for text in ("Seed: 0", "Steps: 5", "Sex: female", "Edit: vary", "amount 0.5", "Volumes: 12", "MB on disk"):
+    for text in ("Seed: 0", "Steps: 5", "Sex: female", "Edit: vary", "amount 0.5", "Volumes: 12", "Files: 0 MB"):
         assert text in details
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import bpy
 
 from ...scene.human import humans
-from ..jobs.drawing import draw_job
+from ...worker.sentence import sentence
+from ..jobs.drawing import draw_job, draw_lines
 from ..jobs.target import selected_person
 from ..manual import draw_manual_button
 
@@ -33,7 +34,7 @@ class PRIMDIFFUSION_PT_assets(bpy.types.Panel):
         try:
             person = selected_person(context) if humans(context.scene) else None
         except ValueError as error:
-            layout.label(text=str(error), icon="INFO")
+            draw_lines(layout, sentence(error), "INFO")
             return
         if person is not None and person.asset_data is not None:
             layout.operator("primdiffusion.unmark_human_asset", icon="X")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..jobs.drawing import draw_job
+from ..jobs.drawing import draw_job, draw_lines
 from ..jobs.target import selected_person
 from ..manual import draw_manual_button
 
@@ -70,7 +70,7 @@ class PRIMDIFFUSION_PT_export_mesh(_InSidebar, bpy.types.Panel):
         row.operator_menu_enum("primdiffusion.show_proxy", "shown", text=_LABELS[shown(person)], icon="HIDE_OFF")
         row.operator("primdiffusion.remove_proxy", text="", icon="X")
         if outdated:
-            self.layout.label(text="Shape or clothes have changed: add it again", icon="INFO")
+            draw_lines(self.layout, "Shape or clothes have changed: add it again", "INFO")
 
 
 class PRIMDIFFUSION_PT_export_volumes(_InSidebar, bpy.types.Panel):

@@ -103,7 +103,8 @@ def told(person: bpy.types.Collection) -> list[tuple[str, str]]:
     volumes = [thing for thing in person.all_objects if thing.type == "VOLUME"]
     memory = person_memory(person)
     lines.append(("Volumes", f"{len(volumes)}, up to {provenance.get('most_overlapping', '?')} overlap"))
-    lines.append(("Memory", f"{memory.grids / 1e6:.0f} MB once drawn, {memory.files / 1e6:.0f} MB on disk"))
+    lines.append(("Memory once drawn", f"{memory.grids / 1e6:.0f} MB"))
+    lines.append(("Files", f"{memory.files / 1e6:.0f} MB"))
     return lines
 
 

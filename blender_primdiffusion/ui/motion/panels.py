@@ -8,6 +8,8 @@ import bpy
 
 from ...motion.own_poses import own_poses
 from ...scene.actions import action_curves, loops
+from ...worker.sentence import sentence
+from ..jobs.drawing import draw_lines
 from ..manual import draw_manual_button
 from .armatures import target_armature
 from .pose_pictures import poses_folder
@@ -41,7 +43,7 @@ class PRIMDIFFUSION_PT_motion(_InSidebar, bpy.types.Panel):
         try:
             armature = target_armature(context)
         except ValueError as error:
-            layout.label(text=str(error), icon="INFO")
+            draw_lines(layout, sentence(error), "INFO")
             return
         self._draw_action(layout, armature)
         row = layout.row(align=True)

@@ -8,6 +8,7 @@ from ...engine.engine import ENGINE
 from ...scene.attachment import MODES, attachment_of
 from ...scene.gain import density_gain
 from ...scene.human import humans, overlap_warning
+from ...worker.sentence import sentence
 from ..jobs.drawing import draw_job, draw_lines
 from ..jobs.target import selected_person
 from ..manual import draw_manual_button
@@ -55,7 +56,7 @@ class _OfPerson(_InSidebar):
         try:
             person = selected_person(context)
         except ValueError as error:
-            draw_lines(self.layout, str(error), "INFO")
+            draw_lines(self.layout, sentence(error), "INFO")
             return
         self.draw_person(context, person)
 
@@ -110,7 +111,7 @@ class PRIMDIFFUSION_PT_cycles_look(_OfPerson, bpy.types.Panel):
         draw_job(self.layout, "fit_gain", "primdiffusion.fit_density_gain", "MOD_OPACITY")
         warning = overlap_warning(person)
         if warning is not None and attachment_of(person) != "MERGED":
-            draw_lines(self.layout, f"{warning}, or merge the person", "ERROR")
+            draw_lines(self.layout, sentence(f"{warning}, or merge the person"), "ERROR")
 
 
 class PRIMDIFFUSION_PT_memory(_OfPerson, bpy.types.Panel):
