@@ -268,6 +268,7 @@ class BackendClient:
             self._output_ended_at = now
             return
         self._reported_end = True
+        self._outgoing.put(None)
         if exit_code is None:
             self._process.kill()
         if self._expected_to_end:

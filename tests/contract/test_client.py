@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 import textwrap
+import threading
 import time
 from pathlib import Path
 
@@ -219,6 +220,16 @@ def test_the_bundled_package_goes_before_an_installed_one(fake_child):
     where = wait_for(client, lambda e: isinstance(e, Notification)).params["file"]
     assert "backend" in Path(where).parts
     assert Path(where).is_relative_to(client._environment["PYTHONPATH"])
+
+
+def test_a_child_that_died_leaves_no_thread(fake_child):
+    before = set(threading.enumerate())
+    client = fake_child("sys.exit(3)")
+    wait_for(client, lambda e: isinstance(e, Died))
+    threads = set(threading.enumerate()) - before
+    for thread in threads:
+        thread.join(5)
+    assert not any(thread.is_alive() for thread in threads)
 
 
 def test_the_environment_leads_the_childs_python_nowhere_else(monkeypatch, tmp_path):
