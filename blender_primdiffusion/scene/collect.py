@@ -13,7 +13,7 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
-from .folders import TEMPORARY, humans_folder
+from .folders import TEMPORARY, humans_folder, stored_path
 from .human import HOME, MARK, PERSON, folders_of, person_file_name, volume_path
 from .merged import sequence_files
 from .placing_files import free_name, put_copy
@@ -37,7 +37,7 @@ def collect_temporary_volumes(blend_path: str) -> Collected:
     """Copy files of people from temporary folders to the folder of `blend_path`, and point to the copies.
 
     Temporary folders of an earlier Blender, after a crash, count too. What the .blend does not use stays behind, for
-    undo. Paths become absolute: Blender makes them relative when it writes a .blend for the first time. Raises
+    undo. In a .blend never saved paths become absolute: Blender makes them relative when it first writes it. Raises
     VolumeWriteError when the folder beside the .blend cannot be written.
     """
     return _collect(blend_path, [volume for volume in _local() if _temporary(volume_path(volume))])
@@ -123,7 +123,7 @@ def _collect(blend_path: str, away: Iterable[bpy.types.Volume]) -> Collected:
             "write permission and free space"
         ) from error
     for volume, path in moved.items():
-        volume.filepath = str(path)
+        volume.filepath = stored_path(path)
     for person, name in names.items():
         person[PERSON] = name
     return Collected(len(moved), len(made), sum(path.stat().st_size for path in made))
