@@ -162,7 +162,7 @@ def test_release_ends_the_child_says_what_was_freed_and_the_next_person_starts_a
     pid = started_and_idle()
     said = memory.release()
     assert said.startswith("1 process ended, 0.")
-    assert said.endswith("GB of memory")
+    assert "GB of memory" in said  # of the process; then what Blender gave back, where tests before left grids
     assert ended(pid)
     assert memory.release() == "nothing was held: no backend runs"
     assert ops.release_memory() == {"FINISHED"}
