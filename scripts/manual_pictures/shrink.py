@@ -1,4 +1,4 @@
-"""Small files of pictures: PNGs and GIFs of few colours."""
+"""Small files of pictures: panels and GIFs of few colours, JPEGs of people."""
 
 from __future__ import annotations
 
@@ -8,22 +8,27 @@ import numpy as np
 from PIL import Image
 
 MOST_BYTES = 120_000
-"""Of a PNG of the manual."""
+"""Of a still picture of the manual."""
 
 
-def save_png(image: Image.Image, path: Path, most_bytes: int = MOST_BYTES) -> None:
-    """With as many of 256 colours as fit `most_bytes`. Raises ValueError where not even 32 do."""
-    for colours in (256, 192, 128, 96, 64, 48, 32):
-        few = image.convert("RGB").quantize(colours, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-        few.save(path, optimize=True)
-        if path.stat().st_size <= most_bytes:
-            print(f"{path.name}: {few.size[0]} x {few.size[1]}, {colours} colours, {path.stat().st_size / 1e3:.0f} kB")
-            return
+def save_png(image: Image.Image, path: Path) -> None:
+    """Of 256 colours: for panels. Raises ValueError where that takes more than MOST_BYTES."""
+    image.convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(path, optimize=True)
+    _check(path, image)
+
+
+def save_jpeg(image: Image.Image, path: Path) -> None:
+    """For pictures with people in them. Raises ValueError where that takes more than MOST_BYTES."""
+    image.convert("RGB").save(path, quality=88, optimize=True, progressive=True)
+    _check(path, image)
+
+
+def _check(path: Path, image: Image.Image) -> None:
     size = path.stat().st_size
-    path.unlink()
-    raise ValueError(
-        f"{path.name} takes {size} bytes with 32 colours and {most_bytes} are wanted: crop it, or scale it"
-    )
+    if size > MOST_BYTES:
+        path.unlink()
+        raise ValueError(f"{path.name} takes {size} bytes and {MOST_BYTES} are wanted: crop it, or scale it")
+    print(f"{path.name}: {image.width} x {image.height}, {size / 1e3:.0f} kB")
 
 
 def save_gif(pictures: list[Path], path: Path, milliseconds: int, colours: int = 256) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 from PIL import Image
 
-from .shrink import save_png
+from .shrink import save_jpeg
 from .stage import armature_of, empty_file, generate, look, pose, render, tiled_floor
 
 SIZE = (360, 480)
@@ -22,7 +22,7 @@ def stills(scratch: Path, out: Path, only: list[str]) -> None:
         if not only or name in only:
             folder = scratch / name
             folder.mkdir()
-            save_png(_row(still(folder)), out / f"{name}.png")
+            save_jpeg(_row(still(folder)), out / f"{name}.jpg")
 
 
 def engine_and_cycles(folder: Path) -> list[Path]:
@@ -35,6 +35,7 @@ def engine_and_cycles(folder: Path) -> list[Path]:
     sun.rotation_euler = (0.6, 0.3, 0.4)
     sun.data.energy = 2.5
     scene.collection.objects.link(sun)
+    scene.cycles.samples = 32
     return [exact, render(scene, folder / "cycles.png", SIZE)]
 
 
@@ -61,9 +62,9 @@ def redressed(folder: Path) -> list[Path]:
     """One person, in a tee instead of the jacket, then in shorts too."""
     scene = _stage(folder, 0, "Contrapposto")
     pictures = [render(scene, folder / "before.png", SIZE)]
-    for part, outfit in (("top", "tee and jeans"), ("bottom", "tee and shorts")):
-        bpy.ops.primdiffusion.redress(parts={part}, attributes=f"outfit={outfit}", seed=5)
-        pictures.append(render(scene, folder / f"{part}.png", SIZE))
+    for number, (parts, outfit) in enumerate((({"clothes"}, "suit"), ({"clothes"}, "tee and shorts"))):
+        bpy.ops.primdiffusion.redress(parts=parts, attributes=f"outfit={outfit}", seed=5)
+        pictures.append(render(scene, folder / f"after{number}.png", SIZE))
     return pictures
 
 

@@ -16,7 +16,7 @@ FRAMES = 32
 """Of a round."""
 FPS = 30
 SIZE = (480, 400)
-_APART = 0.75
+_APART = 0.82
 _OUT_OF_STEP = 11
 """Frames by which each is behind the one before."""
 
@@ -33,7 +33,7 @@ def walk(scratch: Path, out: Path) -> None:
             motion="WALK", rounds=4, speed=CYCLE_SECONDS * FPS / FRAMES, root="PLACE", start=1 - number * _OUT_OF_STEP
         )
     floor = tiled_floor(scene, STRIDE / 2)
-    look(scene, (-2.2, -5.6, 1.5), (0.02, 0.1, 0.87), 84)
+    look(scene, (-2.2, -5.6, 1.5), (0.06, 0.1, 0.87), 82)
     pictures = []
     for frame in range(FRAMES):
         scene.frame_set(1 + FRAMES + frame)

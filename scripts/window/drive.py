@@ -58,11 +58,12 @@ def install() -> None:
 
 
 def photograph(name: str) -> Iterator[float]:
-    """Draw the windows anew, then save what the screen shows."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            area.tag_redraw()
-    yield 0.6
+    """Draw the windows anew, then save what the screen shows. Panels that have grown slide for a while."""
+    for _ in range(3):
+        for window in bpy.context.window_manager.windows:
+            for area in window.screen.areas:
+                area.tag_redraw()
+        yield 0.4
     yield from ask({"picture": name, "where": where()})
 
 

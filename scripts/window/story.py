@@ -219,8 +219,10 @@ def captures(module: str, python: str) -> Steps:
     """Render Captures with its cameras, Human from Captures."""
     yield from begin(module, python)
     yield from show("PRIMDIFFUSION_PT_captures", "PRIMDIFFUSION_PT_captures_cameras", "PRIMDIFFUSION_PT_captures_poses")
-    bpy.context.scene.primdiffusion_captures.people = "//scans"
-    bpy.context.scene.primdiffusion_captures.out = "//captures"
+    for name in ("people", "out"):
+        folder = Path("/tmp/shots") / {"people": "scans", "out": "captures"}[name]
+        folder.mkdir(exist_ok=True, parents=True)
+        setattr(bpy.context.scene.primdiffusion_captures, name, str(folder))
     press("primdiffusion.preview_rig")
     yield 1.0
     yield "captures_cameras"
@@ -259,7 +261,7 @@ def left(module: str, python: str) -> Steps:
     press("primdiffusion.generate")
     yield 3.0
     yield from begin(module, python)
-    yield from sidebar()
+    yield from show("PRIMDIFFUSION_PT_jobs_left", "PRIMDIFFUSION_PT_generate")
     yield "left_offered"
     press("primdiffusion.discard_works")
 
@@ -284,7 +286,7 @@ def missing(module: str, python: str) -> Steps:
 def languages(module: str, python: str) -> Steps:
     """The interface in German and French."""
     yield from with_people(module, python, FIRST_SEED)
-    names = ("generate", "attributes", "variations", "human", "shape", "motion")
+    names = ("generate", "attributes", "variations", "human", "shape")
     for language in ("de_DE", "fr_FR"):
         bpy.context.preferences.view.language = language
         bpy.context.preferences.view.use_translate_interface = True
@@ -314,8 +316,19 @@ def with_people(module: str, python: str, *seeds: int) -> Steps:
             press("primdiffusion.generate", seed=seed)
         yield from wait(lambda: not queue_of(module).busy, 400)
         bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    leave_out_volumes()
     yield 1.0
     select(armatures()[0])
+
+
+def leave_out_volumes() -> None:
+    """Out of the view layer: the engine does not need them, and each person's take a gigabyte."""
+    waiting = [bpy.context.view_layer.layer_collection]
+    while waiting:
+        layer = waiting.pop()
+        waiting += layer.children
+        if layer.name.endswith("_primitives"):
+            layer.exclude = True
 
 
 def people_file(module: str, count: int = 1) -> Path:
@@ -369,7 +382,7 @@ def rendered_view() -> Steps:
     scene.render.engine = "PRIMDIFFUSION"
     scene.view_settings.view_transform = "Standard"
     wide_view()
-    yield 8.0
+    yield 25.0
 
 
 def click_generate() -> Steps:

@@ -1,0 +1,115 @@
+"""The manual's pictures of the window: panels cut out of what scripts/window/look.py has seen."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from .shrink import save_jpeg, save_png
+
+PANELS = {
+    "sidebar": ("first_sidebar",),
+    "generate": ("first_denoising", "generate_in_line", "generate_error"),
+    "attributes": ("generate_attributes",),
+    "variations": ("variations_empty", "variations_denoising", "variations_selected"),
+    "shape": ("human_shape_before", "human_shape_after"),
+    "pose_library": ("human_poses",),
+    "details": ("human_details", "human_assets"),
+    "edits": ("edit_parts", "edit_two_people"),
+    "motion": ("motion_empty", "motion_imported"),
+    "render": ("render_cycles", "render_surface", "render_merged", "render_outdated"),
+    "captures": ("captures_cameras", "captures_output", "captures_human"),
+    "export": ("export_before", "export_proxy"),
+    "left": ("left_offered",),
+    "missing": ("missing_files",),
+    "german_french": ("language_de", "language_fr"),
+}
+"""Each a row of sidebars, with nothing but their panels."""
+WINDOWS = {
+    "preferences_without": ("set_up_preferences", "window 1"),
+    "preferences_with": ("set_up_tested", "window 1"),
+    "window_denoising": ("first_denoising", "window 0"),
+    "window_person": ("first_person", "window 0"),
+    "window_redressed": ("edit_redressed", "window 0"),
+    "window_painting": ("edit_painting", "window 0"),
+    "window_proxy": ("export_proxy", "window 0"),
+    "window_motion": ("motion_imported", "window 0"),
+}
+"""A whole window, or the part of it that WINDOW_PART says."""
+DIALOGS = {"motion_dialog": "motion_dialog"}
+WINDOW_PART = (0, 24, 1320, 1190)
+"""Of the main window, pixels: without the properties and the timeline."""
+PREFERENCES_PART = (172, 222, 872, 573)
+"""Of the preferences' window, pixels: what is the extension's."""
+_WINDOW_WIDTH = 880
+_PANEL_WIDTH = 262
+_OUTLINE_RGB, _OUTLINE_COLUMN, _RUN = 74, 8, 10
+"""Panels have an outline of this grey, this far from the sidebar's left edge; a run of so many rows is no chance."""
+_GAP, _GAP_RGB = 12, (255, 255, 255)
+
+
+def crop_all(shots: Path, out: Path) -> None:
+    """Whatever was seen; what was not is told."""
+    for name, seen in PANELS.items():
+        if _are_there(shots, *seen):
+            save_png(_row([panels_of(shots, shot) for shot in seen]), out / f"{name}.png")
+    for name, (shot, window) in WINDOWS.items():
+        if _are_there(shots, shot):
+            picture, places = _read(shots, shot)
+            box = WINDOW_PART if window == "window 0" else places[window]
+            part = picture.crop(box)
+            if window == "window 0":
+                size = (_WINDOW_WIDTH, round(part.height * _WINDOW_WIDTH / part.width))
+                save_jpeg(part.resize(size, Image.Resampling.LANCZOS), out / f"{name}.jpg")
+            else:
+                save_png(part.crop(PREFERENCES_PART), out / f"{name}.png")
+    for name, shot in DIALOGS.items():
+        if _are_there(shots, shot):
+            save_png(_changed_part(shots, shot), out / f"{name}.png")
+
+
+def panels_of(shots: Path, shot: str) -> Image.Image:
+    """The sidebar down to where its last panel ends."""
+    picture, places = _read(shots, shot)
+    left, top, _, bottom = places["sidebar"]
+    column = np.asarray(picture)[top:bottom, left + _OUTLINE_COLUMN].astype(int)
+    outline = (np.abs(column - _OUTLINE_RGB) <= 1).all(1)
+    runs = np.convolve(outline, np.ones(_RUN), "valid") == _RUN
+    if not runs.any():
+        raise ValueError(f"{shot} shows no panel in its sidebar")
+    end = int(np.flatnonzero(runs)[-1]) + _RUN + 2
+    return picture.crop((left + 2, top, left + _PANEL_WIDTH, top + end))
+
+
+def _changed_part(shots: Path, shot: str) -> Image.Image:
+    """A dialog: what differs from the same window before it, in the 3D view."""
+    after, places = _read(shots, shot)
+    before, _ = _read(shots, "motion_empty")
+    after, before = (np.asarray(p)[: places["sidebar"][3], : places["sidebar"][0]] for p in (after, before))
+    differ = np.abs(after.astype(int) - before).max(2) > 24
+    rows, columns = np.flatnonzero(differ.sum(1) > 40), np.flatnonzero(differ.sum(0) > 40)
+    return Image.fromarray(after[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
+
+
+def _are_there(shots: Path, *names: str) -> bool:
+    missing = [name for name in names if not (shots / f"{name}.png").is_file()]
+    if missing:
+        print(f"not seen: {', '.join(missing)}")
+    return not missing
+
+
+def _read(shots: Path, name: str) -> tuple[Image.Image, dict[str, list[int]]]:
+    return Image.open(shots / f"{name}.png").convert("RGB"), json.loads((shots / f"{name}.json").read_text())
+
+
+def _row(pictures: list[Image.Image]) -> Image.Image:
+    width = sum(picture.width for picture in pictures) + _GAP * (len(pictures) - 1)
+    row = Image.new("RGB", (width, max(picture.height for picture in pictures)), _GAP_RGB)
+    x = 0
+    for picture in pictures:
+        row.paste(picture, (x, 0))
+        x += picture.width + _GAP
+    return row
