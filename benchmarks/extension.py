@@ -21,6 +21,7 @@ import record
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 REGISTRATIONS = 7
+PARTS = ["register", "person", "merged", "soak"]
 
 
 def main() -> None:
@@ -28,7 +29,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
     parser.add_argument("--quick", action="store_true", help="smaller pictures, five rounds")
-    parser.add_argument("--parts", nargs="*", default=["register", "person", "merged", "soak"])
+    parser.add_argument("--parts", nargs="*", default=PARTS, help="the others' figures stay as they are in the file")
     parser.add_argument(
         "--also",
         nargs="*",
@@ -40,6 +41,10 @@ def main() -> None:
     for other in arguments.also:
         name, _, python = other.partition("=")
         figures |= {f"{key}_{name}": value for key, value in measure(Path(python), arguments).items()}
+    if arguments.json is not None and arguments.json.exists() and set(arguments.parts) != set(PARTS):
+        about = record.surroundings()
+        before = json.loads(arguments.json.read_text())
+        figures = {name: value for name, value in before.items() if name not in about} | figures
     record.tell(figures, arguments.json)
 
 
