@@ -20,10 +20,10 @@ from blender_primdiffusion.motion.pose_library import (
 )
 from blender_primdiffusion.motion.rotation import from_axis_angle, to_axis_angle
 from blender_primdiffusion.motion.skeleton import joint_positions
+from blender_primdiffusion.scene.actions import action_curves
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.joints import JOINT_NAMES
-from blender_primdiffusion.scene.actions import action_curves
 from blender_primdiffusion.ui.motion import pose_pictures
 from blender_primdiffusion.ui.motion.panels import PRIMDIFFUSION_PT_poses
 
