@@ -16,7 +16,7 @@ from jobs_driven import drive, shown, until_running
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_generate
 from blender_primdiffusion.ui.generate.work import GenerateWork
-from blender_primdiffusion.ui.jobs import diagnostics, memory, remedies
+from blender_primdiffusion.ui.jobs import diagnostics, drawing, memory, remedies
 from blender_primdiffusion.ui.jobs.follow import follow
 from blender_primdiffusion.ui.jobs.pictures import SoFar, so_far
 from blender_primdiffusion.ui.jobs.queue import queue
@@ -98,6 +98,7 @@ def test_each_error_has_a_button_where_there_is_something_to_do(addon):
     for kind, operator in expected.items():
         assert remedies.remedy_for(JobError("", "", kind)).operator == f"primdiffusion.{operator}"
     assert remedies.remedy_for(JobError("", "", "unwritable")).operator == "wm.save_as_mainfile"
+    assert remedies.remedy_for(JobError("", "", "missing_file")).operator == "preferences.addon_show"
     assert remedies.remedy_for(JobError("", "", "bad_input")) is None
     environment = remedies.remedy_for(JobError("", "", "environment"))
     assert environment is None or environment.operator == "primdiffusion.set_up_backend"
@@ -206,3 +207,10 @@ def test_the_device_line_tells_what_is_known(addon):
     assert memory.device_line() == "CPU, 16.0 GB"
     queue.info = {"device_name": "CPU"}
     assert memory.device_line() == "CPU"
+
+
+def test_numbers_keep_their_units_where_lines_break():
+    lines = drawing._wrapped("Generated in 47.6 s, and after that built in 2.9 s.")
+    assert not any(line.startswith(("s,", "s.")) for line in lines)
+    assert " ".join(lines) == "Generated in 47.6 s, and after that built in 2.9 s."
+    assert max(map(len, lines)) <= drawing._LINE

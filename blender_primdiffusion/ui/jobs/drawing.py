@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from typing import TYPE_CHECKING
 
 import bpy
 
+from ...places import EXTENSION
 from .follow import in_the_way
 from .pictures import so_far
 from .queue import Entry, Outcome, queue
@@ -17,6 +19,8 @@ if TYPE_CHECKING:
 
 _LINE = 34
 """Letters that fit a sidebar as wide as Blender makes it, beside an icon."""
+_QUANTITY = re.compile(r"\d (s|min|mm|MB|GB)\b")
+_NO_BREAK = "\N{NO-BREAK SPACE}"
 _PICTURE_SCALE = 8.0
 _MINUTES_FROM_S = 90.0
 
@@ -43,8 +47,14 @@ def draw_job(
 def draw_lines(layout: bpy.types.UILayout, text: str, icon: str) -> None:
     """A sentence on as many lines as it needs."""
     column = layout.column(align=True)
-    for number, line in enumerate(textwrap.wrap(text, _LINE)):
+    for number, line in enumerate(_wrapped(text)):
         column.label(text=line, icon=icon if number == 0 else "BLANK1")
+
+
+def _wrapped(text: str) -> list[str]:
+    """Lines that fit; numbers keep their units."""
+    together = _QUANTITY.sub(lambda match: match[0].replace(" ", _NO_BREAK), text)
+    return [line.replace(_NO_BREAK, " ") for line in textwrap.wrap(together, _LINE)]
 
 
 def draw_progress(layout: bpy.types.UILayout) -> None:
@@ -85,6 +95,8 @@ def _draw_remedy(layout: bpy.types.UILayout, error: JobError, kind: str) -> None
     props = layout.operator(remedy.operator, text=remedy.label, icon=remedy.icon)
     if remedy.operator == "primdiffusion.try_again":
         props.kind = kind
+    elif remedy.operator == "preferences.addon_show":
+        props.module = EXTENSION
 
 
 def _progress_text() -> str:

@@ -31,6 +31,7 @@ _REMEDIES = {
     "environment": Remedy("primdiffusion.set_up_backend", "Set Up Backend", "IMPORT"),
     "missing_volumes": Remedy("primdiffusion.find_missing_volumes", "Find Missing Volumes", "VIEWZOOM"),
     "out_of_memory": Remedy("primdiffusion.release_memory", "Release Memory", "MEMORY"),
+    "missing_file": Remedy("preferences.addon_show", "Open Preferences", "PREFERENCES"),  # a checkpoint's path
     "unwritable": _SAVE_AS,
     "file_system": _SAVE_AS,
     "busy": _TRY_AGAIN,
