@@ -12,6 +12,7 @@ SOURCES = {
     "people": ("Payloads against their meshes", "benchmarks/people.py --assets DIR --json docs/results/people.json"),
     "march": ("The marcher", "benchmarks/march.py --json docs/results/march.json --table docs/results/march_table.md"),
     "march_cuda": ("The marcher on a CUDA device", "benchmarks/march_cuda.py --json docs/results/march_cuda.json"),
+    "extension": ("The extension on Blender 5.0 and 4.5", "benchmarks/extension.py --json docs/results/extension.json"),
     "engine": ("The engine in Blender", "benchmarks/engine.py --json docs/results/engine.json"),
     "denoisers": ("Denoisers on held-out people", "benchmarks/denoisers.py --json docs/results/denoisers.json"),
     "captures": ("Captures", "benchmarks/captures.py --assets DIR --json docs/results/captures.json"),
