@@ -8,9 +8,7 @@ from primdiffusion.diffusion.samplers import SAMPLERS as BACKENDS_SAMPLERS
 from primdiffusion.editing.regions import PARTS as BACKENDS_PARTS
 from primdiffusion.editing.regions import region_of
 from primdiffusion.serve.edit_params import TRANSFERS as BACKENDS_TRANSFERS
-from primdiffusion.serve.server import JOBS
 from primdiffusion.training.checkpoint import default_checkpoint, load_checkpoint
-from worker.job import EDITS
 from worker.names import PARTS, SAMPLERS, TRANSFERS
 from worker.vocabulary import read_vocabulary
 
@@ -21,10 +19,9 @@ def test_parts_of_the_body_are_the_backends_in_its_order():
     assert all(region_of([part]).any() for part in PARTS)
 
 
-def test_samplers_transfers_and_edits_are_the_backends():
+def test_samplers_and_transfers_are_the_backends():
     assert set(SAMPLERS) == set(BACKENDS_SAMPLERS)
     assert TRANSFERS == BACKENDS_TRANSFERS
-    assert set(EDITS) <= set(JOBS)
 
 
 def test_the_card_of_a_checkpoint_tells_what_its_model_knows(checkpoint):

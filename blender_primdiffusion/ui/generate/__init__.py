@@ -34,3 +34,4 @@ def unregister() -> None:
     del bpy.types.Scene.primdiffusion
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)
+    presets.PRIMDIFFUSION_PT_generate_presets.bl_label = presets.NO_PRESET

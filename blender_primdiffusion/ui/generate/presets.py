@@ -13,11 +13,14 @@ from .attributes import CATEGORIES, SCALARS
 SUBDIR = "primdiffusion/generate"
 _ASKED = (*CATEGORIES, *(part for name in SCALARS for part in (f"use_{name}", name)))
 
+NO_PRESET = "Generate Presets"
+"""What the menu says before one is chosen; it shows the name of the one in use, as Blender's own do."""
+
 
 class PRIMDIFFUSION_PT_generate_presets(PresetPanel, bpy.types.Panel):
     """Choose, add and remove presets"""
 
-    bl_label = "Generate Presets"
+    bl_label = NO_PRESET
     preset_subdir = SUBDIR
     preset_operator = "primdiffusion.use_generate_preset"
     preset_add_operator = "primdiffusion.add_generate_preset"
