@@ -208,7 +208,8 @@ def anna(addon, tmp_path, monkeypatch):
     bpy.ops.wm.save_mainfile()
     (tmp_path / "for the child").mkdir()
     shutil.copytree(tmp_path / "shot_humans", tmp_path / "kept_aside")
-    return tmp_path
+    yield tmp_path
+    shutil.rmtree(tmp_path / "for the child")  # threads wait there for the child's files
 
 
 def _asked(monkeypatch, folder: Path) -> None:
