@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 EXTENSION = str(__package__)
 """The extension's full module name; `bl_ext.<repository>.primdiffusion` once installed."""
+CACHE_VARIABLE = "PRIMDIFFUSION_CACHE"
+"""Names another folder than `cache_folder`'s own, for several Blenders to share."""
 
 
 def backend_module_path() -> Path | None:
@@ -35,11 +37,8 @@ def own_folder() -> Path:
 
 
 def cache_folder() -> Path:
-    """Where children keep byte code and compiled kernels.
-
-    The environment variable `PRIMDIFFUSION_CACHE` names another folder, for several Blenders to share.
-    """
-    named = os.environ.get("PRIMDIFFUSION_CACHE", "")
+    """Where children keep byte code and compiled kernels: our own, or what CACHE_VARIABLE names."""
+    named = os.environ.get(CACHE_VARIABLE, "")
     return Path(named).absolute() if named else own_folder() / "cache"
 
 

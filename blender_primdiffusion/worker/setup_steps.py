@@ -42,7 +42,7 @@ class Plan:
     module_path: str
     """The folder that holds the package `primdiffusion`."""
     cache: str
-    """Of the child: byte code and compiled kernels."""
+    """Of the child: byte code and compiled kernels; for `remove` empty where it is to stay."""
     lock: str = ""
     """For `set_up` and `repair`: the file that names the packages."""
     offline: str = ""
@@ -130,11 +130,12 @@ def remove(plan: Plan) -> Iterator[Step]:
     """Environment, downloads and caches are gone; nothing else in the folder is touched. Raises OSError."""
     folder = plan.folder
     yield Step("Removing the environment", 0.0)
-    freed = sum(bytes_of(path) for path in (folder.environment, folder.wheels, folder.temporary, Path(plan.cache)))
+    going = [folder.environment, folder.wheels, folder.temporary, *([Path(plan.cache)] if plan.cache else ())]
+    freed = sum(map(bytes_of, going))
     unmark(folder)
-    for done, path in enumerate((folder.environment, folder.wheels, folder.temporary, Path(plan.cache)), 1):
+    for done, path in enumerate(going, 1):
         remove_tree(path)
-        yield Step("Removing the environment", done / 4)
+        yield Step("Removing the environment", done / len(going))
     yield Step(f"The backend was removed; {freed / 1e6:.0f} MB are free again", 1.0, {"freed": freed})
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from blender_primdiffusion import places
+from blender_primdiffusion.ui.setup.plans import plan_of_removal, plan_of_test
 
 
 def test_caches_are_our_own_unless_a_folder_is_named(monkeypatch, tmp_path):
@@ -10,3 +13,13 @@ def test_caches_are_our_own_unless_a_folder_is_named(monkeypatch, tmp_path):
     assert places.cache_folder().is_relative_to(places.own_folder())
     monkeypatch.setenv("PRIMDIFFUSION_CACHE", str(tmp_path))
     assert places.cache_folder() == tmp_path
+
+
+def test_set_up_uses_the_folder_that_children_use_and_removes_it_only_where_it_is_ours(
+    empty_scene, monkeypatch, tmp_path
+):
+    monkeypatch.delenv(places.CACHE_VARIABLE)
+    assert Path(plan_of_test().cache) == Path(plan_of_removal().cache) == places.cache_folder()
+    monkeypatch.setenv(places.CACHE_VARIABLE, str(tmp_path))
+    assert Path(plan_of_test().cache) == tmp_path
+    assert plan_of_removal().cache == ""

@@ -70,6 +70,14 @@ def test_removing_takes_environment_and_caches_and_nothing_else(plan):
     assert kept.exists()
 
 
+def test_removing_without_a_cache_to_remove_takes_the_rest(plan):
+    plan.folder.wheels.mkdir(parents=True)
+    plan = dataclasses.replace(plan, cache="")
+    assert done("remove", plan).state == "done"
+    assert not plan.folder.wheels.exists()
+    assert Path.cwd().exists()
+
+
 def test_repair_finds_a_damaged_file_and_mends_it(plan):
     assert done("set_up", plan).state == "done"
     assert done("repair", plan).message.startswith("Nothing had to be repaired")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import bpy
 
-from ...places import backend_module_path, own_folder, preference, set_up_folder
+from ...places import CACHE_VARIABLE, backend_module_path, cache_folder, preference, set_up_folder
 from ...worker.environment import VARIABLE
 from ...worker.setup_steps import Plan
 from . import known
@@ -28,8 +29,9 @@ def plan_of_set_up(offline: Path | None = None) -> Plan:
 
 
 def plan_of_removal() -> Plan:
-    """Also where there are no packages for this machine any more."""
-    return _plan()
+    """Also where there are no packages for this machine any more. A cache that is shared with others stays."""
+    plan = _plan()
+    return dataclasses.replace(plan, cache="") if os.environ.get(CACHE_VARIABLE) else plan
 
 
 def plan_of_test() -> Plan:
@@ -43,7 +45,7 @@ def _plan(**more: Any) -> Plan:
         host=sys.executable,
         root=str(set_up_folder().root),
         module_path=str(backend_module_path() or ""),
-        cache=str(own_folder() / "cache"),
+        cache=str(cache_folder()),
         online=bpy.app.online_access,
         **more,
     )
