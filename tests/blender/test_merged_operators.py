@@ -23,6 +23,7 @@ from blender_primdiffusion.scene.keyframes import keyframe_poses
 from blender_primdiffusion.scene.material import DENSITY_GAIN
 from blender_primdiffusion.scene.merged import merged_of, merged_state, sequence_files
 from blender_primdiffusion.ui.jobs.queue import queue
+from blender_primdiffusion.ui.jobs.target import Target
 from blender_primdiffusion.ui.render import panel
 from blender_primdiffusion.ui.render.merge_work import MergeFramesWork, MergeWork, Moment
 
@@ -140,7 +141,7 @@ def test_a_cancelled_sequence_leaves_nothing_and_its_writer_ends(person, monkeyp
     monkeypatch.setenv("FAKE_MERGE", "takes long")
     moment = Moment.now(person)
     before = sorted(folder_of(person).iterdir())
-    queue.add(bpy.context, MergeFramesWork(person, [moment, moment], 1, 0.02))
+    queue.add(bpy.context, MergeFramesWork(Target.of(person), [moment, moment], 1, 0.02))
     until_running()
     assert [thread for thread in threading.enumerate() if thread.name == "merged frames"]
     queue.cancel()
@@ -167,7 +168,7 @@ def test_a_child_that_misbehaves_leaves_the_person_as_they_were(person, monkeypa
 
 
 def test_somebody_removed_meanwhile_is_not_merged(person):
-    queue.add(bpy.context, MergeWork(person, Moment.now(person), 0.02))
+    queue.add(bpy.context, MergeWork(Target.of(person), Moment.now(person), 0.02))
     remove_human(person)
     drive()
     assert "was removed" in error_of("merge")

@@ -15,6 +15,14 @@ CLASSES = (
     panel.PRIMDIFFUSION_PT_export_volumes,
     file_handler.PRIMDIFFUSION_FH_human,
 )
+WORKS = {
+    "export_mesh": "mesh_work:ExportMeshWork",
+    "add_proxy": "mesh_work:AddProxyWork",
+    "export_gaussians": "person_work:ExportGaussiansWork",
+    "export_vdb_sequence": "person_work:ExportVdbSequenceWork",
+    "import_human": "person_work:ImportHumanWork",
+}
+"""By kind."""
 
 
 def register() -> None:
@@ -22,12 +30,14 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion_export = bpy.props.PointerProperty(type=settings.PRIMDIFFUSION_PG_export)
-    register_kind("import_human", f"{__name__}.person_work:ImportHumanWork")
+    for kind, work in WORKS.items():
+        register_kind(kind, f"{__name__}.{work}")
 
 
 def unregister() -> None:
     """Undo `register`."""
-    unregister_kind("import_human")
+    for kind in WORKS:
+        unregister_kind(kind)
     del bpy.types.Scene.primdiffusion_export
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -15,6 +15,7 @@ from ...scene.exported_human import HumanMotion, motion_in, read_tensors
 from ...scene.human import armature_of
 from ...scene.keyframes import keyframe_poses
 from ...scene.merged import Grid, read_grid, write_grid
+from ..jobs.kept_poses import packed, unpacked
 from ..jobs.person import build_person
 from ..jobs.target import Target
 from ..jobs.work import Work
@@ -44,13 +45,22 @@ class ExportGaussiansWork(Work):
     def params(self, folder: Path) -> dict[str, Any]:
         """Of the child's method."""
         posed = {name: self.person[name] for name in ("object", "joints", "betas")}
-        return {"person": self.person["human"], **posed, "limit": self.limit, "out": str(folder / "gaussians.ply")}
+        return {"person": self.target.file_now(), **posed, "limit": self.limit, "out": str(folder / "gaussians.ply")}
 
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Put the file in its place."""
         put(Path(result["out"]), self.path)
         size = self.path.stat().st_size / 1e6
         return f"Exported {self.target.name} to {self.path.name}: {result['gaussians']} Gaussians, {size:.1f} MB"
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it."""
+        return {**dataclasses.asdict(self), "path": str(self.path)}
+
+    @classmethod
+    def from_json(cls, kept: dict[str, Any]) -> ExportGaussiansWork:
+        """What `to_json` gave."""
+        return cls(**{**kept, "target": Target.from_json(kept["target"]), "path": Path(kept["path"])})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +86,9 @@ class ExportVdbSequenceWork(Work):
 
     def params(self, folder: Path) -> dict[str, Any]:
         """Of the child's method."""
-        return {"people": self.people, "voxel": self.voxel, "out_dir": str(folder)}
+        file = self.target.file_now()
+        people = [{**person, "human": file} for person in self.people]
+        return {"people": people, "voxel": self.voxel, "out_dir": str(folder)}
 
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
         """Write all files aside, then put them in their places."""
@@ -91,6 +103,24 @@ class ExportVdbSequenceWork(Work):
         for path in written:
             put(path, self.folder / path.name)
         return f"Exported {len(written)} frames of {self.target.name} to {self.folder.name}: {size:.0f} MB"
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it."""
+        plain = {name: getattr(self, name) for name in ("stem", "first", "voxel")}
+        return {
+            **plain,
+            "target": dataclasses.asdict(self.target),
+            "folder": str(self.folder),
+            "people": packed(self.people),
+        }
+
+    @classmethod
+    def from_json(cls, kept: dict[str, Any]) -> ExportVdbSequenceWork:
+        """What `to_json` gave."""
+        people = unpacked(kept["people"])
+        return cls(
+            **{**kept, "target": Target.from_json(kept["target"]), "folder": Path(kept["folder"]), "people": people}
+        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -55,7 +55,7 @@ class RestoreWork(Work):
     @classmethod
     def from_json(cls, kept: dict[str, Any]) -> RestoreWork:
         """What `to_json` gave."""
-        return cls(Target(**{**kept["target"], "uid": None}), kept["file"])
+        return cls(Target.from_json(kept["target"]), kept["file"])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +103,7 @@ class RegenerateWork(Work):
     @classmethod
     def from_json(cls, kept: dict[str, Any]) -> RegenerateWork:
         """What `to_json` gave."""
-        return cls(Target(**{**kept["target"], "uid": None}), kept["made"], kept["checkpoint"])
+        return cls(Target.from_json(kept["target"]), kept["made"], kept["checkpoint"])
 
 
 def made_from_seed(person: bpy.types.Collection) -> dict[str, Any]:

@@ -31,8 +31,6 @@ class EditWork(Work):
     """What became of the person, for the news."""
 
     target: Target
-    file: str
-    """The backend's, of whom to edit."""
     steps: int
     asked: Mapping[str, Any]
     """The method's other parameters. A region {"painted": [V numbers]} holds weights, and travels as a file."""
@@ -41,7 +39,8 @@ class EditWork(Work):
     @classmethod
     def of(cls, person: bpy.types.Collection, steps: int, asked: Mapping[str, Any]) -> EditWork:
         """Raises ValueError for a person that cannot be edited, FileNotFoundError for one whose file is missing."""
-        return cls(Target.of(person), str(person_file(person)), steps, asked)
+        person_file(person)
+        return cls(Target.of(person), steps, asked)
 
     @property
     def label(self) -> str:
@@ -55,7 +54,7 @@ class EditWork(Work):
             np.savez(folder / "region.npz", weights=np.asarray(asked["region"]["painted"], np.float32))
             asked["region"] = {"weights": str(folder / "region.npz")}
         checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
-        params = {**asked, "person": self.file, "steps": self.steps, "size": _PICTURE_PX}
+        params = {**asked, "person": self.target.file_now(), "steps": self.steps, "size": _PICTURE_PX}
         params["picture_px"] = _STEP_PICTURE_PX
         return {**params, **checkpoint, "out_dir": str(folder)}
 
@@ -76,9 +75,8 @@ class EditWork(Work):
 
     @classmethod
     def from_json(cls, kept: dict[str, Any]) -> EditWork:
-        """What `to_json` gave; the person is known by name and file alone now."""
-        target = Target(**{**kept["target"], "uid": None})
-        return cls(**{**kept, "target": target})
+        """What `to_json` gave."""
+        return cls(**{**kept, "target": Target.from_json(kept["target"])})
 
 
 class VaryWork(EditWork):

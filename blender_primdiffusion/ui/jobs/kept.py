@@ -70,8 +70,7 @@ def kept_work(work: Work, scene: str, blend: str) -> KeptWork | None:
     """`work` as it is kept; None for one that is not."""
     from ...worker.kept_works import KeptWork
 
-    content = work.to_json()
-    return None if content is None else KeptWork(work.kind, work.label, content, scene, blend)
+    return None if work.not_kept_because else KeptWork(work.kind, work.label, work.to_json(), scene, blend)
 
 
 def work_of(kept: KeptWork) -> Work:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import bpy
 
-from ...scene.human import human_of, humans, person_file_name
+from ...scene.human import human_of, humans, person_file, person_file_name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +28,11 @@ class Target:
         check_editable(person)
         return cls(person.session_uid, person.name, person_file_name(person))
 
+    @classmethod
+    def from_json(cls, kept: dict[str, Any]) -> Target:
+        """What dataclasses.asdict gave, after a restart: the person is known by name and file alone now."""
+        return cls(None, str(kept["name"]), str(kept["file"]))
+
     def found(self) -> bpy.types.Collection:
         """The person, if still in a scene and the one it was; else ValueError with a sentence."""
         from ...scene.edited import check_editable
@@ -45,6 +51,13 @@ class Target:
             )
         check_editable(person)
         return person
+
+    def file_now(self) -> str:
+        """Path of the backend's file, asked for when it is needed: saving the .blend for the first time moves it.
+
+        Raises as `found` does, and FileNotFoundError.
+        """
+        return str(person_file(self.found()))
 
     def _is(self, person: bpy.types.Collection) -> bool:
         return person.name == self.name if self.uid is None else person.session_uid == self.uid

@@ -40,14 +40,19 @@ class Work(abc.ABC):
         OSError and RuntimeError become the panel's error, and must leave the scene as it was.
         """
 
-    def to_json(self) -> dict[str, Any] | None:
-        """What `from_json` needs after a restart of Blender; None: it is not kept."""
-        return None
+    @property
+    def not_kept_because(self) -> str:
+        """Why a restart of Blender ends it, for the panel; empty for what is kept, as almost all is."""
+        return ""
+
+    @abc.abstractmethod
+    def to_json(self) -> dict[str, Any]:
+        """What `from_json` needs after a restart of Blender; not asked of what is not kept."""
 
     @classmethod
+    @abc.abstractmethod
     def from_json(cls, kept: dict[str, Any]) -> Work:
         """The work of `to_json`. Raises ValueError, KeyError or TypeError for what is none."""
-        raise ValueError(f"{cls.kind} is not kept")
 
 
 _kinds: dict[str, str] = {}

@@ -17,6 +17,7 @@ from ...scene.gain import set_density_gain
 from ...scene.human import armature_of
 from ...scene.joints import JOINT_NAMES
 from ...scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
+from ..jobs.kept_poses import packed, unpacked
 from ..jobs.target import Target
 from ..jobs.work import Work
 
@@ -47,15 +48,17 @@ class Moment:
         return cls(pose.params(), pose_digest(person, pose.joints, pose.betas))
 
 
+@dataclasses.dataclass(frozen=True)
 class MergeWork(Work):
     """A person in one pose as one volume."""
 
     kind = method = "merge"
     undo = "Merge Human"
 
-    def __init__(self, person: bpy.types.Collection, moment: Moment, voxel: float):
-        """Raises ValueError for a person that cannot be edited."""
-        self.target, self.moment, self.voxel = Target.of(person), moment, voxel
+    target: Target
+    moment: Moment
+    voxel: float
+    """Metres."""
 
     @property
     def label(self) -> str:
@@ -65,7 +68,8 @@ class MergeWork(Work):
     def params(self, folder: Path) -> dict[str, Any]:
         """Of the child's method."""
         bpy.utils.expose_bundled_modules()
-        return {"people": [self.moment.params], "voxel": self.voxel, "out": str(folder / "grid.npz")}
+        people = [{**self.moment.params, "human": self.target.file_now()}]
+        return {"people": people, "voxel": self.voxel, "out": str(folder / "grid.npz")}
 
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
         """Show the merged volume in the place of the others."""
@@ -77,17 +81,30 @@ class MergeWork(Work):
         size = files[0].stat().st_size / 1e6
         return f"Merged {person.name} at {self.voxel * 1e3:.3g} mm in {result['seconds']:.1f} s, {size:.1f} MB"
 
+    def to_json(self) -> dict[str, Any]:
+        """All of it."""
+        return dataclasses.asdict(self)
 
+    @classmethod
+    def from_json(cls, kept: dict[str, Any]) -> MergeWork:
+        """What `to_json` gave."""
+        return cls(Target.from_json(kept["target"]), Moment(**kept["moment"]), float(kept["voxel"]))
+
+
+@dataclasses.dataclass
 class MergeFramesWork(Work):
     """A person as one volume, another one for each frame."""
 
     kind = method = "merge_frames"
     undo = "Merge Frames"
 
-    def __init__(self, person: bpy.types.Collection, moments: list[Moment], start: int, voxel: float):
-        """Raises ValueError for a person that cannot be edited."""
-        self.target, self.moments, self.start, self.voxel = Target.of(person), moments, start, voxel
-        self._writer: _Writer | None = None
+    target: Target
+    moments: list[Moment]
+    start: int
+    """The first frame's number."""
+    voxel: float
+    """Metres."""
+    _writer: _Writer | None = dataclasses.field(default=None, init=False, repr=False)
 
     @property
     def label(self) -> str:
@@ -99,7 +116,8 @@ class MergeFramesWork(Work):
         bpy.utils.expose_bundled_modules()
         self._writer = _Writer(folder, len(self.moments))
         self._writer.start()
-        people = [moment.params for moment in self.moments]
+        file = self.target.file_now()
+        people = [{**moment.params, "human": file} for moment in self.moments]
         return {"people": people, "voxel": self.voxel, "out_dir": str(folder)}
 
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
@@ -111,7 +129,25 @@ class MergeFramesWork(Work):
         size = sum(path.stat().st_size for path in files) / 1e6
         return f"Merged {len(files)} frames of {person.name} in {result['seconds']:.1f} s, {size:.0f} MB"
 
+    def to_json(self) -> dict[str, Any]:
+        """All of it."""
+        return {
+            "target": dataclasses.asdict(self.target),
+            "people": packed(moment.params for moment in self.moments),
+            "digests": [moment.digest for moment in self.moments],
+            "start": self.start,
+            "voxel": self.voxel,
+        }
 
+    @classmethod
+    def from_json(cls, kept: dict[str, Any]) -> MergeFramesWork:
+        """What `to_json` gave."""
+        both = zip(unpacked(kept["people"]), kept["digests"], strict=True)
+        moments = [Moment(params, digest) for params, digest in both]
+        return cls(Target.from_json(kept["target"]), moments, int(kept["start"]), float(kept["voxel"]))
+
+
+@dataclasses.dataclass(frozen=True)
 class FitGainWork(Work):
     """The density gain of a person in one pose."""
 
@@ -119,9 +155,8 @@ class FitGainWork(Work):
     undo = "Fit Density Gain"
     decimals: ClassVar[int] = 2
 
-    def __init__(self, person: bpy.types.Collection, moment: Moment):
-        """Raises ValueError for a person that cannot be edited."""
-        self.target, self.moment = Target.of(person), moment
+    target: Target
+    moment: Moment
 
     @property
     def label(self) -> str:
@@ -130,7 +165,7 @@ class FitGainWork(Work):
 
     def params(self, _folder: Path) -> dict[str, Any]:
         """Of the child's method."""
-        return {"people": [self.moment.params]}
+        return {"people": [{**self.moment.params, "human": self.target.file_now()}]}
 
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Give the person the gain."""
@@ -140,6 +175,15 @@ class FitGainWork(Work):
             f"Density gain {gain:g} for {person.name}: opacity is off by {100 * result['error']:.1f} % on average, by "
             f"{100 * result['error_before']:.1f} % with {result['gain_before']:g}"
         )
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, kept: dict[str, Any]) -> FitGainWork:
+        """What `to_json` gave."""
+        return cls(Target.from_json(kept["target"]), Moment(**kept["moment"]))
 
 
 class _Writer(threading.Thread):

@@ -9,7 +9,7 @@ import bpy
 from ...scene.attachment import attachment_before_merge, attachment_of, set_attachment
 from ...scene.human import armature_of, humans
 from ..jobs.follow import submit
-from ..jobs.target import named_person, selected_person
+from ..jobs.target import Target, named_person, selected_person
 
 if TYPE_CHECKING:
     from .merge_work import Moment
@@ -101,7 +101,7 @@ class PRIMDIFFUSION_OT_merge(_Merging, bpy.types.Operator):
         from .merge_work import MergeWork
 
         moment = _moment(person, context.evaluated_depsgraph_get())
-        return submit(self, context, MergeWork(person, moment, self.chosen_voxel(context)))
+        return submit(self, context, MergeWork(Target.of(person), moment, self.chosen_voxel(context)))
 
 
 class PRIMDIFFUSION_OT_merge_frames(_Merging, bpy.types.Operator):
@@ -124,7 +124,7 @@ class PRIMDIFFUSION_OT_merge_frames(_Merging, bpy.types.Operator):
                 f"frames {start} to {end} are no sequence: give a start and a later end, of at most {_MOST_FRAMES}"
             )
         moments = _moments(context, person, range(start, end + 1))
-        return submit(self, context, MergeFramesWork(person, moments, start, self.chosen_voxel(context)))
+        return submit(self, context, MergeFramesWork(Target.of(person), moments, start, self.chosen_voxel(context)))
 
 
 class PRIMDIFFUSION_OT_unmerge(_OfPerson, bpy.types.Operator):
@@ -157,7 +157,7 @@ class PRIMDIFFUSION_OT_fit_density_gain(_OfPerson, bpy.types.Operator):
         from .merge_work import FitGainWork
 
         graph = context.evaluated_depsgraph_get()
-        return submit(self, context, FitGainWork(person, _moment(person, graph)))
+        return submit(self, context, FitGainWork(Target.of(person), _moment(person, graph)))
 
 
 def _moment(person: bpy.types.Collection, graph: bpy.types.Depsgraph) -> Moment:
