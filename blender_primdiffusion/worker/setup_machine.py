@@ -24,7 +24,7 @@ class Machine:
     """As far as the choice of packages depends on it."""
 
     platform: str
-    """linux_x86_64, windows_x86_64, macos_arm64, or one without locks such as macos_x86_64."""
+    """linux_x86_64, linux_arm64, windows_x86_64, macos_arm64, or one without locks such as macos_x86_64."""
     python: tuple[int, int]
     macos: int | None
     nvidia: bool
@@ -75,6 +75,11 @@ def chosen_compute(machine: Machine, wish: str, available: Iterable[str]) -> tup
     available = set(available)
     if machine.macos is not None and machine.macos < MACOS:
         raise ValueError(f"torch needs macOS {MACOS} or newer, and this is {machine.macos}: update the system")
+    if machine.platform == "macos_x86_64":
+        raise ValueError(
+            "PyTorch is no longer made for Macs with Intel chips (2.2 was the last, and 2.13 is needed): generate on "
+            "another computer; a .blend with people in it opens here and renders in Cycles"
+        )
     if not available:
         version = ".".join(map(str, machine.python))
         raise ValueError(

@@ -22,7 +22,7 @@ from wheels import NoWheel, Wheel, wheel_of
 ROOT = pathlib.Path(__file__).parents[2]
 OUT = ROOT / "blender_primdiffusion/requirements"
 _OF_CUDA = re.compile(r"(?:nvidia|cuda)-.*|triton")
-_OWN_OF_PYTHON = {"3.13": ("numpy",)}
+_OWN_OF_PYTHON = {"3.13": ("numpy",), "3.14": ("numpy",)}
 """Packages whose locked version has no wheel for that Python: the newest that all others allow."""
 
 

@@ -11,9 +11,9 @@ class Target:
     """One lock: a platform, a Python, a build of torch."""
 
     platform: str
-    """As the extension names it: linux_x86_64, windows_x86_64, macos_arm64."""
+    """As the extension names it: linux_x86_64, linux_arm64, windows_x86_64, macos_arm64."""
     python: str
-    """3.11 (Blender 4.5, 5.0), 3.13 (5.1 and newer)."""
+    """3.11 (Blender 4.5, 5.0), 3.13 (5.1 and newer), 3.14 (as some Linux distributions build Blender)."""
     compute: str
     """cpu, cuda, apple."""
     uv_platform: str
@@ -55,19 +55,39 @@ def _not_newer(tag: str, version: str) -> bool:
     return found is not None and int(found[1]) <= int(version[1:])
 
 
-_LINUX = (r"manylinux_2_28_x86_64", r"manylinux_2_(?:1\d|2[0-7])_x86_64", r"manylinux(?:2014|2010|1|_2_5)_x86_64")
 _MAC = (r"macosx_1[1-4]_\d+_(?:arm64|universal2)", r"macosx_10_\d+_universal2")
 
 
-def _targets(python: str) -> tuple[Target, ...]:
-    linux, windows = ("linux_x86_64", python), ("windows_x86_64", python)
+def _linux(chip: str) -> tuple[str, ...]:
     return (
-        Target(*linux, "cpu", "x86_64-manylinux_2_28", _LINUX, "cpu"),
-        Target(*linux, "cuda", "x86_64-manylinux_2_28", _LINUX),
+        f"manylinux_2_28_{chip}",
+        rf"manylinux_2_(?:1\d|2[0-7])_{chip}",
+        rf"manylinux(?:2014|2010|1|_2_5)_{chip}",
+    )
+
+
+def _on_linux(python: str) -> tuple[Target, ...]:
+    intel, arm = ("linux_x86_64", python), ("linux_arm64", python)
+    return (
+        Target(*intel, "cpu", "x86_64-manylinux_2_28", _linux("x86_64"), "cpu"),
+        Target(*intel, "cuda", "x86_64-manylinux_2_28", _linux("x86_64")),
+        Target(*arm, "cpu", "aarch64-manylinux_2_28", _linux("aarch64"), "cpu"),
+    )
+
+
+def _elsewhere(python: str) -> tuple[Target, ...]:
+    windows = ("windows_x86_64", python)
+    return (
         Target(*windows, "cpu", "x86_64-pc-windows-msvc", ("win_amd64",)),
         Target(*windows, "cuda", "x86_64-pc-windows-msvc", ("win_amd64",), "cu130"),
         Target("macos_arm64", python, "apple", "aarch64-apple-darwin", _MAC),
     )
 
 
-TARGETS = (*_targets("3.11"), *_targets("3.13"))
+TARGETS = (
+    *_on_linux("3.11"),
+    *_elsewhere("3.11"),
+    *_on_linux("3.13"),
+    *_elsewhere("3.13"),
+    *_on_linux("3.14"),
+)

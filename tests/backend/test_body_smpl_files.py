@@ -139,6 +139,12 @@ def test_without_texture_coordinates_the_body_is_unwrapped(tmp_path):
     assert 0 <= body.uv.min() < body.uv.max() <= 1
 
 
+def test_without_xatlas_a_body_without_texture_coordinates_is_refused_with_what_to_do(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xatlas", None)
+    with pytest.raises(BodyFileError, match="give them by a second file"):
+        load_body(pickled(tmp_path, smpl_arrays()))
+
+
 def test_obj_texture_coordinates_follow_the_bodys_face_order(tmp_path, uv_pair):
     arrays = smpl_arrays()
     vt, ft = np.load(uv_pair[0]), np.load(uv_pair[1])

@@ -6,7 +6,7 @@ import torch
 import trimesh
 from export_people import ball, person
 from primdiffusion.export.field import pack_field
-from primdiffusion.export.simplify import simplified
+from primdiffusion.export.simplify import NoUnwrapping, simplified, unwrapped
 from primdiffusion.export.surface import NoSurface, depth_below, outside_surface
 from primdiffusion.human import place
 from primdiffusion.primitives.primitives import Primitives
@@ -56,3 +56,9 @@ def test_a_person_of_nothing_is_refused_with_a_sentence():
     empty = type(primitives)(**{**vars(primitives), "density": torch.zeros_like(primitives.density)})
     with pytest.raises(NoSurface, match="dense enough"):
         outside_surface(pack_field(empty), 0.02)
+
+
+def test_without_xatlas_unwrapping_is_refused_with_what_to_do(monkeypatch):
+    monkeypatch.setitem(sys.modules, "xatlas", None)
+    with pytest.raises(NoUnwrapping, match="has no package for this Python"):
+        unwrapped(np.zeros((3, 3)), np.array([[0, 1, 2]]), 64)

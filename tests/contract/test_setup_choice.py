@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 from worker.setup_folder import LONGEST_INSIDE, WINDOWS_LONGEST, short_root
 from worker.setup_locks import grouped, locks_for, read_lock
 from worker.setup_machine import Machine, chosen_compute, this_machine
@@ -49,7 +50,13 @@ def test_an_apple_computer_takes_its_own_packages():
     ("machine", "wish", "available", "said"),
     [
         (Machine("macos_arm64", (3, 11), 13, False, None), "automatic", ["apple"], "needs macOS 14 or newer"),
-        (Machine("macos_x86_64", (3, 11), 14, False, None), "automatic", [], "no packages for macos_x86_64"),
+        (
+            Machine("macos_x86_64", (3, 11), 14, False, None),
+            "automatic",
+            [],
+            "no longer made for Macs with Intel",
+        ),
+        (Machine("windows_arm64", (3, 13), None, False, None), "automatic", [], "no packages for windows_arm64"),
         (LINUX, "apple", BOTH, "there are no packages for Apple Silicon here, but for CPU, NVIDIA"),
     ],
 )
@@ -72,27 +79,48 @@ def test_the_environment_goes_to_a_short_folder_only_where_windows_needs_it():
     assert len(f"{short}/env/Lib/site-packages/") + LONGEST_INSIDE <= WINDOWS_LONGEST
 
 
-@pytest.mark.parametrize("python", [(3, 11), (3, 13)])
+BLENDERS = ((3, 11), (3, 13))
+"""Pythons of Blender's own builds: 4.5 and 5.0, 5.1 and newer."""
+OF_DISTRIBUTIONS = (3, 14)
+
+
 @pytest.mark.parametrize(
-    ("platform", "computes"), [("linux_x86_64", BOTH), ("windows_x86_64", ("cpu",)), ("macos_arm64", ("apple",))]
+    ("platform", "computes", "pythons"),
+    [
+        ("linux_x86_64", BOTH, (*BLENDERS, OF_DISTRIBUTIONS)),
+        ("linux_arm64", ("cpu",), (*BLENDERS, OF_DISTRIBUTIONS)),
+        ("windows_x86_64", BOTH, BLENDERS),
+        ("macos_arm64", ("apple",), BLENDERS),
+    ],
 )
-def test_every_platform_has_locks_of_the_projects_own_pins(platform, computes, python):
-    locks = locks_for(LOCKS, platform, python)
-    assert set(computes) <= set(locks)
-    pins = dict(
-        line.split("==")
-        for line in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
-        if "==" in line
-    )
-    for path in locks.values():
-        lock = read_lock(path)
-        versions = {package.name: package.version.split("+")[0] for package in lock.packages}
-        assert {name: versions[name] for name in pins} == pins
-        assert "numpy" in versions
-        assert lock.download_bytes > 150e6
-        assert lock.installed_bytes > lock.download_bytes
-        assert all(package.bytes for package in lock.packages)
-        assert bool(lock.indexes) == any("+" in package.version for package in lock.packages)
+def test_every_platform_has_locks_of_the_projects_own_pins(platform, computes, pythons):
+    for python in pythons:
+        locks = locks_for(LOCKS, platform, python)
+        assert set(locks) == set(computes)
+        for path in locks.values():
+            _holds_the_pins(path, _pins(platform, python))
+
+
+def _pins(platform: str, python: tuple[int, int]) -> dict[str, str]:
+    """Names to versions that pyproject.toml asks for there."""
+    marked = {
+        "platform_machine": "aarch64" if platform == "linux_arm64" else "x86_64",
+        "python_version": "%d.%d" % python,
+    }
+    asked = map(Requirement, tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"])
+    wanted = [one for one in asked if one.marker is None or one.marker.evaluate(marked)]
+    return {one.name: str(one.specifier)[2:] for one in wanted if str(one.specifier).startswith("==")}
+
+
+def _holds_the_pins(path: Path, pins: dict[str, str]) -> None:
+    lock = read_lock(path)
+    versions = {package.name: package.version.split("+")[0] for package in lock.packages}
+    assert {name: versions[name] for name in pins} == pins
+    assert "numpy" in versions
+    assert lock.download_bytes > 150e6
+    assert lock.installed_bytes > lock.download_bytes
+    assert all(package.bytes for package in lock.packages)
+    assert bool(lock.indexes) == any("+" in package.version for package in lock.packages)
 
 
 def test_cpu_locks_hold_no_cuda_packages():

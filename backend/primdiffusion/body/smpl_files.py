@@ -13,7 +13,6 @@ import zlib
 
 import numpy as np
 import torch
-import xatlas
 
 from primdiffusion.body.model import BodyModel, J
 from primdiffusion.body.smpl_pickle import BodyFileError, as_array, read_pickle
@@ -159,7 +158,7 @@ def _texture_coordinates(
     elif "vt" in arrays and "ft" in arrays:
         coordinates, coordinate_faces, source = arrays.raw("vt"), arrays.raw("ft"), str(arrays.path)
     else:
-        _, coordinate_faces, coordinates = xatlas.parametrize(template, faces.astype(np.uint32))
+        coordinate_faces, coordinates = _unwrapped(template, faces)
         source = "the automatic unwrap"
     if coordinates.ndim != 2 or coordinates.shape[1] != 2 or coordinate_faces.shape != faces.shape:
         raise BodyFileError(
@@ -172,6 +171,19 @@ def _texture_coordinates(
             f"{source}: texture coordinates are NaN or their numbers out of range; use the body's own UV file."
         )
     return coordinates.astype(np.float32), coordinate_faces
+
+
+def _unwrapped(template: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Faces and coordinates of an automatic unwrap."""
+    try:
+        import xatlas
+    except ModuleNotFoundError as error:  # it has no package for Python 3.14 or Linux on ARM
+        raise BodyFileError(
+            "the body has no texture coordinates, and this Python has no xatlas to make some: give them by a second "
+            "file (uv), or install xatlas."
+        ) from error
+    _, coordinate_faces, coordinates = xatlas.parametrize(template, faces.astype(np.uint32))
+    return coordinate_faces, coordinates
 
 
 def _numpy_file(path: pathlib.Path) -> np.ndarray:
