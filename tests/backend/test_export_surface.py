@@ -1,5 +1,7 @@
 """The outside of boxes as closed triangles."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch

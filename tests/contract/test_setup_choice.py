@@ -105,7 +105,7 @@ def _pins(platform: str, python: tuple[int, int]) -> dict[str, str]:
     """Names to versions that pyproject.toml asks for there."""
     marked = {
         "platform_machine": "aarch64" if platform == "linux_arm64" else "x86_64",
-        "python_version": "%d.%d" % python,
+        "python_version": ".".join(map(str, python)),
     }
     asked = map(Requirement, tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"])
     wanted = [one for one in asked if one.marker is None or one.marker.evaluate(marked)]
