@@ -12,6 +12,7 @@ from pathlib import Path
 import bpy
 from panels import show, sidebar, view, wide_view
 from press import Steps, invoke, press, wait
+from stalls import Stalls
 
 FIRST_SEED, SECOND_SEED = 3, 53
 
@@ -295,6 +296,28 @@ def languages(module: str, python: str) -> Steps:
     bpy.context.preferences.view.language = "en_US"
 
 
+def stalls(module: str, python: str) -> Steps:
+    """A person enters the scene, twice, then a slider is dragged: how long the window stands still."""
+    yield from begin(module, python)
+    yield from show("PRIMDIFFUSION_PT_generate")
+    queue = queue_of(module)
+    for seed in (FIRST_SEED, SECOND_SEED):
+        measured = Stalls()
+        press("primdiffusion.generate", seed=seed)
+        yield from wait(lambda: not queue.busy, 240)
+        yield 3.0
+        print(f"a person is made: {measured.end()}", flush=True)
+    yield "stalls_person"
+    select(armatures()[0])
+    settings = armatures()[0].primdiffusion_human
+    yield 2.0
+    measured = Stalls()
+    for move in range(10):
+        settings.betas[0] = 0.2 * move
+        yield 0.01
+    print(f"a slider is dragged: {measured.end()}", flush=True)
+
+
 def begin(module: str, python: str) -> Steps:
     """A new file, a backend."""
     bpy.ops.wm.read_homefile(use_factory_startup=True)
@@ -413,4 +436,5 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "left": left,
     "missing": missing,
     "languages": languages,
+    "stalls": stalls,
 }
