@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.export.proxy import vertex_normals
+from primdiffusion.export.surface import Surface
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
@@ -46,16 +48,21 @@ def standing_person(seed: int = 0) -> Primitives:
     return place(checkered_human(seed))
 
 
-def checkered_human(seed: int = 0) -> Human:
-    """The default body under a random checkered texture: nothing that was trained takes part."""
+def checkered_human(seed: int = 0, betas: Tensor | None = None, off_the_skin: float = 0.0) -> Human:
+    """The default body (None: the mean one) under a random checkered texture: nothing that was trained takes part.
+
+    The texture is on the skin, or on a suit that lies `off_the_skin` metres over it.
+    """
     body = default_body()
-    vertices = body.shape(torch.zeros(10)).vertices
+    betas = torch.zeros(10) if betas is None else betas
+    vertices = body.shape(betas).vertices
+    suit = Surface(vertices.double().numpy(), body.faces.numpy())
     cells = np.random.default_rng(seed).integers(40, 230, (32, 32, 4), dtype=np.uint8)
     texture = cells.repeat(8, axis=0).repeat(8, axis=1)
     texture[..., 3] = 255
     skin = TexturedPart(
         name="body",
-        vertices=vertices.double().numpy(),
+        vertices=suit.vertices + off_the_skin * vertex_normals(suit),
         faces=body.faces.int().numpy(),
         corner_uv=body.uv[body.uv_faces].double().numpy(),
         texture=texture,
@@ -63,7 +70,7 @@ def checkered_human(seed: int = 0) -> Human:
         skin_weight=np.ones((len(vertices), 1)),
     )
     frames = attach(default_anchors(), vertices, body.faces)
-    return Human(from_mesh(TexturedMesh((skin,)), frames), torch.zeros(10), {})
+    return Human(from_mesh(TexturedMesh((skin,)), frames), betas, {})
 
 
 def portrait(size: int) -> Camera:

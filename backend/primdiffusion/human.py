@@ -178,16 +178,15 @@ def place_skinned(
     human: Human,
     skinning: Float[Tensor, "24 r 4"],
     object_to_world: Float[Tensor, "r 4"],
-    betas: Float[Tensor, "n"] | None = None,
     body: BodyModel | None = None,
     anchors: Anchors | None = None,
 ) -> Primitives:
     """The person's primitives as an armature moves them: affine matrices (r = 3 or 4 rows), joints' and the object's.
 
-    `skinning` takes rest to posed in the object's space (posed x rest^-1, SMPL's joint order); `betas` stand for the
-    human's own where given. The object's 3x3 part is split into Q P (`polar`): the stretch P moves the posed vertices,
-    on which the frames sit, and with s = cbrt(det P) boxes are s times as large and 1/s as dense, so a person is as
-    opaque at any size; Q and the translation move the frames. Where the object mirrors, so do the frames (det -1).
+    `skinning` takes rest to posed in the object's space (posed x rest^-1, SMPL's joint order). The object's 3x3 part
+    is split into Q P (`polar`): the stretch P moves the posed vertices, on which the frames sit, and with
+    s = cbrt(det P) boxes are s times as large and 1/s as dense, so a person is as opaque at any size; Q and the
+    translation move the frames. Where the object mirrors, so do the frames (det -1).
 
     Raises ValueError for matrices with NaN or infinite values, and for a flat object or joint (scaled to zero).
     """
@@ -204,7 +203,7 @@ def place_skinned(
     if not scale > SMALLEST_SCALE:
         raise ValueError(f"the object is scaled to {scale:.3g} of its size: give it a scale other than zero")
     orthogonal, unit_stretch = orthogonal.to(skinning), (stretch / scale).to(skinning)
-    vertices = body.shape(human.betas if betas is None else betas).follow(skinning) @ unit_stretch.T
+    vertices = body.shape(human.betas).follow(skinning) @ unit_stretch.T
     frames = attach(anchors, vertices, body.faces)
     frames = Frames(
         position=frames.position @ (scale * orthogonal).T + object_to_world[:3, 3],

@@ -60,12 +60,12 @@ def test_the_matrices_of_a_pose_place_a_person_as_the_pose_does(human, pose, joi
 def test_the_same_with_pose_dependent_correctives(human, pose):
     body, anchors = with_correctives(default_body()), default_anchors()
     skinning = pose_body(human.betas, pose, body).skinning
-    with_them = place_skinned(human, skinning, torch.eye(4), None, body, anchors)
+    with_them = place_skinned(human, skinning, torch.eye(4), body, anchors)
     assert_equal_frames(with_them, place(human, pose, body, anchors), 5e-6, 5e-4)
     precise = human.to(dtype=torch.float64), pose.to(dtype=torch.float64)
     body, anchors = body.to(dtype=torch.float64), anchors.to(dtype=torch.float64)
     skinning = pose_body(precise[0].betas, precise[1], body).skinning
-    got = place_skinned(precise[0], skinning, torch.eye(4).double(), None, body, anchors)
+    got = place_skinned(precise[0], skinning, torch.eye(4).double(), body, anchors)
     assert_equal_frames(got, place(*precise, body, anchors), 1e-7, 1e-5)  # the pose is of float32
     assert (got.position - place(human, pose).position).abs().max() > 1e-3, "the correctives do something"
 
@@ -123,14 +123,6 @@ def test_a_person_stretched_along_the_world_keeps_its_boxes_on_the_stretched_bod
     assert torch.allclose(identity, torch.eye(3).expand_as(identity), atol=1e-5)
     normals = torch.nn.functional.normalize(still.rotation[..., 2] @ torch.linalg.inv(stretch), dim=-1)
     assert ((normals * stretched.rotation[..., 2]).sum(-1) > 1 - 1e-5).all()
-
-
-def test_betas_of_the_caller_stand_for_the_persons_own(human, joints):
-    betas = torch.zeros(10)
-    betas[0] = 2
-    other = dataclasses.replace(human, betas=betas)
-    assert_equal_frames(place_skinned(human, joints, STILL, betas), place_skinned(other, joints, STILL))
-    assert not torch.allclose(place_skinned(human, joints, STILL, betas).position, place(human).position, atol=1e-2)
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])

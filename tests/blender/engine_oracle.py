@@ -6,7 +6,6 @@ Run by the backend's Python; Blender's tests compare the engine's pictures with 
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -23,6 +22,7 @@ from primdiffusion.primitives.from_mesh import from_mesh
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.lattice import MarchSettings
 from primdiffusion.render.march import march
+from primdiffusion.reshaping import reshaped
 
 
 def make(folder: Path, seed: int, betas: list[float]) -> None:
@@ -54,7 +54,7 @@ def placed(
     """A posed person, of other betas if given, then moved, turned and scaled alike in all directions by `world`."""
     human = load_human(Path(folder) / "person.human.safetensors")
     if betas is not None:
-        human = dataclasses.replace(human, betas=torch.tensor(betas, dtype=torch.float32))
+        human = reshaped(human, torch.tensor(betas))
     pose = BodyPose(torch.tensor(rotations, dtype=torch.float32), torch.tensor(translation, dtype=torch.float32))
     person, matrix = place(human, pose), torch.tensor(world, dtype=torch.float64)
     scale = float(torch.linalg.det(matrix[:3, :3])) ** (1 / 3)

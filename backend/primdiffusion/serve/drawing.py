@@ -26,6 +26,7 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render import cuda
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.render.solids import Solids
+from primdiffusion.reshaping import reshaped
 from primdiffusion.serve.draw_params import DrawParams
 
 Report = Callable[[str, int, int, float | None], None]
@@ -51,6 +52,7 @@ class FrameDrawer:
         """`device` is where to draw if its marcher is the fast one; otherwise pictures are drawn on the CPU."""
         self._device = device if cuda.available(device) else torch.device("cpu")
         self._human = functools.lru_cache(PEOPLE_KEPT)(self._load)
+        self._shaped = functools.lru_cache(PEOPLE_KEPT)(self._reshape)
         self._rig = functools.lru_cache(1)(self._body)
         self._placed = functools.lru_cache(PEOPLE_KEPT)(self._place)
         self._everybody = functools.lru_cache(2)(self._together)
@@ -95,9 +97,11 @@ class FrameDrawer:
         return placed[0] if len(placed) == 1 else Primitives.together(placed)
 
     def _place(self, file: Stamp, matrix: Numbers, joints: Numbers, betas: Numbers | None) -> Primitives:
-        skinning, object_to_world = self._tensor(joints), self._tensor(matrix)
-        shape = None if betas is None else self._tensor(betas)
-        return place_skinned(self._human(file), skinning, object_to_world, shape, *self._stand(file))
+        human = self._human(file) if betas is None else self._shaped(file, betas)
+        return place_skinned(human, self._tensor(joints), self._tensor(matrix), *self._stand(file))
+
+    def _reshape(self, file: Stamp, betas: Numbers) -> Human:
+        return reshaped(self._human(file), self._tensor(betas), *self._stand(file))
 
     def _tensor(self, numbers: Numbers) -> torch.Tensor:
         return torch.tensor(numbers, dtype=torch.float32, device=self._device)

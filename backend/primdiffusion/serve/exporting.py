@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from primdiffusion.export.proxy_files import ARRAYS, TEXTURE, write_proxy_arrays
 from primdiffusion.human import Human, place, place_skinned
 from primdiffusion.human_file import load_human
 from primdiffusion.person_folder import FILES, write_person
+from primdiffusion.reshaping import reshaped
 from primdiffusion.serve.export_params import GaussiansParams, HumanNpzParams, ProxyParams
 from primdiffusion.serve.progress import Report
 from primdiffusion.staging import staged
@@ -31,7 +31,7 @@ def proxy(params: ProxyParams, report: Report) -> dict[str, Any]:
     out = Path(params.out_dir)
     with staged(out) as folder:
         report("load", 0, 4, None)
-        human = _shaped(load_human(params.person), params.betas)
+        human = _shaped(params)
         made = mesh_proxy(human, settings, lambda stage, done, total: report(stage, done, total + 1, None))
         report("write", 3, 4, 0.0)
         write_proxy_arrays(folder, made)
@@ -48,7 +48,7 @@ def gaussians(params: GaussiansParams, report: Report) -> dict[str, Any]:
     """Writes a person as 3D Gaussians, posed as an armature poses them. Raises OSError and what load_human does."""
     began = time.perf_counter()
     report("load", 0, 2, None)
-    human = _shaped(load_human(params.person), params.betas)
+    human = _shaped(params)
     if params.object is None or params.joints is None:
         primitives = place(human)
     else:
@@ -73,10 +73,7 @@ def human_npz(params: HumanNpzParams, report: Report) -> dict[str, Any]:
     return {**FILES.in_folder(out), "seconds": round(time.perf_counter() - began, 3)}
 
 
-def _shaped(human: Human, betas: list | None) -> Human:
-    """The person with other shape coefficients. Raises ValueError for another number of them."""
-    if betas is None:
-        return human
-    if len(betas) != len(human.betas):
-        raise ValueError(f"{len(betas)} betas were given for a body of {len(human.betas)}: give as many")
-    return dataclasses.replace(human, betas=torch.tensor(betas, dtype=human.betas.dtype)).validate()
+def _shaped(params: ProxyParams | GaussiansParams) -> Human:
+    """The person with the shape that is asked for. Raises ValueError for another number of betas."""
+    human = load_human(params.person)
+    return human if params.betas is None else reshaped(human, torch.tensor(params.betas))

@@ -16,6 +16,7 @@ from primdiffusion.human_file import load_human
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.gain import DEFAULT_GAIN, fit_gain, unclamped_alpha
 from primdiffusion.render.merge import merge
+from primdiffusion.reshaping import reshaped
 from primdiffusion.serve.draw_params import PersonParams
 from primdiffusion.serve.merge_params import FitGainParams, MergeFramesParams, MergeParams
 from primdiffusion.serve.progress import Pace, Report
@@ -85,8 +86,9 @@ def _together(people: list[PersonParams]) -> Primitives:
 
 
 def _placed(human: Human, person: PersonParams) -> Primitives:
-    betas = None if person.betas is None else torch.tensor(person.betas)
-    return place_skinned(human, torch.tensor(person.joints), torch.tensor(person.object), betas)
+    if person.betas is not None:
+        human = reshaped(human, torch.tensor(person.betas))
+    return place_skinned(human, torch.tensor(person.joints), torch.tensor(person.object))
 
 
 def _write(path: Path, primitives: Primitives, voxel: float) -> list[int]:
