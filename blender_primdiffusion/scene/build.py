@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import bpy
-import numpy as np
 
 from . import volumes
 from .armature import build_armature
 from .attach import attach_volumes
+from .beforehand import Baked, Written, bake
 from .body_mesh import build_body_mesh
 from .convention import frames_to_blender, points_to_blender
 from .human import BETAS, HOME, MARK, PERSON, folder_of
-from .human_file import HumanFile, read_human
 from .material import volume_material
-from .overlap import most_overlapping
 from .placing_files import free_name
 from .shape_file import body_kept
 
@@ -36,7 +33,37 @@ def build_human(
     and the body's file is put beside that folder. Raises HumanFileError or VolumeWriteError, and then leaves neither
     data nor files. Takes several seconds; makes no undo step, its caller does.
     """
-    human = read_human(human_npz)
+    return _build(context, bake(human_npz), None, name, keep)
+
+
+def build_written(
+    context: bpy.types.Context, written: Written, name: str = "Human", keep: Sequence[Path] = ()
+) -> bpy.types.Collection:
+    """As `build_human`, quickly, of a person whose volumes are written: where they are, or, if somebody else has taken
+    that place meanwhile, as copies elsewhere."""
+    try:
+        person = _build(context, written.baked, written, name, keep)
+    except BaseException:
+        written.discard()
+        raise
+    if folder_of(person) != written.home:
+        written.discard(but=folder_of(person).parent)  # where the body's file is
+    return person
+
+
+def home_of_next(name: str) -> Path:
+    """`folder_of` the person who is built under this name next."""
+    collection = bpy.data.collections.new(name[:_NAME_LENGTH])
+    try:
+        return folder_of(collection)
+    finally:
+        bpy.data.collections.remove(collection, do_unlink=False)
+
+
+def _build(
+    context: bpy.types.Context, baked: Baked, written: Written | None, name: str, keep: Sequence[Path]
+) -> bpy.types.Collection:
+    human = baked.human
     with _nothing_left_on_failure():
         collection = bpy.data.collections.new(name[:_NAME_LENGTH])
         label = collection.name
@@ -50,12 +77,10 @@ def build_human(
         collection.objects.link(body)
         primitives = bpy.data.collections.new(f"{label}_primitives")
         collection.children.link(primitives)
-        rotation = frames_to_blender(human.rotation)
-        grids = volumes.bake(human.density, human.rgb, human.half_extent)
         home = folder_of(collection)
         kept = {free_name(path, home, path.name): path for path in keep}
         with (
-            volumes.written(grids, home, kept) as files,
+            _volumes(baked, written, home, kept) as files,
             body_kept(collection, human.shape_model, home.parent),
         ):
             attach_volumes(
@@ -64,11 +89,11 @@ def build_human(
                 primitives,
                 files,
                 points_to_blender(human.position),
-                rotation,
+                frames_to_blender(human.rotation),
                 human.primitive_weights,
                 volume_material(),
             )
-            collection[MARK] = provenance(human, grids)
+            collection[MARK] = baked.provenance
             collection[HOME] = str(home)
             for name, path in kept.items():
                 if name != path.name:  # the usual name is taken by somebody who was deleted
@@ -77,12 +102,17 @@ def build_human(
     return collection
 
 
-def provenance(human: HumanFile, grids: volumes.Grids) -> str:
-    """What `MARK` holds: where the person comes from, their betas, and how many boxes meet at most."""
-    offset, half = grids.drawn_box()
-    centre = human.position + np.einsum("kij,kj->ki", human.rotation, offset)
-    most = most_overlapping(centre, human.rotation, half)
-    return json.dumps({**human.meta, "betas": np.round(human.betas, 6).tolist(), "most_overlapping": most})
+@contextmanager
+def _volumes(baked: Baked, written: Written | None, home: Path, kept: dict[str, Path]) -> Iterator[Sequence[Path]]:
+    """The files of the volumes in `home`, with `kept` beside them where the block ends well."""
+    if written is None:
+        with volumes.written(baked.grids, home, kept) as files:
+            yield files
+        return
+    here = written.home == home
+    copies = {} if here else {path.name: path for path in written.files}
+    with volumes.written(baked.grids, home, {**kept, **copies}, which=[]):
+        yield written.files if here else [home / name for name in copies]
 
 
 @contextmanager

@@ -15,7 +15,7 @@ import bpy
 import numpy as np
 
 from . import merged, shape_file, volumes
-from .build import provenance
+from .beforehand import provenance
 from .folders import humans_folder, stored_path
 from .human import MARK, PERSON, armature_of, folder_of, folders_of, people_files, person_file_name, volume_path
 from .human_file import read_human

@@ -7,7 +7,7 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -111,26 +111,30 @@ def file_name(grids: Grids, k: int, blender_version: tuple[int, ...]) -> str:
 
 @contextmanager
 def written(
-    grids: Grids, folder: Path, keep: Mapping[str, Path] | None = None, which: Sequence[int] | None = None
+    grids: Grids,
+    folder: Path,
+    keep: Mapping[str, Path] | None = None,
+    which: Sequence[int] | None = None,
+    step: Callable[[float], None] = lambda _fraction: None,
 ) -> Iterator[list[Path]]:
     """Write the VDBs in a hidden part of `folder`, and move them into it when the block ends well.
 
     `which` primitives, None for all. The files in `keep` are copied there too, under the names given. Yields the final
     paths, one for each written primitive, which exist only after the block. When the block or a write fails, neither
     the files nor folders made for them remain. Raises VolumeWriteError when the folder cannot be written or the disk is
-    full.
+    full, and what `step` raises, which hears before each file what fraction is written.
     """
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     try:
         folder.mkdir(parents=True, exist_ok=True)
         staging = Path(tempfile.mkdtemp(prefix=".writing_", dir=folder))
     except OSError as error:
-        _remove_empty(folder, existing)
+        remove_empty(folder, existing)
         raise _write_error(folder, error) from error
     published: list[Path] = []
     try:
         try:
-            names = _write_files(grids, staging, range(len(grids.density)) if which is None else which)
+            names = _write_files(grids, staging, range(len(grids.density)) if which is None else which, step)
             kept = [Path(shutil.copyfile(path, staging / name)).name for name, path in (keep or {}).items()]
         except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
             raise _write_error(folder, error) from error
@@ -148,15 +152,16 @@ def written(
         raise
     finally:
         shutil.rmtree(staging, ignore_errors=True)
-        _remove_empty(folder, existing)
+        remove_empty(folder, existing)
 
 
-def _write_files(grids: Grids, folder: Path, which: Sequence[int]) -> list[str]:
+def _write_files(grids: Grids, folder: Path, which: Sequence[int], step: Callable[[float], None]) -> list[str]:
     bpy.utils.expose_bundled_modules()
     import openvdb  # Blender's own, importable only after the line above
 
     names = []
     for k in which:
+        step(len(names) / len(which))
         transform = openvdb.createLinearTransform(index_to_local(grids.half_extent[k], bpy.app.version).tolist())
         written_part = tuple(slice(a, b + 1) for a, b in zip(grids.first[k], grids.last[k], strict=True))
         start = tuple((grids.first[k] - PAD).tolist())
@@ -184,7 +189,7 @@ def _write_error(folder: Path, error: BaseException) -> VolumeWriteError:
     )
 
 
-def _remove_empty(folder: Path, existing: Path) -> None:
+def remove_empty(folder: Path, existing: Path) -> None:
     """Remove `folder` and its parents below `existing`, as far as they are empty."""
     for path in (folder, *folder.parents):
         if path == existing or not path.is_dir() or any(path.iterdir()):

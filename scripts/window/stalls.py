@@ -1,4 +1,5 @@
-"""How long the window stands still: the longest times between two calls of a timer that is due every few milliseconds."""
+"""How long the window stands still: the longest times between two calls of a timer that is due every few
+milliseconds."""
 
 from __future__ import annotations
 

@@ -15,6 +15,7 @@ from oracle import TOLERANCE_M, blended_frames, evaluated_matrices
 
 from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.attach import attach_volumes
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving
 from blender_primdiffusion.scene.human import MARK, armature_of, folder_of, humans, overlap_warning, remove_human
@@ -192,10 +193,11 @@ def test_a_failure_in_the_middle_of_building_leaves_scene_and_disk_as_they_were(
 ):
     before, files = datablocks(), volume_files()
 
-    def failing(*_):
+    def failing(*given):
+        attach_volumes(*given)
         raise MemoryError("no memory for the volumes")
 
-    monkeypatch.setattr(build, "provenance", failing)
+    monkeypatch.setattr(build, "attach_volumes", failing)
     with pytest.raises(MemoryError):
         build_human(saved_scene, synthetic.write(tmp_path / "second.npz", 8, seed=3))
     assert datablocks() == before

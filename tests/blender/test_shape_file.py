@@ -9,6 +9,7 @@ import synthetic
 import synthetic_shape
 
 from blender_primdiffusion.scene import build
+from blender_primdiffusion.scene.attach import attach_volumes
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving
 from blender_primdiffusion.scene.edited import unused
@@ -97,10 +98,11 @@ def test_a_missing_or_damaged_file_is_named_with_what_to_do(person):
 
 
 def test_a_failure_while_building_leaves_no_file(saved_scene, tmp_path, monkeypatch):
-    def failing(*_):
+    def failing(*given):
+        attach_volumes(*given)
         raise MemoryError("no memory for the volumes")
 
-    monkeypatch.setattr(build, "provenance", failing)
+    monkeypatch.setattr(build, "attach_volumes", failing)
     with pytest.raises(MemoryError):
         build_human(saved_scene, synthetic_shape.write(tmp_path / "human.npz"))
     assert not (tmp_path / "shot_humans").exists()

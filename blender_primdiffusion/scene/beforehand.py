@@ -1,0 +1,134 @@
+"""What of building a person needs none of Blender's data: done in a thread, so that the window goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from . import shape_file, volumes
+from .human_file import HumanFile, read_human
+from .overlap import most_overlapping
+
+
+class Stopped(Exception):
+    """Nobody waits for this person any more."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Baked:
+    """A human.npz as the scene takes it."""
+
+    human: HumanFile
+    grids: volumes.Grids
+    provenance: str
+    """JSON, what `human.MARK` holds."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Written:
+    """A person whose volumes are in their folder before anything of them is in the scene."""
+
+    baked: Baked
+    home: Path
+    """The person's folder."""
+    files: tuple[Path, ...]
+    """One for each primitive."""
+    made: tuple[Path, ...]
+    """Of these, and the body's, those that were not there before."""
+    existing: Path
+    """The folder that was there before."""
+
+    def whole(self) -> bool:
+        """Nobody has removed a file since."""
+        return all(path.is_file() for path in self.files)
+
+    def discard(self, but: Path | None = None) -> None:
+        """Nobody shows them: remove the files that were written, but not those in the folder `but`."""
+        for path in self.made:
+            if path.parent != but:
+                path.unlink(missing_ok=True)
+        volumes.remove_empty(self.home, self.existing)
+
+
+def bake(human_npz: str | Path) -> Baked:
+    """Read and bake. Raises HumanFileError."""
+    human = read_human(human_npz)
+    grids = volumes.bake(human.density, human.rgb, human.half_extent)
+    return Baked(human, grids, provenance(human, grids))
+
+
+def write(human_npz: Path, home: Path, step: Callable[[float], None]) -> Written:
+    """Bake, and write the volumes to `home` and the body's file beside it; `step` hears what fraction is done.
+
+    Raises HumanFileError, VolumeWriteError and what `step` raises, and then leaves no files.
+    """
+    step(0.0)
+    baked = bake(human_npz)
+    existing = next(parent for parent in (home, *home.parents) if parent.exists())
+    model = baked.human.shape_model
+    body = () if model is None else (home.parent / shape_file.file_name(model),)
+    with contextlib.ExitStack() as undone:
+        files = undone.enter_context(volumes.written(baked.grids, home, step=step))
+        made = tuple(path for path in (*files, *body) if not path.exists())
+        if model is not None:
+            undone.enter_context(shape_file.kept(model, home.parent))
+    return Written(baked, home, tuple(files), made, existing)
+
+
+class Writing:
+    """`write` in a thread."""
+
+    def __init__(self, human_npz: Path, home: Path) -> None:
+        bpy.utils.expose_bundled_modules()  # not for threads
+        self.fraction = 0.0
+        self.result: Written | None = None
+        """None until it is done, and where it has failed."""
+        self.error: Exception | None = None
+        self._wanted, self._lock = True, threading.Lock()
+        self._thread = threading.Thread(target=self._run, args=(human_npz, home), name="volumes")
+        self._thread.start()
+
+    @property
+    def over(self) -> bool:
+        """Done or failed."""
+        return not self._thread.is_alive()
+
+    def stop(self) -> None:
+        """Have it end soon and leave no files; does not wait."""
+        with self._lock:
+            self._wanted = False
+            if self.result is not None:
+                self.result.discard()
+                self.result = None
+
+    def _run(self, human_npz: Path, home: Path) -> None:
+        try:
+            result = write(human_npz, home, self._step)
+        except Exception as error:  # whoever asked decides: the thread has nobody to tell
+            self.error = error
+            return
+        with self._lock:
+            if self._wanted:
+                self.result = result
+            else:
+                result.discard()
+
+    def _step(self, fraction: float) -> None:
+        if not self._wanted:
+            raise Stopped
+        self.fraction = fraction
+
+
+def provenance(human: HumanFile, grids: volumes.Grids) -> str:
+    """What `human.MARK` holds: where the person comes from, their betas, and how many boxes meet at most."""
+    offset, half = grids.drawn_box()
+    centre = human.position + np.einsum("kij,kj->ki", human.rotation, offset)
+    most = most_overlapping(centre, human.rotation, half)
+    return json.dumps({**human.meta, "betas": np.round(human.betas, 6).tolist(), "most_overlapping": most})
