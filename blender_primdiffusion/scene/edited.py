@@ -23,10 +23,12 @@ from .placing_files import named_by_content
 from .shape import (
     PRIMITIVE,
     SAME_BETAS,
+    betas_of,
     check_shapeable,
     generated_betas,
     keeps_own_shape,
     own_data,
+    show_growth,
     show_rest,
     volumes_of,
 )
@@ -82,10 +84,13 @@ def replace_person(collection: bpy.types.Collection, human_npz: Path, person: Pa
             f"the person {collection.name!r} has a volume {max(shown)} and the edited one only {len(human.density)}; "
             "use an add-on and a backend of the same release"
         )
-    other = not np.allclose(human.betas, generated_betas(collection), atol=SAME_BETAS)
-    reshaped = other and not keeps_own_shape(collection)
+    other, own = not np.allclose(human.betas, generated_betas(collection), atol=SAME_BETAS), keeps_own_shape(collection)
+    reshaped = other and not own
     if reshaped:
         check_shapeable(collection)
+    growth = np.ones((len(human.density), 3))
+    if own and human.shape_model is not None:
+        growth = human.shape_model.growth(human.betas, betas_of(collection))
     grids = volumes.bake(human.density, human.rgb, human.half_extent)
     home, files = home_of(collection), {}
     for k in shown:
@@ -95,7 +100,9 @@ def replace_person(collection: bpy.types.Collection, human_npz: Path, person: Pa
     with volumes.written(grids, home, {name: person}, missing), body_kept(collection, human.shape_model, home.parent):
         pass
     rest = Rest(human.vertices, human.joints, human.position, human.rotation)
-    warning = show_rest(collection, rest, human.betas) if reshaped else ""
+    warning = show_rest(collection, rest, human.betas, growth) if reshaped else ""
+    if other and own:
+        show_growth(collection, growth)
     changed = 0
     for k, objects in shown.items():
         for thing in objects:

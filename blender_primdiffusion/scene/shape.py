@@ -21,7 +21,7 @@ from .convention import frames_to_blender, points_to_blender
 from .human import BETAS, MARK, armature_of, folders_of, volume_path
 from .joints import JOINT_NAMES
 from .quaternion import matrix_to_quaternion
-from .shape_model import Rest, ShapeModel
+from .shape_model import SAME_BETAS, Rest, ShapeModel
 from .shape_names import BETAS as COUNT
 from .shape_names import LARGEST_BETA
 
@@ -29,7 +29,6 @@ PRIMITIVE = re.compile(r"prim_(\d{4,})_[0-9a-f]{12}\.vdb")
 """Names of the files of volumes."""
 _ON_THE_FLOOR = 1e-3
 """Metres the soles may be off the floor and still be on it."""
-SAME_BETAS = 1e-5
 
 
 def betas_of(collection: bpy.types.Collection) -> NDArray[np.float64]:
@@ -113,11 +112,15 @@ def reshape(collection: bpy.types.Collection, betas: NDArray) -> str:
     if betas.shape != (COUNT,) or not np.abs(betas).max() <= LARGEST_BETA:
         raise ValueError(f"a shape is {COUNT} numbers from -{LARGEST_BETA:g} to {LARGEST_BETA:g}, not {betas.tolist()}")
     check_shapeable(collection)
-    return show_rest(collection, shape_model_of(collection).rest(betas), betas)
+    model, generated = shape_model_of(collection), generated_betas(collection)
+    return show_rest(collection, model.rest(betas), betas, model.growth(generated, betas))
 
 
-def show_rest(collection: bpy.types.Collection, rest: Rest, betas: NDArray) -> str:
-    """Move bones, body mesh and volumes to where a person at rest has them (see `reshape`)."""
+def show_rest(collection: bpy.types.Collection, rest: Rest, betas: NDArray, growth: NDArray) -> str:
+    """Move bones, body mesh and volumes to where a person at rest has them (see `reshape`); volumes are `growth` [K, 3]
+    times as large as in their files."""
+    from .surface import grow
+
     armature, body = armature_of(collection), body_of(collection)
     vertices = points_to_blender(rest.vertices)
     mesh = None if body is None else own_data(body, collection)
@@ -128,13 +131,24 @@ def show_rest(collection: bpy.types.Collection, rest: Rest, betas: NDArray) -> s
     position, quaternion = points_to_blender(rest.position), matrix_to_quaternion(frames_to_blender(rest.rotation))
     for k, objects in volumes_of(collection).items():
         for thing in objects:
-            thing.location, thing.rotation_quaternion = position[k], quaternion[k]
+            thing.location, thing.rotation_quaternion, thing.scale = position[k], quaternion[k], growth[k]
+    grow(collection, growth)
     armature.update_tag()
     if lowest is not None:
         _stay_on_the_floor(armature, lowest, float(vertices[:, 2].min()))
         mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
         mesh.update()
     return "" if body is None or whole else f"the mesh {body.name!r} was changed by hand and keeps its shape"
+
+
+def show_growth(collection: bpy.types.Collection, growth: NDArray) -> None:
+    """Make volumes `growth` [K, 3] times as large as in their files, however they are attached."""
+    from .surface import grow
+
+    for k, objects in volumes_of(collection).items():
+        for thing in objects:
+            thing.scale = growth[k]
+    grow(collection, growth)
 
 
 def volumes_of(collection: bpy.types.Collection) -> dict[int, list[bpy.types.Object]]:

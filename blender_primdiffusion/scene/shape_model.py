@@ -13,6 +13,11 @@ from .shape_names import BETAS
 _TINY = 1e-12
 """What the backend divides by at least when it normalises."""
 
+SHARE = 0.5
+"""Exponent of the surface's stretch by which boxes grow; the backend's `reshaping.SHARE`."""
+SAME_BETAS = 1e-5
+"""Betas that differ by less are the same body."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rest:
@@ -68,11 +73,31 @@ class ShapeModel:
 
         T = normalize(dP/du), N = normalize(T x dP/dv), B = N x T (SPEC 1.8, 2), in whatever axes the vertices are.
         """
-        support = vertices[self.stencil_vertex]
-        tangent = _unit(np.matmul(self.stencil_du[:, None], support)[:, 0])
-        normal = _unit(np.cross(tangent, np.matmul(self.stencil_dv[:, None], support)[:, 0]))
+        du, dv = self._planes(vertices)
+        tangent = _unit(du)
+        normal = _unit(np.cross(tangent, dv))
         rotation = np.stack([tangent, np.cross(normal, tangent), normal], -1)
         return np.einsum("kc,kcx->kx", self.barycentric, vertices[self.faces[self.face]]), rotation
+
+    def growth(self, before: NDArray, after: NDArray) -> NDArray[np.float64]:
+        """Factors [K, 3] on boxes along T, B, N when the person of these betas [10] gets others: see the backend's
+        `reshaping.box_growth`. Ones where the betas are the same."""
+        if np.allclose(before, after, rtol=0, atol=SAME_BETAS):
+            return np.ones((len(self.face), 3))
+        stretch = self._sides(after) / np.maximum(self._sides(before), _TINY)
+        return np.concatenate([stretch**SHARE, np.ones_like(stretch[:, :1])], -1)
+
+    def _sides(self, betas: NDArray) -> NDArray[np.float64]:
+        """How long cells are along T, and how wide along B, at rest [K, 2], metres."""
+        du, dv = self._planes(self.surface(betas))
+        length = np.linalg.norm(du, axis=-1)
+        area = np.linalg.norm(np.cross(du, dv), axis=-1)
+        return np.stack([length, area / np.maximum(length, _TINY)], -1)
+
+    def _planes(self, vertices: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """dP/du and dP/dv [K, 3] of the cells, metres per cell."""
+        support = vertices[self.stencil_vertex]
+        return np.matmul(self.stencil_du[:, None], support)[:, 0], np.matmul(self.stencil_dv[:, None], support)[:, 0]
 
 
 FIELDS: dict[str, tuple[int | str, ...]] = {

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from .body_mesh import body_of
 from .human import armature_of
 from .node_inputs import set_node_input
-from .shape import shape_model_of, volumes_of
+from .shape import betas_of, generated_betas, own_data, shape_model_of, volumes_of
 from .shape_model import ShapeModel
-from .surface_nodes import BODY, FIRST, PICK, PRIMITIVE, VERTEX, VOLUMES, WEIGHTS, surface_group
+from .surface_nodes import BODY, FIRST, GROWTH, PICK, PRIMITIVE, VERTEX, VOLUMES, WEIGHTS, surface_group
 
 MARK = "primdiffusion_surface"
 """Custom property of a carrier."""
@@ -56,6 +56,7 @@ def build_surface(collection: bpy.types.Collection) -> bpy.types.Object:
             "to its surface"
         )
     carrier = carrier_of(collection)
+    growth = model.growth(generated_betas(collection), betas_of(collection))
     mesh = carrier_mesh(f"{collection.name}_surface", model, picks(collection, primitives, len(model.face)))
     if carrier is None:
         carrier = bpy.data.objects.new(mesh.name, mesh)
@@ -66,6 +67,7 @@ def build_surface(collection: bpy.types.Collection) -> bpy.types.Object:
         former, carrier.data = carrier.data, mesh
         if former.users == 0:
             bpy.data.meshes.remove(former)
+    grow(collection, growth)
     modifier = carrier.modifiers.get("Surface") or carrier.modifiers.new("Surface", "NODES")
     modifier.node_group = surface_group()
     sockets = {
@@ -74,6 +76,19 @@ def build_surface(collection: bpy.types.Collection) -> bpy.types.Object:
     set_node_input(modifier, sockets[BODY], body)
     set_node_input(modifier, sockets[VOLUMES], primitives)
     return carrier
+
+
+def grow(collection: bpy.types.Collection, growth: NDArray) -> None:
+    """Have the person's carrier, if there is one, show volumes `growth` [K, 3] times as large as in their files."""
+    carrier = carrier_of(collection)
+    if carrier is None:
+        return
+    mesh = own_data(carrier, collection)
+    primitive = np.empty(len(mesh.vertices), np.int32)
+    mesh.attributes[PRIMITIVE].data.foreach_get("value", primitive)
+    attribute = mesh.attributes.get(GROWTH) or mesh.attributes.new(GROWTH, "FLOAT_VECTOR", "POINT")
+    attribute.data.foreach_set("vector", growth[primitive].astype(np.float32).ravel())
+    mesh.update_tag()
 
 
 def picks(collection: bpy.types.Collection, primitives: bpy.types.Collection, count: int) -> NDArray[np.int32]:

@@ -1,15 +1,15 @@
 """The node group that puts a person's volumes on their posed surface, as the paper does for every pose (sec. 3.1).
 
 a point for each weight of each primitive's sums -> the body's vertex, times the weights, summed over the primitive
--> centre, dP/du, dP/dv -> T = normalize(dP/du), N = normalize(T x dP/dv) -> an instance of the volume
+-> centre, dP/du, dP/dv -> T = normalize(dP/du), N = normalize(T x dP/dv) -> an instance of the volume, grown
 """
 
 from __future__ import annotations
 
 import bpy
 
-GROUP_NAME = "PrimDiffusion Surface"
-VERTEX, PRIMITIVE, FIRST, PICK = "vertex", "primitive", "first", "pick"
+GROUP_NAME = "PrimDiffusion Boxes on Surface"
+VERTEX, PRIMITIVE, FIRST, PICK, GROWTH = "vertex", "primitive", "first", "pick", "growth"
 WEIGHTS = ("centre_weight", "du_weight", "dv_weight")
 """Attributes of the carrier's points: see `surface.carrier_mesh`."""
 BODY, VOLUMES = "Body", "Volumes"
@@ -93,6 +93,7 @@ def _build(tree: bpy.types.NodeTree) -> None:
             "Pick Instance": True,
             "Instance Index": attribute(PICK, "INT"),
             "Rotation": rotation,
+            "Scale": attribute(GROWTH, "FLOAT_VECTOR"),
         },
     )
     output = node("NodeGroupOutput")

@@ -12,9 +12,10 @@ TOLERANCE_M = 1e-5
 
 
 def blended_frames(human: dict, rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """Rest frames moved by linear blend skinning [K, 4, 4], z up: (sum_j w_j G_j) [R | x]."""
+    """Rest frames moved by linear blend skinning [K, 4, 4], z up: (sum_j w_j G_j) [R diag(growth) | x]."""
     frames = np.tile(np.eye(4), (len(human["position"]), 1, 1))
-    frames[:, :3, :3], frames[:, :3, 3] = human["rotation"], human["position"]
+    growth = human.get("growth", np.ones((len(frames), 3)))
+    frames[:, :3, :3], frames[:, :3, 3] = human["rotation"] * growth[:, None], human["position"]
     transforms = skinning(human["joints"], rotations, translation)
     return Z_UP @ np.einsum("kj,jab->kab", human["primitive_weights"], transforms) @ frames
 

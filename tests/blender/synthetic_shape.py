@@ -27,10 +27,11 @@ def frames(vertices: np.ndarray, model: dict) -> tuple[np.ndarray, np.ndarray]:
 
 
 def at(person: dict, betas: np.ndarray) -> dict:
-    """The person's arrays at other betas."""
+    """The person's arrays at other betas, and how much larger boxes are there: `growth` [K, 3]."""
     vertices = person["template"] + np.einsum("vcb,b->vc", person["shape_basis"].astype(np.float64), betas)
     joints = person["joint_template"] + np.einsum("jcb,b->jc", person["joint_basis"].astype(np.float64), betas)
     position, rotation = frames(vertices, person)
+    growth = (sides(vertices, person) / sides(person["vertices"], person)) ** 0.5
     return {
         **person,
         "betas": betas,
@@ -38,7 +39,21 @@ def at(person: dict, betas: np.ndarray) -> dict:
         "joints": joints,
         "position": position,
         "rotation": rotation,
+        "growth": np.pad(growth, [(0, 0), (0, 1)], constant_values=1.0),
     }
+
+
+def sides(vertices: np.ndarray, model: dict) -> np.ndarray:
+    """How long and wide cells are along T and B [K, 2], one after the other by definition."""
+    found = []
+    for k in range(len(model["face"])):
+        du, dv = (
+            model[name][k].astype(np.float64) @ vertices[model["stencil_vertex"][k]]
+            for name in ("stencil_du", "stencil_dv")
+        )
+        t = du / np.linalg.norm(du)
+        found.append([np.linalg.norm(du), np.linalg.norm(dv - (dv @ t) * t)])
+    return np.array(found)
 
 
 def arrays(count: int = 12, seed: int = 0) -> dict[str, np.ndarray]:
@@ -66,7 +81,9 @@ def arrays(count: int = 12, seed: int = 0) -> dict[str, np.ndarray]:
         "stencil_du": rng.normal(0, 1, (count, STENCIL)).astype(np.float32),
         "stencil_dv": rng.normal(0, 1, (count, STENCIL)).astype(np.float32),
     }
-    return at({**person, **model, "format_version": np.array(2)}, person["betas"] * 0.5)
+    generated = at({**person, **model, "format_version": np.array(2)}, person["betas"] * 0.5)
+    del generated["growth"]
+    return generated
 
 
 def write(path: Path, count: int = 12, seed: int = 0, **changes: np.ndarray) -> Path:

@@ -19,6 +19,7 @@ from blender_primdiffusion.scene.duplicate import duplicate_human
 from blender_primdiffusion.scene.human import armature_of, folder_of, humans
 from blender_primdiffusion.scene.shape import volumes_of
 from blender_primdiffusion.scene.surface import carrier_of
+from blender_primdiffusion.scene.surface_nodes import GROUP_NAME
 
 COUNT = 12
 
@@ -170,7 +171,7 @@ def test_two_people_share_the_nodes_and_keep_to_their_own_bodies(person, tmp_pat
     for collection in (person[0], other):
         set_attachment(collection, "SURFACE")
     assert len(shown()) == 2 * COUNT
-    assert sum(group.name.startswith("PrimDiffusion Surface") for group in bpy.data.node_groups) == 1
+    assert sum(group.name.startswith(GROUP_NAME) for group in bpy.data.node_groups) == 1
     pose_from_joint_rotations(armature_of(other), *strong_pose(1))
     rest = on_the_surface(person[0], person[1], np.tile(np.eye(3), (24, 1, 1)), np.zeros(3))
     found = shown()

@@ -285,3 +285,41 @@ def test_volumes_on_the_posed_surface_follow_the_shape_and_outlive_another_name(
     assert after.keys() == before.keys()
     for name, matrix in before.items():
         np.testing.assert_allclose(after[name], matrix, atol=1e-6)
+
+
+def sizes(matrices) -> np.ndarray:
+    """How many times as large as in their files volumes are along their axes [K, 3]."""
+    return np.linalg.norm(np.asarray(matrices)[:, :3, :3], axis=1)
+
+
+@pytest.mark.parametrize("first", ["reshape", "attach"])
+def test_volumes_grow_with_half_of_the_surface_s_stretch_in_either_attachment(person, saved_scene, first):
+    if first == "attach":
+        set_attachment(person, "SURFACE")
+    reshape(person, SHAPE)
+    set_attachment(person, "SURFACE")
+    saved_scene.view_layer.update()
+    wanted = at(SHAPE)["growth"]
+    assert wanted.max() > 1.01
+    shown = shown_on_the_surface()
+    np.testing.assert_allclose(sizes([shown[name] for name in sorted(shown)]), wanted, rtol=1e-5)
+    set_attachment(person, "ARMATURE")
+    saved_scene.view_layer.update()
+    np.testing.assert_allclose(sizes(evaluated_matrices(person)), wanted, rtol=1e-5)
+    reshape(person, generated_betas(person))
+    set_attachment(person, "SURFACE")
+    saved_scene.view_layer.update()
+    np.testing.assert_array_equal([tuple(o.scale) for o in person.all_objects if o.type == "VOLUME"], 1)
+    np.testing.assert_allclose(sizes(list(shown_on_the_surface().values())), 1, rtol=1e-5)
+
+
+def test_volumes_of_an_edited_person_grow_from_the_edited_one_s_body(person, saved_scene, tmp_path):
+    reshape(person, SHAPE)
+    replace_person(person, *edited_file(tmp_path, np.ones(10)))
+    saved_scene.view_layer.update()
+    edited = at(np.ones(10))
+    wanted = at(SHAPE)["growth"] / edited["growth"]
+    np.testing.assert_allclose(sizes(evaluated_matrices(person)), wanted, rtol=1e-5)
+    reshape(person, np.ones(10))
+    saved_scene.view_layer.update()
+    np.testing.assert_allclose(sizes(evaluated_matrices(person)), 1, rtol=1e-5)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from primdiffusion.human import Human
 from primdiffusion.human_file import export_for_blender
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.primitives import K, Payload
+from primdiffusion.reshaping import box_growth
 
 from blender_primdiffusion.scene.human_file import read_human
 from blender_primdiffusion.scene.shape_measures import betas_of_measures, measure
@@ -57,6 +60,15 @@ def test_frames_on_a_posed_surface_in_blenders_axes_are_the_backends_turned(mode
     position, rotation = model.frames(vertices.double().numpy() @ turn.T)
     np.testing.assert_allclose(position, wanted.position.numpy() @ turn.T, atol=1e-6)
     np.testing.assert_allclose(rotation, turn @ wanted.rotation.numpy(), atol=1e-5)
+
+
+def test_boxes_grow_as_the_backends(model):
+    body, anchors = default_body().to(dtype=torch.float64), default_anchors().to(dtype=torch.float64)
+    for before, after in pairwise(SHAPES):
+        wanted = box_growth(body, anchors, torch.tensor(before), torch.tensor(after))
+        assert wanted.max() > 1.1
+        np.testing.assert_allclose(model.growth(before, after), wanted, rtol=1e-5)
+    assert (model.growth(SHAPES[0], SHAPES[0]) == 1).all()
 
 
 @pytest.mark.parametrize("betas", SHAPES)
