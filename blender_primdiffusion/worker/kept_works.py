@@ -43,6 +43,7 @@ class Shelf:
         works = list(works)
         if not works:
             self._file.unlink(missing_ok=True)
+            self.close()
             return
         self._folder.mkdir(parents=True, exist_ok=True)
         if self._lock is None:

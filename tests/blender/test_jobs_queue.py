@@ -13,6 +13,7 @@ import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 from blender_primdiffusion.scene.human import humans, person_file
+from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_generate
 from blender_primdiffusion.ui.generate.work import GenerateWork
 from blender_primdiffusion.ui.jobs import follow as follow_module
 from blender_primdiffusion.ui.jobs.follow import follow, watch
@@ -49,9 +50,9 @@ def test_one_that_waits_can_be_taken_out_and_the_others_are_done(addon):
     ask(11, 20)
     second, _ = ask(12), ask(13)
     until_running()
-    texts = shown(PRIMDIFFUSION_PT_jobs, addon)
-    assert "In Line: 2" in texts
-    assert "Generate Human, seed 12" in texts
+    assert shown(PRIMDIFFUSION_PT_jobs, addon)[:2] == ["Generate Human, seed 11", "primdiffusion.cancel"]
+    assert "Generate Human, seed 12" in shown(PRIMDIFFUSION_PT_jobs, addon)
+    assert "In Line: 2" in shown(PRIMDIFFUSION_PT_generate, addon)
     assert ops.cancel(number=second) == {"FINISHED"}
     drive()
     assert seeds() == [11, 13]
@@ -197,7 +198,7 @@ def test_a_result_waits_for_the_user_to_let_go_of_what_is_being_moved(addon, mon
     for _ in range(5):
         follow()
     assert not humans(bpy.context.scene)
-    assert "Done: waits for Move" in shown(PRIMDIFFUSION_PT_jobs, addon)
+    assert "Done: waits for Move" in shown(PRIMDIFFUSION_PT_generate, addon)
     assert ops.cancel() == {"FINISHED"}
     drive()
     assert not humans(bpy.context.scene)
@@ -223,11 +224,30 @@ def test_loading_a_file_ends_the_child_and_offers_what_was_in_line(addon):
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
     texts = shown(PRIMDIFFUSION_PT_jobs_left, addon)
-    assert texts[2:4] == ["Generate Human, seed 12", "for shot.blend, Scene"]
+    assert texts[:3] == ["For shot.blend, Scene", "Generate Human, seed 4", "Generate Human, seed 12"]
     assert not humans(bpy.context.scene)
     assert ops.discard_works() == {"FINISHED"}
     assert not ops.resume_works.poll()
     assert not ops.discard_works.poll()
+
+
+def test_progress_is_shown_once_beside_the_button_and_the_jobs_panel_tells_what_ended(addon, monkeypatch):
+    monkeypatch.setattr("blender_primdiffusion.ui.jobs.drawing._progress_text", lambda: "step 1")
+    for seed, steps in ((FAILS, 1), (11, 1), (TAKES_LONG, 50)):
+        ask(seed, steps)
+    while len(queue.ended) < 2:
+        follow()
+        time.sleep(0.01)
+    until_running()
+    assert "step 1" not in shown(PRIMDIFFUSION_PT_jobs, addon)
+    assert shown(PRIMDIFFUSION_PT_generate, addon).count("step 1") == 1
+    ops.cancel()
+    drive()
+    assert [(outcome.entry.work.seed, outcome.went_well) for outcome in queue.ended] == [
+        (TAKES_LONG, False), (11, True), (FAILS, False)
+    ]  # fmt: skip
+    texts = shown(PRIMDIFFUSION_PT_jobs, addon)
+    assert texts[:3] == [f"Generate Human, seed {seed}" for seed in (TAKES_LONG, 11, FAILS)]
 
 
 def test_try_again_asks_for_the_same(addon):

@@ -50,9 +50,10 @@ def folder(addon, tmp_path, monkeypatch) -> Path:
     return tmp_path / "own"
 
 
-def kept(seed: int, kind: str = "generate") -> KeptWork:
+def kept(seed: int, kind: str = "generate", scene: str = "Scene", blend: str | None = None) -> KeptWork:
+    """For the file that is open, unless another is given."""
     work = {"seed": seed, "steps": 1, "checkpoint": ""}
-    return KeptWork(kind, f"Generate Human, seed {seed}", work, "Scene", "/films/Kürbis 1.blend")
+    return KeptWork(kind, f"Generate Human, seed {seed}", work, scene, bpy.data.filepath if blend is None else blend)
 
 
 def leave(folder: Path, *works: KeptWork) -> None:
@@ -74,8 +75,15 @@ def test_works_in_line_of_a_killed_blender_are_offered_to_the_next_and_resumed(f
     look_for_left()
     assert PRIMDIFFUSION_PT_jobs_left.poll(bpy.context)
     texts = shown(PRIMDIFFUSION_PT_jobs_left, bpy.context)
-    assert texts[:2] == ["Generate Human, seed 21", "for fïlm 1.blend, Scene"]
+    assert texts == [
+        "For fïlm 1.blend, Scene", "Generate Human, seed 21", "Generate Human, seed 22", "wm.open_mainfile",
+        "primdiffusion.resume_works", "primdiffusion.discard_works",
+    ]  # fmt: skip
     assert not queue.busy, "nothing runs by itself"
+    with pytest.raises(RuntimeError, match=r"nothing was left for this file, but for fïlm 1\.blend, Scene: open it"):
+        ops.resume_works()
+    bpy.ops.wm.open_mainfile(filepath=blend)
+    assert "wm.open_mainfile" not in shown(PRIMDIFFUSION_PT_jobs_left, bpy.context)
     assert ops.resume_works() == {"FINISHED"}
     drive()
     assert len(humans(bpy.context.scene)) == 2
@@ -105,6 +113,56 @@ def test_what_is_done_cancelled_or_awaited_by_a_script_is_not_kept(folder):
     queue.add(bpy.context, GenerateWork(8, 1))
     drive()
     assert not list(folder.glob("queue/*.json"))
+
+
+def test_works_enter_the_scenes_that_they_were_asked_for(folder):
+    first, second = bpy.context.scene, bpy.data.scenes.new("Second")
+    leave(folder, kept(31, scene="Second"), kept(32), kept(33, scene="Third"), kept(34, blend="/films/Kürbis 1.blend"))
+    look_for_left()
+    assert ops.resume_works() == {"FINISHED"}
+    assert (len(humans(first)), len(humans(second))) == (1, 1)
+    assert [work.work["seed"] for work in queue.kept.left] == [33, 34]
+    texts = shown(PRIMDIFFUSION_PT_jobs_left, bpy.context)
+    assert "For shot.blend, Third (not there any more)" in texts
+    assert "For Kürbis 1.blend, Scene" in texts
+    assert "wm.open_mainfile" not in texts, "there is no such file"
+
+
+def test_works_of_another_file_enter_this_one_only_when_that_is_said(folder):
+    leave(folder, kept(31, blend="/films/Kürbis 1.blend"), kept(32, blend="/films/Kürbis 2.blend"), kept(33, blend=""))
+    look_for_left()
+    with pytest.raises(RuntimeError, match="nothing was left for this file"):
+        ops.resume_works()
+    assert len(queue.kept.left) == 3
+    assert ops.resume_works(blend="/films/Kürbis 2.blend") == {"FINISHED"}
+    assert len(humans(bpy.context.scene)) == 1
+    assert ops.resume_works(blend="", scene="Scene") == {"FINISHED"}
+    assert len(humans(bpy.context.scene)) == 2
+    assert ops.discard_works(blend="/films/Kürbis 2.blend") == {"FINISHED"}
+    assert [work.work["seed"] for work in queue.kept.left] == [31]
+    assert ops.discard_works() == {"FINISHED"}
+    assert not queue.kept.left
+
+
+def test_a_file_saved_under_another_name_takes_its_works_along(folder, tmp_path):
+    queue.add(bpy.context, GenerateWork(7, 1))
+    bpy.context.scene.name = "Küche"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "take 2.blend"))
+    queue.close()
+    look_for_left()
+    (left,) = queue.kept.left
+    assert (Path(left.blend).name, left.scene) == ("take 2.blend", "Küche")
+    assert ops.resume_works() == {"FINISHED"}
+    assert len(humans(bpy.context.scene)) == 1
+
+
+def test_what_is_not_resumed_stays_for_the_next_blender(folder):
+    leave(folder, kept(31), kept(32, blend="/films/Kürbis 1.blend"))
+    look_for_left()
+    ops.resume_works()
+    queue.close()
+    look_for_left()
+    assert [work.work["seed"] for work in queue.kept.left] == [32]
 
 
 def test_what_this_version_does_not_know_is_told_and_the_rest_is_resumed(folder):

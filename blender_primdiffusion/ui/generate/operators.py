@@ -59,5 +59,4 @@ class PRIMDIFFUSION_OT_random_seed(bpy.types.Operator):
 
 def _seeds_in_line() -> set[int]:
     """Of people who are asked for already: a second press of the button means somebody else."""
-    entries = [*queue.waiting, *([queue.current] if queue.current is not None else [])]
-    return {entry.work.seed for entry in entries if entry.work.kind == "generate"}
+    return {entry.work.seed for entry in queue.in_line if entry.work.kind == "generate"}

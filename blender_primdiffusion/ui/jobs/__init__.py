@@ -25,18 +25,31 @@ def set_aside_before_loading(*_: object) -> None:
 
 
 @persistent
+def follow_the_file(*_: object) -> None:
+    """Handler of save_post: what is in line is kept for the file by its name of now."""
+    queue.queue.file_saved()
+
+
+@persistent
 def watch_after_loading(*_: object) -> None:
     """Handler of load_post, and of a load that failed: timers go on."""
     follow.keep_watching()
+
+
+_HANDLERS = (
+    ("load_pre", set_aside_before_loading),
+    ("load_post", watch_after_loading),
+    ("load_post_fail", watch_after_loading),
+    ("save_post", follow_the_file),
+)
 
 
 def register() -> None:
     """Make the room known to Blender."""
     for cls in CLASSES:
         bpy.utils.register_class(cls)
-    bpy.app.handlers.load_pre.append(set_aside_before_loading)
-    bpy.app.handlers.load_post.append(watch_after_loading)
-    bpy.app.handlers.load_post_fail.append(watch_after_loading)
+    for name, handler in _HANDLERS:
+        getattr(bpy.app.handlers, name).append(handler)
     if not bpy.app.background:
         bpy.app.timers.register(follow.look_for_left, first_interval=follow.LOOK_AFTER_S, persistent=True)
         follow.keep_watching()
@@ -49,13 +62,8 @@ def unregister() -> None:
     for timer in _TIMERS:
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
-    handlers = bpy.app.handlers
-    for listening, handler in (
-        (handlers.load_post_fail, watch_after_loading),
-        (handlers.load_post, watch_after_loading),
-        (handlers.load_pre, set_aside_before_loading),
-    ):
-        if handler in listening:  # Blender 5.2 clears them before it disables extensions at exit
-            listening.remove(handler)
+    for name, handler in _HANDLERS:
+        if handler in getattr(bpy.app.handlers, name):  # Blender 5.2 clears them before it disables extensions at exit
+            getattr(bpy.app.handlers, name).remove(handler)
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -11,7 +11,7 @@ import bpy
 from ...places import EXTENSION
 from .follow import in_the_way
 from .pictures import so_far
-from .queue import Entry, Outcome, queue
+from .queue import Outcome, queue
 from .remedies import remedy_for
 
 if TYPE_CHECKING:
@@ -28,19 +28,20 @@ _MINUTES_FROM_S = 90.0
 def draw_job(
     layout: bpy.types.UILayout, kind: str, operator_idname: str, icon: str
 ) -> bpy.types.OperatorProperties | None:
-    """The button of an operator that submits works of `kind`, what is in line of them, and how the last one ended.
+    """The button of an operator that submits works of `kind`, the progress of one, and how the last one ended.
 
-    Returns the button's properties, to be filled in.
+    The one place where that is shown; the panel Jobs names what is in line. Returns the button's properties, to be
+    filled in.
     """
     props = layout.operator(operator_idname, icon=icon)
     if queue.current is not None and queue.current.work.kind == kind:
         if so_far.icon:
             layout.template_icon(icon_value=so_far.icon, scale=_PICTURE_SCALE)
-        draw_progress(layout)
-    waiting = [entry for entry in queue.waiting if entry.work.kind == kind]
-    draw_waiting(layout, waiting)
+        _draw_progress(layout)
+    if waiting := sum(entry.work.kind == kind for entry in queue.waiting):
+        layout.label(text=f"In Line: {waiting}", icon="SORTTIME")
     if (outcome := queue.outcomes.get(kind)) is not None:
-        draw_outcome(layout, outcome)
+        _draw_outcome(layout, outcome)
     return props
 
 
@@ -57,27 +58,33 @@ def _wrapped(text: str) -> list[str]:
     return [line.replace(_NO_BREAK, " ") for line in textwrap.wrap(together, _LINE)]
 
 
-def draw_progress(layout: bpy.types.UILayout) -> None:
+def _draw_progress(layout: bpy.types.UILayout) -> None:
     """What is at work: how far it is, how long it will take, Cancel."""
-    job = queue.job
     row = layout.row(align=True)
-    row.progress(factor=job.fraction, text=_progress_text())
+    row.progress(factor=queue.job.fraction, text=_progress_text())
     row.operator("primdiffusion.cancel", text="", icon="CANCEL").number = 0
 
 
-def draw_waiting(layout: bpy.types.UILayout, entries: list[Entry]) -> None:
-    """What waits for its turn, each removable."""
-    if not entries:
-        return
+def draw_in_line(layout: bpy.types.UILayout) -> None:
+    """What is at work and what waits for its turn, each removable."""
     column = layout.column(align=True)
-    column.label(text=f"In Line: {len(entries)}", icon="SORTTIME")
-    for entry in entries:
+    for entry in queue.in_line:
         row = column.row(align=True)
-        row.label(text=entry.work.label, icon="BLANK1")
+        row.label(text=entry.work.label, icon="PLAY" if entry is queue.current else "SORTTIME", translate=False)
         row.operator("primdiffusion.cancel", text="", icon="X").number = entry.number
+        if entry.work.not_kept_because:
+            draw_lines(column, f"Not kept over a restart: {entry.work.not_kept_because}", "BLANK1")
 
 
-def draw_outcome(layout: bpy.types.UILayout, outcome: Outcome) -> None:
+def draw_ended(layout: bpy.types.UILayout) -> None:
+    """What has ended of late, and how; the news are beside the button that asked."""
+    column = layout.column(align=True)
+    for outcome in queue.ended:
+        icon = "ERROR" if outcome.error is not None else "CHECKMARK" if outcome.went_well else "CANCEL"
+        column.label(text=outcome.entry.work.label, icon=icon, translate=False)
+
+
+def _draw_outcome(layout: bpy.types.UILayout, outcome: Outcome) -> None:
     """News, or an error with what can be done about it."""
     if outcome.error is None:
         draw_lines(layout, outcome.notice, "INFO")

@@ -25,13 +25,18 @@ _IN_THE_WAY = {"UNDO", "BLOCKING", "GRAB_CURSOR", "GRAB_CURSOR_X", "GRAB_CURSOR_
 """Options of modal operators that hold on to the scene or the mouse; others (screencasts) may run for ever."""
 
 
-def submit(operator: bpy.types.Operator, context: bpy.types.Context, work: Work) -> set[str]:
-    """Put `work` in line: with a window a timer sees it through, in background mode this waits for its end."""
+def submit(
+    operator: bpy.types.Operator, context: bpy.types.Context, work: Work, scene: bpy.types.Scene | None = None
+) -> set[str]:
+    """Put `work` in line for a scene, that of `context` if none is given.
+
+    With a window a timer sees it through, in background mode this waits for its end.
+    """
     if not bpy.app.background:
-        queue.add(context, work)
+        queue.add(context, work, scene)
         keep_following()
         return {"FINISHED"}
-    outcome = _wait_for(queue.add_awaited(context, work))
+    outcome = _wait_for(queue.add_awaited(context, work, scene))
     if outcome.error is not None:
         operator.report({"ERROR"}, outcome.sentence)
         return {"CANCELLED"}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 import bpy
@@ -45,12 +46,12 @@ class Kept:
         """Find out what is left."""
         self.left = [*self._shelf_of_now().left(), *self._set_aside]
 
-    def take(self) -> list[KeptWork]:
-        """All that is offered, which then is offered no more, to nobody."""
-        works = [*self._shelf_of_now().claim(), *self._set_aside]
-        self._set_aside, self.left = [], []
+    def take(self, wanted: Callable[[KeptWork], bool]) -> list[KeptWork]:
+        """What is offered and wanted, which then is offered no more, to nobody; the rest stays, as this Blender's."""
+        offered = [*self._shelf_of_now().claim(), *self._set_aside]
+        self._set_aside = self.left = [work for work in offered if not wanted(work)]
         self.save(self._in_line)
-        return works
+        return [work for work in offered if wanted(work)]
 
     def close(self) -> None:
         """The extension is going: what is kept stays on disk."""
@@ -84,6 +85,22 @@ def work_of(kept: KeptWork) -> Work:
         raise ValueError(f"{kept.label!r} was kept by another version and cannot be read: {error}") from error
 
 
+def is_open(blend: str) -> bool:
+    """This is the path of the file that is open now. A work's file that was never saved is gone."""
+    return bool(blend) and _real(blend) == _real(bpy.data.filepath)
+
+
+def home_of(kept: KeptWork) -> bpy.types.Scene | None:
+    """The scene that it was asked for, where that is in the file that is open now."""
+    return bpy.data.scenes.get(kept.scene) if is_open(kept.blend) else None
+
+
 def meant_for(kept: KeptWork) -> str:
     """For people: where the work was asked for."""
-    return f"{bpy.path.basename(kept.blend) or 'a file never saved'}, {kept.scene}"
+    file = bpy.path.basename(kept.blend) or "a file never saved"
+    gone = " (not there any more)" if is_open(kept.blend) and home_of(kept) is None else ""
+    return f"{file}, {kept.scene}{gone}"
+
+
+def _real(path: str) -> str:
+    return os.path.normcase(os.path.realpath(path))

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import bpy
 
 from . import memory
 from .follow import redraw, submit
-from .kept import work_of
+from .kept import home_of, is_open, meant_for, work_of
 from .queue import queue
+
+if TYPE_CHECKING:
+    from ...worker.kept_works import KeptWork
+
+_SKIP = {"SKIP_SAVE"}
+_RESUME_HERE = "Put these works in line for the scene that is open now, though they were asked for in another file"
 
 
 class PRIMDIFFUSION_OT_cancel(bpy.types.Operator):
@@ -18,7 +26,7 @@ class PRIMDIFFUSION_OT_cancel(bpy.types.Operator):
     bl_options: set[str] = set()  # noqa: RUF012
 
     number: bpy.props.IntProperty(
-        name="Number", description="Of the work in line; 0 is the one under way", min=0, options={"SKIP_SAVE"}
+        name="Number", description="Of the work in line; 0 is the one under way", min=0, options=_SKIP
     )
 
     @classmethod
@@ -45,7 +53,7 @@ class PRIMDIFFUSION_OT_try_again(bpy.types.Operator):
     bl_options: set[str] = set()  # noqa: RUF012
 
     kind: bpy.props.StringProperty(
-        name="Kind", description="Of work, like generate; empty: the last one that ended", options={"SKIP_SAVE"}
+        name="Kind", description="Of work, like generate; empty: the last one that ended", options=_SKIP
     )
 
     @classmethod
@@ -63,52 +71,85 @@ class PRIMDIFFUSION_OT_try_again(bpy.types.Operator):
         return submit(self, context, outcome.entry.work)
 
 
-class PRIMDIFFUSION_OT_resume_works(bpy.types.Operator):
-    """Put the works that were left in line again, for the scene that is open now"""
+class _OfWorksLeft:
+    """Which of the works that were left; those of one place, or all that the operator is for."""
+
+    bl_options: set[str] = set()  # noqa: RUF012
+
+    blend: bpy.props.StringProperty(
+        name="File",
+        description="Those asked for in this .blend, whichever is open now. Not given: as the operator says",
+        options=_SKIP,
+    )
+    scene: bpy.props.StringProperty(
+        name="Scene", description="Those for this scene of the file; empty: for any", options=_SKIP
+    )
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        """Only where something was left."""
+        cls.poll_message_set("No work was left by an earlier Blender or file")
+        return bool(queue.kept.left)
+
+    @property
+    def names_a_place(self) -> bool:
+        """A file is given; that of works asked for in one never saved is the empty name."""
+        return self.properties.is_property_set("blend")
+
+    def is_of_the_place(self, kept: KeptWork) -> bool:
+        """It was asked for in the file, and scene, that are given."""
+        return kept.blend == self.blend and self.scene in ("", kept.scene)
+
+
+class PRIMDIFFUSION_OT_resume_works(_OfWorksLeft, bpy.types.Operator):
+    """Put works that were left in line again: those asked for in the open file, for their scenes"""
 
     bl_idname = "primdiffusion.resume_works"
     bl_label = "Resume"
-    bl_options: set[str] = set()  # noqa: RUF012
 
     @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        """Only where something was left."""
-        cls.poll_message_set("No work was left by an earlier Blender or file")
-        return bool(queue.kept.left)
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        """The tooltip."""
+        elsewhere = properties.is_property_set("blend") and not is_open(properties.blend)
+        return _RESUME_HERE if elsewhere else str(cls.__doc__)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """All of them, in the order in which they were asked for."""
-        unknown, works = [], []
-        for kept in queue.kept.take():
+        """In the order in which they were asked for. Those of a file that is not open enter the scene at hand, and
+        only when their file is given."""
+        taken = queue.kept.take(self.is_of_the_place if self.names_a_place else home_of)
+        if not taken:
+            self.report({"ERROR"}, _nothing_taken())
+            return {"CANCELLED"}
+        unknown, states = [], []
+        for kept in taken:
             try:
-                works.append(work_of(kept))
+                work = work_of(kept)
             except ValueError as error:
                 unknown.append(str(error))
+            else:
+                states.append(submit(self, context, work, home_of(kept)))
         if unknown:
-            self.report({"WARNING"}, "; ".join(unknown))
-        if not works:
-            self.report({"ERROR"}, "; ".join(unknown) or "another Blender has taken the works meanwhile")
-            return {"CANCELLED"}
-        states = [submit(self, context, work) for work in works]
+            self.report({"WARNING"} if states else {"ERROR"}, "; ".join(unknown))
+        redraw()
         return {"FINISHED"} if {"FINISHED"} in states else {"CANCELLED"}
 
 
-class PRIMDIFFUSION_OT_discard_works(bpy.types.Operator):
-    """Forget the works that were left"""
+def _nothing_taken() -> str:
+    places = sorted({meant_for(kept) for kept in queue.kept.left})
+    if not places:
+        return "another Blender has taken the works meanwhile"
+    return f"nothing was left for this file, but for {'; '.join(places)}: open it, or press Resume Here"
+
+
+class PRIMDIFFUSION_OT_discard_works(_OfWorksLeft, bpy.types.Operator):
+    """Forget works that were left"""
 
     bl_idname = "primdiffusion.discard_works"
     bl_label = "Discard"
-    bl_options: set[str] = set()  # noqa: RUF012
-
-    @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        """Only where something was left."""
-        cls.poll_message_set("No work was left by an earlier Blender or file")
-        return bool(queue.kept.left)
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        """All of them."""
-        queue.kept.take()
+        """Of all files where none is given."""
+        queue.kept.take(self.is_of_the_place if self.names_a_place else lambda _: True)
         redraw()
         return {"FINISHED"}
 

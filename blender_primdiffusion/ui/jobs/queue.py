@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from ...worker.job import Job, JobError
     from ...worker.kept_works import KeptWork
 
+CANCELLED = "Cancelled"
 GONE = "The scene {!r} was deleted meanwhile: nothing was added. Undo the deletion and try again."
+_REMEMBERED = 5
 
 
 @dataclasses.dataclass
@@ -37,8 +39,6 @@ class Entry:
     scene: str
     scene_uid: int
     """For as long as the file is open."""
-    blend: str
-    """Path of the file it was asked for in; empty for one never saved."""
     asked_at: float
     """time.monotonic()."""
     kept: KeptWork | None
@@ -61,6 +61,11 @@ class Outcome:
         """Why it failed; empty when it did not."""
         return str(self.error) if self.error is not None else ""
 
+    @property
+    def went_well(self) -> bool:
+        """Neither failed nor cancelled."""
+        return self.error is None and self.notice != CANCELLED
+
 
 class Queue:
     """Owns the child and the line. All methods are for Blender's main thread."""
@@ -74,6 +79,8 @@ class Queue:
         self.outcomes: dict[str, Outcome] = {}
         """The last of each kind of work, for the panels."""
         self.last: Outcome | None = None
+        self.ended: collections.deque[Outcome] = collections.deque(maxlen=_REMEMBERED)
+        """The last of any kind, the latest first."""
         self.kept = Kept()
         self.child_news = ""
         """How the child ended between works; empty when it did not."""
@@ -91,20 +98,26 @@ class Queue:
         return self.current is not None or bool(self.waiting)
 
     @property
+    def in_line(self) -> list[Entry]:
+        """What is at work, and what waits for its turn."""
+        return [*([self.current] if self.current is not None else ()), *self.waiting]
+
+    @property
     def ready(self) -> bool:
         """An answer waits to be put into the scene, by `finish`."""
         return self.job is not None and self.job.state == "done"
 
-    def add(self, context: bpy.types.Context, work: Work) -> Entry:
-        """Put `work` in line for the scene of `context`, for Blender to see through some time, even after a restart."""
-        entry = self._entry(context, work)
-        entry.kept = kept_work(work, entry.scene, entry.blend)
+    def add(self, context: bpy.types.Context, work: Work, scene: bpy.types.Scene | None = None) -> Entry:
+        """Put `work` in line for a scene, that of `context` if none is given; Blender sees it through some time, even
+        after a restart."""
+        entry = self._entry(scene or context.scene, work)
+        entry.kept = kept_work(work, entry.scene, bpy.data.filepath)
         self._append(entry)
         return entry
 
-    def add_awaited(self, context: bpy.types.Context, work: Work) -> Entry:
-        """Put `work` in line for a script that waits for it, and with which it ends."""
-        entry = self._entry(context, work)
+    def add_awaited(self, context: bpy.types.Context, work: Work, scene: bpy.types.Scene | None = None) -> Entry:
+        """As `add`, for a script that waits for it, and with which it ends."""
+        entry = self._entry(scene or context.scene, work)
         self._append(entry)
         return entry
 
@@ -119,7 +132,7 @@ class Queue:
         if self.job.info:
             self.info, self.child_news = self.job.info, ""
         if self.job.state == "cancelled":
-            self._end(Outcome(self.current, notice="Cancelled"))
+            self._end(Outcome(self.current, notice=CANCELLED))
         elif self.job.state == "failed":
             self._end(Outcome(self.current, error=self.job.error))
         return changed
@@ -148,7 +161,7 @@ class Queue:
         """Take a work out of the line, or ask the child to stop; 0: what is at work. Whether there was such a one."""
         if self.current is not None and number in (0, self.current.number):
             if self.ready:  # and waits to enter the scene
-                self._end(Outcome(self.current, notice="Cancelled"))
+                self._end(Outcome(self.current, notice=CANCELLED))
             else:
                 self.job.cancel()
             return True
@@ -188,11 +201,22 @@ class Queue:
             self.kept.set_aside()
         self._drop()
 
+    def file_saved(self) -> None:
+        """The open file may have another name now, and scenes too: what is in line is kept for these."""
+        scenes = {scene.session_uid: scene.name for scene in bpy.data.scenes}
+        for entry in self.in_line:
+            entry.scene = scenes.get(entry.scene_uid, entry.scene)
+            if entry.kept is not None:
+                entry.kept = dataclasses.replace(entry.kept, blend=bpy.data.filepath, scene=entry.scene)
+        if self.busy:
+            self._save()
+
     def close(self) -> None:
         """Drop all works and end the child: the extension is going. What is kept stays on disk."""
         self.kept.close()
         self._drop()
         self.outcomes.clear()
+        self.ended.clear()
         self.last = None
 
     @property
@@ -206,9 +230,8 @@ class Queue:
         """The last lines that the child wrote to stderr."""
         return self._backend.log if self._backend is not None else ()
 
-    def _entry(self, context: bpy.types.Context, work: Work) -> Entry:
-        scene, number = context.scene, next(self._numbers)
-        return Entry(number, work, scene.name, scene.session_uid, bpy.data.filepath, time.monotonic(), None)
+    def _entry(self, scene: bpy.types.Scene, work: Work) -> Entry:
+        return Entry(next(self._numbers), work, scene.name, scene.session_uid, time.monotonic(), None)
 
     def _append(self, entry: Entry) -> None:
         self.waiting.append(entry)
@@ -216,8 +239,7 @@ class Queue:
         self._save()
 
     def _save(self) -> None:
-        in_line = [*([self.current] if self.current is not None else ()), *self.waiting]
-        self.kept.save(entry.kept for entry in in_line if entry.kept is not None)
+        self.kept.save(entry.kept for entry in self.in_line if entry.kept is not None)
 
     def _drop(self) -> None:
         self.waiting.clear()
@@ -242,6 +264,7 @@ class Queue:
 
     def _end(self, outcome: Outcome) -> Outcome:
         self.outcomes[outcome.entry.work.kind] = self.last = outcome
+        self.ended.appendleft(outcome)
         self.current = self.job = None
         self.idle_since = time.monotonic()
         self._clear_folder()
