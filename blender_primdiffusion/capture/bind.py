@@ -67,7 +67,7 @@ def bind_static(
     posed, _, skinning = body.pose(betas, parameters.rotations, shift)
     weights, trust = surface_weights(surface, posed, body)
     rest = points_to_blender(unpose(surface.points, weights, skinning))
-    armature = build_armature(context, f"{scan_file.name} rig", points_to_blender(body.rest(betas)[1]))
+    armature = build_armature(f"{scan_file.name} rig", points_to_blender(body.rest(betas)[1]))
     context.scene.collection.objects.link(armature)
     start = 0
     for mesh in meshes:

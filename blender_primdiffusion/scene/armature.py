@@ -38,22 +38,14 @@ def bone_tails(joints: NDArray) -> NDArray[np.float64]:
     return tails
 
 
-def build_armature(context: bpy.types.Context, name: str, joints: NDArray) -> bpy.types.Object:
+def build_armature(name: str, joints: NDArray) -> bpy.types.Object:
     """An armature object with a bone for each joint, heads at `joints` [24, 3] (z up, metres), linked to no collection.
 
-    Bones exist only in edit mode, so the object is linked to the scene for the moment; the active object and the
-    selection are as before afterwards.
+    Modes, selection and the active object stay as they are.
     """
     data = bpy.data.armatures.new(name)
     armature = bpy.data.objects.new(name, data)
-    layer = context.view_layer
-    active = layer.objects.active
-    if active is not None and active.mode != "OBJECT":
-        bpy.ops.object.mode_set(mode="OBJECT")
-    context.scene.collection.objects.link(armature)
-    try:
-        layer.objects.active = armature
-        bpy.ops.object.mode_set(mode="EDIT")
+    with _in_edit_mode(armature):
         tails = bone_tails(joints)
         for index, joint in enumerate(JOINT_NAMES):
             bone = data.edit_bones.new(joint)
@@ -62,10 +54,6 @@ def build_armature(context: bpy.types.Context, name: str, joints: NDArray) -> bp
             bone.align_roll((0.0, 0.0, 1.0) if forward else (0.0, -1.0, 0.0))
             if PARENTS[index] >= 0:
                 bone.parent = data.edit_bones[JOINT_NAMES[PARENTS[index]]]
-        bpy.ops.object.mode_set(mode="OBJECT")
-    finally:
-        context.scene.collection.objects.unlink(armature)
-        layer.objects.active = active
     data.display_type = "STICK"
     armature.show_in_front = True
     for bone in armature.pose.bones:
@@ -86,36 +74,37 @@ def move_rest_joints(data: bpy.types.Armature, joints: NDArray) -> None:
     if data.is_editmode:
         raise ValueError(f"the armature {data.name!r} is in Edit Mode: leave it (Tab) to change the shape")
     mirrored, data.use_mirror_x = data.use_mirror_x, False
+    carrier = bpy.data.objects.new("PrimDiffusion Bones", data)
     try:
-        with _edit_bones(data) as bones:
+        with _in_edit_mode(carrier):
             for name, joint in zip(JOINT_NAMES, joints, strict=True):
-                bone = bones[name]
+                bone = data.edit_bones[name]
                 along, bone.head = bone.tail - bone.head, Vector(joint)
                 bone.tail = bone.head + along
     finally:
+        bpy.data.objects.remove(carrier)
         data.use_mirror_x = mirrored
 
 
 @contextmanager
-def _edit_bones(data: bpy.types.Armature) -> Iterator[bpy.types.ArmatureEditBones]:
-    """An armature's bones for editing, by an object and in a scene of their own for as long as the block lasts.
+def _in_edit_mode(armature: bpy.types.Object) -> Iterator[None]:
+    """An armature object of no scene in edit mode, in a scene of its own for as long as the block lasts.
 
     Edit mode evaluates the scene it is in twice: with a person's thousand volumes that takes half a second, alone some
-    milliseconds. The person may be hidden, or in a mode.
+    milliseconds. A person who is there may be hidden, or in a mode.
     """
-    scene, carrier = bpy.data.scenes.new("PrimDiffusion Bones"), bpy.data.objects.new("PrimDiffusion Bones", data)
+    scene = bpy.data.scenes.new("PrimDiffusion Bones")
     try:
-        scene.collection.objects.link(carrier)
+        scene.collection.objects.link(armature)
         layer = scene.view_layers[0]
-        layer.objects.active = carrier
-        with bpy.context.temp_override(scene=scene, view_layer=layer, active_object=carrier, object=carrier):
+        layer.objects.active = armature
+        with bpy.context.temp_override(scene=scene, view_layer=layer, active_object=armature, object=armature):
             bpy.ops.object.mode_set(mode="EDIT")
             try:
-                yield data.edit_bones
+                yield
             finally:
                 bpy.ops.object.mode_set(mode="OBJECT")
     finally:
-        bpy.data.objects.remove(carrier)
         bpy.data.scenes.remove(scene)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +15,7 @@ from .attach import attach_volumes
 from .beforehand import Baked, Written, bake
 from .body_mesh import build_body_mesh
 from .convention import frames_to_blender, points_to_blender
+from .folders import humans_folder
 from .human import BETAS, HOME, MARK, PERSON, folder_of
 from .material import volume_material
 from .placing_files import free_name
@@ -52,12 +54,12 @@ def build_written(
 
 
 def home_of_next(name: str) -> Path:
-    """`folder_of` the person who is built under this name next."""
-    collection = bpy.data.collections.new(name[:_NAME_LENGTH])
-    try:
-        return folder_of(collection)
-    finally:
-        bpy.data.collections.remove(collection, do_unlink=False)
+    """`folder_of` the person who is built under this name next, as far as can be told: Blender numbers names."""
+    name = name[:_NAME_LENGTH]
+    taken = {collection.name for collection in bpy.data.collections if collection.library is None}
+    numbered = (f"{name}.{number:03d}" for number in itertools.count(1))
+    free = name if name not in taken else next(one for one in numbered if one not in taken)
+    return humans_folder() / bpy.path.clean_name(free)
 
 
 def _build(
@@ -67,7 +69,7 @@ def _build(
     with _nothing_left_on_failure():
         collection = bpy.data.collections.new(name[:_NAME_LENGTH])
         label = collection.name
-        armature = build_armature(context, label, points_to_blender(human.joints))
+        armature = build_armature(label, points_to_blender(human.joints))
         armature[BETAS] = human.betas.tolist()
         armature.id_properties_ui(BETAS).update(description="Shape of the body, drawn by the engine PrimDiffusion")
         collection.objects.link(armature)

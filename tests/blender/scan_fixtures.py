@@ -70,7 +70,7 @@ def person(
     vertices, joints = body.rest(betas)
     joints, skinning = skinning_transforms(rotations, np.zeros(3), joints)
     vertices = skin(vertices, body.skin_weights, skinning)
-    armature = build_armature(bpy.context, "rig", points_to_blender(joints))
+    armature = build_armature("rig", points_to_blender(joints))
     bpy.context.scene.collection.objects.link(armature)
     for name in JOINT_NAMES:
         armature.data.bones[name].name = names[name]

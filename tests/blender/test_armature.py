@@ -17,7 +17,7 @@ from blender_primdiffusion.scene.quaternion import continuous_quaternions, matri
 
 @pytest.fixture
 def armature(empty_scene):
-    made = build_armature(empty_scene, "Human", points_to_blender(synthetic.joints()))
+    made = build_armature("Human", points_to_blender(synthetic.joints()))
     empty_scene.scene.collection.objects.link(made)
     return made
 
@@ -77,7 +77,7 @@ def test_left_and_right_bones_mirror(armature):
 
 
 def test_joints_that_coincide_still_give_24_bones(empty_scene):
-    made = build_armature(empty_scene, "Human", np.zeros((24, 3)))
+    made = build_armature("Human", np.zeros((24, 3)))
     assert len(made.data.bones) == 24
 
 
@@ -85,7 +85,7 @@ def test_building_keeps_the_active_object_and_leaves_the_armature_unlinked(empty
     other = bpy.data.objects.new("other", None)
     empty_scene.scene.collection.objects.link(other)
     empty_scene.view_layer.objects.active = other
-    made = build_armature(empty_scene, "Human", points_to_blender(synthetic.joints()))
+    made = build_armature("Human", points_to_blender(synthetic.joints()))
     assert empty_scene.view_layer.objects.active == other
     assert made.name not in empty_scene.scene.collection.objects
 

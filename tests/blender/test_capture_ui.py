@@ -39,7 +39,7 @@ def write_person(path: Path) -> None:
     body = read_body()
     vertices, joints = body.rest(np.zeros(10))
     kept, faces = _few_faces()
-    armature = build_armature(bpy.context, "person", points_to_blender(joints))
+    armature = build_armature("person", points_to_blender(joints))
     bpy.context.scene.collection.objects.link(armature)
     mesh = bpy.data.meshes.new("skin")
     mesh.from_pydata(points_to_blender(vertices[kept]).tolist(), [], faces.tolist())

@@ -128,7 +128,7 @@ def test_a_rig_without_toes_and_fingers_moves_its_limbs_all_the_same(tmp_path):
 
 
 def test_blenders_own_export_comes_back(tmp_path, empty_scene):
-    armature = build_armature(empty_scene, "rig", points_to_blender(REST_JOINTS))
+    armature = build_armature("rig", points_to_blender(REST_JOINTS))
     empty_scene.scene.collection.objects.link(armature)
     rotations, moves = motion_of()
     rotations[:, 22:] = np.eye(3)

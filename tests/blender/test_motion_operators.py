@@ -264,7 +264,7 @@ def test_edit_mode_renamed_bones_and_linked_armatures_are_refused_by_name(addon,
 
 
 def test_any_armature_with_smpls_joints_can_be_moved(addon, tmp_path):
-    other = build_armature(addon, "SMPL", points_to_blender(synthetic.joints()))
+    other = build_armature("SMPL", points_to_blender(synthetic.joints()))
     addon.scene.collection.objects.link(other)
     addon.view_layer.objects.active = other
     assert ops.import_motion(filepath=amass(tmp_path / "m.npz")) == {"FINISHED"}

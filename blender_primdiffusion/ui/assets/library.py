@@ -31,7 +31,7 @@ def write_pose_library(context: bpy.types.Context, folder: Path | None = None) -
     folder = folder if folder is not None else own_folder() / "assets"
     folder.mkdir(parents=True, exist_ok=True)
     path, unfinished = folder / FILE, folder / f".{FILE}"
-    armature = build_armature(context, "PrimDiffusion Poses", points_to_blender(REST_JOINTS))
+    armature = build_armature("PrimDiffusion Poses", points_to_blender(REST_JOINTS))
     context.scene.collection.objects.link(armature)  # only what is in a scene has a pose
     actions: set[bpy.types.Action] = set()
     try:
