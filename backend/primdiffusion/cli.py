@@ -26,6 +26,7 @@ from primdiffusion.export_command import Export
 from primdiffusion.failures import describe
 from primdiffusion.generate_command import Generate
 from primdiffusion.machine import share_processors
+from primdiffusion.merge_command import Merge
 
 TRACEBACK = "--traceback"
 DEFECT = 70
@@ -216,6 +217,7 @@ Command = (
     | Annotated[Refine, tyro.conf.subcommand("refine")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Merge, tyro.conf.subcommand("merge")]
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[People, tyro.conf.subcommand("people")]
     | Annotated[Payloads, tyro.conf.subcommand("payloads")]
@@ -322,7 +324,7 @@ def run(arguments: Sequence[str]) -> None:
         FORWARDED[arguments[0]](arguments[1:])
         return
     command = tyro.cli(Command, args=arguments or ["--help"], prog="primdiffusion", description=DESCRIPTION)
-    assert isinstance(command, Generate | Render | Export | Info), "the others are forwarded"
+    assert isinstance(command, Generate | Render | Export | Merge | Info), "the others are forwarded"
     command.run()
 
 

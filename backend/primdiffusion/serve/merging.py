@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from primdiffusion.export.merged_file import upright_grid, write_grid_npz
 from primdiffusion.human import Human, framing, place_skinned
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.gain import DEFAULT_GAIN, fit_gain, unclamped_alpha
-from primdiffusion.render.merge import merge
 from primdiffusion.reshaping import reshaped
 from primdiffusion.serve.draw_params import PersonParams
 from primdiffusion.serve.merge_params import FitGainParams, MergeFramesParams, MergeParams
@@ -26,8 +26,6 @@ GAIN_VIEWS = 4
 """Around the person."""
 GAIN_PIXELS = 128
 """A side of each view; 4 x 128 x 128 rays meet a standing person about ten thousand times."""
-Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Blender's axes from the backend's. Grids are turned before they are made: their voxels would not turn afterwards."""
 
 
 def merge_people(params: MergeParams, report: Report) -> dict[str, Any]:
@@ -92,20 +90,6 @@ def _placed(human: Human, person: PersonParams) -> Primitives:
 
 
 def _write(path: Path, primitives: Primitives, voxel: float) -> list[int]:
-    upright = Primitives(
-        primitives.position @ Z_UP.T,
-        Z_UP @ primitives.rotation,
-        primitives.half_extent,
-        primitives.rgb,
-        primitives.density,
-    )
-    grid = merge(upright, voxel)
-    with path.open("wb") as file:  # savez would append .npz to a temporary name
-        np.savez_compressed(
-            file,
-            density=grid.density.astype(np.float16),
-            colour=grid.colour.astype(np.float16),
-            origin=grid.origin,
-            voxel=np.float64(grid.voxel),
-        )
+    grid = upright_grid(primitives, voxel)
+    write_grid_npz(path, grid)
     return list(grid.density.shape)

@@ -1,0 +1,97 @@
+"""`primdiffusion merge`: people as one volume in a file."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from primdiffusion import cli
+from primdiffusion.export.merged_file import NoOpenVDB
+from primdiffusion.human import generate
+from primdiffusion.human_file import save_human
+from tiny_model import tiny_model
+
+COARSE = ["--voxel", "0.03"]
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("people") / "anna.human"
+    save_human(path, generate(tiny_model(), seed=3, steps=5))
+    return path
+
+
+@pytest.fixture
+def blenders_openvdb(monkeypatch):
+    """The module that Blender brings along."""
+    spec = importlib.util.find_spec("bpy")
+    if spec is None or spec.origin is None:
+        pytest.skip("bpy is not installed")
+    (folder,) = Path(spec.origin).parent.glob("*/python/lib/python3.*/site-packages")
+    monkeypatch.syspath_prepend(str(folder))
+    return pytest.importorskip("openvdb")
+
+
+def grid_of(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path, allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+def test_a_person_becomes_a_grid_that_stands_upright(saved, tmp_path, capsys):
+    out = tmp_path / "anna.npz"
+    cli.run(["merge", str(saved), "--out", str(out), *COARSE])
+    assert capsys.readouterr().out.strip() == str(out)
+    grid = grid_of(out)
+    height = grid["density"].shape[2] * 0.03
+    assert 1.2 < height < 2.6
+    assert grid["density"].shape[1] * 0.03 < 1.0  # arms are stretched out to the sides: x
+    assert grid["colour"].shape == (*grid["density"].shape, 3)
+
+
+def test_several_stand_side_by_side(saved, tmp_path):
+    cli.run(["merge", str(saved), str(saved), "--apart", "3", "--out", str(tmp_path / "two.npz"), *COARSE])
+    cli.run(["merge", str(saved), "--out", str(tmp_path / "one.npz"), *COARSE])
+    one, two = (grid_of(tmp_path / f"{name}.npz") for name in ("one", "two"))
+    assert (two["density"].shape[0] - one["density"].shape[0]) * 0.03 == pytest.approx(3, abs=0.07)
+    masses = [grid["density"].sum(dtype=np.float64) for grid in (one, two)]
+    assert masses[1] == pytest.approx(2 * masses[0], rel=0.02)
+
+
+def test_a_vdb_holds_the_same_numbers_where_they_belong(saved, tmp_path, blenders_openvdb):
+    cli.run(["merge", str(saved), "--out", str(tmp_path / "anna.npz"), *COARSE])
+    cli.run(["merge", str(saved), "--out", str(tmp_path / "anna.vdb"), *COARSE])
+    grid = grid_of(tmp_path / "anna.npz")
+    stored = {one.name: one for one in blenders_openvdb.readAllGridMetadata(str(tmp_path / "anna.vdb"))}
+    assert set(stored) == {"density", "Cd"}
+    density = blenders_openvdb.read(str(tmp_path / "anna.vdb"), "density")
+    values = np.zeros(grid["density"].shape, np.float32)
+    density.copyToArray(values)
+    np.testing.assert_array_equal(values, grid["density"].astype(np.float32))
+    np.testing.assert_allclose(density.transform.indexToWorld((0, 0, 0)), grid["origin"], atol=1e-6)
+    assert density.transform.voxelSize()[0] == pytest.approx(0.03)
+
+
+def test_without_openvdb_a_vdb_is_refused_before_any_work(saved, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "openvdb", None)
+    with pytest.raises(NoOpenVDB, match=r"or write an \.npz"):
+        cli.run(["merge", str(saved), "--out", str(tmp_path / "anna.vdb")])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        (["--out", "anna.obj"], "has none of the endings"),
+        (["--out", "nowhere/anna.npz"], "there is no folder"),
+        (["--out", "anna.npz", "--voxel", "0"], "above zero"),
+        (["--out", "anna.npz", "--voxel", "0.0001"], "choose .* mm or more"),
+        (["--out", "anna.npz", "--frame", "2"], "without a pose file"),
+        (["--out", "anna.npz", "--apart", "inf"], "apart is inf"),
+    ],
+)
+def test_what_cannot_be_merged_is_refused_and_leaves_nothing(saved, tmp_path, monkeypatch, more, sentence):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((ValueError, FileNotFoundError), match=sentence):
+        cli.run(["merge", str(saved), *more])
+    assert not list(tmp_path.iterdir())
