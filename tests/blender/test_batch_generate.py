@@ -16,6 +16,7 @@ import synthetic
 
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, NO_BACKEND, UNUSABLE
 from blender_primdiffusion.scene.human import armature_of, humans, person_file, volume_path
+from blender_primdiffusion.ui.batch.asking import NoBackend
 from blender_primdiffusion.ui.batch.command import execute
 from blender_primdiffusion.worker.environment import BackendNotFound
 
@@ -136,7 +137,28 @@ def test_without_a_backend_everybody_is_spared_the_attempt(out, monkeypatch, cap
     monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", nowhere)
     assert generate(out, "--count", 3) == NO_BACKEND
     assert "/nowhere does not exist" in capfd.readouterr().err
-    assert not list(out.glob("person*"))
+    assert not out.exists()
+
+
+def test_people_who_are_there_and_how_they_were_made_stay_without_a_backend(out, monkeypatch):
+    assert generate(out, "--seed", 7) == DONE
+    before = (out / "settings.json").read_text()
+    monkeypatch.setattr("blender_primdiffusion.ui.batch.generate.ask", _no_backend)
+    assert generate(out, "--seed", 7, "--count", 2) == NO_BACKEND
+    assert (out / "settings.json").read_text() == before
+    assert report(out)["skipped"] == ["person_000007"]
+
+
+def _no_backend(*_, **__):
+    raise NoBackend("No Python for the backend")
+
+
+def test_a_folder_that_cannot_be_is_a_sentence(addon, tmp_path, capfd):
+    (tmp_path / "file").write_text("")
+    assert generate(tmp_path / "file" / "people") == UNUSABLE
+    said = capfd.readouterr().err
+    assert f"nothing can be written to {tmp_path / 'file' / 'people'} (" in said
+    assert "choose another folder with --out" in said
 
 
 @pytest.mark.parametrize(

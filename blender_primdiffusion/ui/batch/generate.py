@@ -21,8 +21,8 @@ from ...worker.job import Job
 from ..generate.attributes import Attributes, parsed
 from .asking import NoBackend, Stopped, ask, backend_of
 from .people import NPZ_FILE, PERSON_FILE, Movement, motion_name, movement_of, person_blend
-from .running import Clock, Say, reason, run, write_report
-from .staging import claim, publish, staging
+from .running import Clock, Say, begun, reason, run
+from .staging import publish, staging
 from .words import parse_generate
 
 SETTINGS = "settings.json"
@@ -38,22 +38,19 @@ def main(argv: Sequence[str]) -> int:
 def _generate(options: argparse.Namespace, say: Say, stop: threading.Event) -> Report:
     attributes, movement = parsed(", ".join(options.attributes)), movement_of(options)
     params = _params(options, attributes)
-    claim(options.out / SETTINGS, {**params, "motion": motion_name(options)}, options.resume)
     report, clock = Report(), Clock(options.count)
-    try:
-        with backend_of(options.python) as backend:
-            for number in range(options.count):
-                seed = options.seed + number
-                if stop.is_set():
-                    raise Stopped
-                if _is_there(options.out / person_name(seed), options.blend):
-                    report.skipped.append(person_name(seed))
-                    clock.piece_skipped()
-                    continue
-                job = _Person(options, {**params, "seed": seed}, movement, f"{number + 1}/{options.count}", say, stop)
-                _try(job, backend, report, clock)
-    finally:
-        write_report(report, options.out)
+    settings = {**params, "motion": motion_name(options)}
+    with begun(report, options.out / SETTINGS, settings, options.resume), backend_of(options.python) as backend:
+        for number in range(options.count):
+            seed = options.seed + number
+            if stop.is_set():
+                raise Stopped
+            if _is_there(options.out / person_name(seed), options.blend):
+                report.skipped.append(person_name(seed))
+                clock.piece_skipped()
+                continue
+            job = _Person(options, {**params, "seed": seed}, movement, f"{number + 1}/{options.count}", say, stop)
+            _try(job, backend, report, clock)
     return report
 
 

@@ -8,6 +8,7 @@ OUT/NAME/0001.png ...           several frames; turn_00.png ... of a turntable
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import shutil
 import tempfile
@@ -37,9 +38,8 @@ from .people import (
     moving_extent,
     new_file,
 )
-from .running import Clock, Say, reason, run, write_report
+from .running import Clock, Say, begun, reason, run
 from .sources import Source, sources
-from .staging import claim
 from .words import ENGINES, parse_render
 
 SETTINGS = "pictures.json"
@@ -67,18 +67,19 @@ def _render(options: argparse.Namespace, say: Say, stop: threading.Event) -> Rep
     movement, everybody = movement_of(options), sources(options.source)
     names = ("engine", "size", "frames", "yaw", "turntable", "transparent", "samples")
     drawn = {name: getattr(options, name) for name in names}
-    claim(options.out / SETTINGS, {**drawn, "motion": motion_name(options)}, options.resume)
     report, clock = Report(), Clock(len(everybody))
-    try:
-        with everywhere(options.python), backend_of(options.python) as backend:
-            drawing = _Drawing(options, movement, backend, stop, say)
-            for source in everybody:
-                if stop.is_set():
-                    raise Stopped
-                _try(drawing, source, report, clock)
-    finally:
-        studio.close()
-        write_report(report, options.out)
+    settings = {**drawn, "motion": motion_name(options)}
+    with (
+        begun(report, options.out / SETTINGS, settings, options.resume),
+        contextlib.closing(studio),
+        everywhere(options.python),
+        backend_of(options.python) as backend,
+    ):
+        drawing = _Drawing(options, movement, backend, stop, say)
+        for source in everybody:
+            if stop.is_set():
+                raise Stopped
+            _try(drawing, source, report, clock)
     return report
 
 

@@ -6,12 +6,15 @@ import argparse
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from ...capture.report import Report, report_path
 from ...console import CANCELLED, DONE, FAILED, NO_BACKEND, UNUSABLE, duration, stdout_of_our_own, stopped_by_signals
 from .asking import NoBackend, Stopped
+from .staging import claim
 from .words import UsageError
 
 Say = Callable[[str], None]
@@ -52,9 +55,28 @@ def run(
         return FAILED if report.failed else DONE
 
 
-def write_report(report: Report, out: Path) -> None:
-    """To report.json."""
-    report.write(out, _ALL)
+@contextmanager
+def begun(report: Report, claimed: Path, settings: Mapping[str, Any], whatever_is_there: bool) -> Iterator[None]:
+    """A batch under way: its settings are claimed (see `claim`), its report is written beside them in the end.
+
+    Neither stays where no backend was found for the first of it: another try may have other settings. Raises ValueError
+    and OSError as `claim` does.
+    """
+    out, nothing = claimed.parent, False
+    is_new, is_new_folder = not claimed.is_file(), not out.exists()
+    claim(claimed, settings, whatever_is_there)
+    try:
+        yield
+    except NoBackend:
+        nothing = is_new and not (report.done or report.failed)
+        raise
+    finally:
+        if not nothing:
+            report.write(out, _ALL)
+        else:
+            claimed.unlink(missing_ok=True)
+            if is_new_folder:
+                out.rmdir()
 
 
 def reason(error: Exception) -> str:

@@ -38,11 +38,14 @@ def publish(made: Path, folder: Path, last: str) -> None:
 
 
 def claim(path: Path, settings: Mapping[str, Any], whatever_is_there: bool) -> None:
-    """Write the settings of a batch to the .json at `path`. Raises ValueError where other ones are there.
+    """Write the settings of a batch to the .json at `path`. Raises ValueError where other ones are there, and OSError.
 
     `whatever_is_there`: the settings are then those of what is still to come.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(path.parent, error) from error
     wanted = json.loads(json.dumps(settings))
     if path.is_file() and not whatever_is_there:
         try:
@@ -55,5 +58,12 @@ def claim(path: Path, settings: Mapping[str, Any], whatever_is_there: bool) -> N
                     f"what is in {path.parent} was made with {name} = {there.get(name)}, not {wanted.get(name)}: "
                     "choose another folder, or add --resume to keep it"
                 )
-    with replacing(path) as unfinished:
-        unfinished.write_text(json.dumps(wanted, indent=1), encoding="utf-8")
+    try:
+        with replacing(path) as unfinished:
+            unfinished.write_text(json.dumps(wanted, indent=1), encoding="utf-8")
+    except OSError as error:
+        raise _unwritable(path.parent, error) from error
+
+
+def _unwritable(folder: Path, error: OSError) -> OSError:
+    return OSError(f"nothing can be written to {folder} ({error.strerror or error}): choose another folder with --out")
