@@ -9,12 +9,14 @@ from ...worker.sentence import sentence
 from ..jobs.drawing import draw_job, draw_lines
 from ..jobs.target import selected_person
 from ..manual import draw_manual_button
+from ..translations import CONTEXT
 
 
 class PRIMDIFFUSION_PT_assets(bpy.types.Panel):
     """People and poses for other files."""
 
     bl_label = "Assets"
+    bl_translation_context = CONTEXT
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "PrimDiffusion"

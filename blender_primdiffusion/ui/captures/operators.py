@@ -11,6 +11,7 @@ import bpy
 from mathutils import Vector
 
 from ..jobs.follow import redraw
+from ..translations.told import told
 from .session import Busy, captures
 from .settings import words_of
 
@@ -52,7 +53,7 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
             settings_of(parse(words))  # what is impossible is said at once
             captures.start(words)
         except (Busy, OSError, ValueError, RuntimeError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, told(str(error)))
             return {"CANCELLED"}
         bpy.app.timers.register(follow, first_interval=_TICK_S, persistent=True)
         return {"FINISHED"}
@@ -64,20 +65,20 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
         from ...capture.report import Report, report_path
 
         options = parse(words)
-        settings, report, told = settings_of(options), Report(), 0.0
+        settings, report, printed = settings_of(options), Report(), 0.0
         captures.close()  # the file of cameras is read
         scans = scans_in(options.people, options.only)
         with contextlib.closing(run(context, settings, scans, report)) as steps:
             for progress in steps:
                 for line in progress.news:
                     print(f"PrimDiffusion: {line}", flush=True)
-                if time.monotonic() - told > _TOLD_S:
-                    told = time.monotonic()
+                if time.monotonic() - printed > _TOLD_S:
+                    printed = time.monotonic()
                     print(f"PrimDiffusion: {describe(progress)}", flush=True)
         if report.failed:
             first, path = report.failed[0], report_path(settings.out, settings.shard)
             who = first["subject"] or first["what"]
-            self.report({"ERROR"}, f"{len(report.failed)} failed; {who}: {first['why']} (all: {path})")
+            self.report({"ERROR"}, told(f"{len(report.failed)} failed; {who}: {first['why']} (all: {path})"))
             return {"CANCELLED"}
         return {"FINISHED"}
 
@@ -130,12 +131,12 @@ class PRIMDIFFUSION_OT_verify_captures(bpy.types.Operator):
             root = parse(words).out
             wrong = repair(root) if self.repair else verify(root)
         except (Busy, OSError, ValueError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, told(str(error)))
             return {"CANCELLED"}
         for sentence in wrong:
             print(f"PrimDiffusion: {sentence}")
         if wrong and not self.repair:
-            self.report({"ERROR"}, f"{len(wrong)} problems; the first: {wrong[0]}")
+            self.report({"ERROR"}, told(f"{len(wrong)} problems; the first: {wrong[0]}"))
             return {"CANCELLED"}
         return {"FINISHED"}
 
@@ -158,7 +159,7 @@ class PRIMDIFFUSION_OT_preview_rig(bpy.types.Operator):
         try:
             rig = context.scene.primdiffusion_captures.rig()
         except ValueError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, told(str(error)))
             return {"CANCELLED"}
         collection = bpy.data.collections.new(RIG)
         context.scene.collection.children.link(collection)

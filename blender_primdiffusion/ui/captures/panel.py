@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Callable
 
 import bpy
 
+from ..jobs.drawing import draw_lines
 from ..manual import draw_manual_button
+from ..translations.told import told
 from .operators import RIG
 from .session import captures
 
-_LINE = 46
 _SHOWN_LINES = 4
 
 
@@ -43,15 +43,15 @@ class PRIMDIFFUSION_PT_captures(_InSidebar, bpy.types.Panel):
         column.prop(asked, "out")
         if captures.busy:
             left = f" ({_minutes(captures.eta_s)} left)" if captures.eta_s else ""
-            layout.progress(factor=captures.fraction, text=f"{captures.message}{left}")
+            layout.progress(factor=captures.fraction, text=told(f"{captures.message}{left}"), translate=False)
             layout.operator("primdiffusion.cancel_captures", icon="CANCEL")
         else:
             layout.operator("primdiffusion.render_captures", icon="RENDER_ANIMATION")
         for text, icon in ((captures.error, "ERROR"), (captures.notice, "INFO")):
-            _paragraph(layout, text, icon)
+            draw_lines(layout, text, icon)
         if captures.busy or captures.error:
             for text in list(captures.lines)[-_SHOWN_LINES:]:
-                _paragraph(layout, text, "DOT")
+                draw_lines(layout, text, "DOT")
 
 
 def _sub_panel(name: str, label: str, content: Callable) -> type:
@@ -137,11 +137,6 @@ SUB_PANELS = (
     _sub_panel("cycles", "Cycles", _draw_cycles),
     _sub_panel("output", "Output", _draw_output),
 )
-
-
-def _paragraph(layout: bpy.types.UILayout, text: str, icon: str) -> None:
-    for number, line in enumerate(textwrap.wrap(text, _LINE)):
-        layout.label(text=line, icon=icon if number == 0 else "BLANK1")
 
 
 def _minutes(seconds: float) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ...capture.names import LAYOUTS, PASSES
+from ..translations import CONTEXT
 
 if TYPE_CHECKING:
     from ...capture.rig import Rig
@@ -82,8 +83,8 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         subtype="ANGLE",
     )
     fov: bpy.props.FloatProperty(
-        name="Field of View", description="Vertical", default=math.radians(30), min=math.radians(1),
-        max=math.radians(150), subtype="ANGLE",
+        name="Field of View", translation_context=CONTEXT, description="Vertical", default=math.radians(30),
+        min=math.radians(1), max=math.radians(150), subtype="ANGLE",
     )  # fmt: skip
     margin: bpy.props.FloatProperty(name="Margin", description="Room around people", default=1.05, min=0.1, max=100)
     cameras: bpy.props.PointerProperty(
@@ -93,6 +94,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     samples: bpy.props.IntProperty(name="Samples", description="Of a pixel", default=16, min=1, soft_max=1024)
     light: bpy.props.EnumProperty(
         name="Light",
+        translation_context=CONTEXT,
         description="What the people are seen in",
         items=[
             ("uniform", "Uniform", "Every surface shows its own colour"),

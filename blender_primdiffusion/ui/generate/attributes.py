@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ...places import backend_module_path, preference
+from ..translations import CONTEXT
 
 if TYPE_CHECKING:
     from ...worker.vocabulary import Vocabulary
@@ -56,11 +57,15 @@ def menu(name: str) -> list[Item]:
 
     values = known().categories.get(name, ())
     if values not in _items:
-        numbered = [
-            (value, value[:1].upper() + value[1:], "", zlib.crc32(value.encode()) & 0x7FFFFFFF or 1) for value in values
-        ]
+        numbered = [(value, choice_label(value), "", zlib.crc32(value.encode()) & 0x7FFFFFFF or 1) for value in values]
         _items[values] = [(ANY, "Any", "Whatever comes", 0), *numbered]
     return _items[values]
+
+
+def choice_label(value: str) -> str:
+    """A value of the backend's, for people: side parting -> Side parting, shoes01 -> Shoes 1."""
+    spaced = re.sub(r"(?<=[a-z])0*(\d+)$", r" \1", value)
+    return spaced[:1].upper() + spaced[1:]
 
 
 def title(name: str) -> str:
@@ -70,7 +75,9 @@ def title(name: str) -> str:
 
 def _menu_property(name: str):
     items: Callable = lambda _self, _context: menu(name)  # noqa: E731  bpy wants a function of its own for each
-    return bpy.props.EnumProperty(name=title(name), description="What the person is asked to be", items=items)
+    return bpy.props.EnumProperty(
+        name=title(name), description="What the person is asked to be", items=items, translation_context=CONTEXT
+    )
 
 
 class PRIMDIFFUSION_PG_attributes(bpy.types.PropertyGroup):
@@ -83,9 +90,13 @@ class PRIMDIFFUSION_PG_attributes(bpy.types.PropertyGroup):
     hair: _menu_property("hair")
     hat: _menu_property("hat")
     use_height: bpy.props.BoolProperty(name="Ask for a Height", description="The body is of this height")
-    height: bpy.props.FloatProperty(name="Height", description="Metres", default=1.7, min=0.5, max=2.5, step=1)
+    height: bpy.props.FloatProperty(
+        name="Height", description="Metres", default=1.7, min=0.5, max=2.5, step=1, translation_context=CONTEXT
+    )
     use_weight: bpy.props.BoolProperty(name="Ask for a Weight", description="The body is of this weight")
-    weight: bpy.props.FloatProperty(name="Weight", description="Kilograms", default=70.0, min=10.0, max=300.0, step=100)
+    weight: bpy.props.FloatProperty(
+        name="Weight", description="Kilograms", default=70.0, min=10.0, max=300.0, step=100, translation_context=CONTEXT
+    )
 
 
 def asked(group: PRIMDIFFUSION_PG_attributes) -> Attributes:
@@ -123,7 +134,7 @@ def draw_attributes(layout: bpy.types.UILayout, group: PRIMDIFFUSION_PG_attribut
             layout.prop(group, name)
     for name in SCALARS:
         if name in vocabulary.scalars:
-            row = layout.row(align=True, heading=title(name))
+            row = layout.row(align=True, heading=title(name), heading_ctxt=CONTEXT)
             row.prop(group, f"use_{name}", text="")
             number = row.row()
             number.enabled = getattr(group, f"use_{name}")

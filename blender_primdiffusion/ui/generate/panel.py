@@ -8,6 +8,7 @@ from .. import setup
 from ..jobs.drawing import draw_job, draw_lines
 from ..jobs.memory import device_line
 from ..manual import draw_manual_button
+from ..translations import CONTEXT
 from .attributes import draw_attributes
 from .presets import PRIMDIFFUSION_PT_generate_presets
 
@@ -51,6 +52,7 @@ class PRIMDIFFUSION_PT_attributes(bpy.types.Panel):
     """What the person is asked to be; nothing is asked for unless something is chosen."""
 
     bl_label = "Attributes"
+    bl_translation_context = CONTEXT
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "PrimDiffusion"

@@ -15,6 +15,8 @@ from ...scene.human import humans, person_file
 from ..generate.attributes import asked, parsed
 from ..jobs.follow import submit
 from ..jobs.target import named_person, selected_person
+from ..translations import CONTEXT
+from ..translations.told import told
 from .edit_settings import TRANSFER_ITEMS, parts_property
 
 if TYPE_CHECKING:
@@ -46,7 +48,7 @@ class _Edit:
             steps = self.chosen("steps", context.scene.primdiffusion)
             work = self.work().of(person, steps, self.params(context, person))
         except (OSError, ValueError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, told(str(error)))
             return {"CANCELLED"}
         return submit(self, context, work)
 
@@ -178,7 +180,9 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
     bl_label = "Blend"
 
     other: bpy.props.StringProperty(name="Other", description=f"Name of the other person. {_PANELS}", options=_SKIP)
-    fraction: bpy.props.FloatProperty(name="Fraction", min=0.0, max=1.0, description=_PANELS, options=_SKIP)
+    fraction: bpy.props.FloatProperty(
+        name="Fraction", translation_context=CONTEXT, min=0.0, max=1.0, description=_PANELS, options=_SKIP
+    )
 
     def work(self) -> type[EditWork]:
         """Blend."""

@@ -7,6 +7,7 @@ import bpy
 from ...scene.human import MARK, humans
 from ...worker.names import PARTS, TRANSFERS
 from ..generate.attributes import PRIMDIFFUSION_PG_attributes, title
+from ..translations import CONTEXT
 
 PAINTED_GROUP = "PrimDiffusion Region"
 """Vertex group of the body mesh that Paint Region makes."""
@@ -74,6 +75,7 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
     )
     fraction: bpy.props.FloatProperty(
         name="Fraction",
+        translation_context=CONTEXT,
         description="How much of the other person: 0 is this one, 1 the other",
         default=0.5,
         min=0.0,

@@ -9,6 +9,8 @@ import bpy
 
 from ...scene.shape_names import BETAS
 from ..jobs.target import named_person, selected_person
+from ..translations import CONTEXT
+from ..translations.told import told
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,10 +34,10 @@ class _Shape:
             person = named_person(context, self.human) if self.human else selected_person(context)
             warning = reshape(person, self.betas_for(context, person))
         except (OSError, ValueError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, told(str(error)))
             return {"CANCELLED"}
         if warning:
-            self.report({"WARNING"}, warning)
+            self.report({"WARNING"}, told(warning))
         return {"FINISHED"}
 
     def betas_for(self, context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
@@ -90,6 +92,7 @@ class PRIMDIFFUSION_OT_random_shape(_Shape, bpy.types.Operator):
     seed: bpy.props.IntProperty(name="Seed", description="Another seed is another body", min=0)
     spread: bpy.props.FloatProperty(
         name="Spread",
+        translation_context=CONTEXT,
         description="How far bodies are from the mean one: 1 as people are",
         default=1.0,
         min=0.0,

@@ -7,8 +7,10 @@ import json
 import bpy
 
 from ...scene.human import BETAS, MARK, armature_of
+from ...worker.sentence import sentence
 from ..jobs.drawing import draw_lines
 from ..jobs.target import selected_person
+from ..translations.told import told
 
 _SHOWN = ("seed", "steps", "sampler", "guidance", "checkpoint", "version")
 """Of the provenance, in this order."""
@@ -50,14 +52,14 @@ class PRIMDIFFUSION_PT_shape(_InHuman, bpy.types.Panel):
             armature, names = armature_of(person), slider_names(shape_model_of(person))
             check_shapeable(person)
         except (OSError, ValueError) as error:
-            draw_lines(layout, str(error), "INFO")
+            draw_lines(layout, sentence(error), "INFO")
             return
         settings = armature.primdiffusion_human
         layout.prop(settings, "height")
         layout.prop(settings, "weight")
         shown = in_the_scene(context.scene, armature, settings.height)
         if shown:
-            layout.label(text=f"In the scene: {shown}", icon="BLANK1")
+            layout.label(text=told(f"In the scene: {shown}"), icon="BLANK1", translate=False)
         column = layout.column(align=True)
         for index, name in enumerate(names):
             column.prop(settings, "betas", index=index, text=name, slider=True)
@@ -84,11 +86,11 @@ class PRIMDIFFUSION_PT_details(_InHuman, bpy.types.Panel):
         """Reads the scene; changes nothing."""
         person = selected_person(context)
         column = self.layout.column(align=True)
-        for name, value in told(person):
-            column.label(text=f"{name}: {value}")
+        for name, value in details(person):
+            column.label(text=f"{told(name)}: {told(value)}", translate=False)
 
 
-def told(person: bpy.types.Collection) -> list[tuple[str, str]]:
+def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
     """What Details says: names and values."""
     from ...scene.memory import person_memory
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import bpy
 
 from ...places import EXTENSION, backend_module_path, preference
+from ..translations.told import told
 from .memory import device_line
 from .queue import queue
 
@@ -87,12 +88,12 @@ class PRIMDIFFUSION_OT_copy_diagnostics(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Without a window there is no clipboard: then a text block of the file holds it."""
-        told = diagnostics()
+        text = diagnostics()
         if bpy.app.background:
             block = bpy.data.texts.get(TEXT) or bpy.data.texts.new(TEXT)
-            block.from_string(told)
-            self.report({"INFO"}, f"the text {TEXT!r} holds them")
+            block.from_string(text)
+            self.report({"INFO"}, told(f"the text {TEXT!r} holds them"))
         else:
-            context.window_manager.clipboard = told
-            self.report({"INFO"}, "copied: paste it into the report, and read it first")
+            context.window_manager.clipboard = text
+            self.report({"INFO"}, told("copied: paste it into the report, and read it first"))
         return {"FINISHED"}

@@ -10,6 +10,9 @@ import bpy
 from bpy_extras.io_utils import ImportHelper
 
 from ...scene.joints import JOINT_NAMES
+from ...worker.sentence import sentence
+from ..jobs.drawing import draw_lines
+from ..translations.told import told
 from .armatures import OnArmature, target_armature
 from .options import WhereTo
 from .under_cursor import person_under
@@ -159,7 +162,7 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
             self.report(
                 {"WARNING"}, f"{armature.name!r} shows its rest position: switch to Pose Position to see it move"
             )
-        self.report({"INFO"}, f"{motion.name}: {len(motion)} frames of the file on frames {first:g} to {last:g}")
+        self.report({"INFO"}, told(f"{motion.name}: {len(motion)} frames of the file on frames {first:g} to {last:g}"))
         return {"FINISHED"}
 
     def axis(self) -> str:
@@ -200,10 +203,10 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
         try:
             box.label(text=target_armature(context, self.person).name, icon="OUTLINER_OB_ARMATURE")
         except ValueError as error:
-            box.label(text=str(error), icon="ERROR")
+            draw_lines(box, sentence(error), "ERROR")
         for label, text in look.facts.items():
             row = box.split(factor=0.4)
             row.label(text=label)
-            row.label(text=text)
+            row.label(text=told(text), translate=False)
         if look.error:
-            box.label(text=look.error, icon="ERROR")
+            draw_lines(box, sentence(look.error), "ERROR")

@@ -7,6 +7,8 @@ from pathlib import Path
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
+from ..translations import CONTEXT
+from ..translations.told import told
 from .armatures import OnArmature, scene_fps
 from .options import WhereTo
 
@@ -25,7 +27,9 @@ class PRIMDIFFUSION_OT_add_motion(OnArmature, WhereTo, bpy.types.Operator):
     bl_label = "Add Motion"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    motion: bpy.props.EnumProperty(name="Motion", description="What the person does", items=_BUILT_IN)
+    motion: bpy.props.EnumProperty(
+        name="Motion", translation_context=CONTEXT, description="What the person does", items=_BUILT_IN
+    )
     rounds: bpy.props.IntProperty(name="Rounds", description="How often, in a row", default=2, min=1, max=500)
     speed: bpy.props.FloatProperty(name="Speed", description="2 is twice as fast", default=1.0, min=0.1, max=10.0)
 
@@ -111,7 +115,7 @@ class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operato
         motion, betas, pelvis = sample_motion(context, armature, first, last)
         path = Path(bpy.path.abspath(self.filepath))
         write_amass(path, motion, betas, pelvis)
-        self.report({"INFO"}, f"{len(motion)} frames of {armature.name!r} written to {path.name!r}")
+        self.report({"INFO"}, told(f"{len(motion)} frames of {armature.name!r} written to {path.name!r}"))
         return {"FINISHED"}
 
 

@@ -11,6 +11,7 @@ from ...scene.actions import action_curves, loops
 from ...worker.sentence import sentence
 from ..jobs.drawing import draw_lines
 from ..manual import draw_manual_button
+from ..translations.told import told
 from .armatures import target_armature
 from .pose_pictures import poses_folder
 from .settings import FACTS, moves_bones
@@ -60,11 +61,11 @@ class PRIMDIFFUSION_PT_motion(_InSidebar, bpy.types.Panel):
         for label, text in facts_of(action).items():
             row = box.split(factor=0.4)
             row.label(text=label)
-            row.label(text=text)
+            row.label(text=told(text), translate=False)
         start, end = action.frame_range
         row = box.split(factor=0.4)
         row.label(text="In the Scene")
-        row.label(text=f"{start:g} to {end:g}")
+        row.label(text=f"{start:g} \N{EN DASH} {end:g}", translate=False)
         if action_curves(armature) is not None:
             layout.operator("primdiffusion.loop_motion", icon="FILE_REFRESH", depress=loops(armature))
 

@@ -8,6 +8,7 @@ import bpy
 
 from ...motion.own_poses import load_pose, own_poses, save_pose
 from ...scene.joints import JOINT_NAMES
+from ..translations.told import told
 from .armatures import OnArmature, warn_of_rest
 from .pose_pictures import poses_folder
 
@@ -53,7 +54,7 @@ class _Posing(OnArmature):
             key_pose(armature, context.scene.frame_current, changed)
         locked = len(joints) - len(changed)
         if locked:
-            self.report({"WARNING"}, f"{locked} locked bones of {armature.name!r} stayed as they were")
+            self.report({"WARNING"}, told(f"{locked} locked bones of {armature.name!r} stayed as they were"))
         warn_of_rest(self, armature)
         return {"FINISHED"}
 
@@ -175,7 +176,7 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
         rotations, translation = current_pose(armature)
         save_pose(poses_folder(), name, to_axis_angle(rotations), translation)
         context.scene.primdiffusion_motion.pose = name
-        self.report({"INFO"}, f"The pose {name!r} is in the library")
+        self.report({"INFO"}, told(f"The pose {name!r} is in the library"))
         return {"FINISHED"}
 
 
@@ -198,12 +199,12 @@ class PRIMDIFFUSION_OT_delete_pose(bpy.types.Operator):
         name = self.pose_name or settings.pose
         own = own_poses(poses_folder())
         if name not in own:
-            self.report({"ERROR"}, f"{name!r} is no pose of your own: only those can be deleted")
+            self.report({"ERROR"}, told(f"{name!r} is no pose of your own: only those can be deleted"))
             return {"CANCELLED"}
         try:
             own[name].unlink()
         except OSError as error:
-            self.report({"ERROR"}, f"{str(own[name])!r} could not be deleted ({error.strerror or error})")
+            self.report({"ERROR"}, told(f"{str(own[name])!r} could not be deleted ({error.strerror or error})"))
             return {"CANCELLED"}
         settings.property_unset("pose")
         return {"FINISHED"}

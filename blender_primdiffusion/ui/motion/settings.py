@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...scene.actions import action_curves
+from ..translations.told import told
 from .armatures import target_armature
 from .pose_pictures import pose_items
 
@@ -52,7 +53,7 @@ class PRIMDIFFUSION_OT_use_action(bpy.types.Operator):
             if not moves_bones(action):
                 raise ValueError(f"the action {self.action!r} moves no bones of a person")
         except ValueError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, told(str(error)))
             return {"CANCELLED"}
         animation = armature.animation_data_create()
         animation.action = action

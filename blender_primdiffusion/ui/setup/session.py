@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import bpy
 
+from ..translations.told import told
+
 if TYPE_CHECKING:
     from ...worker.setup_job import Kind, SetUpJob
     from ...worker.setup_steps import Plan
@@ -71,17 +73,17 @@ def see_through(operator: bpy.types.Operator) -> set[str]:
         if not bpy.app.timers.is_registered(follow):
             bpy.app.timers.register(follow, first_interval=TICK_S, persistent=True)
         return {"FINISHED"}
-    told = 0.0
+    printed = 0.0
     try:
         while (job := session.job) is not None:
-            if session.tick() and session.busy and time.monotonic() - told > _TOLD_S:
-                told = time.monotonic()
+            if session.tick() and session.busy and time.monotonic() - printed > _TOLD_S:
+                printed = time.monotonic()
                 print(f"PrimDiffusion: {job.message}", flush=True)
             time.sleep(TICK_S / 4)
     finally:
         session.cancel()
     if session.error:
-        operator.report({"ERROR"}, session.error)
+        operator.report({"ERROR"}, told(session.error))
         return {"CANCELLED"}
     print(f"PrimDiffusion: {session.notice}", flush=True)
     return {"FINISHED"}

@@ -8,7 +8,10 @@ import bpy
 
 LANGUAGES = ("de_DE", "fr_FR")
 """In the order of the tables' columns, as Blender calls them."""
-_CONTEXTS = ("*", "Operator")
+CONTEXT = "PrimDiffusion"
+"""Of properties whose words mean something else elsewhere in Blender: its French Hair is an animal's, and its own words
+win in the contexts that it has."""
+_CONTEXTS = ("*", "Operator", CONTEXT)
 """Buttons of operators look their words up in a context of their own."""
 
 Messages = dict[str, dict[tuple[str, str], str]]
@@ -27,10 +30,14 @@ def messages(*tables: Iterable[tuple[str, ...]]) -> Messages:
 
 def register() -> None:
     """Make the words known to Blender."""
+    from . import tooltips_of_options, tooltips_of_settings
+    from .choices import CHOICES
     from .labels import LABELS
+    from .refusals import REFUSALS
     from .tooltips import TOOLTIPS
 
-    bpy.app.translations.register(__package__, messages(LABELS, TOOLTIPS))
+    tooltips = (TOOLTIPS, tooltips_of_settings.TOOLTIPS, tooltips_of_options.TOOLTIPS)
+    bpy.app.translations.register(__package__, messages(LABELS, CHOICES, REFUSALS, *tooltips))
 
 
 def unregister() -> None:

@@ -380,11 +380,6 @@ TOOLTIPS = (
         "Copier ce qu'il faut à un rapport d'erreur : versions, périphérique, dernière erreur, journal, sans noms",
     ),
     (
-        "Forget the works that were left",
-        "Die übrigen Aufträge vergessen",
-        "Oublier les tâches qui restaient",
-    ),
-    (
         "Export the selected person in the current pose as 3D Gaussians for splat viewers",
         "Die gewählte Person in der aktuellen Pose als 3D-Gaußsche exportieren",
         "Exporter la personne choisie dans la pose actuelle en gaussiennes 3D",
@@ -425,11 +420,6 @@ TOOLTIPS = (
         "Retirer le maillage de substitution de la personne choisie et montrer les volumes",
     ),
     (
-        "Put the works that were left in line again, for the scene that is open now",
-        "Die übrigen Aufträge für die jetzt offene Szene wieder einreihen",
-        "Remettre en file les tâches qui restaient, pour la scène ouverte",
-    ),
-    (
         "Render with Cycles: people are approximated, shadows and lights on other objects are right",
         "Mit Cycles rendern: Menschen sind genähert, Schatten und Licht auf anderen Objekten stimmen",
         "Rendre avec Cycles : les personnes sont approchées, ombres et lumières des autres objets sont justes",
@@ -468,5 +458,11 @@ TOOLTIPS = (
         "Copy all files of this file's people beside it, so that it can be moved or sent with one folder",
         "Alle Dateien der Menschen neben diese Datei kopieren, damit beide zusammen verschoben werden können",
         "Copier tous les fichiers des personnes à côté de ce fichier, pour les déplacer ensemble",
+    ),
+    ("Forget works that were left", "Übrige Aufträge vergessen", "Oublier les tâches restantes"),
+    (
+        "Put works that were left in line again: those asked for in the open file, for their scenes",
+        "Übrige Aufträge wieder einreihen: die der offenen Datei, für ihre Szenen",
+        "Remettre en file les tâches restantes : celles du fichier ouvert, pour leurs scènes",
     ),
 )

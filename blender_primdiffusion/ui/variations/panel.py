@@ -10,6 +10,7 @@ import bpy
 from ..jobs.drawing import draw_job
 from ..jobs.queue import queue
 from ..manual import draw_manual_button
+from ..translations.told import told
 from .icons import icons
 from .sheet import sheet
 
@@ -79,7 +80,7 @@ def _draw_coming(layout: bpy.types.UILayout, columns: tuple[int, float], work: V
 
 
 def _draw_sheet(layout: bpy.types.UILayout, columns: tuple[int, float]) -> None:
-    layout.label(text=f"{sheet.title}: {len(sheet.variations)}")
+    layout.label(text=told(f"{sheet.title}: {len(sheet.variations)}"), translate=False)
     grid = _grid(layout, columns[0])
     for index, variation in enumerate(sheet.variations):
         cell = grid.column(align=True)
@@ -99,7 +100,12 @@ def _draw_choice(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) 
     number = sum(variation.chosen for variation in sheet.variations)
     chosen = layout.row()
     chosen.enabled = number > 0
-    chosen.operator("primdiffusion.build_variation", text=f"Build Selected ({number})", icon="OUTLINER_OB_ARMATURE")
+    chosen.operator(
+        "primdiffusion.build_variation",
+        text=told(f"Build Selected ({number})"),
+        translate=False,
+        icon="OUTLINER_OB_ARMATURE",
+    )
     row = layout.row(align=True)
     row.operator("primdiffusion.build_variation", text="Build All").build_all = True
     row.operator("primdiffusion.clear_variations", text="Clear", icon="TRASH")
