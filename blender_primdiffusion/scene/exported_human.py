@@ -67,12 +67,25 @@ def read_tensors(path: Path) -> HumanTensors:
     return HumanTensors(metadata, arrays)
 
 
-def with_now(human: HumanTensors, betas: NDArray | None, motion: HumanMotion | None) -> HumanTensors:
-    """The person with another shape [10] and a motion; None leaves the shape, and takes a motion away."""
+def reshaped(human: HumanTensors, betas: NDArray, growth: NDArray | None) -> HumanTensors:
+    """The person with another shape [10], on which their boxes are `growth` [K, 3] times as large (None: as they are).
+
+    Raises ValueError for a file that holds another number of boxes.
+    """
+    arrays = {**human.arrays, "betas": _stored(np.asarray(betas, np.float32))}
+    if growth is not None:
+        dtype, shape, raw = human.arrays.get("delta_scale", ("", (), b""))
+        if dtype != "F32" or shape != growth.shape:
+            given, wanted = f"{dtype}{list(shape)}", f"F32{list(growth.shape)}"
+            raise ValueError(f"the person's file holds sizes of boxes as {given}, not {wanted}; {_REMEDY}")
+        arrays["delta_scale"] = _stored((_loaded(dtype, shape, raw) * growth).astype(np.float32))
+    return HumanTensors(human.metadata, arrays)
+
+
+def with_motion(human: HumanTensors, motion: HumanMotion | None) -> HumanTensors:
+    """The person with a motion; None takes it away."""
     metadata = {name: text for name, text in human.metadata.items() if name != "motion"}
     arrays = {name: array for name, array in human.arrays.items() if name not in _MOTION}
-    if betas is not None:
-        arrays["betas"] = _stored(np.asarray(betas, np.float32))
     if motion is not None:
         metadata["motion"] = json.dumps({"fps": motion.fps})
         for name, array in zip(_MOTION, (motion.frames, motion.rotations, motion.translations), strict=True):

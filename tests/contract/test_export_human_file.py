@@ -5,19 +5,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 sys.path.append(str(Path(__file__).parents[1] / "backend"))
 
 from export_people import person
-from primdiffusion.human_file import load_human, save_human
+from primdiffusion.human_file import export_for_blender, load_human, save_human
+from primdiffusion.reshaping import reshaped as reshape_in_backend
 
 from blender_primdiffusion.scene.exported_human import (
     HumanMotion,
     motion_in,
     read_tensors,
-    with_now,
+    reshaped,
+    with_motion,
     write_tensors,
 )
+from blender_primdiffusion.scene.human_file import read_human
 
 
 @pytest.fixture
@@ -39,21 +43,31 @@ def test_a_file_taken_apart_and_written_again_is_the_same_person(saved, tmp_path
     assert dict(again.provenance) == {"seed": 1}
 
 
-def test_the_backend_reads_the_new_shape_and_passes_over_the_motion(saved, tmp_path):
-    shape = np.linspace(-1, 1, 10)
-    write_tensors(tmp_path / "b.human", with_now(read_tensors(saved), shape, walk()))
-    again = load_human(tmp_path / "b.human")
-    assert again.betas.numpy() == pytest.approx(shape, abs=1e-6)
-    assert again.payload.delta_scale.equal(person().payload.delta_scale)
+def test_a_reshaped_person_in_a_file_is_the_backends_reshaped_person(saved, tmp_path):
+    betas = np.linspace(-1.5, 1.5, 10).astype(np.float32)
+    export_for_blender(tmp_path / "human.npz", person())
+    model = read_human(tmp_path / "human.npz").shape_model
+    assert model is not None
+    kept = reshaped(read_tensors(saved), betas, model.growth(person().betas.numpy(), betas))
+    write_tensors(tmp_path / "b.human", with_motion(kept, walk()))
+    again, wanted = load_human(tmp_path / "b.human"), reshape_in_backend(person(), torch.tensor(betas))
+    assert again.betas.equal(wanted.betas)
+    assert torch.allclose(again.payload.delta_scale, wanted.payload.delta_scale, rtol=1e-5)
+    assert wanted.payload.delta_scale.max() > 1.05 * person().payload.delta_scale.max()
+
+
+def test_boxes_of_another_body_are_refused(saved):
+    with pytest.raises(ValueError, match=r"not F32\[5, 3\]; choose a .human file"):
+        reshaped(read_tensors(saved), np.zeros(10), np.ones((5, 3)))
 
 
 def test_a_motion_comes_back_as_it_was_and_can_be_taken_away(saved, tmp_path):
-    write_tensors(tmp_path / "b.human", with_now(read_tensors(saved), None, walk()))
+    write_tensors(tmp_path / "b.human", with_motion(read_tensors(saved), walk()))
     found = motion_in(read_tensors(tmp_path / "b.human"))
     assert found is not None
     assert found.fps == 24.0
     assert np.array_equal(found.translations, walk().translations)
-    write_tensors(tmp_path / "c.human", with_now(read_tensors(tmp_path / "b.human"), None, None))
+    write_tensors(tmp_path / "c.human", with_motion(read_tensors(tmp_path / "b.human"), None))
     assert motion_in(read_tensors(tmp_path / "c.human")) is None
 
 
@@ -64,7 +78,7 @@ def test_a_damaged_motion_is_refused_with_a_sentence(saved, damage):
         motion = HumanMotion(motion.frames[::-1].copy(), motion.rotations, motion.translations, 24.0)
     if damage == "shape":
         motion = HumanMotion(motion.frames, motion.rotations[:2], motion.translations, 24.0)
-    human = with_now(read_tensors(saved), None, motion)
+    human = with_motion(read_tensors(saved), motion)
     if damage == "fps":
         human.metadata["motion"] = '{"fps": "fast"}'
     with pytest.raises(ValueError, match="export the person again"):

@@ -8,10 +8,11 @@ import bpy
 import numpy as np
 
 from ...motion.skeleton import unchain
-from ...scene.exported_human import HumanMotion, read_tensors, with_now, write_tensors
+from ...scene.exported_human import HumanMotion, read_tensors, reshaped, with_motion, write_tensors
 from ...scene.exported_model import Frames
 from ...scene.human import person_file
-from ...scene.shape import betas_of, keeps_own_shape
+from ...scene.shape import betas_of, generated_betas, keeps_own_shape, shape_model_of
+from ...scene.shape_file import BODY_FILE
 from .posing import posed_frames
 
 
@@ -22,9 +23,13 @@ def write_human(context: bpy.types.Context, person: bpy.types.Collection, path: 
     is left out.
     """
     human = read_tensors(person_file(person))
-    betas = betas_of(person) if keeps_own_shape(person) else None
+    if keeps_own_shape(person):
+        betas, growth = betas_of(person), None
+        if BODY_FILE in person:  # people of earlier versions have none, and boxes that keep their size
+            growth = shape_model_of(person).growth(generated_betas(person), betas)
+        human = reshaped(human, betas, growth)
     motion = None if frames is None else _motion(context, person, frames)
-    write_tensors(path, with_now(human, betas, motion))
+    write_tensors(path, with_motion(human, motion))
 
 
 def _motion(context: bpy.types.Context, person: bpy.types.Collection, frames: Frames) -> HumanMotion:
