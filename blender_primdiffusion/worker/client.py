@@ -155,7 +155,9 @@ class BackendClient:
     @property
     def alive(self) -> bool:
         """The child runs and can be asked for something."""
-        return self._process is not None and self._process.poll() is None and self._output_ended_at is None
+        if self._process is None or self._expected_to_end:  # one that was killed may take a moment to go
+            return False
+        return self._process.poll() is None and self._output_ended_at is None
 
     @property
     def stderr(self) -> tuple[str, ...]:
@@ -218,14 +220,27 @@ class BackendClient:
         except subprocess.TimeoutExpired:
             self.kill()
 
-    def kill(self) -> None:
-        """Ends the child at once. It was told to go, so no Died follows."""
+    def kill(self, patience_s: float = 1.0) -> bool:
+        """Ends the child at once. It was told to go, so no Died follows.
+
+        Waits no longer than `patience_s` for the system to take it away, gigabytes of memory with it; whether it is
+        gone.
+        """
         self._expected_to_end = True
         if self._process is not None:
             self._process.kill()
             self._outgoing.put(None)
-            with contextlib.suppress(subprocess.TimeoutExpired):  # a process in an uninterruptible wait dies later
-                self._process.wait(1.0)
+        return self.gone_within(patience_s)
+
+    def gone_within(self, seconds: float) -> bool:
+        """Wait for the end of a child that was told to go; whether it has ended."""
+        if self._process is None:
+            return True
+        try:
+            self._process.wait(seconds)
+        except subprocess.TimeoutExpired:  # a busy system, or an uninterruptible wait
+            return False
+        return True
 
     # what has arrived
 

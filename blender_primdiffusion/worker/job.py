@@ -19,8 +19,11 @@ from .sentence import sentence
 State = Literal["starting", "running", "cancelling", "done", "failed", "cancelled"]
 FINAL: tuple[State, ...] = ("done", "failed", "cancelled")
 CANCELLED_CODE = -32001
-CANCEL_PATIENCE_S = 0.8
-"""A cancel takes effect at the end of a step; the user waits no longer than this."""
+CANCEL_PATIENCE_S = 0.5
+"""A cancel takes effect at the end of a step; no step is waited for longer than this. Beside it the second in which a
+cancel is done holds a tick of the timer and a drawing of the window."""
+_KILL_PATIENCE_S = 0.1
+_GONE_AT_LAST_S = 60.0
 STAGES = {
     "read": "Reading the pictures",
     "load": "Loading the model",
@@ -214,9 +217,17 @@ class Job:
         self._end("cancelled", "Cancelled")
 
     def _kill(self) -> None:
-        if self._client is not None:
-            self._client.kill()
-        self._clear_leftovers()
+        """Blender does not stand still while the system takes a large child away: what is left is cleared after it."""
+        client = self._client
+        if client is None or client.kill(_KILL_PATIENCE_S):
+            self._clear_leftovers()
+        else:
+
+            def clear() -> None:
+                client.gone_within(_GONE_AT_LAST_S)
+                self._clear_leftovers()
+
+            threading.Thread(target=clear, name="primdiffusion end", daemon=True).start()
 
     def _clear_leftovers(self) -> None:
         """Half-written files of a killed child lie in a folder of its own (the backend's staging.py names it so)."""

@@ -1,0 +1,80 @@
+"""A cancel in the middle of a step, with the real child: the step is made to hold the interpreter for a minute, so that
+the child neither hears the cancel nor beats."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from child_jobs import generate_job
+from worker.backend import Backend
+from worker.client import BackendClient
+from worker.job import Job
+
+TICK_S = 0.1
+"""Of Blender's timer."""
+LONG_STEPS = """
+import ctypes, importlib.util, sys
+
+class LongSteps:
+    def find_spec(self, name, path, target=None):
+        if name != "primdiffusion.serve.progress":
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(name)
+        execute = spec.loader.exec_module
+
+        def execute_and_lengthen(module):
+            execute(module)
+            reporter = module.step_reporter
+
+            def long_reporter(*args):
+                tell = reporter(*args)
+                return lambda step: (tell(step), ctypes.PyDLL(None).sleep(60))
+
+            module.step_reporter = long_reporter
+
+        spec.loader.exec_module = execute_and_lengthen
+        return spec
+
+sys.meta_path.insert(0, LongSteps())
+"""
+
+
+def tick(job: Job, until, timeout_s: float = 90.0) -> None:
+    """As Blender's timer does."""
+    end = time.monotonic() + timeout_s
+    while not until():
+        assert time.monotonic() < end, (job.state, job.message)
+        job.tick()
+        time.sleep(TICK_S)
+
+
+@pytest.fixture
+def backend(tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(LONG_STEPS)
+    backend = Backend(lambda: BackendClient(Path(sys.executable), env={"PYTHONPATH": str(tmp_path)}))
+    yield backend
+    backend.shutdown()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the long step is made by libc")
+def test_a_cancel_in_the_middle_of_a_step_is_done_within_a_second_and_leaves_nothing(backend, checkpoint, tmp_path):
+    out = tmp_path / "out"
+    job = generate_job(backend, seed=4, steps=5, out_dir=out, checkpoint=checkpoint)
+    tick(job, lambda: job.step >= 1)
+    client = backend.client
+    time.sleep(0.3)
+    asked = time.monotonic()
+    job.cancel()
+    tick(job, lambda: job.finished)
+    assert time.monotonic() - asked < 1.0
+    assert job.state == "cancelled"
+    assert backend.client is None, "nobody is given a child that is about to end"
+    assert client.gone_within(10.0)
+    end = time.monotonic() + 10.0
+    while out.exists():
+        assert time.monotonic() < end, list(out.iterdir())
+        time.sleep(0.05)
