@@ -9,6 +9,8 @@ import bpy
 from ...scene.human import armature_of, humans
 from ..jobs.follow import submit
 from ..jobs.target import Target, named_person, selected_person
+from ..translations import CONTEXT
+from ..translations.told import told
 from .destination import check_writable, destination
 from .settings import FORMATS, HUMAN_ENDINGS, MODEL_ENDINGS, SHOWN
 
@@ -36,7 +38,7 @@ class _OfPerson:
             person = named_person(context, self.human) if self.human else selected_person(context)
             return self.act(context, person)
         except (ValueError, OSError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, told(str(error)))
             return {"CANCELLED"}
 
     def chosen(self, context: bpy.types.Context, name: str):
@@ -56,7 +58,7 @@ class _ToFile(_OfPerson):
         try:
             person = named_person(context, self.human) if self.human else selected_person(context)
         except ValueError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, told(str(error)))
             return {"CANCELLED"}
         if not self.filepath:
             self.filepath = bpy.path.clean_name(person.name) + self.endings(context)[0]
@@ -81,7 +83,9 @@ class PRIMDIFFUSION_OT_export_mesh(_ToFile, bpy.types.Operator):
     format: bpy.props.EnumProperty(name="Format", items=FORMATS, description=_PANELS, options=_SKIP)
     animation: bpy.props.BoolProperty(name="Animation", description=_PANELS, options=_SKIP)
     texture_px: bpy.props.IntProperty(name="Texture", description=_PANELS, min=64, max=8192, options=_SKIP)
-    triangles: bpy.props.IntProperty(name="Triangles", description=_PANELS, min=500, max=1_000_000, options=_SKIP)
+    triangles: bpy.props.IntProperty(
+        name="Triangles", translation_context=CONTEXT, description=_PANELS, min=500, max=1_000_000, options=_SKIP
+    )
 
     def endings(self, context: bpy.types.Context) -> tuple[str, ...]:
         """Of the format."""
@@ -110,7 +114,9 @@ class PRIMDIFFUSION_OT_add_proxy(_OfPerson, bpy.types.Operator):
     bl_label = "Add Mesh Proxy"
 
     texture_px: bpy.props.IntProperty(name="Texture", description=_PANELS, min=64, max=8192, options=_SKIP)
-    triangles: bpy.props.IntProperty(name="Triangles", description=_PANELS, min=500, max=1_000_000, options=_SKIP)
+    triangles: bpy.props.IntProperty(
+        name="Triangles", translation_context=CONTEXT, description=_PANELS, min=500, max=1_000_000, options=_SKIP
+    )
 
     def act(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """In line."""
@@ -130,7 +136,9 @@ class PRIMDIFFUSION_OT_show_proxy(_OfPerson, bpy.types.Operator):
     bl_label = "Show Volumes or Mesh"
     bl_options = {"UNDO"}  # noqa: RUF012
 
-    shown: bpy.props.EnumProperty(name="Show", description="What is seen of the person", items=SHOWN)
+    shown: bpy.props.EnumProperty(
+        name="Show", translation_context=CONTEXT, description="What is seen of the person", items=SHOWN
+    )
 
     def act(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """At once."""
@@ -239,7 +247,7 @@ class PRIMDIFFUSION_OT_export_human(_ToFile, bpy.types.Operator):
         write_human(
             context, person, path, scene_frames(context.scene, True) if self.chosen(context, "motion") else None
         )
-        self.report({"INFO"}, f"Exported {person.name} to {path.name}")
+        self.report({"INFO"}, told(f"Exported {person.name} to {path.name}"))
         return {"FINISHED"}
 
 
@@ -279,7 +287,7 @@ class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
                 raise FileNotFoundError(f"there is no file {str(path)!r}: choose a .human file")
             motion_in(read_tensors(path))
         except (ValueError, OSError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, told(str(error)))
             return {"CANCELLED"}
         at = tuple(self.location) if self.properties.is_property_set("location") else None
         return submit(self, context, ImportHumanWork(str(path), at))

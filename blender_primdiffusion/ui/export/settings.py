@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import bpy
 
+from ..translations import CONTEXT
+
 FORMATS = (
     ("GLB", "glTF", "One .glb file: for game engines, web viewers and most other programs"),
     ("FBX", "FBX", "One .fbx file with the texture in it"),
@@ -35,7 +37,12 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
         default="2048",
     )
     triangles: bpy.props.IntProperty(
-        name="Triangles", description="Of the mesh proxy, at most", default=20_000, min=500, max=1_000_000
+        name="Triangles",
+        translation_context=CONTEXT,
+        description="Of the mesh proxy, at most",
+        default=20_000,
+        min=500,
+        max=1_000_000,
     )
     gaussians: bpy.props.IntProperty(
         name="Gaussians",

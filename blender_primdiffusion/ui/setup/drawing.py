@@ -7,6 +7,7 @@ import textwrap
 import bpy
 
 from ...worker.sentence import sentence
+from ..translations.told import told
 from .known import chosen, cost, known
 from .session import session
 
@@ -21,7 +22,7 @@ def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
     Draws nothing where a backend is there. Returns whether there is one.
     """
     if session.busy:
-        draw_progress(layout)
+        draw_progress(layout, width)
         return False
     now = known()
     if now.usable:
@@ -37,11 +38,12 @@ def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
     return False
 
 
-def draw_progress(layout: bpy.types.UILayout) -> None:
-    """The bar, and Cancel."""
+def draw_progress(layout: bpy.types.UILayout, width: int) -> None:
+    """The bar, what is being done, and Cancel. A bar cuts words that are too long for it."""
     job = session.job
     if job is not None:
-        layout.progress(factor=job.fraction, text=job.message)
+        layout.progress(factor=job.fraction, text=f"{job.fraction:.0%}")
+        draw_text(layout, job.message, "BLANK1", width)
         layout.operator("primdiffusion.cancel_set_up", icon="CANCEL")
 
 
@@ -70,5 +72,5 @@ def draw_news(layout: bpy.types.UILayout, width: int) -> None:
 def draw_text(layout: bpy.types.UILayout, text: str, icon: str, width: int) -> None:
     """A sentence over as many lines as it needs."""
     column = layout.column(align=True)
-    for number, line in enumerate(textwrap.wrap(text, width)):
+    for number, line in enumerate(textwrap.wrap(told(text), width)):
         column.label(text=line, icon=icon if number == 0 else "BLANK1", translate=False)

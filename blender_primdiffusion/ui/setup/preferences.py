@@ -64,7 +64,7 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
 
     def _draw_backend(self, box: bpy.types.UILayout) -> None:
         if session.busy:
-            draw_progress(box)
+            draw_progress(box, _WIDTH)
             return
         now, folder = known(), set_up_folder()
         draw_text(box, now.line, "CHECKMARK" if now.usable else "ERROR", _WIDTH)
