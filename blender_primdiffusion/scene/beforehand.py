@@ -100,6 +100,16 @@ class Writing:
         """Done or failed."""
         return not self._thread.is_alive()
 
+    def take(self) -> Written | None:
+        """What was written, whose files are the caller's from now on; None where that has failed, or somebody has
+        removed some. Waits for the end."""
+        self._thread.join()
+        written, self.result = self.result, None
+        if written is not None and not written.whole():
+            written.discard()
+            return None
+        return written
+
     def stop(self) -> None:
         """Have it end soon and leave no files; does not wait."""
         with self._lock:

@@ -18,6 +18,7 @@ class ReconstructWork(Work):
 
     kind = method = "reconstruct"
     undo = "Human from Captures"
+    new_person = "Human"
 
     capture: str
     """Folder of a dataset of captures, or of one subject in it."""

@@ -140,6 +140,11 @@ class ImportHumanWork(Work):
         """For people."""
         return f"Import {Path(self.path).name}"
 
+    @property
+    def new_person(self) -> str:
+        """As the file is called."""
+        return name_of(self.path)
+
     def params(self, folder: Path) -> dict[str, Any]:
         """Of the child's method."""
         return {"person": self.path, "out_dir": str(folder), "size": _PICTURE_PX}

@@ -25,6 +25,7 @@ class GenerateWork(Work):
 
     kind = method = "generate"
     undo = "Generate Human"
+    new_person = "Human"
 
     seed: int
     steps: int

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 from bpy.app.handlers import persistent
 
-from . import diagnostics, follow, operators, panel, pictures, queue, result_operator
+from . import building, diagnostics, follow, operators, panel, pictures, queue, result_operator
 
 CLASSES = (
     *operators.CLASSES,
@@ -21,6 +21,7 @@ _TIMERS = (follow.follow, follow.watch, follow.look_for_left)
 def set_aside_before_loading(*_: object) -> None:
     """Handler of load_pre: what was asked for in one file must not appear in another by itself."""
     queue.queue.set_aside()
+    building.building.close()
     pictures.so_far.show(None)
 
 
@@ -58,6 +59,7 @@ def register() -> None:
 def unregister() -> None:
     """Undo `register`."""
     queue.queue.close()
+    building.building.close()
     pictures.so_far.close()
     for timer in _TIMERS:
         if bpy.app.timers.is_registered(timer):

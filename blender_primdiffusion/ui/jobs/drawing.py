@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ...places import EXTENSION
+from .building import building
 from .follow import in_the_way
 from .pictures import so_far
 from .queue import Outcome, queue
@@ -61,7 +62,7 @@ def _wrapped(text: str) -> list[str]:
 def _draw_progress(layout: bpy.types.UILayout) -> None:
     """What is at work: how far it is, how long it will take, Cancel."""
     row = layout.row(align=True)
-    row.progress(factor=queue.job.fraction, text=_progress_text())
+    row.progress(factor=building.fraction if queue.ready else queue.job.fraction, text=_progress_text())
     row.operator("primdiffusion.cancel", text="", icon="CANCEL").number = 0
 
 

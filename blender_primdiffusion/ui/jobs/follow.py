@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import bpy
 
+from .building import building
 from .memory import release_when_idle
 from .pictures import so_far
 from .queue import GONE, Entry, Outcome, queue
@@ -52,12 +53,11 @@ def keep_following() -> None:
 
 def follow() -> float | None:
     """The timer: one tick of the line; an answer enters the scene as soon as nothing is in the way."""
-    if not queue.busy:
-        return None
     changed = queue.tick()
-    if queue.ready and not in_the_way():
-        _enter()
-        changed = True
+    if queue.ready:
+        changed |= _nearer()
+    if not queue.ready:
+        building.close()
     changed |= so_far.show(queue.job.picture if queue.job is not None else None)
     if changed:
         redraw()
@@ -116,6 +116,17 @@ def in_the_way() -> str:
         if _IN_THE_WAY & modal.bl_options:
             return modal.name
     return ""
+
+
+def _nearer() -> bool:
+    """Bring the answer nearer to the scene, and into it at last; True when something visible changed."""
+    building.begin(queue.current, queue.job.result or {})
+    waits = bool(in_the_way())
+    if building.goes_on(may_read=not waits):
+        return True
+    if not waits:
+        _enter()
+    return not waits
 
 
 def _enter() -> None:

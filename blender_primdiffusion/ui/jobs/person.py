@@ -9,9 +9,10 @@ from typing import Any
 import bpy
 
 from ...scene.beside import stand_beside_others
-from ...scene.build import build_human
+from ...scene.build import build_human, build_written
 from ...scene.human import overlap_warning
 from ...worker.sentence import sentence
+from .building import building
 
 
 def build_person(
@@ -23,7 +24,12 @@ def build_person(
     """
     began = time.monotonic()
     keep = [Path(result["person"])] if "person" in result else []  # for the exact marcher, later
-    collection = build_human(context, Path(result["human"]), name, keep)
+    human = Path(result["human"])
+    written = building.take(human)
+    if written is not None:
+        collection = build_written(context, written, name, keep)
+    else:
+        collection = build_human(context, human, name, keep)
     stand_beside_others(context, collection)
     warnings = list(result.get("warnings", ()))
     if context.scene.render.engine == "CYCLES" and (overlap := overlap_warning(collection)):

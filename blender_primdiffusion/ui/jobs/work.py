@@ -21,6 +21,8 @@ class Work(abc.ABC):
     """Of the child."""
     undo: ClassVar[str] = ""
     """Name of the undo step that `finish` makes; empty when it leaves the scene as it is."""
+    new_person: str = ""
+    """Name of the person whom `finish` builds of the answer's "human"; empty for works that build nobody."""
 
     @property
     @abc.abstractmethod

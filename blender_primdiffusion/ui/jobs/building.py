@@ -1,0 +1,78 @@
+"""A person on their way into the scene: volumes written and read before the operator's turn, so that it is short."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ...scene.beforehand import Writing, Written
+    from .queue import Entry
+
+READ_S = 0.05
+"""Of reading grids between two times that the window is drawn."""
+_WRITING = 0.6
+"""How much of the time goes by until all is written."""
+
+
+class Building:
+    """One person at a time. All methods are for Blender's main thread."""
+
+    def __init__(self) -> None:
+        self._entry: Entry | None = None
+        self._human: Path | None = None
+        self._writing: Writing | None = None
+        self._read = 0
+
+    @property
+    def fraction(self) -> float:
+        """How far the person is, 0 to 1; 1 when there is none."""
+        if self._writing is None:
+            return 1.0
+        if not self._writing.over:
+            return _WRITING * self._writing.fraction
+        written = self._writing.result
+        return _WRITING + (1 - _WRITING) * self._read / len(written.files) if written is not None else 1.0
+
+    def begin(self, entry: Entry, result: dict[str, Any]) -> None:
+        """Start, once, on the person that `entry` builds of the child's `result`, if it builds any."""
+        if entry is self._entry:
+            return
+        self.close()
+        self._entry = entry
+        if entry.work.new_person and "human" in result:
+            from ...scene.beforehand import Writing
+            from ...scene.build import home_of_next
+
+            self._human = Path(result["human"])
+            self._writing = Writing(self._human, home_of_next(entry.work.new_person))
+
+    def goes_on(self, *, may_read: bool) -> bool:
+        """Whether there is more to do before the operator's turn; reads some grids where that is allowed now."""
+        if self._writing is None:
+            return False
+        if not self._writing.over:
+            return True
+        written = self._writing.result
+        if written is None or self._read == len(written.files):
+            return False  # where it failed, the operator tries again and tells why
+        if may_read:
+            from ...scene.grid_warming import read_grids
+
+            self._read += read_grids(written.files[self._read :], READ_S)
+        return self._read < len(written.files)
+
+    def take(self, human: Path) -> Written | None:
+        """The person of this human.npz, whose files are the caller's from now on; None where they are not written."""
+        return self._writing.take() if self._writing is not None and human == self._human else None
+
+    def close(self) -> None:
+        """Forget this person; what was written and not taken is removed."""
+        if self._writing is not None:
+            self._writing.stop()
+        self._entry = self._human = self._writing = None
+        self._read = 0
+
+
+building = Building()
+"""There is one line."""
