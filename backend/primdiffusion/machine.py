@@ -58,5 +58,6 @@ def device_info(device: torch.device) -> dict[str, Any]:
             "device_memory_gb": round(total / GB, 2),
             "device_memory_free_gb": round(free / GB, 2),
         }
-    name = f"CPU, {torch.get_num_threads()} threads"
+    threads = torch.get_num_threads()
+    name = f"CPU, {threads} {'thread' if threads == 1 else 'threads'}"
     return {"device": str(device), "device_name": name, "device_memory_gb": None, "device_memory_free_gb": None}

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import bpy
 
 from ...scene.body_mesh import body_of
+from ...scene.human import humans
 from ...worker.names import SIDED_PARTS, WHOLE_PARTS
 from ..generate.attributes import draw_attributes
 from ..jobs.drawing import draw_job
@@ -25,6 +26,10 @@ def _sub_panel(name: str, label: str, order: int, content: Callable) -> type:
         bl_order = order
         bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
         __doc__ = content.__doc__
+
+        @classmethod
+        def poll(cls, context: bpy.types.Context) -> bool:
+            return name == "files" or bool(humans(context.scene))
 
         def draw(self, context: bpy.types.Context) -> None:
             self.layout.use_property_split = True

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ...places import EXTENSION
+from ..translations.told import told
 from .building import building
 from .follow import in_the_way
 from .pictures import so_far
@@ -40,17 +41,17 @@ def draw_job(
             layout.template_icon(icon_value=so_far.icon, scale=_PICTURE_SCALE)
         _draw_progress(layout)
     if waiting := sum(entry.work.kind == kind for entry in queue.waiting):
-        layout.label(text=f"In Line: {waiting}", icon="SORTTIME")
+        layout.label(text=told(f"In Line: {waiting}"), icon="SORTTIME", translate=False)
     if (outcome := queue.outcomes.get(kind)) is not None:
         _draw_outcome(layout, outcome)
     return props
 
 
 def draw_lines(layout: bpy.types.UILayout, text: str, icon: str) -> None:
-    """A sentence on as many lines as it needs."""
+    """A sentence in the interface's language, on as many lines as it needs."""
     column = layout.column(align=True)
-    for number, line in enumerate(_wrapped(text)):
-        column.label(text=line, icon=icon if number == 0 else "BLANK1")
+    for number, line in enumerate(_wrapped(told(text))):
+        column.label(text=line, icon=icon if number == 0 else "BLANK1", translate=False)
 
 
 def _wrapped(text: str) -> list[str]:
@@ -62,7 +63,9 @@ def _wrapped(text: str) -> list[str]:
 def _draw_progress(layout: bpy.types.UILayout) -> None:
     """What is at work: how far it is, how long it will take, Cancel."""
     row = layout.row(align=True)
-    row.progress(factor=building.fraction if queue.ready else queue.job.fraction, text=_progress_text())
+    row.progress(
+        factor=building.fraction if queue.ready else queue.job.fraction, text=told(_progress_text()), translate=False
+    )
     row.operator("primdiffusion.cancel", text="", icon="CANCEL").number = 0
 
 
@@ -71,7 +74,8 @@ def draw_in_line(layout: bpy.types.UILayout) -> None:
     column = layout.column(align=True)
     for entry in queue.in_line:
         row = column.row(align=True)
-        row.label(text=entry.work.label, icon="PLAY" if entry is queue.current else "SORTTIME", translate=False)
+        icon = "PLAY" if entry is queue.current else "SORTTIME"
+        row.label(text=told(entry.work.label), icon=icon, translate=False)
         row.operator("primdiffusion.cancel", text="", icon="X").number = entry.number
         if entry.work.not_kept_because:
             draw_lines(column, f"Not kept over a restart: {entry.work.not_kept_because}", "BLANK1")
@@ -82,7 +86,7 @@ def draw_ended(layout: bpy.types.UILayout) -> None:
     column = layout.column(align=True)
     for outcome in queue.ended:
         icon = "ERROR" if outcome.error is not None else "CHECKMARK" if outcome.went_well else "CANCEL"
-        column.label(text=outcome.entry.work.label, icon=icon, translate=False)
+        column.label(text=told(outcome.entry.work.label), icon=icon, translate=False)
 
 
 def _draw_outcome(layout: bpy.types.UILayout, outcome: Outcome) -> None:
@@ -91,9 +95,9 @@ def _draw_outcome(layout: bpy.types.UILayout, outcome: Outcome) -> None:
         draw_lines(layout, outcome.notice, "INFO")
         return
     draw_lines(layout, outcome.sentence, "ERROR")
-    row = layout.row(align=True)
-    _draw_remedy(row, outcome.error, outcome.entry.work.kind)
-    row.operator("primdiffusion.copy_diagnostics", icon="COPYDOWN")
+    column = layout.column(align=True)  # beside each other their words would be cut
+    _draw_remedy(column, outcome.error, outcome.entry.work.kind)
+    column.operator("primdiffusion.copy_diagnostics", icon="COPYDOWN")
 
 
 def _draw_remedy(layout: bpy.types.UILayout, error: JobError, kind: str) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import bpy
 
+from ..translations.told import told
 from .building import building
 from .memory import release_when_idle
 from .pictures import so_far
@@ -39,7 +40,7 @@ def submit(
         return {"FINISHED"}
     outcome = _wait_for(queue.add_awaited(context, work, scene))
     if outcome.error is not None:
-        operator.report({"ERROR"}, outcome.sentence)
+        operator.report({"ERROR"}, told(outcome.sentence))
         return {"CANCELLED"}
     print(f"PrimDiffusion: {outcome.notice}", flush=True)
     return {"FINISHED"}
@@ -95,10 +96,10 @@ def redraw() -> None:
 
 
 def _wait_for(entry: Entry) -> Outcome:
-    told = 0.0
+    printed = 0.0
     while queue.last is None or queue.last.entry is not entry:
-        if queue.tick() and queue.job is not None and time.monotonic() - told > _TOLD_S:
-            told = time.monotonic()
+        if queue.tick() and queue.job is not None and time.monotonic() - printed > _TOLD_S:
+            printed = time.monotonic()
             print(f"PrimDiffusion: {queue.job.message}", flush=True)
         if queue.ready:
             _enter()

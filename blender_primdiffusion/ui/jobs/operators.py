@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import bpy
 
+from ..translations.told import told
 from . import memory
 from .follow import redraw, submit
 from .kept import home_of, is_open, meant_for, work_of
@@ -39,7 +40,7 @@ class PRIMDIFFUSION_OT_cancel(bpy.types.Operator):
         """Ask; the timer sees it through."""
         if not queue.cancel(self.number):
             which = f"work {self.number} is not in line any more" if self.number else "nothing is under way yet"
-            self.report({"ERROR"}, which)
+            self.report({"ERROR"}, told(which))
             return {"CANCELLED"}
         redraw()
         return {"FINISHED"}
@@ -66,7 +67,8 @@ class PRIMDIFFUSION_OT_try_again(bpy.types.Operator):
         """Put the failed work in line again, for the scene at hand."""
         outcome = queue.outcomes.get(self.kind) if self.kind else queue.last
         if outcome is None or outcome.error is None:
-            self.report({"ERROR"}, f"no work {self.kind!r} has failed" if self.kind else "the last work went well")
+            why = f"no work {self.kind!r} has failed" if self.kind else "the last work went well"
+            self.report({"ERROR"}, told(why))
             return {"CANCELLED"}
         return submit(self, context, outcome.entry.work)
 
@@ -118,7 +120,7 @@ class PRIMDIFFUSION_OT_resume_works(_OfWorksLeft, bpy.types.Operator):
         only when their file is given."""
         taken = queue.kept.take(self.is_of_the_place if self.names_a_place else home_of)
         if not taken:
-            self.report({"ERROR"}, _nothing_taken())
+            self.report({"ERROR"}, told(_nothing_taken()))
             return {"CANCELLED"}
         unknown, states = [], []
         for kept in taken:
@@ -129,7 +131,7 @@ class PRIMDIFFUSION_OT_resume_works(_OfWorksLeft, bpy.types.Operator):
             else:
                 states.append(submit(self, context, work, home_of(kept)))
         if unknown:
-            self.report({"WARNING"} if states else {"ERROR"}, "; ".join(unknown))
+            self.report({"WARNING"} if states else {"ERROR"}, told("; ".join(unknown)))
         redraw()
         return {"FINISHED"} if {"FINISHED"} in states else {"CANCELLED"}
 
@@ -166,9 +168,9 @@ class PRIMDIFFUSION_OT_release_memory(bpy.types.Operator):
         try:
             freed = memory.release()
         except RuntimeError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, told(str(error)))
             return {"CANCELLED"}
-        self.report({"INFO"}, freed)
+        self.report({"INFO"}, told(freed))
         redraw()
         return {"FINISHED"}
 

@@ -210,4 +210,7 @@ SENTENCES = (
     ("{} is no shard: 0/4 is the first of four",
      "{} ist keine Teilmenge: 0/4 ist die erste von vieren",
      "{} n'est pas une part : 0/4 est la première de quatre"),
+    ("{} holds people made of primitives, and captures are made of meshes: export these as .glb (primdiffusion export), or name a folder of scans",
+     "{} enthält Menschen aus Primitiven, Aufnahmen entstehen aus Netzen: diese als .glb exportieren (primdiffusion export), oder einen Ordner mit Scans nennen",
+     "{} contient des personnes en primitives, et les captures viennent de maillages : les exporter en .glb (primdiffusion export), ou nommer un dossier de scans"),
 )
