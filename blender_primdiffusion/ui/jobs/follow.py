@@ -88,11 +88,15 @@ def keep_watching() -> None:
 
 
 def redraw() -> None:
-    """Draw the sidebars of all windows anew: nothing else tells them that the work has moved on."""
+    """Draw the sidebars of all windows anew: nothing else tells them that the work has moved on.
+
+    Not the views beside them, which take long to draw.
+    """
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
+            for region in area.regions if area.type == "VIEW_3D" else ():
+                if region.type == "UI":
+                    region.tag_redraw()
 
 
 def _wait_for(entry: Entry) -> Outcome:
