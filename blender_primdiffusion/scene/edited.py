@@ -16,10 +16,12 @@ import numpy as np
 
 from . import merged, shape_file, volumes
 from .beforehand import provenance
+from .exported_proxy import proxy_of
 from .folders import humans_folder, stored_path
 from .human import MARK, PERSON, armature_of, folder_of, folders_of, people_files, person_file_name, volume_path
 from .human_file import read_human
 from .placing_files import named_by_content
+from .proxy_shape import follow_shape
 from .shape import (
     PRIMITIVE,
     SAME_BETAS,
@@ -101,6 +103,8 @@ def replace_person(collection: bpy.types.Collection, human_npz: Path, person: Pa
         pass
     rest = Rest(human.vertices, human.joints, human.position, human.rotation)
     warning = show_rest(collection, rest, human.betas, growth) if reshaped else ""
+    if reshaped and human.shape_model is not None:
+        follow_shape(collection, proxy_of(collection), human.betas)
     if other and own:
         show_growth(collection, growth)
     changed = 0

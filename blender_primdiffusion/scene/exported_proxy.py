@@ -20,7 +20,7 @@ from .human import armature_of, person_file_name
 from .joints import JOINT_NAMES
 
 MARK = "primdiffusion_proxy"
-"""Custom property of a proxy object: the person's file and shape that it was made of, as JSON."""
+"""Custom property of a proxy object: the person's file that it was made of and the shape that it shows, as JSON."""
 _FORMAT_VERSION = 1
 _SHAPES = {"vertices": ("V", 3), "faces": ("F", 3), "uv_corner": ("F", 3, 2), "skin_weights": ("V", 24)}
 
@@ -89,12 +89,23 @@ def proxy_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
 
 
 def is_outdated(collection: bpy.types.Collection, proxy: bpy.types.Object, betas: NDArray | None) -> bool:
-    """The person was edited or reshaped since."""
+    """The person was edited since, or has a shape that the proxy could not follow."""
     made_of, now = json.loads(proxy[MARK]), _origin(collection, betas)
     same_shape = (made_of["betas"] is None) == (now["betas"] is None) and (
         now["betas"] is None or np.allclose(made_of["betas"], now["betas"], atol=1e-4)
     )
     return made_of["file"] != now["file"] or not same_shape
+
+
+def shown_betas(proxy: bpy.types.Object) -> NDArray[np.float64] | None:
+    """The shape [10] that a proxy shows; None where that is not known."""
+    betas = json.loads(proxy[MARK])["betas"]
+    return None if betas is None else np.array(betas, np.float64)
+
+
+def show_betas(proxy: bpy.types.Object, betas: NDArray) -> None:
+    """Note that a proxy shows another shape [10]."""
+    proxy[MARK] = json.dumps({**json.loads(proxy[MARK]), "betas": _rounded(betas)})
 
 
 def remove_proxy(proxy: bpy.types.Object) -> None:
@@ -110,8 +121,11 @@ def remove_proxy(proxy: bpy.types.Object) -> None:
 
 
 def _origin(collection: bpy.types.Collection, betas: NDArray | None) -> dict[str, object]:
-    rounded = None if betas is None else np.round(np.asarray(betas, np.float64), 5).tolist()
-    return {"file": person_file_name(collection), "betas": rounded}
+    return {"file": person_file_name(collection), "betas": None if betas is None else _rounded(betas)}
+
+
+def _rounded(betas: NDArray) -> list[float]:
+    return np.round(np.asarray(betas, np.float64), 7).tolist()
 
 
 def _material(name: str, texture: Path) -> bpy.types.Material:

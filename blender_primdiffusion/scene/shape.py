@@ -104,16 +104,21 @@ def check_shapeable(collection: bpy.types.Collection) -> None:
 def reshape(collection: bpy.types.Collection, betas: NDArray) -> str:
     """Give a person another shape [10]; returns what could not follow in a sentence, empty when all did.
 
-    Bones, body mesh and volumes at rest take their new places; pose, animation and files stay as they are, and soles
-    that stood on the floor do so again. Raises ValueError or FileNotFoundError before anything is touched; makes no
-    undo step, its caller does.
+    Bones, body mesh, volumes and mesh proxy at rest take their new places; pose, animation and files stay as they are,
+    and soles that stood on the floor do so again. Raises ValueError or FileNotFoundError before anything is touched;
+    makes no undo step, its caller does.
     """
+    from .exported_proxy import proxy_of
+    from .proxy_shape import follow_shape
+
     betas = np.asarray(betas, np.float64)
     if betas.shape != (COUNT,) or not np.abs(betas).max() <= LARGEST_BETA:
         raise ValueError(f"a shape is {COUNT} numbers from -{LARGEST_BETA:g} to {LARGEST_BETA:g}, not {betas.tolist()}")
     check_shapeable(collection)
     model, generated = shape_model_of(collection), generated_betas(collection)
-    return show_rest(collection, model.rest(betas), betas, model.growth(generated, betas))
+    notice = show_rest(collection, model.rest(betas), betas, model.growth(generated, betas))
+    follow_shape(collection, proxy_of(collection), betas)
+    return notice
 
 
 def show_rest(collection: bpy.types.Collection, rest: Rest, betas: NDArray, growth: NDArray) -> str:

@@ -40,6 +40,7 @@ def proxy(params: ProxyParams, report: Report) -> dict[str, Any]:
         "proxy": str(out / ARRAYS),
         "texture": str(out / TEXTURE),
         "triangles": len(made.faces),
+        "betas": human.betas.tolist(),
         "seconds": round(time.perf_counter() - began, 3),
     }
 

@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
 
 from ...scene.exported_model import Frames, check_ready, write_model
 from ...scene.exported_proxy import build_proxy, proxy_of, read_proxy, remove_proxy
 from ...scene.human import armature_of, person_file
+from ...scene.proxy_shape import follow_shape
 from ...scene.shape import betas_of
+from ...scene.shape_file import BODY_FILE
 from ..jobs.target import Target
 from ..jobs.work import Work
 from .showing import show
@@ -39,8 +42,12 @@ class ProxyWork(Work):
         }
 
     def built(self, person: bpy.types.Collection, result: dict[str, Any]) -> bpy.types.Object:
-        """The proxy as an object, in no collection."""
-        return build_proxy(person, read_proxy(Path(result["proxy"])), Path(result["texture"]), betas_of(person))
+        """The proxy as an object, in no collection; on the body of now, if the person was reshaped meanwhile."""
+        made = np.array(result["betas"], np.float64)
+        proxy = build_proxy(person, read_proxy(Path(result["proxy"])), Path(result["texture"]), made)
+        if BODY_FILE in person:
+            follow_shape(person, proxy, betas_of(person))
+        return proxy
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,7 +21,7 @@ def proxy(params: dict) -> dict:
     shutil.copyfile(STORE / "proxy.npz", out / "proxy.npz")
     shutil.copyfile(STORE / "proxy.png", out / "proxy.png")
     files = {"proxy": str(out / "proxy.npz"), "texture": str(out / "proxy.png")}
-    return {**files, "triangles": params["triangles"], "seconds": 0.1}
+    return {**files, "triangles": params["triangles"], "betas": params["betas"], "seconds": 0.1}
 
 
 def gaussians(params: dict) -> dict:

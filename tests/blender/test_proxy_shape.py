@@ -1,0 +1,89 @@
+"""A mesh proxy in the scene follows the person's shape, as far as nobody has locked its mesh."""
+
+from __future__ import annotations
+
+import bpy
+import exporting
+import numpy as np
+import pytest
+import synthetic_shape
+
+from blender_primdiffusion.scene.body_mesh import body_of
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.convention import points_to_blender
+from blender_primdiffusion.scene.exported_proxy import build_proxy, is_outdated, proxy_of, read_proxy, shown_betas
+from blender_primdiffusion.scene.shape import betas_of, generated_betas, reshape
+from blender_primdiffusion.ui.export.mesh_work import AddProxyWork
+from blender_primdiffusion.ui.jobs.target import Target
+
+TALLER, WIDER = np.eye(10)[0] * 2.0, np.eye(10)[1] * 2.0
+
+
+@pytest.fixture
+def person(saved_scene, tmp_path):
+    """Somebody whose proxy has the vertices of their body."""
+    exporting.write_store(tmp_path)
+    person = build_human(saved_scene, synthetic_shape.write(tmp_path / "human.npz"))
+    arrays = dict(np.load(tmp_path / "proxy.npz"))
+    arrays["vertices"] = synthetic_shape.arrays()["vertices"]
+    np.savez(tmp_path / "proxy.npz", **arrays)
+    made = generated_betas(person)
+    person.objects.link(build_proxy(person, read_proxy(tmp_path / "proxy.npz"), tmp_path / "proxy.png", made))
+    return person
+
+
+def places(thing) -> np.ndarray:
+    return np.array([vertex.co for vertex in thing.data.vertices])
+
+
+def surface(betas) -> np.ndarray:
+    return points_to_blender(synthetic_shape.at(synthetic_shape.arrays(), betas)["vertices"])
+
+
+@pytest.mark.parametrize("change", [TALLER, WIDER, TALLER - WIDER])
+def test_the_proxy_goes_where_the_body_goes(person, change):
+    proxy, before = proxy_of(person), betas_of(person)
+    reshape(person, before + change)
+    moved = np.linalg.norm(surface(before + change) - surface(before), axis=-1)
+    off = np.linalg.norm(places(proxy) - surface(before + change), axis=-1)
+    assert moved.max() > 0.05
+    assert np.sqrt((off**2).mean()) < 0.15 * np.sqrt((moved**2).mean()), "neighbours' mean, not the vertex' own way"
+    assert np.allclose(shown_betas(proxy), before + change)
+    assert not is_outdated(person, proxy, betas_of(person))
+
+
+def test_there_and_back_the_proxy_is_what_it_was_with_what_was_sculpted(person):
+    proxy, before = proxy_of(person), betas_of(person)
+    proxy.data.vertices[3].co.x += 0.3
+    as_sculpted = places(proxy)
+    for change in (TALLER, WIDER, -TALLER):
+        reshape(person, before + change)
+    reshape(person, before)
+    np.testing.assert_allclose(places(proxy), as_sculpted, atol=1e-5)
+
+
+@pytest.mark.parametrize("lock", ["shape keys", "edit mode"])
+def test_a_proxy_that_cannot_follow_stays_and_is_outdated(person, lock):
+    proxy = proxy_of(person)
+    if lock == "shape keys":
+        proxy.shape_key_add(name="Basis")
+    else:
+        bpy.context.view_layer.objects.active = proxy
+        bpy.ops.object.mode_set(mode="EDIT")
+    still = places(proxy)
+    reshape(person, betas_of(person) + TALLER)
+    np.testing.assert_array_equal(places(proxy), still)
+    assert is_outdated(person, proxy, betas_of(person))
+    assert np.abs(places(body_of(person)) - still).max() > 0.05, "the body has moved"
+    if lock == "edit mode":
+        bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def test_who_is_reshaped_while_the_child_works_gets_a_proxy_of_the_body_of_now(person, tmp_path):
+    before = betas_of(person)
+    followed = proxy_of(person)
+    reshape(person, before + TALLER)
+    result = {"proxy": str(tmp_path / "proxy.npz"), "texture": str(tmp_path / "proxy.png"), "betas": before.tolist()}
+    made = AddProxyWork(Target.of(person), 64, 500).built(person, result)
+    np.testing.assert_allclose(places(made), places(followed), atol=1e-5)
+    assert not is_outdated(person, made, betas_of(person))
