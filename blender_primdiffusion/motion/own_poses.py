@@ -1,7 +1,8 @@
-"""The user's own poses: a JSON file each in a folder, so that they can be copied to another computer."""
+"""The user's own poses: a JSON file each in a folder, so that they can be copied to another computer, and a picture."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SUFFIX = ".pose.json"
+PICTURE_SUFFIX = ".pose.png"
 _LONGEST_NAME = 60
 
 
@@ -23,6 +25,18 @@ class PoseFileError(ValueError):
 def own_poses(folder: Path) -> dict[str, Path]:
     """Names of the poses in a folder and their files, sorted; a folder that is not there holds none."""
     return {path.name.removesuffix(SUFFIX): path for path in sorted(folder.glob(f"*{SUFFIX}"))}
+
+
+def picture_of(pose: Path) -> Path:
+    """The picture beside the file of a pose; one that came without has none."""
+    return pose.with_name(pose.name.removesuffix(SUFFIX) + PICTURE_SUFFIX)
+
+
+def delete_pose(pose: Path) -> None:
+    """Remove the file of a pose, with its picture. Raises OSError where the file stays."""
+    pose.unlink()
+    with contextlib.suppress(OSError):  # nobody shows it without the pose
+        picture_of(pose).unlink()
 
 
 def save_pose(folder: Path, name: str, pose: NDArray, translation: NDArray) -> Path:

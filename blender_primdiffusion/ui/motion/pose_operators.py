@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ...motion.own_poses import load_pose, own_poses, save_pose
+from ...motion.own_poses import delete_pose, load_pose, own_poses, save_pose
 from ...scene.joints import JOINT_NAMES
 from ..translations.told import told
 from .armatures import OnArmature, warn_of_rest
-from .pose_pictures import poses_folder
+from .pose_pictures import draw_picture, look_again, poses_folder
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -174,7 +174,12 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
         if name in builtin_poses():
             raise ValueError(f"{name!r} is a built-in pose: give yours another name")
         rotations, translation = current_pose(armature)
-        save_pose(poses_folder(), name, to_axis_angle(rotations), translation)
+        path = save_pose(poses_folder(), name, to_axis_angle(rotations), translation)
+        try:
+            draw_picture(path, rotations)
+        except OSError as error:
+            self.report({"WARNING"}, told(f"The pose {name!r} has no picture: {error}"))
+        look_again()
         context.scene.primdiffusion_motion.pose = name
         self.report({"INFO"}, told(f"The pose {name!r} is in the library"))
         return {"FINISHED"}
@@ -202,7 +207,8 @@ class PRIMDIFFUSION_OT_delete_pose(bpy.types.Operator):
             self.report({"ERROR"}, told(f"{name!r} is no pose of your own: only those can be deleted"))
             return {"CANCELLED"}
         try:
-            own[name].unlink()
+            delete_pose(own[name])
+            look_again()
         except OSError as error:
             self.report({"ERROR"}, told(f"{str(own[name])!r} could not be deleted ({error.strerror or error})"))
             return {"CANCELLED"}
