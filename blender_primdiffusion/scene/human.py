@@ -80,7 +80,7 @@ def overlap_warning(collection: bpy.types.Collection) -> str | None:
         return None
     return (
         f"up to {most} volumes of {collection.name!r} overlap at a point and Cycles draws only {CYCLES_LIMIT}; "
-        "render it with the exact marcher"
+        "render with PrimDiffusion (Exact)"
     )
 
 

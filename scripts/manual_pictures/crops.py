@@ -25,7 +25,7 @@ PANELS = {
     "export": ("export_before", "export_proxy"),
     "left": ("left_offered",),
     "missing": ("missing_files",),
-    "german_french": ("language_de", "language_fr"),
+    "german_french": ("language_de_generate", "language_fr_generate"),
 }
 """Each a row of sidebars, with nothing but their panels."""
 WINDOWS = {

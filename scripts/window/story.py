@@ -285,14 +285,19 @@ def missing(module: str, python: str) -> Steps:
 
 
 def languages(module: str, python: str) -> Steps:
-    """The interface in German and French."""
+    """The interface in German and French, panel by panel; an error with its remedy."""
     yield from with_people(module, python, FIRST_SEED)
-    names = ("generate", "attributes", "variations", "human", "shape")
+    preferences = bpy.context.preferences.addons[module].preferences
+    preferences.checkpoint = "/nowhere/model.safetensors"
+    press("primdiffusion.generate")
+    yield from wait(lambda: not queue_of(module).busy, 60)
+    preferences.checkpoint = ""
     for language in ("de_DE", "fr_FR"):
         bpy.context.preferences.view.language = language
         bpy.context.preferences.view.use_translate_interface = True
-        yield from show(*(f"PRIMDIFFUSION_PT_{name}" for name in names))
-        yield f"language_{language[:2]}"
+        for group, names in TRANSLATED.items():
+            yield from show(*(f"PRIMDIFFUSION_PT_{name}" for name in names))
+            yield f"language_{language[:2]}_{group}"
     bpy.context.preferences.view.language = "en_US"
 
 
@@ -419,6 +424,15 @@ def click_generate() -> Steps:
     yield {"point": [x - 400, top + 300]}
 
 
+TRANSLATED = {
+    "generate": ("generate", "attributes", "variations", "jobs"),
+    "human": ("human", "shape", "details", "poses"),
+    "edits": ("human", "edit_redress", "edit_transfer"),
+    "assets": ("human", "edit_vary", "edit_blend", "assets", "edit_files", "motion"),
+    "render": ("render", "attachment", "merge", "cycles_look", "memory", "export", "export_mesh", "export_volumes"),
+    "captures": ("captures", *(f"captures_{name}" for name in ("input", "poses", "cameras", "cycles", "output"))),
+}
+"""Panels that are seen together in other languages."""
 GENERATE_BUTTON_PX = 118
 """Below the top of the sidebar, in the panel as it opens."""
 

@@ -98,7 +98,9 @@ def test_each_error_has_a_button_where_there_is_something_to_do(addon):
     for kind, operator in expected.items():
         assert remedies.remedy_for(JobError("", "", kind)).operator == f"primdiffusion.{operator}"
     assert remedies.remedy_for(JobError("", "", "unwritable")).operator == "wm.save_as_mainfile"
-    assert remedies.remedy_for(JobError("", "", "missing_file")).operator == "preferences.addon_show"
+    no_checkpoint = JobError("there is no checkpoint at 'x.safetensors'", "", "missing_file")
+    assert remedies.remedy_for(no_checkpoint).operator == "preferences.addon_show"
+    assert remedies.remedy_for(JobError("there is no folder of captures 'x'", "", "missing_file")) is None
     assert remedies.remedy_for(JobError("", "", "bad_input")) is None
     environment = remedies.remedy_for(JobError("", "", "environment"))
     assert environment is None or environment.operator == "primdiffusion.set_up_backend"

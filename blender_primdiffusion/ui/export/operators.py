@@ -199,7 +199,7 @@ class PRIMDIFFUSION_OT_export_vdb_sequence(_OfPerson, bpy.types.Operator):
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     first: bpy.props.IntProperty(name="First Frame", description="Not given: the scene's", options=_SKIP)
     last: bpy.props.IntProperty(name="Last Frame", description="Not given: the scene's", options=_SKIP)
-    voxel: bpy.props.FloatProperty(name="Voxel", description=_PANELS, min=0.002, max=0.05, options=_SKIP)
+    voxel: bpy.props.FloatProperty(name="Voxel Size", description=_PANELS, min=0.002, max=0.05, options=_SKIP)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         """The file browser, for a folder."""

@@ -52,7 +52,7 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
         max=1_000_000,
     )
     voxel: bpy.props.FloatProperty(
-        name="Voxel",
+        name="Voxel Size",
         description="Side of the voxels of a VDB sequence: half of it, eight times the memory",
         default=0.006,
         min=0.002,

@@ -63,14 +63,14 @@ def _draw_transfer(layout: bpy.types.UILayout, settings, context) -> None:
     layout.prop(settings, "harmonise")
     if settings.harmonise > 0:
         layout.prop(settings, "seed")
-    draw_job(layout, "transfer", "primdiffusion.transfer_texture", "TEXTURE")
+    draw_job(layout, "transfer", "primdiffusion.transfer_texture", "TEXTURE", settings.other is not None)
 
 
 def _draw_blend(layout: bpy.types.UILayout, settings, _context) -> None:
     """With whom, how far, and the button."""
     layout.prop(settings, "other")
     layout.prop(settings, "fraction")
-    draw_job(layout, "interpolate", "primdiffusion.blend", "ARROW_LEFTRIGHT")
+    draw_job(layout, "interpolate", "primdiffusion.blend", "ARROW_LEFTRIGHT", settings.other is not None)
 
 
 def _draw_files(layout: bpy.types.UILayout, _settings, _context) -> None:

@@ -70,7 +70,9 @@ class PRIMDIFFUSION_PT_shape(_InHuman, bpy.types.Panel):
         reset.operator("primdiffusion.reset_shape", text="Reset", icon="LOOP_BACK")
         row = layout.row(align=True)
         row.prop(context.scene.primdiffusion_edit, "other", text="Copy From")
-        row.operator("primdiffusion.copy_shape", text="", icon="PASTEDOWN")
+        copy = row.row(align=True)
+        copy.enabled = context.scene.primdiffusion_edit.other is not None
+        copy.operator("primdiffusion.copy_shape", text="", icon="PASTEDOWN")
         if _animated(armature):
             draw_lines(layout, _ANIMATED, "INFO")
 

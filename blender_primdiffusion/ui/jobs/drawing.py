@@ -28,14 +28,16 @@ _MINUTES_FROM_S = 90.0
 
 
 def draw_job(
-    layout: bpy.types.UILayout, kind: str, operator_idname: str, icon: str
+    layout: bpy.types.UILayout, kind: str, operator_idname: str, icon: str, ready: bool = True
 ) -> bpy.types.OperatorProperties | None:
     """The button of an operator that submits works of `kind`, the progress of one, and how the last one ended.
 
-    The one place where that is shown; the panel Jobs names what is in line. Returns the button's properties, to be
-    filled in.
+    The one place where that is shown; the panel Jobs names what is in line. `ready`: whether what the button needs has
+    been chosen; it is grey until then. Returns the button's properties, to be filled in.
     """
-    props = layout.operator(operator_idname, icon=icon)
+    button = layout.row()
+    button.enabled = ready
+    props = button.operator(operator_idname, icon=icon)
     if queue.current is not None and queue.current.work.kind == kind:
         if so_far.icon:
             layout.template_icon(icon_value=so_far.icon, scale=_PICTURE_SCALE)

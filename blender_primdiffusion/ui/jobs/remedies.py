@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import re
 from typing import TYPE_CHECKING
 
 import bpy
@@ -39,12 +40,14 @@ _REMEDIES = {
     "hung": _TRY_AGAIN,
 }
 """By the kind of the error."""
+_OF_PREFERENCES = re.compile("checkpoint|encoder|safetensors")
+"""A missing folder of captures is chosen in its panel."""
 
 
 def remedy_for(error: JobError) -> Remedy | None:
     """The button for an error; None where the sentence must do, or this version has no such button."""
     remedy = _REMEDIES.get(error.kind)
-    if remedy is None:
+    if remedy is None or (error.kind == "missing_file" and not _OF_PREFERENCES.search(error.message)):
         return None
     room, name = remedy.operator.split(".")
     try:

@@ -49,7 +49,9 @@ class PRIMDIFFUSION_PT_motion(_InSidebar, bpy.types.Panel):
         self._draw_action(layout, armature)
         row = layout.row(align=True)
         row.operator("primdiffusion.key_pose", icon="KEY_HLT")
-        row.operator("primdiffusion.clear_motion", icon="X")
+        clear = row.row(align=True)
+        clear.enabled = bool(armature.animation_data and armature.animation_data.action)
+        clear.operator("primdiffusion.clear_motion", icon="X")
         layout.operator("primdiffusion.export_motion", icon="EXPORT")
 
     def _draw_action(self, layout: bpy.types.UILayout, armature: bpy.types.Object) -> None:

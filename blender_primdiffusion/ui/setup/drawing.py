@@ -6,6 +6,7 @@ import textwrap
 
 import bpy
 
+from ...places import EXTENSION
 from ...worker.sentence import sentence
 from ..translations.told import told
 from .known import chosen, cost, known
@@ -29,8 +30,10 @@ def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
         return True
     box = layout.box()
     draw_text(box, now.line, "ERROR", width)
-    draw_cost(box, width)
-    if now.state == "moved":
+    if not draw_cost(box, width):
+        props = box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES")
+        props.module = EXTENSION
+    elif now.state == "moved":
         box.operator("primdiffusion.repair_backend", icon="TOOL_SETTINGS")
     else:
         box.operator("primdiffusion.set_up_backend", icon="IMPORT")
@@ -47,18 +50,19 @@ def draw_progress(layout: bpy.types.UILayout, width: int) -> None:
         layout.operator("primdiffusion.cancel_set_up", icon="CANCEL")
 
 
-def draw_cost(layout: bpy.types.UILayout, width: int) -> None:
-    """What pressing the button takes, and what stands in its way."""
+def draw_cost(layout: bpy.types.UILayout, width: int) -> bool:
+    """What pressing the button takes, and what stands in its way; whether there is anything to set up here."""
     try:
         _, lock, note = chosen()
     except (ValueError, OSError) as error:
         draw_text(layout, sentence(error), "ERROR", width)
-        return
+        return False
     draw_text(layout, cost(lock), "BLANK1", width)
     if note:
         draw_text(layout, note, "INFO", width)
     if not bpy.app.online_access:
         draw_text(layout, ONLINE, "INTERNET_OFFLINE", width)
+    return True
 
 
 def draw_news(layout: bpy.types.UILayout, width: int) -> None:

@@ -91,7 +91,8 @@ def _draw_private(preferences: PRIMDIFFUSION_AP_preferences, box: bpy.types.UILa
     row = box.row()
     row.prop(preferences, "compute", expand=True)
     draw_text(box, f"Found: {machine().described}", "SYSTEM", _WIDTH)
-    draw_cost(box, _WIDTH)
+    here = draw_cost(box, _WIDTH)
     row = box.row()
+    row.enabled = here
     row.operator("primdiffusion.set_up_backend", icon="IMPORT")
     row.operator("primdiffusion.install_from_folder", icon="FILE_FOLDER")

@@ -255,4 +255,7 @@ SENTENCES = (
     ("{} poses were wanted and the files hold {}: give more, or ask for fewer",
      "{} Posen waren verlangt, die Dateien enthalten {}: mehr angeben, oder weniger verlangen",
      "{} poses demandées et les fichiers en contiennent {} : en donner plus, ou en demander moins"),
+    ("The pose {} has no picture: {}",
+     "Die Pose {} hat kein Bild: {}",
+     "La pose {} n'a pas d'image : {}"),
 )
