@@ -36,7 +36,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.error = _refuse
     add = made.add_argument
-    add("--people", type=Path, nargs="+", default=[], help="folders of scans, or of generated people")
+    add("--people", type=Path, nargs="+", default=[], help="folders of scans, or of what `primdiffusion people` made")
     add("--out", type=Path, required=True, help="the dataset's folder; one begun before is gone on with")
     add("--seed", type=int, default=0)
     add("--only", nargs="+", default=[], metavar="SUBJECT", help="just these people")

@@ -52,6 +52,11 @@ def find_scans(folder: Path | str) -> list[ScanFile]:
         if stem not in chosen or _rank(path) < _rank(chosen[stem]):
             chosen[stem] = path
     if not chosen:
+        if any(folder.rglob("*.human*")):
+            raise ScanError(
+                f"{folder} holds people made of primitives, and captures are made of meshes: export these as .glb "
+                "(primdiffusion export), or name a folder of scans"
+            )
         raise ScanError(f"{folder} holds no scans: none of its files ends in {', '.join(ENDINGS)}")
     taken: set[str] = set()
     scans = []

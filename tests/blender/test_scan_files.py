@@ -70,6 +70,9 @@ def test_folders_and_files_without_anybody_are_named(tmp_path):
         find_scans(tmp_path / "none")
     with pytest.raises(ScanError, match="holds no scans"):
         find_scans(tmp_path)
+    touch(tmp_path / "people" / "person_000007" / "person.human.safetensors")
+    with pytest.raises(ScanError, match=r"export these as \.glb"):
+        find_scans(tmp_path / "people")
     touch(tmp_path / "a.blend")
     with pytest.raises(ScanError, match="is no scan: give a"):
         find_scans(tmp_path / "a.blend")

@@ -13,7 +13,7 @@ COMMAND = "primdiffusion"
 _HELP = """\
 blender -c primdiffusion generate --count 50 --seed 7 --out PEOPLE     people in folders
 blender -c primdiffusion render PEOPLE --out PICTURES                  pictures of them, or of a .blend
-blender -c primdiffusion capture --people PEOPLE --out CAPTURES        captures from all sides, to train on
+blender -c primdiffusion capture --people SCANS --out CAPTURES         captures from all sides, to train on
 Each tells more with --help.
 Exit codes: 0 all is done, 1 some failed, 2 wrong words, 3 no Python runs the backend, 130 stopped by Ctrl-C."""
 
