@@ -32,7 +32,7 @@ class PRIMDIFFUSION_PT_generate(bpy.types.Panel):
         layout, settings = self.layout, context.scene.primdiffusion
         layout.use_property_split = True
         layout.use_property_decorate = False
-        setup.draw_set_up(layout)
+        ready = setup.draw_set_up(layout)
         column = layout.column()
         row = column.row(align=True)
         row.prop(settings, "seed")
@@ -44,7 +44,7 @@ class PRIMDIFFUSION_PT_generate(bpy.types.Panel):
         if settings.quality == "CUSTOM":
             column.prop(settings, "steps")
             column.prop(settings, "sampler")
-        draw_job(layout, "generate", "primdiffusion.generate", "OUTLINER_OB_ARMATURE")
+        draw_job(layout, "generate", "primdiffusion.generate", "OUTLINER_OB_ARMATURE", ready)
         draw_lines(layout, f"Device: {device_line()}", "MEMORY")
 
 
