@@ -118,6 +118,11 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
     scale: bpy.props.FloatProperty(
         name="Scale Path", description="How much longer the way becomes; turns stay", default=1.0, min=0.0, soft_max=10
     )
+    fit_stride: bpy.props.BoolProperty(
+        name="Fit Stride",
+        description="Make the way as long as this person's legs go, so that feet stay where they are put down",
+        default=True,
+    )
     ground: bpy.props.BoolProperty(
         name="Feet on the Floor",
         description="Raise or lower the whole motion until its lowest feet stand",
@@ -188,6 +193,7 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
         row.prop(self, "start")
         layout.prop(self, "timing")
         layout.prop(self, "root")
+        layout.prop(self, "fit_stride")
         layout.prop(self, "scale")
         layout.prop(self, "ground")
         layout.prop(self, "extend")

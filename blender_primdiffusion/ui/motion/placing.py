@@ -9,9 +9,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...motion.adjust import cut, from_origin, in_place, leg_ratio, on_floor, resample, scale_places
+from ...motion.adjust import cut, from_origin, in_place, on_floor, resample, scale_places
 from ...motion.motion import Motion
 from ...motion.pose_library import check_posable, rest_joints
+from ...motion.stride import stride_ratio
 from ...scene.actions import last_key, push_to_strip
 from ...scene.keyframes import append_poses, keyframe_poses
 from .armatures import scene_fps
@@ -33,6 +34,8 @@ class Placement:
     stride: int = 1
     scale: float = 1.0
     """Of the path."""
+    fit_stride: bool = True
+    """Whether the path is made as long as the armature's legs go, before `scale`."""
     root: str = "ORIGIN"
     """ORIGIN: the path begins at the person; KEEP: it is left alone; PLACE: they stay where they are."""
     ground: bool = True
@@ -46,7 +49,10 @@ def place_motion(
 ) -> tuple[float, float]:
     """Put the keys in; returns the first and last frame. Raises ValueError before anything is changed."""
     check_posable(armature)
-    fitted, times = fit(motion, rest_joints(armature), scene_fps(context.scene), how)
+    rest = rest_joints(armature)
+    ratio = stride_ratio(motion, rest) if how.fit_stride else None
+    way = dataclasses.replace(how, scale=how.scale * (1.0 if ratio is None else ratio))
+    fitted, times = fit(motion, rest, scene_fps(context.scene), way)
     start = how.start
     if how.into == "APPEND":
         end = last_key(armature)
@@ -58,7 +64,7 @@ def place_motion(
     else:
         action = keyframe_poses(armature, frames, fitted.rotations, fitted.translations, motion.name)
         action.use_fake_user = True
-    action[FACTS] = json.dumps(facts(motion))
+    action[FACTS] = json.dumps({**facts(motion), "Stride": "as in the file" if ratio is None else f"x {ratio:.2f}"})
     if how.into == "STRIP":
         push_to_strip(armature)
     return float(frames[0]), float(frames[-1])
@@ -69,8 +75,7 @@ def fit(motion: Motion, rest: NDArray, scene_rate: float, how: Placement) -> tup
     fitted = cut(motion, how.first, how.last, how.stride)
     if how.timing == "SCENE":
         fitted = resample(fitted, scene_rate)
-    ratio = leg_ratio(rest) if motion.detected.average_legs else 1.0
-    fitted = scale_places(fitted, how.scale * ratio)
+    fitted = scale_places(fitted, how.scale)
     if how.root != "KEEP":
         fitted = in_place(fitted) if how.root == "PLACE" else from_origin(fitted)
     if how.ground:
