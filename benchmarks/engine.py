@@ -10,7 +10,6 @@ the child's march. engine_pixel_error_max is the largest difference of an 8-bit 
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import tempfile
 import time
@@ -18,8 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_benchmark_"))
-
+import blender_apart  # noqa: F401  before bpy
 import bpy
 import numpy as np
 import torch

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import sys
 import tempfile
 from pathlib import Path
 
-os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_pictures_"))
-
+import blender_apart  # noqa: F401  before bpy
 import bpy
 import numpy as np
 from march_people import generated

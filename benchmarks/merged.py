@@ -9,14 +9,11 @@ surface_error is against the backend's own frames on the surface as it poses it.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
-import tempfile
 import time
 from pathlib import Path
 
-os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_benchmark_"))
-
+import blender_apart  # noqa: F401  before bpy
 import bpy
 import numpy as np
 import psutil

@@ -9,7 +9,6 @@ body_file_mb is what is kept on disk for all people on one body; human_npz_mb wh
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
 import sys
 import tempfile
@@ -17,8 +16,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_benchmark_"))
-
+import blender_apart  # noqa: F401  before bpy
 import bpy
 import numpy as np
 from march_people import checkered_human
@@ -45,8 +43,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     parser.add_argument("--quick", action="store_true")
     given = parser.parse_args()
-    folder = Path(tempfile.mkdtemp(prefix="primdiffusion_reshape_"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
+    folder = Path(tempfile.mkdtemp(prefix="reshape_", dir=bpy.app.tempdir))
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
     export_for_blender(folder / "human.npz", checkered_human(0))
     person = build_human(bpy.context, folder / "human.npz")

@@ -29,7 +29,7 @@ class Stage:
     def __init__(self, context: bpy.types.Context, settings: CaptureSettings):
         self.belongings = Belongings()
         """What was made for the capture: use as a context around whatever makes more."""
-        self.scratch = Path(tempfile.mkdtemp(prefix="primdiffusion_capture_"))
+        self.scratch = Path(tempfile.mkdtemp(prefix="primdiffusion_capture_", dir=bpy.app.tempdir or None))
         """For pictures between Cycles and us."""
         self._context = context
         try:

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import shutil
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import pytest
 
-os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_blender_"))
+_PREFIX, _DAY_S = "primdiffusion_blender_", 24 * 3600
+_OWN = Path(tempfile.mkdtemp(prefix=_PREFIX))
+"""Of this process: Blender's user folder, and the temporary files of Blender and of all programs that tests start."""
+for _name in ("user", "tmp"):
+    (_OWN / _name).mkdir()
+os.environ.setdefault("BLENDER_USER_RESOURCES", str(_OWN / "user"))
+os.environ["TMPDIR"] = str(_OWN / "tmp")
 _TESTS = Path(__file__).parents[1]
 os.environ.setdefault("PRIMDIFFUSION_CACHE", str(_TESTS.parent / ".pytest_cache" / "children"))  # compile once
 sys.path[:0] = [str(folder) for folder in (_TESTS.parent, _TESTS, Path(__file__).parent, _TESTS / "backend")]
@@ -21,6 +30,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if Path(__file__).parent in item.path.parents:
             item.add_marker("blender")
+
+
+def pytest_unconfigure() -> None:
+    shutil.rmtree(_OWN, ignore_errors=True)
+    for crashed in _OWN.parent.glob(f"{_PREFIX}*"):
+        with contextlib.suppress(FileNotFoundError):  # another process removes it too
+            if time.time() - crashed.stat().st_mtime > _DAY_S:
+                shutil.rmtree(crashed, ignore_errors=True)
 
 
 GRIDS_KEPT_MB = 64

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import sys
-import tempfile
-
-os.environ["BLENDER_USER_RESOURCES"] = tempfile.mkdtemp(prefix="primdiffusion_installed_")
 
 import bpy
 

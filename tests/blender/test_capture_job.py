@@ -199,7 +199,7 @@ def test_nothing_stays_in_the_file(empty_scene, tmp_path):
     assert after - before == {("MATERIAL", "made by the user meanwhile")}
     assert before <= after
     assert mine.name == "mine"
-    assert not list(Path(os.environ.get("TMPDIR", "/tmp")).glob(f"primdiffusion_capture_{os.getpid()}*"))
+    assert not list(Path(bpy.app.tempdir).glob("primdiffusion_capture_*"))
 
 
 def test_somebody_who_fails_leaves_the_others_alone(empty_scene, tmp_path):

@@ -1,0 +1,23 @@
+"""What a run of the tests leaves on the disk."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_a_run_that_passes_leaves_no_files(tmp_path):
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
+    chosen = str(Path(__file__).with_name("test_volumes.py"))
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST_", "BLENDER_"))}
+    environment["TMPDIR"] = str(tmp_path)
+    done = subprocess.run(
+        [*command, chosen], env=environment, cwd=ROOT, capture_output=True, text=True, timeout=280, check=False
+    )
+    assert " passed" in done.stdout, done.stdout + done.stderr
+    assert [path for path in tmp_path.rglob("*") if path.name != "pytest-current" and not path.is_dir()] == []
+    assert not list(tmp_path.glob("*blender_*"))
