@@ -14,6 +14,12 @@ VENV52 := .venv52
 PYTHON313 ?= $(shell for python in python3.13 "$${PYENV_ROOT:-$$HOME/.pyenv}"/versions/3.13*/bin/python3.13; do \
 	"$$python" -c "import sys, ensurepip; sys.exit(sys.version_info[:2] != (3, 13))" 2>/dev/null && echo "$$python" && break; done)
 
+# Megabytes of environments (`du -sm`): a full disk is told before pip is in the middle of it.
+ROOM := sh scripts/enough_room.sh
+VENV_MB := $(VENV):3700
+VENV45_MB := $(VENV45):1000
+VENV52_MB := $(VENV52):1200
+
 # A worker for each core, each with one thread: more would fight over the cores.
 ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE
 # A test is tried again where Blender itself has crashed under it (seen once in ed.undo_push), never where it fails.
@@ -30,7 +36,8 @@ demo: $(READY)
 	$(BIN)/python benchmarks/demo.py --out demo_out
 
 # One after the other, also with -j: they share the cores.
-test: $(READY_TO_TEST)
+test:
+	@$(ROOM) $(VENV_MB) $(VENV45_MB) $(if $(PYTHON313),$(VENV52_MB))
 	$(MAKE) test-5.0
 	$(MAKE) test-4.5
 	$(MAKE) test-5.2
@@ -64,6 +71,7 @@ setup: $(READY_TO_TEST)
 $(READY): pyproject.toml requirements.lock
 	@command -v $(PYTHON) >/dev/null || { echo "Python 3.11 is needed ($(PYTHON) was not found): install it or run make PYTHON=/path/to/python3.11"; exit 1; }
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info[:2] != (3, 11))" || { echo "$(PYTHON) is not Python 3.11, which bpy 5.0 needs: run make PYTHON=/path/to/python3.11"; exit 1; }
+	@$(ROOM) $(VENV_MB)
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP_INSTALL) -e ".[training,blender]"
 	@$(BIN)/python -c "import bpy" || { echo "Blender's module did not load: install the system packages named in README.md"; exit 1; }
@@ -75,12 +83,14 @@ $(READY_TO_TEST): $(READY)
 
 # Blender 4.5's module; all else is .venv's.
 $(VENV45)/ready: $(READY_TO_TEST) Makefile
+	@$(ROOM) $(VENV45_MB)
 	test -x $(VENV45)/bin/python || $(BIN)/python -m venv --without-pip $(VENV45)
 	$(BIN)/python -m pip --python $(VENV45)/bin/python install --quiet --disable-pip-version-check --no-deps bpy==4.5.15
 	$(BIN)/python -c "import site; print('import site; site.addsitedir(%r)' % site.getsitepackages()[0])" > `echo $(VENV45)/lib/python3.*/site-packages`/zz_shared.pth
 	touch $@
 
 $(VENV52)/ready: requirements52.lock
+	@$(ROOM) $(VENV52_MB)
 	test -x $(VENV52)/bin/python || $(PYTHON313) -m venv $(VENV52)
 	$(VENV52)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements52.lock
 	touch $@
