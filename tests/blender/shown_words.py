@@ -6,6 +6,7 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+import bpy
 from test_tooltips import labels, ours, properties, tooltips
 
 ROOT = Path(__file__).resolve().parents[2] / "blender_primdiffusion"
@@ -25,8 +26,10 @@ def said_by_blender() -> set[str]:
     for _, prop in properties():
         known |= {item.description for item in getattr(prop, "enum_items_static", ())}
     for _, prop in filter(lambda pair: ours(pair[1]), properties()):
-        if prop.type not in ("POINTER", "COLLECTION"):
-            known.add(prop.description)
+        group = prop.type == "COLLECTION" or (prop.type == "POINTER" and "_PG_" in prop.fixed_type.identifier)
+        known |= set() if group else {prop.name, prop.description}
+    gain = bpy.types.Collection.bl_rna.properties["primdiffusion_density_gain"]
+    known |= {gain.name, gain.description}
     known |= {text for _, text in written(_shown_keywords) if "{}" not in text}
     known |= {text for _, text in written(lambda node: _argument(node, {"poll_message_set": 0}))}
     return {text for text in known if any(letter.isalpha() for letter in text.replace("{}", ""))}

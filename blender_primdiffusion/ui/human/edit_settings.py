@@ -23,6 +23,7 @@ def parts_property():
     """Several parts of the body may be chosen."""
     return bpy.props.EnumProperty(
         name="Parts",
+        translation_context=CONTEXT,
         description="What to change: Shift-click for several. A person's left and right",
         items=[(name, title(name), "", 1 << i) for i, name in enumerate(PARTS)],
         options={"ENUM_FLAG", "SKIP_SAVE"},

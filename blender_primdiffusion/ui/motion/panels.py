@@ -47,9 +47,9 @@ class PRIMDIFFUSION_PT_motion(_InSidebar, bpy.types.Panel):
             draw_lines(layout, sentence(error), "INFO")
             return
         self._draw_action(layout, armature)
-        row = layout.row(align=True)
-        row.operator("primdiffusion.key_pose", icon="KEY_HLT")
-        clear = row.row(align=True)
+        column = layout.column(align=True)
+        column.operator("primdiffusion.key_pose", icon="KEY_HLT")
+        clear = column.row(align=True)
         clear.enabled = bool(armature.animation_data and armature.animation_data.action)
         clear.operator("primdiffusion.clear_motion", icon="X")
         layout.operator("primdiffusion.export_motion", icon="EXPORT")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...scene.actions import action_curves
+from ..translations import CONTEXT
 from ..translations.told import told
 from .armatures import target_armature
 from .pose_pictures import pose_items
@@ -27,7 +28,10 @@ class PRIMDIFFUSION_PG_motion(bpy.types.PropertyGroup):
     )
     mirror: bpy.props.BoolProperty(name="Mirror", description="Left and right change places", default=False)
     only_selected: bpy.props.BoolProperty(
-        name="Only Selected Bones", description="Leave bones alone that are not selected", default=False
+        name="Only Selected Bones",
+        translation_context=CONTEXT,
+        description="Leave bones alone that are not selected",
+        default=False,
     )
 
 

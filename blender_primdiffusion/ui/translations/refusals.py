@@ -32,4 +32,7 @@ REFUSALS = (
     ("There are no variations: press Show Variations first",
      "Keine Varianten da: zuerst „Varianten zeigen“ drücken",
      "Il n'y a pas de variantes : presser d'abord « Montrer des variantes »"),
+    ("No result waits to enter the scene",
+     "Kein Ergebnis wartet auf die Szene",
+     "Aucun résultat n'attend d'entrer dans la scène"),
 )

@@ -300,4 +300,13 @@ TOOLTIPS = (
     ("A built-in pose",
      "Eine eingebaute Pose",
      "Une pose intégrée"),
+    ("From whom",
+     "Von wem",
+     "De qui"),
+    ("Whose cameras take the pictures",
+     "Deren Kameras die Bilder aufnehmen",
+     "Dont les caméras prennent les images"),
+    ("How much denser Cycles takes this person for: it absorbs exponentially, the exact engine adds up",
+     "Um wie viel dichter Cycles diese Person nimmt: es absorbiert exponentiell, die genaue Engine summiert",
+     "De combien Cycles prend cette personne pour plus dense : il absorbe exponentiellement, le moteur exact additionne"),
 )

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from . import backend, captures, files, jobs, motion, people, render
+from . import backend, captures, child, files, jobs, motion, people, render
 
 SENTENCES: tuple[tuple[str, str, str], ...] = (
     *people.SENTENCES, *files.SENTENCES, *motion.SENTENCES, *render.SENTENCES,
-    *captures.SENTENCES, *jobs.SENTENCES, *backend.SENTENCES,
+    *captures.SENTENCES, *jobs.SENTENCES, *backend.SENTENCES, *child.SENTENCES,
 )  # fmt: skip
 """English, German, French."""

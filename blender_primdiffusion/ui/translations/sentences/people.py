@@ -342,4 +342,7 @@ SENTENCES = (
     ("the person's file holds sizes of boxes as {}, not {}; {}",
      "die Datei der Person enthält die Größen der Kästen als {}, nicht {}; {}",
      "le fichier de la personne donne les tailles des boîtes en {}, et non {} ; {}"),
+    ("{}, up to {} overlap",
+     "{}, bis zu {} überlappen",
+     "{}, jusqu'à {} se recouvrent"),
 )
