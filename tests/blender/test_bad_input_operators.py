@@ -6,6 +6,7 @@ import functools
 import inspect
 import re
 import shutil
+import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -15,20 +16,25 @@ import bpy
 import pytest
 import synthetic
 import synthetic_shape
+from jobs_driven import drive
 from test_missing_volumes import write_person
 
 from blender_primdiffusion.scene.body_mesh import body_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of, humans
+from blender_primdiffusion.ui.generate.work import GenerateWork
+from blender_primdiffusion.ui.human.edit_work import VaryWork
+from blender_primdiffusion.ui.jobs.queue import queue
+from blender_primdiffusion.ui.jobs.work import Work
 
-ELSEWHERE = {"open_manual", "repair_backend", "test_backend", "set_up_backend", "make_pose_assets", "take_result"}
-"""Open a browser, set up, or write a library, whatever is in the scene; `take_result` is for the queue alone."""
+ELSEWHERE = {"open_manual", "repair_backend", "test_backend", "set_up_backend", "make_pose_assets", "copy_diagnostics"}
+"""Open a browser, set up, write a library or a text: whatever is in the scene, it stays as it is."""
 _BLENDER_LISTS = {"window_managers", "workspaces", "screens", "texts", "palettes", "brushes", "libraries"}
 """Blender's own, or where an operator says something. A linked person's library is one of theirs."""
 
 
 def operators() -> list[str]:
-    return [name for name in dir(bpy.ops.primdiffusion) if name not in ELSEWHERE]
+    return dir(bpy.ops.primdiffusion)
 
 
 def everything() -> dict[str, set[str]]:
@@ -64,7 +70,10 @@ def fault(name: str) -> str:
             return f"{name}: no sentence: {said!r}"
         changes = [(a, b) for a, b in zip(before, state(), strict=True) if a != b]
         return f"{name}: refused ({said}) after changing {changes}" if changes else ""
-    return "" if answer == {"FINISHED"} else f"{name}: {answer} without a word"
+    if answer != {"FINISHED"}:
+        return f"{name}: {answer} without a word"
+    changes = [(a, b) for a, b in zip(before, state(), strict=True) if a != b] if name in ELSEWHERE else []
+    return f"{name}: changed {changes}" if changes else ""
 
 
 def empty(_person) -> None:
@@ -212,6 +221,27 @@ def anna(addon, tmp_path, monkeypatch):
     shutil.rmtree(tmp_path / "for the child")  # threads wait there for the child's files
 
 
+@pytest.fixture
+def outside(anna, monkeypatch):
+    """No browser opens, nothing is downloaded or installed, and libraries are written where tests write."""
+    from blender_primdiffusion.ui.assets import library
+    from blender_primdiffusion.worker.setup_job import SetUpJob
+
+    def start(job: SetUpJob) -> None:
+        job.state, job.message = "done", "as if it were done"
+
+    monkeypatch.setattr("webbrowser.open", lambda _: True)
+    monkeypatch.setattr(SetUpJob, "start", start)
+    monkeypatch.setattr("blender_primdiffusion.worker.setup_folder.short_root", lambda *_: anna / "set up")
+    monkeypatch.setattr(library, "own_folder", lambda: anna / "own")
+    bpy.context.preferences.system.use_online_access = True
+    yield
+    bpy.context.preferences.system.use_online_access = False
+    libraries = bpy.context.preferences.filepaths.asset_libraries
+    for ours in [one for one in libraries if one.name.startswith(library.LIBRARY)]:
+        libraries.remove(ours)
+
+
 def _asked(monkeypatch, folder: Path) -> None:
     """Works are asked for their parameters, and then end well: what the child does is for other tests."""
     from blender_primdiffusion.ui.jobs import follow
@@ -230,6 +260,7 @@ def _asked(monkeypatch, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("situation", SITUATIONS, ids=lambda one: one.__name__)
+@pytest.mark.usefixtures("outside")
 def test_every_operator_works_or_says_what_is_wrong(anna, situation, monkeypatch):
     if situation is not backend_missing:
         _asked(monkeypatch, anna / "for the child")
@@ -248,6 +279,40 @@ def test_every_operator_works_or_says_what_is_wrong(anna, situation, monkeypatch
         if wrong:
             faults.append(wrong)
     assert not faults, "\n".join(faults)
+
+
+def _generated(_person) -> Work:
+    return GenerateWork(11, 1)
+
+
+def _varied(person) -> Work:
+    return VaryWork.of(person, 1, {"amount": 0.5, "seed": 3})
+
+
+@pytest.mark.parametrize("ask", [_generated, _varied], ids=["generated", "varied"])
+@pytest.mark.parametrize("situation", SITUATIONS, ids=lambda one: one.__name__)
+def test_a_result_that_waits_enters_the_scene_or_says_why_not(anna, situation, ask, capfd):
+    (person,) = humans(bpy.context.scene)
+    queue.add(bpy.context, ask(person))
+    while not queue.ready:
+        queue.tick()
+        assert queue.busy, queue.last.sentence
+        time.sleep(0.01)
+    situation(person)
+    if not queue.ready:
+        assert queue.kept.left, "of a file that was closed"
+        queue.kept.take(lambda _: True)
+        return
+    before = state()
+    drive()
+    assert "Traceback" not in capfd.readouterr().err
+    error = queue.last.error
+    if error is not None:
+        assert error.kind != "died"
+        assert len(str(error).split()) > 3
+        assert "\n" not in str(error)
+        after = state()
+        assert (after[0], *after[2:]) == (before[0], *before[2:]), str(error)
 
 
 class _Drawn:
