@@ -47,7 +47,8 @@ def made_of_values() -> set[str]:
     from blender_primdiffusion.worker.job import STAGES
 
     sliders = {f"Shape {index + 1}" for index in range(BETAS)} | {"Stature", "Shoulders", "Waist", "Girth"}
-    facts = {"Rig", "Up Axis", "Frames", "Frame Rate", "Units", "Bones", "Stride", "Volumes", "Files", "Memory once drawn"}
+    facts = {"Rig", "Up Axis", "Frames", "Frame Rate", "Units", "Bones", "Stride"}
+    facts |= {"Volumes", "Files", "Memory once drawn"}
     more = {"Whatever comes", "A pose of your own", "A built-in pose"}
     more |= {"Show Volumes", "Show Mesh", "Show Mesh in Viewport"}
     return sliders | facts | more | {name.capitalize() for name in _SHOWN} | set(STAGES.values()) | {"Any"}
