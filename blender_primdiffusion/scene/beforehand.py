@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -44,6 +45,8 @@ class Written:
     """Of these, and the body's, those that were not there before."""
     existing: Path
     """The folder that was there before."""
+    began: float
+    """time.monotonic() when this was begun."""
 
     def whole(self) -> bool:
         """Nobody has removed a file since."""
@@ -69,6 +72,7 @@ def write(human_npz: Path, home: Path, step: Callable[[float], None]) -> Written
 
     Raises HumanFileError, VolumeWriteError and what `step` raises, and then leaves no files.
     """
+    began = time.monotonic()
     step(0.0)
     baked = bake(human_npz)
     existing = next(parent for parent in (home, *home.parents) if parent.exists())
@@ -79,7 +83,7 @@ def write(human_npz: Path, home: Path, step: Callable[[float], None]) -> Written
         made = tuple(path for path in (*files, *body) if not path.exists())
         if model is not None:
             undone.enter_context(shape_file.kept(model, home.parent))
-    return Written(baked, home, tuple(files), made, existing)
+    return Written(baked, home, tuple(files), made, existing, began)
 
 
 class Writing:

@@ -18,9 +18,10 @@ def read_grids(files: Sequence[Path], most_s: float) -> int:
     with bpy.data.temp_data() as beside:  # removing a volume from bpy.data has Blender evaluate the scene anew
         volume = beside.volumes.new("PrimDiffusion")
         for count, path in enumerate(files, 1):
-            volume.filepath = str(path)
-            for grid in volume.grids if volume.grids.load() else ():
-                grid.load()
+            if path.is_file():  # of one that is missing Blender would keep the error
+                volume.filepath = str(path)
+                for grid in volume.grids if volume.grids.load() else ():
+                    grid.load()
             if time.monotonic() > end:
                 return count
     return len(files)

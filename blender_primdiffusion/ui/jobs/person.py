@@ -22,11 +22,11 @@ def build_person(
 
     Raises as `build_human` does, and then leaves nothing.
     """
-    began = time.monotonic()
     keep = [Path(result["person"])] if "person" in result else []  # for the exact marcher, later
     human = Path(result["human"])
-    written = building.take(human)
+    written, began = building.take(human), time.monotonic()
     if written is not None:
+        began = written.began
         collection = build_written(context, written, name, keep)
     else:
         collection = build_human(context, human, name, keep)

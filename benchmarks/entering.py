@@ -1,0 +1,84 @@
+"""How long a person of 1024 volumes keeps Blender's window from going on while they enter the scene.
+
+`python benchmarks/entering.py --json entering.json`. Milliseconds of wall time, each what the main thread does without
+a pause. At once, as scripts and background mode have it: at_once_build_ms, then at_once_evaluate_ms until Blender can
+draw. In a window a thread writes the volumes meanwhile (write_ms), their grids are read some at a time (read_ms, each
+time longest_read_ms at most), and only then enter_build_ms and enter_undo_ms, which evaluates the scene, are in the
+way. second_* is the same for somebody who joins a first person. Drawing is not in it;
+`scripts/window/look.py --scenes stalls` has that too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_benchmark_"))
+
+import bpy
+from march_people import checkered_human
+from primdiffusion.human_file import export_for_blender
+from record import tell
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from blender_primdiffusion.scene.beforehand import write
+from blender_primdiffusion.scene.build import build_human, build_written, home_of_next
+from blender_primdiffusion.scene.grid_warming import read_grids
+from blender_primdiffusion.ui.jobs.building import READ_S
+
+
+def milliseconds(does: Callable[[], object]) -> float:
+    """Of one call."""
+    began = time.perf_counter()
+    does()
+    return 1000 * (time.perf_counter() - began)
+
+
+def new_file(folder: Path, name: str) -> None:
+    """An empty one, saved."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / name))
+    bpy.ops.ed.undo_push(message="before")
+
+
+def enter(human: Path) -> dict[str, float]:
+    """As in a window, a part after the other."""
+    began = time.perf_counter()
+    written = write(human, home_of_next("Human"), lambda _fraction: None)
+    figures = {"write_ms": 1000 * (time.perf_counter() - began)}
+    parts, read = [], 0
+    while read < len(written.files):
+        began = time.perf_counter()
+        read += read_grids(written.files[read:], READ_S)
+        parts.append(1000 * (time.perf_counter() - began))
+    figures |= {"read_ms": sum(parts), "longest_read_ms": max(parts)}
+    figures["enter_build_ms"] = milliseconds(lambda: build_written(bpy.context, written))
+    figures["enter_undo_ms"] = milliseconds(lambda: bpy.ops.ed.undo_push(message="Generate Human"))
+    return figures
+
+
+def main() -> None:
+    """At once, then in parts, then in parts beside the person who is there."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    folder = Path(tempfile.mkdtemp(prefix="primdiffusion_entering_"))
+    people = [folder / f"human_{seed}.npz" for seed in range(3)]
+    for seed, path in enumerate(people):
+        export_for_blender(path, checkered_human(seed))
+    new_file(folder, "at_once.blend")
+    figures = {"at_once_build_ms": milliseconds(lambda: build_human(bpy.context, people[0]))}
+    figures["at_once_evaluate_ms"] = milliseconds(bpy.context.view_layer.update)
+    new_file(folder, "in_parts.blend")
+    figures |= enter(people[1])
+    figures |= {f"second_{name}": value for name, value in enter(people[2]).items()}
+    tell(figures, given.json)
+
+
+if __name__ == "__main__":
+    main()
