@@ -11,7 +11,7 @@ import bpy
 from ...places import EXTENSION
 from ..translations.told import told
 from .building import building
-from .follow import in_the_way
+from .entering import in_the_way
 from .pictures import so_far
 from .queue import Outcome, queue
 from .remedies import remedy_for
