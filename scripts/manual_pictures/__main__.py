@@ -2,6 +2,7 @@
 
     .venv/bin/python -m scripts.manual_pictures walk            # docs/manual/pictures/walking.gif
     .venv/bin/python -m scripts.manual_pictures stills          # engine, Cycles, a group, edits
+    .venv/bin/python -m scripts.manual_pictures boxes           # a reshaped person, as in the paper and as here
     .venv/bin/python -m scripts.manual_pictures window SHOTS    # crops of what scripts/window/look.py has seen
 
 Runs in Blender as a Python module, with the extension from this checkout.
@@ -19,9 +20,9 @@ PICTURES = ROOT / "docs" / "manual" / "pictures"
 
 
 def main(words: list[str]) -> None:
-    """One of the three."""
+    """One of the four."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("walk", "stills", "window"))
+    parser.add_argument("what", choices=("walk", "stills", "boxes", "window"))
     parser.add_argument("shots", type=Path, nargs="?", help="folder of the window's pictures")
     parser.add_argument("--out", type=Path, default=PICTURES)
     parser.add_argument("--only", nargs="*", default=[], help="names of stills; none: all")
@@ -33,6 +34,11 @@ def main(words: list[str]) -> None:
         from .crops import crop_all
 
         crop_all(asked.shots, asked.out)
+        return
+    if asked.what == "boxes":
+        from .boxes import boxes
+
+        boxes(asked.out / "reshaped_boxes.jpg")
         return
     with tempfile.TemporaryDirectory() as scratch:
         if asked.what == "walk":

@@ -1,0 +1,42 @@
+"""A person on a far heavier body: with boxes that keep their size, as in the paper, and with boxes that grow."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from primdiffusion.body.measures import betas_of_measures
+from primdiffusion.body.model import default_body
+from primdiffusion.geometry.camera import look_at
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.human import Human, generate, render
+from primdiffusion.render.image import over
+from primdiffusion.reshaping import reshaped
+from primdiffusion.training.checkpoint import load_checkpoint
+
+from .shrink import save_jpeg
+
+SEED = 7
+HEIGHT_M, WEIGHT_KG = 1.74, 108.0
+SIZE = 420
+_GREY = (0.35, 0.35, 0.35)
+
+
+def boxes(out: Path) -> None:
+    """Generate, reshape, draw both side by side."""
+    human = generate(load_checkpoint(), SEED)
+    betas = betas_of_measures(human.betas, torch.eye(10), default_body(), HEIGHT_M, WEIGHT_KG).float()
+    of_the_paper = dataclasses.replace(human, betas=betas)
+    pictures = [_torso(person) for person in (of_the_paper, reshaped(human, betas))]
+    save_jpeg(Image.fromarray(np.concatenate(pictures, 1)), out)
+
+
+def _torso(human: Human) -> np.ndarray:
+    eye, target = torch.tensor([0.8, 0.1, 1.5]), torch.tensor([0.0, 0.1, 0.0])
+    camera = look_at(eye, target, vertical_fov=math.radians(32), width=SIZE, height=SIZE)
+    colours = encode_srgb(over(render(human, camera), _GREY).clamp(0, 1))
+    return (colours * 255).round().byte().numpy()
