@@ -103,6 +103,13 @@ def _check(options: argparse.Namespace, say: Say) -> int:
 def _render(
     options: argparse.Namespace, settings: CaptureSettings, scans: list[ScanFile], say: Say, stop: threading.Event
 ) -> int:
+    try:
+        settings.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise CaptureFolderError(
+            f"nothing can be written to {settings.out} ({reason}): choose another folder with --out"
+        ) from error
     report, told = Report(), 0.0
     with contextlib.closing(run(bpy.context, settings, scans, report)) as steps:
         for progress in steps:

@@ -39,11 +39,15 @@ WINDOWS = {
     "window_motion": ("motion_imported", "window 0"),
 }
 """A whole window, or the part of it that WINDOW_PART says."""
+STACKS = {"set_up_progress": ("set_up_real_0", "set_up_real_1", "set_up_real_2")}
+"""The extension's part of the preferences, one under the other."""
 DIALOGS = {"motion_dialog": "motion_dialog"}
 WINDOW_PART = (0, 24, 1320, 1190)
 """Of the main window, pixels: without the properties and the timeline."""
 PREFERENCES_PART = (172, 222, 872, 573)
 """Of the preferences' window, pixels: what is the extension's."""
+_STACKED_ROWS = 130
+"""Of the preferences' part: down to the end of the backend's box, while it is at work."""
 _WINDOW_WIDTH = 880
 _PANEL_WIDTH = 262
 _OUTLINE_RGB, _OUTLINE_COLUMN, _RUN = 74, 8, 10
@@ -66,6 +70,9 @@ def crop_all(shots: Path, out: Path) -> None:
                 save_jpeg(part.resize(size, Image.Resampling.LANCZOS), out / f"{name}.jpg")
             else:
                 save_png(part.crop(PREFERENCES_PART), out / f"{name}.png")
+    for name, seen in STACKS.items():
+        if _are_there(shots, *seen):
+            save_png(_column([_preferences_top(shots, shot) for shot in seen]), out / f"{name}.png")
     for name, shot in DIALOGS.items():
         if _are_there(shots, shot):
             save_png(_changed_part(shots, shot), out / f"{name}.png")
@@ -113,3 +120,18 @@ def _row(pictures: list[Image.Image]) -> Image.Image:
         row.paste(picture, (x, 0))
         x += picture.width + _GAP
     return row
+
+
+def _preferences_top(shots: Path, shot: str) -> Image.Image:
+    picture, places = _read(shots, shot)
+    left, top, right, _ = PREFERENCES_PART
+    return picture.crop(places["window 1"]).crop((left, top, right, top + _STACKED_ROWS))
+
+
+def _column(pictures: list[Image.Image]) -> Image.Image:
+    column = Image.new("RGB", (pictures[0].width, sum(picture.height for picture in pictures)))
+    y = 0
+    for picture in pictures:
+        column.paste(picture, (0, y))
+        y += picture.height
+    return column

@@ -24,11 +24,13 @@ MODULE = "bl_ext.user_default.primdiffusion"
 def play() -> Iterator[float]:
     """Everything, seconds to wait between steps."""
     import story
+    from setting_up import set_up_real
 
+    asked_for = {"set_up_real": set_up_real} if "set_up_real" in SCENES else {}
     yield 2.0
     install()
     yield 0.5
-    for name, scene in story.SCENES.items():
+    for name, scene in {**story.SCENES, **asked_for}.items():
         if SCENES and name not in SCENES:
             continue
         print(f"scene {name}", flush=True)

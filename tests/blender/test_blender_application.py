@@ -141,6 +141,10 @@ def test_a_rigged_mesh_is_captured(command, tmp_path, empty_scene):
     pictures = [path for path in out.rglob("*.png") if "img" in str(path) or "camera" in str(path)]
     assert pictures
     assert command("capture", "--out", out, "--verify").returncode == DONE
+    (tmp_path / "file").write_text("")
+    done = command("capture", "--people", tmp_path / "scans", "--out", tmp_path / "file" / "captures", *cheap)
+    assert done.returncode == UNUSABLE
+    assert "nothing can be written to" in done.stderr
 
 
 def test_one_who_cannot_be_drawn_is_reported_and_the_exit_code_says_so(command, tmp_path):
