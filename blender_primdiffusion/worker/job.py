@@ -19,10 +19,10 @@ from .sentence import sentence
 State = Literal["starting", "running", "cancelling", "done", "failed", "cancelled"]
 FINAL: tuple[State, ...] = ("done", "failed", "cancelled")
 CANCELLED_CODE = -32001
-CANCEL_PATIENCE_S = 0.5
+CANCEL_PATIENCE_S = 0.35
 """A cancel takes effect at the end of a step; no step is waited for longer than this. Beside it the second in which a
-cancel is done holds a tick of the timer and a drawing of the window."""
-_KILL_PATIENCE_S = 0.1
+cancel is done holds ticks of the timer and drawings of the window, which on a busy machine take as long."""
+_KILL_PATIENCE_S = 0.05
 _GONE_AT_LAST_S = 60.0
 STAGES = {
     "read": "Reading the pictures",

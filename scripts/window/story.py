@@ -5,6 +5,7 @@ Every scene is told the name of the extension's module and the backend's Python,
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -255,9 +256,25 @@ def export(module: str, python: str) -> Steps:
     yield "export_proxy"
 
 
+def cancelled(module: str, python: str) -> Steps:
+    """Works are cancelled in the middle of their steps: how long that takes."""
+    yield from begin(module, python)
+    yield from show("PRIMDIFFUSION_PT_generate", "PRIMDIFFUSION_PT_jobs")
+    queue = queue_of(module)
+    for seed in (FIRST_SEED, SECOND_SEED, FIRST_SEED):
+        press("primdiffusion.generate", seed=seed)
+        yield from wait(lambda: queue.job is not None and queue.job.step > 1, 120)
+        asked = time.monotonic()
+        press("primdiffusion.cancel")
+        yield from wait(lambda: not queue.busy, 10)
+        print(f"a work is cancelled: {time.monotonic() - asked:.2f} s", flush=True)
+    yield "cancelled"
+
+
 def left(module: str, python: str) -> Steps:
     """Another file is opened while works are in line."""
     yield from begin(module, python)
+    bpy.ops.wm.save_as_mainfile(filepath=str(people_file(module).with_name("walk.blend")))
     bpy.context.scene.primdiffusion.count = 3
     press("primdiffusion.generate")
     yield 3.0
@@ -447,6 +464,7 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "render": render,
     "captures": captures,
     "export": export,
+    "cancelled": cancelled,
     "left": left,
     "missing": missing,
     "languages": languages,

@@ -73,6 +73,8 @@ def _draw_progress(layout: bpy.types.UILayout) -> None:
 
 def draw_in_line(layout: bpy.types.UILayout) -> None:
     """What is at work and what waits for its turn, each removable."""
+    if not queue.busy:
+        return  # an empty column would leave a gap
     column = layout.column(align=True)
     for entry in queue.in_line:
         row = column.row(align=True)
@@ -85,6 +87,8 @@ def draw_in_line(layout: bpy.types.UILayout) -> None:
 
 def draw_ended(layout: bpy.types.UILayout) -> None:
     """What has ended of late, and how; the news are beside the button that asked."""
+    if not queue.ended:
+        return
     column = layout.column(align=True)
     for outcome in queue.ended:
         icon = "ERROR" if outcome.error is not None else "CHECKMARK" if outcome.went_well else "CANCEL"
