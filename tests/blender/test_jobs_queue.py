@@ -50,8 +50,8 @@ def test_one_that_waits_can_be_taken_out_and_the_others_are_done(addon):
     ask(11, 20)
     second, _ = ask(12), ask(13)
     until_running()
-    assert shown(PRIMDIFFUSION_PT_jobs, addon)[:2] == ["Generate Human, seed 11", "primdiffusion.cancel"]
-    assert "Generate Human, seed 12" in shown(PRIMDIFFUSION_PT_jobs, addon)
+    assert shown(PRIMDIFFUSION_PT_jobs, addon)[:2] == ["Human, seed 11", "primdiffusion.cancel"]
+    assert "Human, seed 12" in shown(PRIMDIFFUSION_PT_jobs, addon)
     assert "In Line: 2" in shown(PRIMDIFFUSION_PT_generate, addon)
     assert ops.cancel(number=second) == {"FINISHED"}
     drive()
@@ -224,7 +224,7 @@ def test_loading_a_file_ends_the_child_and_offers_what_was_in_line(addon):
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
     texts = shown(PRIMDIFFUSION_PT_jobs_left, addon)
-    assert texts[:3] == ["For shot.blend, Scene", "Generate Human, seed 4", "Generate Human, seed 12"]
+    assert texts[:3] == ["For shot.blend, Scene", "Human, seed 4", "Human, seed 12"]
     assert not humans(bpy.context.scene)
     assert ops.discard_works() == {"FINISHED"}
     assert not ops.resume_works.poll()
@@ -247,7 +247,7 @@ def test_progress_is_shown_once_beside_the_button_and_the_jobs_panel_tells_what_
         (TAKES_LONG, False), (11, True), (FAILS, False)
     ]  # fmt: skip
     texts = shown(PRIMDIFFUSION_PT_jobs, addon)
-    assert texts[:3] == [f"Generate Human, seed {seed}" for seed in (TAKES_LONG, 11, FAILS)]
+    assert texts[:3] == [f"Human, seed {seed}" for seed in (TAKES_LONG, 11, FAILS)]
 
 
 def test_try_again_asks_for_the_same(addon):

@@ -53,7 +53,7 @@ def folder(addon, tmp_path, monkeypatch) -> Path:
 def kept(seed: int, kind: str = "generate", scene: str = "Scene", blend: str | None = None) -> KeptWork:
     """For the file that is open, unless another is given."""
     work = {"seed": seed, "steps": 1, "checkpoint": ""}
-    return KeptWork(kind, f"Generate Human, seed {seed}", work, scene, bpy.data.filepath if blend is None else blend)
+    return KeptWork(kind, f"Human, seed {seed}", work, scene, bpy.data.filepath if blend is None else blend)
 
 
 def leave(folder: Path, *works: KeptWork) -> None:
@@ -76,7 +76,7 @@ def test_works_in_line_of_a_killed_blender_are_offered_to_the_next_and_resumed(f
     assert PRIMDIFFUSION_PT_jobs_left.poll(bpy.context)
     texts = shown(PRIMDIFFUSION_PT_jobs_left, bpy.context)
     assert texts == [
-        "For fïlm 1.blend, Scene", "Generate Human, seed 21", "Generate Human, seed 22", "wm.open_mainfile",
+        "For fïlm 1.blend, Scene", "Human, seed 21", "Human, seed 22", "wm.open_mainfile",
         "primdiffusion.resume_works", "primdiffusion.discard_works",
     ]  # fmt: skip
     assert not queue.busy, "nothing runs by itself"
@@ -96,7 +96,7 @@ def test_unregistering_with_works_in_line_leaves_them_to_the_next_start(folder):
     queue.add(bpy.context, GenerateWork(7, 1))
     queue.close()
     look_for_left()
-    assert [work.label for work in queue.kept.left] == ["Generate Human, seed 7"]
+    assert [work.label for work in queue.kept.left] == ["Human, seed 7"]
     assert ops.discard_works() == {"FINISHED"}
     look_for_left()
     assert not queue.kept.left

@@ -39,7 +39,7 @@ class GenerateWork(Work):
     @property
     def label(self) -> str:
         """For people."""
-        return f"Generate Human, seed {self.seed}"
+        return f"Human, seed {self.seed}"
 
     def params(self, folder: Path) -> dict[str, Any]:
         """Of the child's method generate."""

@@ -27,7 +27,7 @@ class Work(abc.ABC):
     @property
     @abc.abstractmethod
     def label(self) -> str:
-        """For people: Generate Human, seed 7."""
+        """For people: Human, seed 7."""
 
     @abc.abstractmethod
     def params(self, folder: Path) -> dict[str, Any]:
