@@ -65,8 +65,8 @@ def _upper_body(phase: NDArray) -> NDArray[np.float64]:
     """Shoulders turn against the pelvis, arms swing against the legs, the head looks ahead [F, 24, 3, 3]."""
     swing = _wave(phase + 0.02)
     pose = Pose(
-        Arm(down=75, swing=3 - 23 * swing, elbow=24 - 11 * swing, forearm=-8, twist=6),
-        Arm(down=75, swing=3 + 23 * swing, elbow=24 + 11 * swing, forearm=-8, twist=6),
+        Arm(down=79, swing=3 - 23 * swing, elbow=24 - 11 * swing, forearm=-8, twist=6),
+        Arm(down=79, swing=3 + 23 * swing, elbow=24 + 11 * swing, forearm=-8, twist=6),
         Leg(),
         Leg(),
         trunk=(2.0, 11 * _wave(phase), 2.0 * _wave(phase - 0.14)),
