@@ -16,12 +16,14 @@ from .beforehand import Baked, Written, bake
 from .body_mesh import build_body_mesh
 from .convention import frames_to_blender, points_to_blender
 from .folders import humans_folder
-from .human import BETAS, HOME, MARK, PERSON, folder_of
+from .grid_cache import read_headers
+from .human import BETAS, HOME, MARK, PERSON, folder_of, volume_path
 from .material import volume_material
 from .placing_files import free_name
 from .shape_file import body_kept
 
 _NAME_LENGTH = 40
+_ABOUT_BETAS = "Shape of the body. The sliders in the sidebar set it; keys and drivers move the engine's picture alone"
 _KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials")
 
 
@@ -35,7 +37,9 @@ def build_human(
     and the body's file is put beside that folder. Raises HumanFileError or VolumeWriteError, and then leaves neither
     data nor files. Takes several seconds; makes no undo step, its caller does.
     """
-    return _build(context, bake(human_npz), None, name, keep)
+    person = _build(context, bake(human_npz), None, name, keep)
+    read_headers(volume_path(thing.data) for thing in person.all_objects if thing.type == "VOLUME")
+    return person
 
 
 def build_written(
@@ -71,7 +75,7 @@ def _build(
         label = collection.name
         armature = build_armature(label, points_to_blender(human.joints))
         armature[BETAS] = human.betas.tolist()
-        armature.id_properties_ui(BETAS).update(description="Shape of the body, drawn by the engine PrimDiffusion")
+        armature.id_properties_ui(BETAS).update(description=_ABOUT_BETAS)
         collection.objects.link(armature)
         vertices = points_to_blender(human.vertices)
         armature.location = (0.0, 0.0, -vertices[:, 2].min())

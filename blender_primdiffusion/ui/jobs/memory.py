@@ -37,15 +37,24 @@ def idle_minutes() -> float:
 
 
 def release_when_idle(now: float) -> bool:
-    """End the child when nothing has been asked of it for `idle_minutes`; whether it was. `now`: time.monotonic()."""
+    """End the child when nothing has been asked of it for `idle_minutes`; whether it was. `now`: time.monotonic().
+
+    Grids that Blender can read again are freed with it.
+    """
     minutes = idle_minutes()
     if queue.busy or minutes <= 0 or now - queue.idle_since < minutes * 60:
         return False
-    return queue.release() is not None
+    if queue.release() is None:
+        return False
+    if not bpy.app.is_job_running("RENDER"):
+        from ...scene.grid_cache import free_unused_grids
+
+        free_unused_grids()
+    return True
 
 
 def release() -> str:
-    """End the children that generate and draw, and free grids that nothing shows; what that gave back.
+    """End the children that generate and draw, and free grids that Blender can read again; what that gave back.
 
     Raises RuntimeError while one of them is at work.
     """
@@ -64,7 +73,9 @@ def release() -> str:
     before = resident_bytes(os.getpid()) or 0
     free_unused_grids()
     grids = before - (resident_bytes(os.getpid()) or before)
-    freed = f"Blender gave back {grids / 1e9:.1f} GB of volumes that nothing shows" if grids > _WORTH_TELLING else ""
+    freed = (
+        f"Blender gave back {grids / 1e9:.1f} GB of volumes, read again when needed" if grids > _WORTH_TELLING else ""
+    )
     if not pids:
         return freed or "nothing was held: no backend runs"
     card = f", and what they held of {queue.info['device_name']}" if queue.info.get("device_memory_gb") else ""
