@@ -5,11 +5,11 @@ from __future__ import annotations
 import bpy
 from bpy.app.handlers import persistent
 
-from . import building, diagnostics, follow, operators, panel, pictures, queue, result_operator
+from . import building, diagnostics, entering, follow, operators, panel, pictures, queue
 
 CLASSES = (
     *operators.CLASSES,
-    result_operator.PRIMDIFFUSION_OT_take_result,
+    entering.PRIMDIFFUSION_OT_take_result,
     diagnostics.PRIMDIFFUSION_OT_copy_diagnostics,
     panel.PRIMDIFFUSION_PT_jobs_left,
     panel.PRIMDIFFUSION_PT_jobs,
