@@ -21,7 +21,7 @@ import record
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 REGISTRATIONS = 7
-PARTS = ["register", "person", "merged", "soak"]
+PARTS = ["register", "person", "memory", "merged", "soak", "bare"]
 
 
 def main() -> None:
@@ -58,8 +58,12 @@ def measure(python: Path, arguments: argparse.Namespace) -> dict[str, float | st
         if "register" in arguments.parts:
             times = [run(python, "register", folder)["register_ms"] for _ in range(REGISTRATIONS)]
             found["register_ms"] = min(times)  # what other programs took is not ours
-        options = {"merged": ["--size", "128"], "soak": ["--rounds", "5"]} if arguments.quick else {}
-        for part in ("person", "merged", "soak"):
+        options = (
+            {"merged": ["--size", "128"], "soak": ["--rounds", "5"], "bare": ["--rounds", "5"]}
+            if arguments.quick
+            else {}
+        )
+        for part in ("person", "memory", "merged", "soak", "bare"):
             if part in arguments.parts:
                 found |= run(python, part, folder, *options.get(part, []))
         return found

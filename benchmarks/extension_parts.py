@@ -6,23 +6,22 @@ FOLDER holds `person/` (what `primdiffusion generate` has written) and takes eac
 from __future__ import annotations
 
 import argparse
-import ctypes
 import json
 import os
 import sys
-import tempfile
 import time
 from pathlib import Path
 
-os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_extension_"))
-
+import blender_apart  # before bpy
 import bpy
 import numpy as np
 import psutil
+import resident
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 SEED, FRAMES, MOTION_FRAMES = 7, 48, 1500
+UNDO_STEPS = 4  # of the 32 by default: each holds a person's data blocks, and they must be full before growth is told
 
 
 def register(_arguments: argparse.Namespace) -> dict[str, float]:
@@ -35,21 +34,17 @@ def register(_arguments: argparse.Namespace) -> dict[str, float]:
 
 
 def person(arguments: argparse.Namespace) -> dict[str, float | None]:
-    """One person: building, memory, frames, motion, errors of both attachments."""
+    """One person: building, frames, motion, errors of both attachments."""
     _enable(arguments)
     from blender_primdiffusion.scene.build import build_human
     from blender_primdiffusion.scene.human import armature_of
 
     context = bpy.context
-    _trim()
-    before = _resident_mb()
     start = time.perf_counter()
     folder = arguments.folder / "person"
     collection = build_human(context, folder / "human.npz", "Human", [folder / "person.human.safetensors"])
     context.view_layer.update()
     built = time.perf_counter() - start
-    _trim()
-    memory = _resident_mb() - before
     armature = armature_of(collection)
     context.view_layer.objects.active = armature
 
@@ -59,7 +54,6 @@ def person(arguments: argparse.Namespace) -> dict[str, float | None]:
     keyed = time.perf_counter() - start
     figures: dict[str, float | None] = {
         "build_seconds": built,
-        "ram_per_human_mb": memory,
         "amass_1500_seconds": keyed,
         "frame_ms": _frame_ms(context.scene),
     }
@@ -67,6 +61,21 @@ def person(arguments: argparse.Namespace) -> dict[str, float | None]:
     bpy.ops.primdiffusion.set_attachment(mode="SURFACE")
     figures["frame_surface_ms"] = _frame_ms(context.scene)
     return figures
+
+
+def memory(arguments: argparse.Namespace) -> dict[str, float]:
+    """One person: what Blender takes for them once all grids are read, and once it has given back what it can."""
+    _enable(arguments)
+    from blender_primdiffusion.scene.build import build_human
+
+    resident.trim()
+    before = resident.resident_mb()
+    build_human(bpy.context, arguments.folder / "person" / "human.npz")
+    bpy.context.view_layer.update()
+    resident.trim()
+    read = resident.resident_mb() - before
+    bpy.ops.primdiffusion.release_memory()
+    return {"ram_per_human_mb": read, "ram_per_human_released_mb": resident.resident_mb() - before}
 
 
 def merged(arguments: argparse.Namespace) -> dict[str, float]:
@@ -97,7 +106,8 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
     from blender_primdiffusion.scene.human import armature_of, humans
     from blender_primdiffusion.ui.jobs.queue import queue
 
-    context, resident = bpy.context, []
+    context, megabytes, blender = bpy.context, [], []
+    context.preferences.edit.undo_steps = UNDO_STEPS
     rng = np.random.default_rng(SEED)
     for number in range(arguments.rounds):
         bpy.ops.primdiffusion.generate(seed=SEED + number, steps=arguments.steps)
@@ -109,9 +119,10 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
         bpy.ops.primdiffusion.delete_human(human=collection.name)
         bpy.ops.outliner.orphans_purge(do_recursive=True)
         bpy.ops.primdiffusion.remove_unused_files()
-        _trim()
-        resident.append(_resident_mb() + _children_mb())
-        print(f"round {number + 1}: {resident[-1]:.0f} MB with the child", flush=True)
+        resident.trim()
+        blender.append(resident.resident_mb())
+        megabytes.append(blender[-1] + resident.children_mb())
+        print(f"round {number + 1}: {blender[-1]:.0f} MB, {megabytes[-1]:.0f} MB with the child", flush=True)
     kept = {"shot.blend", "shot.blend1"}
     stray = [path for path in (arguments.folder / "scene").rglob("*") if path.is_file() and path.name not in kept]
     compiled = Path(bpy.app.tempdir) / "primdiffusion" / "cache"  # where an add-on that is not installed keeps code
@@ -121,12 +132,12 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
         print(f"left behind: {path}", flush=True)
     queue.close()
     time.sleep(3.0)
-    warm = min(4, arguments.rounds - 1)  # the child's and Blender's own caches fill in the first rounds
-    third = max(1, (len(resident) - warm) // 3)
     return {
         "soak_rounds": float(arguments.rounds),
-        "soak_memory_mb": resident[-1],
-        "soak_memory_growth_mb": float(np.median(resident[-third:]) - np.median(resident[warm : warm + third])),
+        "soak_memory_mb": megabytes[-1],
+        "soak_memory_growth_mb": resident.growth_mb(megabytes),
+        "soak_growth_mb_a_person": resident.growth_mb_a_round(megabytes),
+        "soak_growth_mb_a_person_blender": resident.growth_mb_a_round(blender),
         "soak_stray_files": float(len(stray)),
         "soak_stray_processes": float(len(psutil.Process().children(recursive=True))),
     }
@@ -179,22 +190,14 @@ def _rendered(path: Path) -> float:
     return time.perf_counter() - start
 
 
-def _trim() -> None:
-    """What the C library keeps of freed memory goes back to the system, so that resident memory is memory in use."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
+def bare(arguments: argparse.Namespace) -> dict[str, float]:
+    """What Blender keeps without us, a person's number of files at a time."""
+    import extension_bare
+
+    return extension_bare.figures(arguments.rounds)
 
 
-def _resident_mb() -> float:
-    return psutil.Process().memory_info().rss / 1e6
-
-
-def _children_mb() -> float:
-    return sum(child.memory_info().rss for child in psutil.Process().children(recursive=True)) / 1e6
-
-
-PARTS = {"register": register, "person": person, "merged": merged, "soak": soak}
+PARTS = {"register": register, "person": person, "memory": memory, "merged": merged, "soak": soak, "bare": bare}
 
 
 def main() -> None:
@@ -208,6 +211,7 @@ def main() -> None:
     arguments = parser.parse_args()
     figures = PARTS[arguments.part](arguments)
     print("\nfigures " + json.dumps(figures), flush=True)
+    blender_apart.remove()
     os._exit(0)  # bpy as a module may hang when it is torn down
 
 
