@@ -57,8 +57,11 @@ class Building:
         if written is None or self._read == len(written.files):
             return False  # where it failed, the operator tries again and tells why
         if may_read:
+            from ...scene.grid_cache import read_headers
             from ...scene.grid_warming import read_grids
 
+            if self._read == 0:
+                read_headers(path for path in written.files if path.is_file())
             self._read += read_grids(written.files[self._read :], READ_S)
         return self._read < len(written.files)
 
