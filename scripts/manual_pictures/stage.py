@@ -65,14 +65,15 @@ def pose(person: bpy.types.Collection, name: str) -> None:
     bpy.ops.primdiffusion.apply_pose(pose_name=name)
 
 
-def tiled_floor(scene: bpy.types.Scene, tile: float) -> bpy.types.Object:
-    """Tiles of two greys, `tile` metres a side; the pattern repeats after two."""
-    half = _FLOOR_TILES * tile / 2
+def tiled_floor(scene: bpy.types.Scene, tile: float, columns: int = _FLOOR_TILES) -> bpy.types.Object:
+    """Tiles of two greys, `tile` metres a side, `columns` of them along x; the pattern repeats after two."""
     corners = [
-        (x * tile - half, y * tile - half, 0.0) for y in range(_FLOOR_TILES + 1) for x in range(_FLOOR_TILES + 1)
+        ((x - columns / 2) * tile, (y - _FLOOR_TILES / 2) * tile, 0.0)
+        for y in range(_FLOOR_TILES + 1)
+        for x in range(columns + 1)
     ]
-    row = _FLOOR_TILES + 1
-    starts = [y * row + x for y in range(_FLOOR_TILES) for x in range(_FLOOR_TILES)]
+    row = columns + 1
+    starts = [y * row + x for y in range(_FLOOR_TILES) for x in range(columns)]
     mesh = bpy.data.meshes.new("Floor")
     mesh.from_pydata(corners, [], [(i, i + 1, i + row + 1, i + row) for i in starts])
     for number, colour in enumerate(_TILES):

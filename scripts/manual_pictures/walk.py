@@ -1,11 +1,14 @@
-"""Three people walk side by side, for ever: the floor runs below them, a stride a round."""
+"""Three people walk side by side, for ever: a floor runs below each of them, a stride of their own legs a round."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import bpy
 
+from blender_primdiffusion.motion.adjust import leg_ratio
+from blender_primdiffusion.motion.pose_library import rest_joints
 from blender_primdiffusion.motion.walk import CYCLE_SECONDS, STRIDE
 
 from .shrink import save_gif
@@ -17,6 +20,8 @@ FRAMES = 32
 FPS = 30
 SIZE = (480, 400)
 _APART = 0.82
+_WIDEST = 40
+"""Columns of tiles of the floors at the sides; the one in the middle has two."""
 _OUT_OF_STEP = 11
 """Frames by which each is behind the one before."""
 
@@ -25,18 +30,29 @@ def walk(scratch: Path, out: Path) -> None:
     """Generate, add the built-in motion, render a round with the engine, save the loop."""
     scene = empty_file(scratch / "walk.blend")
     scene.render.fps = FPS
-    middle = (len(SEEDS) - 1) / 2
+    middle, floors = (len(SEEDS) - 1) / 2, []
     for number, seed in enumerate(SEEDS):
         person = generate(seed, ((number - middle) * _APART, abs(number - middle) * 0.35))
-        bpy.context.view_layer.objects.active = armature_of(person)
+        armature = armature_of(person)
+        floors.append(_floor(scene, number - middle, STRIDE * leg_ratio(rest_joints(armature))))
+        bpy.context.view_layer.objects.active = armature
         bpy.ops.primdiffusion.add_motion(
             motion="WALK", rounds=4, speed=CYCLE_SECONDS * FPS / FRAMES, root="PLACE", start=1 - number * _OUT_OF_STEP
         )
-    floor = tiled_floor(scene, STRIDE / 2)
     look(scene, (-2.2, -5.6, 1.5), (0.06, 0.1, 0.87), 82)
     pictures = []
     for frame in range(FRAMES):
         scene.frame_set(1 + FRAMES + frame)
-        floor.location.y = STRIDE * frame / FRAMES
+        for floor, stride in floors:
+            floor.location.y = stride * frame / FRAMES
         pictures.append(render(scene, scratch / f"{frame:04d}.png", SIZE))
     save_gif(pictures, out, 1000 // FPS)
+
+
+def _floor(scene: bpy.types.Scene, lane: float, stride: float) -> tuple[bpy.types.Object, float]:
+    """A floor for one person, two tiles wide below them and on to the side they are at; and their stride, metres."""
+    columns = _WIDEST if lane else 2
+    floor = tiled_floor(scene, stride / 2, columns)
+    floor.scale.x = _APART / stride
+    floor.location.x = math.copysign((columns / 2 - 1) * _APART / 2, lane) + lane * _APART
+    return floor, stride
