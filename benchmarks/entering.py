@@ -4,7 +4,8 @@
 a pause. At once, as scripts and background mode have it: at_once_build_ms, then at_once_evaluate_ms until Blender can
 draw. In a window a thread writes the volumes meanwhile (write_ms), their grids are read some at a time (read_ms, each
 time longest_read_ms at most), and only then enter_build_ms and enter_undo_ms, which evaluates the scene, are in the
-way. second_* is the same for somebody who joins a first person. Drawing is not in it;
+way. second_* is the same for somebody who joins a first person, and edit_* for one who takes the place of the second,
+with all volumes changed (at_once_edit_ms where that is done at once, then evaluated). Drawing is not in it;
 `scripts/window/look.py --scenes stalls` has that too.
 """
 
@@ -26,9 +27,12 @@ from primdiffusion.human_file import export_for_blender
 from record import tell
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from blender_primdiffusion.scene.beforehand import write
+from blender_primdiffusion.scene.beforehand import Place, Written, write
 from blender_primdiffusion.scene.build import build_human, build_written, home_of_next
+from blender_primdiffusion.scene.edited import place_of, replace_by_written, replace_person
+from blender_primdiffusion.scene.grid_cache import free_unused_grids
 from blender_primdiffusion.scene.grid_warming import read_grids
+from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui.jobs.building import READ_S
 
 
@@ -46,29 +50,44 @@ def new_file(folder: Path, name: str) -> None:
     bpy.ops.ed.undo_push(message="before")
 
 
-def enter(human: Path) -> dict[str, float]:
-    """As in a window, a part after the other."""
+def prepare(human: Path, place: Place) -> tuple[Written, dict[str, float]]:
+    """What a window does before the operator's turn."""
     began = time.perf_counter()
-    written = write(human, home_of_next("Human"), lambda _fraction: None)
+    written = write(human, place, lambda _fraction: None)
     figures = {"write_ms": 1000 * (time.perf_counter() - began)}
     parts, read = [], 0
     while read < len(written.files):
         began = time.perf_counter()
         read += read_grids(written.files[read:], READ_S)
         parts.append(1000 * (time.perf_counter() - began))
-    figures |= {"read_ms": sum(parts), "longest_read_ms": max(parts)}
+    return written, figures | {"read_ms": sum(parts), "longest_read_ms": max(parts)}
+
+
+def enter(human: Path) -> dict[str, float]:
+    """As in a window, a part after the other."""
+    written, figures = prepare(human, Place(home_of_next("Human")))
     figures["enter_build_ms"] = milliseconds(lambda: build_written(bpy.context, written))
     figures["enter_undo_ms"] = milliseconds(lambda: bpy.ops.ed.undo_push(message="Generate Human"))
     return figures
 
 
+def edit(person: bpy.types.Collection, human: Path, file: Path) -> dict[str, float]:
+    """Likewise, of somebody who becomes the one of `human`; what is evaluated holds grids until it is so anew."""
+    written, figures = prepare(human, place_of(person))
+    figures["enter_swap_ms"] = milliseconds(lambda: replace_by_written(person, written, file))
+    figures["enter_evaluate_ms"] = milliseconds(bpy.context.view_layer.update)
+    figures["enter_free_ms"] = milliseconds(free_unused_grids)
+    figures["enter_undo_ms"] = milliseconds(lambda: bpy.ops.ed.undo_push(message="Vary Human"))
+    return figures
+
+
 def main() -> None:
-    """At once, then in parts, then in parts beside the person who is there."""
+    """At once, then in parts, then in parts beside the person who is there, then edits of the one and of the other."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="primdiffusion_entering_"))
-    people = [folder / f"human_{seed}.npz" for seed in range(3)]
+    people = [folder / f"human_{seed}.npz" for seed in range(5)]
     for seed, path in enumerate(people):
         export_for_blender(path, checkered_human(seed))
     new_file(folder, "at_once.blend")
@@ -77,6 +96,13 @@ def main() -> None:
     new_file(folder, "in_parts.blend")
     figures |= enter(people[1])
     figures |= {f"second_{name}": value for name, value in enter(people[2]).items()}
+    first, second = humans(bpy.context.scene)
+    file = folder / "person.human.safetensors"
+    file.write_bytes(b"somebody")
+    figures["at_once_edit_ms"] = milliseconds(lambda: replace_person(first, people[3], file))
+    figures["at_once_edit_evaluate_ms"] = milliseconds(bpy.context.view_layer.update)
+    free_unused_grids()
+    figures |= {f"edit_{name}": value for name, value in edit(second, people[4], file).items()}
     tell(figures, given.json)
 
 

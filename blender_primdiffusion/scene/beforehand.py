@@ -32,15 +32,27 @@ class Baked:
     """JSON, what `human.MARK` holds."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where a person's volumes go, and which."""
+
+    home: Path
+    """The person's folder."""
+    which: tuple[int, ...] | None = None
+    """Primitives of somebody in the scene that volumes stand for; None for a new person, who gets them all."""
+    shown: frozenset[Path] = frozenset()
+    """Files that Blender has read: volumes show them."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Written:
-    """A person whose volumes are in their folder before anything of them is in the scene."""
+    """A person whose volumes are in their folder before they are in the scene."""
 
     baked: Baked
     home: Path
     """The person's folder."""
     files: tuple[Path, ...]
-    """One for each primitive."""
+    """Those that no volume shows yet: of a new person, one for each primitive."""
     made: tuple[Path, ...]
     """Of these, and the body's, those that were not there before."""
     existing: Path
@@ -67,36 +79,42 @@ def bake(human_npz: str | Path) -> Baked:
     return Baked(human, grids, provenance(human, grids))
 
 
-def write(human_npz: Path, home: Path, step: Callable[[float], None]) -> Written:
-    """Bake, and write the volumes to `home` and the body's file beside it; `step` hears what fraction is done.
+def write(human_npz: Path, place: Place, step: Callable[[float], None]) -> Written:
+    """Bake, and write the volumes, and the body's file beside their folder; `step` hears what fraction is done.
+
+    Of somebody in the scene, volumes whose file is there are not written again.
 
     Raises HumanFileError, VolumeWriteError and what `step` raises, and then leaves no files.
     """
     began = time.monotonic()
     step(0.0)
-    baked = bake(human_npz)
+    baked, home = bake(human_npz), place.home
+    which = range(len(baked.grids.density)) if place.which is None else place.which
+    files = {k: home / volumes.file_name(baked.grids, k, bpy.app.version) for k in which}
+    absent = [k for k, path in files.items() if place.which is None or not path.is_file()]
     existing = next(parent for parent in (home, *home.parents) if parent.exists())
     model = baked.human.shape_model
     body = () if model is None else (home.parent / shape_file.file_name(model),)
     with contextlib.ExitStack() as undone:
-        files = undone.enter_context(volumes.written(baked.grids, home, step=step))
-        made = tuple(path for path in (*files, *body) if not path.exists())
+        new = undone.enter_context(volumes.written(baked.grids, home, which=absent, step=step))
+        made = tuple(path for path in (*new, *body) if not path.exists())
         if model is not None:
             undone.enter_context(shape_file.kept(model, home.parent))
-    return Written(baked, home, tuple(files), made, existing, began)
+    unread = tuple(path for path in files.values() if path not in place.shown)
+    return Written(baked, home, unread, made, existing, began)
 
 
 class Writing:
     """`write` in a thread."""
 
-    def __init__(self, human_npz: Path, home: Path) -> None:
+    def __init__(self, human_npz: Path, place: Place) -> None:
         bpy.utils.expose_bundled_modules()  # not for threads
         self.fraction = 0.0
         self.result: Written | None = None
         """None until it is done, and where it has failed."""
         self.error: Exception | None = None
         self._wanted, self._lock = True, threading.Lock()
-        self._thread = threading.Thread(target=self._run, args=(human_npz, home), name="volumes")
+        self._thread = threading.Thread(target=self._run, args=(human_npz, place), name="volumes")
         self._thread.start()
 
     @property
@@ -122,9 +140,9 @@ class Writing:
                 self.result.discard()
                 self.result = None
 
-    def _run(self, human_npz: Path, home: Path) -> None:
+    def _run(self, human_npz: Path, place: Place) -> None:
         try:
-            result = write(human_npz, home, self._step)
+            result = write(human_npz, place, self._step)
         except Exception as error:  # whoever asked decides: the thread has nobody to tell
             self.error = error
             return

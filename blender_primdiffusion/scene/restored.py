@@ -7,10 +7,10 @@ from pathlib import Path
 import bpy
 
 from . import volumes
+from .beforehand import Baked, Place, Written, bake
 from .edited import check_editable, home_of
 from .folders import stored_path
 from .human import PERSON, person_file_name, volume_path
-from .human_file import read_human
 from .placing_files import free_name
 from .shape import volumes_of
 from .shape_file import body_kept
@@ -23,7 +23,38 @@ def restore_volumes(collection: bpy.types.Collection, human_npz: Path, person: P
     shape, names, and volumes that have their files. The backend's and the body's files are put back too. Raises
     HumanFileError, VolumeWriteError or ValueError before anything in the scene is touched; makes no undo step.
     """
-    human = read_human(human_npz)
+    return _restore(collection, bake(human_npz), _lost(collection), person)
+
+
+def restore_written(collection: bpy.types.Collection, written: Written, person: Path) -> int:
+    """As `restore_volumes`, quickly, where they are written already: to `place_of_lost`, or, if the person has gone
+    elsewhere meanwhile, there once more."""
+    shown = [thing for objects in volumes_of(collection).values() for thing in objects]
+    lost = _lost(collection) | {thing for thing in shown if volume_path(thing.data) in written.made}
+    try:
+        count = _restore(collection, written.baked, lost, person)
+    except BaseException:
+        written.discard()
+        raise
+    if (home := home_of(collection)) != written.home:
+        written.discard(but=home.parent)  # where the body's file is
+    return count
+
+
+def place_of_lost(collection: bpy.types.Collection) -> Place:
+    """Where the volumes of a person go whose files are missing, and which these are."""
+    lost = _lost(collection)
+    which = tuple(k for k, objects in volumes_of(collection).items() if lost.intersection(objects))
+    return Place(home_of(collection), which)
+
+
+def _lost(collection: bpy.types.Collection) -> set[bpy.types.Object]:
+    shown = volumes_of(collection)
+    return {thing for objects in shown.values() for thing in objects if not volume_path(thing.data).is_file()}
+
+
+def _restore(collection: bpy.types.Collection, baked: Baked, lost: set[bpy.types.Object], person: Path) -> int:
+    human, grids = baked.human, baked.grids
     check_editable(collection)
     shown = volumes_of(collection)
     if max(shown) >= len(human.density):
@@ -31,9 +62,7 @@ def restore_volumes(collection: bpy.types.Collection, human_npz: Path, person: P
             f"the person {collection.name!r} has a volume {max(shown)} and {person.name!r} only {len(human.density)}: "
             "it is somebody else's file"
         )
-    grids = volumes.bake(human.density, human.rgb, human.half_extent)
     home = home_of(collection)
-    lost = {thing for objects in shown.values() for thing in objects if not volume_path(thing.data).is_file()}
     files = {k: home / volumes.file_name(grids, k, bpy.app.version) for k in shown}
     absent = [k for k, objects in shown.items() if lost.intersection(objects) and not files[k].is_file()]
     name = free_name(person, home, person_file_name(collection))

@@ -8,6 +8,7 @@ import synthetic
 import synthetic_shape
 
 from blender_primdiffusion.scene import beforehand, build
+from blender_primdiffusion.scene.beforehand import Place
 from blender_primdiffusion.scene.build import build_human, build_written, home_of_next
 from blender_primdiffusion.scene.grid_warming import read_grids
 from blender_primdiffusion.scene.human import folder_of, volume_path
@@ -48,7 +49,7 @@ def state(person):
 
 
 def test_a_person_written_before_is_the_one_that_is_built_at_once(saved_scene, source, keep, tmp_path):
-    written = beforehand.write(source, home_of_next("Anna"), silent)
+    written = beforehand.write(source, Place(home_of_next("Anna")), silent)
     early = build_written(saved_scene, written, "Anna", [keep])
     late = build_human(saved_scene, source, "Berta", [keep])
     saved_scene.view_layer.update()
@@ -67,7 +68,7 @@ def test_the_next_home_is_the_one_the_next_person_gets(saved_scene, source):
 
 
 def test_a_place_taken_meanwhile_is_left_to_who_has_it(saved_scene, source, keep, tmp_path):
-    written = beforehand.write(source, home_of_next("Anna"), silent)
+    written = beforehand.write(source, Place(home_of_next("Anna")), silent)
     bpy.data.collections.new("Anna")
     person = build_written(saved_scene, written, "Anna", [keep])
     assert person.name == "Anna.001"
@@ -79,7 +80,7 @@ def test_a_place_taken_meanwhile_is_left_to_who_has_it(saved_scene, source, keep
 
 def test_a_file_saved_meanwhile_has_the_person_beside_it(empty_scene, tmp_path):
     source = synthetic_shape.write(tmp_path / "human.npz")
-    written = beforehand.write(source, home_of_next("Anna"), silent)
+    written = beforehand.write(source, Place(home_of_next("Anna")), silent)
     (tmp_path / "film").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film" / "shot.blend"))
     person = build_written(empty_scene, written, "Anna")
@@ -93,9 +94,9 @@ def test_a_file_saved_meanwhile_has_the_person_beside_it(empty_scene, tmp_path):
 def test_discarding_leaves_what_others_had(saved_scene, source, tmp_path):
     person = build_human(saved_scene, source, "Anna")
     before = on_disk(tmp_path)
-    again = beforehand.write(source, folder_of(person), silent)  # as after the person was deleted and made again
+    again = beforehand.write(source, Place(folder_of(person)), silent)  # as after the person was deleted and made again
     again.discard()
-    beforehand.write(source, home_of_next("Anna"), silent).discard()
+    beforehand.write(source, Place(home_of_next("Anna")), silent).discard()
     assert on_disk(tmp_path) == before
 
 
@@ -108,14 +109,14 @@ def test_a_person_nobody_waits_for_leaves_no_files(saved_scene, source, tmp_path
             raise beforehand.Stopped
 
     with pytest.raises(beforehand.Stopped):
-        beforehand.write(source, home_of_next("Anna"), stop)
+        beforehand.write(source, Place(home_of_next("Anna")), stop)
     assert 0.5 < done[-1] < 0.7
     assert on_disk(tmp_path) == before
 
 
 def test_a_failure_while_building_removes_what_was_written(saved_scene, source, tmp_path, monkeypatch):
     before = on_disk(tmp_path)
-    written = beforehand.write(source, home_of_next("Anna"), silent)
+    written = beforehand.write(source, Place(home_of_next("Anna")), silent)
 
     def failing(*_):
         raise MemoryError("no memory for the volumes")
@@ -129,7 +130,7 @@ def test_a_failure_while_building_removes_what_was_written(saved_scene, source, 
 
 
 def test_the_thread_writes_what_the_call_writes(saved_scene, source, tmp_path):
-    writing = beforehand.Writing(source, home_of_next("Anna"))
+    writing = beforehand.Writing(source, Place(home_of_next("Anna")))
     writing._thread.join(30)
     assert writing.over
     assert writing.error is None
@@ -144,7 +145,7 @@ def test_the_thread_writes_what_the_call_writes(saved_scene, source, tmp_path):
 def test_a_stopped_thread_leaves_no_files_however_far_it_was(saved_scene, tmp_path, wait_s):
     source = synthetic.write(tmp_path / "human.npz", 64)
     before = on_disk(tmp_path)
-    writing = beforehand.Writing(source, home_of_next("Anna"))
+    writing = beforehand.Writing(source, Place(home_of_next("Anna")))
     writing._thread.join(wait_s)
     writing.stop()
     writing._thread.join(30)
@@ -154,9 +155,9 @@ def test_a_stopped_thread_leaves_no_files_however_far_it_was(saved_scene, tmp_pa
 
 def test_the_thread_keeps_its_failure_for_who_asks(saved_scene, tmp_path):
     (tmp_path / "bad.npz").write_bytes(b"nothing")
-    bad = beforehand.Writing(tmp_path / "bad.npz", home_of_next("Anna"))
+    bad = beforehand.Writing(tmp_path / "bad.npz", Place(home_of_next("Anna")))
     (tmp_path / "shot_humans").write_text("in the way")
-    full = beforehand.Writing(synthetic.write(tmp_path / "human.npz", 2), home_of_next("Anna"))
+    full = beforehand.Writing(synthetic.write(tmp_path / "human.npz", 2), Place(home_of_next("Anna")))
     for writing in (bad, full):
         writing._thread.join(30)
     assert isinstance(bad.error, HumanFileError)
@@ -164,7 +165,7 @@ def test_the_thread_keeps_its_failure_for_who_asks(saved_scene, tmp_path):
 
 
 def test_grids_read_before_are_there_when_volumes_show_them_and_nothing_else_is(saved_scene, source):
-    written = beforehand.write(source, home_of_next("Anna"), silent)
+    written = beforehand.write(source, Place(home_of_next("Anna")), silent)
     read = 0
     while read < len(written.files):
         count = read_grids(written.files[read:], 0.0)
@@ -180,6 +181,6 @@ def test_grids_read_before_are_there_when_volumes_show_them_and_nothing_else_is(
 
 
 def test_a_missing_file_is_no_reason_not_to_read_the_others(saved_scene, source):
-    written = beforehand.write(source, home_of_next("Anna"), silent)
+    written = beforehand.write(source, Place(home_of_next("Anna")), silent)
     written.files[0].unlink()
     assert read_grids(written.files, 60.0) == len(written.files)

@@ -9,10 +9,13 @@ from typing import Any
 
 import bpy
 
-from ...scene.edited import replace_person
+from ...scene.beforehand import Place
+from ...scene.edited import place_of
 from ...scene.human import MARK
 from ...scene.human_file import read_human
-from ...scene.restored import restore_volumes
+from ...scene.restored import place_of_lost, restore_volumes, restore_written
+from ..jobs.building import building
+from ..jobs.person import show_in_place
 from ..jobs.target import Target
 from ..jobs.work import Work, chosen_checkpoint
 
@@ -41,10 +44,15 @@ class RestoreWork(Work):
         """Of the child's method."""
         return {"person": self.file, "out_dir": str(folder), "size": _PICTURE_PX}
 
+    def place(self) -> Place:
+        """Where the lost ones were."""
+        return place_of_lost(self.target.found())
+
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Put the volumes back."""
-        person = self.target.found()
-        count = restore_volumes(person, Path(result["human"]), Path(self.file))
+        person, human, file = self.target.found(), Path(result["human"]), Path(self.file)
+        written = building.take(human)
+        count = restore_written(person, written, file) if written is not None else restore_volumes(person, human, file)
         _look()
         return f"{count} volumes of {person.name} restored from their file in {result['seconds']:.1f} s"
 
@@ -82,6 +90,10 @@ class RegenerateWork(Work):
         checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
         return {"seed": self.made["seed"], **asked, **checkpoint, "size": _PICTURE_PX, "out_dir": str(folder)}
 
+    def place(self) -> Place:
+        """Where the lost ones were."""
+        return place_of(self.target.found())
+
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Show them where the lost ones were. Raises ValueError where another checkpoint has made somebody else."""
         person, human = self.target.found(), Path(result["human"])
@@ -92,7 +104,7 @@ class RegenerateWork(Work):
                     f"{person.name!r} was made by the checkpoint {before.get('checkpoint')!r}, and this one is "
                     f"{made.get('checkpoint')!r}: choose that one in the preferences, or it would be somebody else"
                 )
-        replace_person(person, human, Path(result["person"]))
+        show_in_place(person, result)
         _look()
         return f"{person.name} generated again from seed {self.made['seed']} in {result['seconds']:.1f} s"
 

@@ -10,10 +10,12 @@ from typing import Any, ClassVar
 import bpy
 import numpy as np
 
-from ...scene.edited import replace_person
+from ...scene.beforehand import Place
+from ...scene.edited import place_of
 from ...scene.grid_cache import free_unused_grids
 from ...scene.human import overlap_warning, person_file
 from ...worker.sentence import sentence
+from ..jobs.person import show_in_place
 from ..jobs.target import Target
 from ..jobs.work import Work, chosen_checkpoint
 
@@ -58,10 +60,14 @@ class EditWork(Work):
         params["picture_px"] = _STEP_PICTURE_PX
         return {**params, **checkpoint, "out_dir": str(folder)}
 
+    def place(self) -> Place:
+        """In the place of the person's own."""
+        return place_of(self.target.found())
+
     def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Show the edited person in the place of the one that was; in which scene does not matter."""
         person = self.target.found()
-        done = replace_person(person, Path(result["human"]), Path(result["person"]))
+        done = show_in_place(person, result)
         context.view_layer.update()  # what is evaluated holds the grids of before
         free_unused_grids()
         shape = ", the body's shape too" if done.reshaped else ""

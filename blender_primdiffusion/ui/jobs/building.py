@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ...scene.beforehand import Writing, Written
+    from ...scene.beforehand import Place, Writing, Written
     from .queue import Entry
+    from .work import Work
 
 READ_S = 0.05
 """Of reading grids between two times that the window is drawn."""
@@ -32,20 +33,22 @@ class Building:
         if not self._writing.over:
             return _WRITING * self._writing.fraction
         written = self._writing.result
-        return _WRITING + (1 - _WRITING) * self._read / len(written.files) if written is not None else 1.0
+        if written is None or not written.files:
+            return 1.0
+        return _WRITING + (1 - _WRITING) * self._read / len(written.files)
 
     def begin(self, entry: Entry, result: dict[str, Any]) -> None:
-        """Start, once, on the person that `entry` builds of the child's `result`, if it builds any."""
+        """Start, once, on the person that `entry` shows of the child's `result`, if it shows any."""
         if entry is self._entry:
             return
         self.close()
         self._entry = entry
-        if entry.work.new_person and "human" in result:
+        place = _place(entry.work) if "human" in result else None
+        if place is not None:
             from ...scene.beforehand import Writing
-            from ...scene.build import home_of_next
 
             self._human = Path(result["human"])
-            self._writing = Writing(self._human, home_of_next(entry.work.new_person))
+            self._writing = Writing(self._human, place)
 
     def goes_on(self, *, may_read: bool) -> bool:
         """Whether there is more to do before the operator's turn; reads some grids where that is allowed now."""
@@ -75,6 +78,13 @@ class Building:
             self._writing.stop()
         self._entry = self._human = self._writing = None
         self._read = 0
+
+
+def _place(work: Work) -> Place | None:
+    try:
+        return work.place()
+    except (ValueError, OSError):  # the operator tells what has become of the person
+        return None
 
 
 building = Building()

@@ -10,6 +10,7 @@ import bpy
 
 from ...scene.beside import stand_beside_others
 from ...scene.build import build_human, build_written
+from ...scene.edited import Replaced, replace_by_written, replace_person
 from ...scene.human import overlap_warning
 from ...worker.sentence import sentence
 from .building import building
@@ -36,3 +37,12 @@ def build_person(
         warnings.append(overlap)
     notice = f"{made} in {result['seconds']:.1f} s, built in {time.monotonic() - began:.1f} s"
     return collection, " ".join([sentence(notice), *map(sentence, warnings)])
+
+
+def show_in_place(person: bpy.types.Collection, result: dict[str, Any]) -> Replaced:
+    """Show the person of the child's `result` where `person` is. Raises as `replace_person` does."""
+    human, file = Path(result["human"]), Path(result["person"])
+    written = building.take(human)
+    if written is None:
+        return replace_person(person, human, file)
+    return replace_by_written(person, written, file)

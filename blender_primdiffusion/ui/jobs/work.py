@@ -5,11 +5,14 @@ from __future__ import annotations
 import abc
 import importlib
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import bpy
 
 from ...places import preference
+
+if TYPE_CHECKING:
+    from ...scene.beforehand import Place
 
 
 class Work(abc.ABC):
@@ -41,6 +44,16 @@ class Work(abc.ABC):
         Runs inside an operator, in object mode where `undo` is given; that operator makes the undo step. ValueError,
         OSError and RuntimeError become the panel's error, and must leave the scene as it was.
         """
+
+    def place(self) -> Place | None:
+        """Where the volumes of the answer's "human" go, which a thread writes before `finish`; None for works that show
+        nobody. Asked for when the answer is there. ValueError and OSError are left to `finish` to tell."""
+        if not self.new_person:
+            return None
+        from ...scene.beforehand import Place
+        from ...scene.build import home_of_next
+
+        return Place(home_of_next(self.new_person))
 
     @property
     def not_kept_because(self) -> str:
