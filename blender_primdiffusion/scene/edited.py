@@ -18,6 +18,7 @@ from . import merged, shape_file, volumes
 from .beforehand import Baked, Place, Written, bake
 from .exported_proxy import proxy_of
 from .folders import humans_folder, stored_path
+from .grid_warming import read_again
 from .human import MARK, PERSON, armature_of, folder_of, folders_of, people_files, person_file_name, volume_path
 from .placing_files import named_by_content
 from .proxy_shape import follow_shape
@@ -96,8 +97,8 @@ def replace_by_written(collection: bpy.types.Collection, written: Written, perso
 def place_of(collection: bpy.types.Collection) -> Place:
     """Where volumes of the person go when they become another."""
     shown = volumes_of(collection)
-    files = frozenset(volume_path(thing.data) for objects in shown.values() for thing in objects)
-    return Place(home_of(collection), tuple(shown), files)
+    files = {volume_path(thing.data) for objects in shown.values() for thing in objects}
+    return Place(home_of(collection), tuple(shown), frozenset(path for path in files if path.is_file()))
 
 
 def _replace(collection: bpy.types.Collection, baked: Baked, person: Path) -> Replaced:
@@ -135,6 +136,8 @@ def _replace(collection: bpy.types.Collection, baked: Baked, person: Path) -> Re
             if volume_path(thing.data) != files[k]:
                 own_data(thing, collection).filepath = stored_path(files[k])
                 changed += 1
+            if thing.data.grids.error_message:  # its file was missing, and is there now
+                read_again(thing.data)
     collection[MARK] = baked.provenance
     collection[PERSON] = name
     armature_of(collection).update_tag()

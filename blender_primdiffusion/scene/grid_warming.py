@@ -1,4 +1,5 @@
-"""Grids read before a volume shows them, some at a time: Blender would read all of a new person's at once."""
+"""Grids read before a volume shows them, some at a time: Blender would read all of a new person's at once. And again,
+where Blender has looked for a file in vain."""
 
 from __future__ import annotations
 
@@ -25,3 +26,11 @@ def read_grids(files: Sequence[Path], most_s: float) -> int:
             if time.monotonic() > end:
                 return count
     return len(files)
+
+
+def read_again(volume: bpy.types.Volume) -> None:
+    """Have Blender show a volume whose file was missing when it looked: it looks no more, and keeps the error until
+    grids are unloaded that were read."""
+    volume.grids.load()
+    volume.grids.unload()
+    volume.update_tag()

@@ -10,6 +10,7 @@ from . import volumes
 from .beforehand import Baked, Place, Written, bake
 from .edited import check_editable, home_of
 from .folders import stored_path
+from .grid_warming import read_again
 from .human import PERSON, person_file_name, volume_path
 from .placing_files import free_name
 from .shape import volumes_of
@@ -30,7 +31,8 @@ def restore_written(collection: bpy.types.Collection, written: Written, person: 
     """As `restore_volumes`, quickly, where they are written already: to `place_of_lost`, or, if the person has gone
     elsewhere meanwhile, there once more."""
     shown = [thing for objects in volumes_of(collection).values() for thing in objects]
-    lost = _lost(collection) | {thing for thing in shown if volume_path(thing.data) in written.made}
+    made = {path.resolve() for path in written.made}
+    lost = _lost(collection) | {thing for thing in shown if volume_path(thing.data).resolve() in made}
     try:
         count = _restore(collection, written.baked, lost, person)
     except BaseException:
@@ -73,6 +75,7 @@ def _restore(collection: bpy.types.Collection, baked: Baked, lost: set[bpy.types
             thing.data.filepath = stored_path(files[k])
     if name != person_file_name(collection):
         collection[PERSON] = name
-    for thing in lost:
-        thing.data.grids.unload()
-    return len({thing.data for thing in lost})
+    found = {thing.data for thing in lost}
+    for volume in found:
+        read_again(volume)
+    return len(found)
