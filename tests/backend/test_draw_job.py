@@ -15,6 +15,7 @@ from primdiffusion.human import framing, generate, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings
+from primdiffusion.reshaping import reshaped
 from primdiffusion.serve import drawing
 from primdiffusion.serve.draw_params import DrawParams, PersonParams
 from primdiffusion.serve.drawing import FrameDrawer, map_frame
@@ -70,6 +71,20 @@ def test_the_frame_holds_the_picture_of_the_placed_person_from_its_bottom_row(hu
     depth = values[WIDTH * HEIGHT * 4 :].reshape(HEIGHT, WIDTH)
     assert np.allclose(combined[::-1], want.combined, atol=2e-3)
     assert np.allclose(depth[::-1], want.depth, rtol=2e-3)
+
+
+def test_other_betas_draw_the_reshaped_person_whose_boxes_have_grown(human, pose, params):
+    betas = human.betas + torch.tensor([0.0, 3.0, 1.0, 2.0, 0.0, 4.0, 0.0, 0.0, 0.0, 0.0])
+    joints = pose_body(betas, pose).skinning[:, :3].tolist()
+    person = dataclasses.replace(params.people[0], joints=joints, betas=betas.tolist())
+    got = drawn(dataclasses.replace(params, people=[person])).combined
+    camera = framing(place(human, pose), 0.4, WIDTH, HEIGHT)
+    grown, ungrown = (
+        draw(Scene(place(one, pose)), camera, Look(clip=(0.0, 1e10))).combined
+        for one in (reshaped(human, betas), dataclasses.replace(human, betas=betas))
+    )
+    assert np.abs(grown - ungrown).max() > 0.1
+    assert np.allclose(got, grown, atol=2e-3)
 
 
 @pytest.mark.parametrize("region", [[0, 0, 40, 56], [5, 7, 20, 30], [39, 55, 1, 1], [0, 20, 40, 1]])

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose
+from primdiffusion.export.merged_file import upright_grid
 from primdiffusion.human import generate, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.render.gain import DEFAULT_GAIN
 from primdiffusion.render.merge import merge
+from primdiffusion.reshaping import reshaped
 from primdiffusion.serve.draw_params import PersonParams
 from primdiffusion.serve.merge_params import FitGainParams, MergeFramesParams, MergeParams
 from primdiffusion.serve.merging import fit_gain_of, merge_frames, merge_people
@@ -58,6 +60,21 @@ def test_a_grid_is_the_posed_person_turned_z_up(human, person, tmp_path):
     x, y, z = centre(expected.density, expected.origin)
     np.testing.assert_allclose(centre(density, origin), [x, -z, y], atol=2e-3)
     assert density.astype(np.float64).sum() == pytest.approx(expected.density.sum(dtype=np.float64), rel=0.02)
+
+
+def test_other_betas_merge_the_reshaped_person_whose_boxes_have_grown(human, person, tmp_path):
+    betas = human.betas + torch.tensor([0.0, 3.0, 1.0, 2.0, 0.0, 4.0, 0.0, 0.0, 0.0, 0.0])
+    joints = pose_body(betas, pose(2)).skinning[:, :3].tolist()
+    wider = dataclasses.replace(person, joints=joints, betas=betas.tolist())
+    result = merge_people(MergeParams([wider], str(tmp_path / "grid.npz"), VOXEL), quiet)
+    with np.load(result["out"], allow_pickle=False) as grid:
+        got = grid["density"].sum(dtype=np.float64)
+    grown, ungrown = (
+        upright_grid(place(one, pose(2)), VOXEL).density.sum(dtype=np.float64)
+        for one in (reshaped(human, betas), dataclasses.replace(human, betas=betas))
+    )
+    assert abs(grown / ungrown - 1) > 0.02
+    assert got == pytest.approx(grown, rel=1e-3)
 
 
 def test_frames_are_the_person_s_single_grids(human, person, tmp_path):

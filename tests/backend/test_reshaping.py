@@ -33,6 +33,7 @@ def one(value: float) -> torch.Tensor:
 def test_with_the_betas_they_have_a_person_is_the_same_object(human):
     assert reshaped(human, human.betas.clone()) is human
     assert reshaped(human, human.betas + 5e-6) is human
+    assert reshaped(human, human.betas + 1e-4) is not human
 
 
 def test_a_body_twice_as_large_has_boxes_larger_by_the_share_and_as_thick():
