@@ -12,6 +12,7 @@ import synthetic_shape
 
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.exported_model import Frames
+from blender_primdiffusion.scene.human import person_file
 from blender_primdiffusion.ui.assets.work import HumanAssetWork, PoseAssetWork
 from blender_primdiffusion.ui.captures.reconstruct_work import ReconstructWork
 from blender_primdiffusion.ui.export.mesh_work import AddProxyWork, ExportMeshWork
@@ -93,6 +94,20 @@ def test_every_kind_asks_for_the_same_after_a_restart(person, tmp_path, monkeypa
         assert (again.label, again.kind) == (work.label, work.kind)
         if hasattr(work, "target"):
             assert again.target == Target(None, "Änne", work.target.file)
+
+
+def test_works_ask_where_the_person_s_file_is_when_their_turn_comes(person, tmp_path, monkeypatch):
+    monkeypatch.setattr("blender_primdiffusion.ui.render.merge_work._Writer.start", lambda _: None)
+    works, before = works_about(person, tmp_path), person_file(person)
+    now = before.parent.rename(tmp_path / "elsewhere") / before.name
+    for volume in bpy.data.volumes:
+        volume.filepath = str(now.parent / Path(volume.filepath).name)
+    assert person_file(person) == now
+    for work in works:
+        asked = json.dumps(work.params(tmp_path))
+        assert json.dumps(str(before)) not in asked, work.label
+        made_anew = isinstance(work, RestoreWork | RegenerateWork)
+        assert (json.dumps(str(now)) in asked) == (hasattr(work, "target") and not made_anew), work.label
 
 
 def test_variants_of_a_person_say_why_they_end_with_blender():

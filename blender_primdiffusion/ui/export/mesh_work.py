@@ -11,7 +11,7 @@ import numpy as np
 
 from ...scene.exported_model import Frames, check_ready, write_model
 from ...scene.exported_proxy import build_proxy, proxy_of, read_proxy, remove_proxy
-from ...scene.human import armature_of, person_file
+from ...scene.human import armature_of
 from ...scene.proxy_shape import follow_shape
 from ...scene.shape import betas_of
 from ...scene.shape_file import BODY_FILE
@@ -32,11 +32,10 @@ class ProxyWork(Work):
 
     def params(self, folder: Path) -> dict[str, Any]:
         """Of the child's method; the shape as it is now."""
-        person = self.target.found()
         return {
-            "person": str(person_file(person)),
+            "person": self.target.file_now(),
             "out_dir": str(folder / "proxy"),
-            "betas": betas_of(person).tolist(),
+            "betas": betas_of(self.target.found()).tolist(),
             "texture_px": self.texture_px,
             "triangles": self.triangles,
         }

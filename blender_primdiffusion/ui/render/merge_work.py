@@ -114,9 +114,9 @@ class MergeFramesWork(Work):
     def params(self, folder: Path) -> dict[str, Any]:
         """Of the child's method; its grids are taken in beside it as they appear."""
         bpy.utils.expose_bundled_modules()
+        file = self.target.file_now()
         self._writer = _Writer(folder, len(self.moments))
         self._writer.start()
-        file = self.target.file_now()
         people = [{**moment.params, "human": file} for moment in self.moments]
         return {"people": people, "voxel": self.voxel, "out_dir": str(folder)}
 
