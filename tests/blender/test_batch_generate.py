@@ -16,7 +16,7 @@ import synthetic
 
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, NO_BACKEND, UNUSABLE
 from blender_primdiffusion.scene.human import armature_of, humans, person_file, volume_path
-from blender_primdiffusion.ui.batch.asking import NoBackend
+from blender_primdiffusion.ui.batch.asking import NoBackend, ask
 from blender_primdiffusion.ui.batch.command import execute
 from blender_primdiffusion.worker.environment import BackendNotFound
 
@@ -147,6 +147,17 @@ def test_people_who_are_there_and_how_they_were_made_stay_without_a_backend(out,
     assert generate(out, "--seed", 7, "--count", 2) == NO_BACKEND
     assert (out / "settings.json").read_text() == before
     assert report(out)["skipped"] == ["person_000007"]
+
+
+def test_a_backend_lost_on_the_way_leaves_who_was_made_and_says_who(out, monkeypatch):
+    def lost(backend, method, params, *more):
+        return _no_backend() if params["seed"] == 8 else ask(backend, method, params, *more)
+
+    monkeypatch.setattr("blender_primdiffusion.ui.batch.generate.ask", lost)
+    assert generate(out, "--seed", 7, "--count", 3) == NO_BACKEND
+    assert report(out)["done"] == ["person_000007"]
+    assert (out / "settings.json").is_file()
+    assert (out / "person_000007").is_dir()
 
 
 def _no_backend(*_, **__):

@@ -156,6 +156,7 @@ def test_cancel_adds_nothing_and_leaves_no_files(on_their_way, tmp_path):
 
 def test_another_file_loaded_meanwhile_has_nobody_and_no_files_stay(on_their_way, tmp_path):
     bpy.ops.wm.read_homefile(use_empty=True)
+    assert building.fraction == 1.0, "at once: no timer may run any more"
     drive()
     assert not humans(bpy.context.scene)
     assert not (tmp_path / "shot_humans").exists()

@@ -8,6 +8,7 @@ import struct
 import time
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import pytest
@@ -193,6 +194,17 @@ def test_an_idle_child_is_ended_after_the_minutes_of_the_preferences(addon, monk
     assert memory.release_when_idle(begun + 601)
     assert ended(pid)
     assert not memory.release_when_idle(begun + 700), "nothing is left to end"
+
+
+@pytest.mark.parametrize("renders", [False, True])
+def test_grids_are_given_back_with_an_idle_child_but_not_under_a_render(addon, monkeypatch, renders):
+    started_and_idle()
+    freed = []
+    monkeypatch.setattr("blender_primdiffusion.scene.grid_cache.free_unused_grids", lambda: freed.append(1))
+    monkeypatch.setattr(memory, "idle_minutes", lambda: 10.0)
+    monkeypatch.setattr(memory, "bpy", SimpleNamespace(app=SimpleNamespace(is_job_running=lambda _: renders)))
+    assert memory.release_when_idle(queue.idle_since + 601)
+    assert len(freed) == (0 if renders else 1)
 
 
 def test_a_child_that_works_is_never_idle(addon):

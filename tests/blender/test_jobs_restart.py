@@ -165,6 +165,15 @@ def test_what_is_not_resumed_stays_for_the_next_blender(folder):
     assert [work.work["seed"] for work in queue.kept.left] == [32]
 
 
+def test_what_is_not_discarded_stays_for_the_next_blender(folder):
+    leave(folder, kept(31), kept(32, blend="/films/Kürbis 1.blend"))
+    look_for_left()
+    ops.discard_works(blend="/films/Kürbis 1.blend")
+    queue.close()
+    look_for_left()
+    assert [work.work["seed"] for work in queue.kept.left] == [31]
+
+
 def test_what_this_version_does_not_know_is_told_and_the_rest_is_resumed(folder):
     leave(folder, kept(31), kept(32, kind="sculpt"))
     look_for_left()

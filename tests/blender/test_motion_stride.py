@@ -78,6 +78,12 @@ def test_who_goes_nowhere_tells_nothing(name):
     assert stride_ratio(unknown(built_in_motion(name, 4, 30.0)), longer_legs(1.15)) is None
 
 
+def test_who_jumps_on_the_spot_tells_nothing(walk):
+    jumps = np.zeros_like(walk.translations)
+    jumps[:, 1] = np.abs(np.sin(np.linspace(0, 20, len(jumps))))
+    assert stride_ratio(dataclasses.replace(walk, translations=jumps), longer_legs(1.15)) is None
+
+
 def test_skaters_and_walkers_on_treadmills_slide_on_purpose(walk):
     still = np.tile(np.eye(3), (len(walk), 24, 1, 1))
     assert stride_ratio(dataclasses.replace(walk, rotations=still), longer_legs(1.15)) is None

@@ -11,6 +11,7 @@ import synthetic_shape
 from blender_primdiffusion.scene.body_mesh import body_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
+from blender_primdiffusion.scene.edited import replace_person
 from blender_primdiffusion.scene.exported_proxy import build_proxy, is_outdated, proxy_of, read_proxy, shown_betas
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, reshape
 from blender_primdiffusion.ui.export.mesh_work import AddProxyWork
@@ -50,6 +51,16 @@ def test_the_proxy_goes_where_the_body_goes(person, change):
     assert np.sqrt((off**2).mean()) < 0.15 * np.sqrt((moved**2).mean()), "neighbours' mean, not the vertex' own way"
     assert np.allclose(shown_betas(proxy), before + change)
     assert not is_outdated(person, proxy, betas_of(person))
+
+
+def test_an_edit_that_changes_the_body_takes_the_proxy_along(person, tmp_path):
+    after = betas_of(person) + TALLER
+    edited = {**synthetic_shape.at(synthetic_shape.arrays(), after), "meta": np.array('{"seed": 9}')}
+    np.savez(tmp_path / "edited.npz", **edited)
+    assert replace_person(person, tmp_path / "edited.npz", tmp_path / "person.human.safetensors").reshaped
+    proxy = proxy_of(person)
+    assert np.linalg.norm(places(proxy) - surface(after), axis=-1).mean() < 0.02
+    assert np.allclose(shown_betas(proxy), after)
 
 
 def test_there_and_back_the_proxy_is_what_it_was_with_what_was_sculpted(person):

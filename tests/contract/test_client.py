@@ -254,6 +254,17 @@ def test_a_module_in_the_current_folder_is_not_taken_for_the_backends(monkeypatc
     client.kill()
 
 
+def test_a_killed_child_that_the_system_has_not_taken_away_yet_is_not_alive(client, monkeypatch):
+    wait_for(client, lambda e: isinstance(e, Response))
+    assert client.alive
+    monkeypatch.setattr(client, "gone_within", lambda _seconds: False)
+    monkeypatch.setattr(client._process, "poll", lambda: None)
+    assert not client.kill(0.0)
+    assert not client.alive
+    monkeypatch.undo()
+    assert client.gone_within(10.0)
+
+
 def test_every_way_to_die_has_a_sentence():
     assert "memory" in death_sentence(-9)
     assert "signal 11" in death_sentence(-11)

@@ -70,7 +70,9 @@ def test_removing_takes_environment_and_caches_and_nothing_else(plan):
     assert kept.exists()
 
 
-def test_removing_without_a_cache_to_remove_takes_the_rest(plan):
+def test_removing_without_a_cache_to_remove_takes_the_rest(plan, tmp_path, monkeypatch):
+    (tmp_path / "working directory").mkdir()
+    monkeypatch.chdir(tmp_path / "working directory")  # which an empty path means
     plan.folder.wheels.mkdir(parents=True)
     plan = dataclasses.replace(plan, cache="")
     assert done("remove", plan).state == "done"
