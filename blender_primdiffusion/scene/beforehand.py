@@ -65,11 +65,16 @@ class Written:
         return all(path.is_file() for path in self.files)
 
     def discard(self, but: Path | None = None) -> None:
-        """Nobody shows them: remove the files that were written, but not those in the folder `but`."""
+        """Nobody shows them: remove the files that were written, but not those in the folder `but`.
+
+        One that the system does not let go of stays, and is one of the unused files.
+        """
         for path in self.made:
             if path.parent != but:
-                path.unlink(missing_ok=True)
-        volumes.remove_empty(self.home, self.existing)
+                with contextlib.suppress(OSError):  # Windows keeps what somebody reads
+                    path.unlink()
+        with contextlib.suppress(OSError):
+            volumes.remove_empty(self.home, self.existing)
 
 
 def bake(human_npz: str | Path) -> Baked:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import bpy
 import pytest
 import synthetic
@@ -98,6 +100,19 @@ def test_discarding_leaves_what_others_had(saved_scene, source, tmp_path):
     again.discard()
     beforehand.write(source, Place(home_of_next("Anna")), silent).discard()
     assert on_disk(tmp_path) == before
+
+
+def test_a_file_that_the_system_keeps_is_no_reason_to_leave_the_others(saved_scene, source, monkeypatch):
+    written, unlink = beforehand.write(source, Place(home_of_next("Anna")), silent), Path.unlink
+
+    def as_on_windows(path: Path, missing_ok: bool = False) -> None:
+        if path == written.files[2]:
+            raise PermissionError(13, "it is used by another process", str(path))
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", as_on_windows)
+    written.discard()
+    assert [path for path in written.made if path.exists()] == [written.files[2]]
 
 
 def test_a_person_nobody_waits_for_leaves_no_files(saved_scene, source, tmp_path):
