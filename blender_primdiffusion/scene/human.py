@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import bpy
@@ -71,9 +70,11 @@ def volume_path(volume: bpy.types.Volume) -> Path:
 
 
 def overlap_warning(collection: bpy.types.Collection) -> str | None:
-    """A sentence for the user when Cycles will drop volumes of this person, else None."""
+    """A sentence for the user when Cycles will drop volumes of this person in their shape of now, else None."""
+    from .overlap_now import overlapping_now
+
     try:
-        most = int(json.loads(collection[MARK])["most_overlapping"])
+        most = overlapping_now(collection)
     except (ValueError, KeyError, TypeError):  # changed by hand
         return None
     if most <= CYCLES_LIMIT:

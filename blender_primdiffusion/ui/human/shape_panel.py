@@ -95,6 +95,7 @@ class PRIMDIFFUSION_PT_details(_InHuman, bpy.types.Panel):
 def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
     """What Details says: names and values."""
     from ...scene.memory import person_memory
+    from ...scene.overlap_now import overlapping_now
 
     provenance = json.loads(person[MARK])
     lines = [(name.capitalize(), f"{provenance[name]}") for name in _SHOWN if provenance.get(name) not in (None, "")]
@@ -106,7 +107,11 @@ def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
         lines.append((f"Edit: {edit['edit']}", rest))
     volumes = [thing for thing in person.all_objects if thing.type == "VOLUME"]
     memory = person_memory(person)
-    lines.append(("Volumes", f"{len(volumes)}, up to {provenance.get('most_overlapping', '?')} overlap"))
+    try:
+        most = str(overlapping_now(person))
+    except (ValueError, KeyError, TypeError):  # changed by hand
+        most = "?"
+    lines.append(("Volumes", f"{len(volumes)}, up to {most} overlap"))
     lines.append(("Memory once drawn", f"{memory.grids / 1e6:.0f} MB"))
     lines.append(("Files", f"{memory.files / 1e6:.0f} MB"))
     return lines
