@@ -12,15 +12,13 @@ with all volumes changed (at_once_edit_ms where that is done at once, then evalu
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="primdiffusion_benchmark_"))
-
+import blender_apart  # noqa: F401  before bpy
 import bpy
 from march_people import checkered_human
 from primdiffusion.human_file import export_for_blender
@@ -82,11 +80,17 @@ def edit(person: bpy.types.Collection, human: Path, file: Path) -> dict[str, flo
 
 
 def main() -> None:
-    """At once, then in parts, then in parts beside the person who is there, then edits of the one and of the other."""
+    """Measure."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
-    folder = Path(tempfile.mkdtemp(prefix="primdiffusion_entering_"))
+    with tempfile.TemporaryDirectory(prefix="primdiffusion_entering_") as folder:
+        figures = measured(Path(folder))
+    tell(figures, given.json)
+
+
+def measured(folder: Path) -> dict[str, float]:
+    """At once, then in parts, then in parts beside the person who is there, then edits of the one and of the other."""
     people = [folder / f"human_{seed}.npz" for seed in range(5)]
     for seed, path in enumerate(people):
         export_for_blender(path, checkered_human(seed))
@@ -103,7 +107,7 @@ def main() -> None:
     figures["at_once_edit_evaluate_ms"] = milliseconds(bpy.context.view_layer.update)
     free_unused_grids()
     figures |= {f"edit_{name}": value for name, value in edit(second, people[4], file).items()}
-    tell(figures, given.json)
+    return figures
 
 
 if __name__ == "__main__":
