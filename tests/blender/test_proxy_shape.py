@@ -73,11 +73,16 @@ def test_there_and_back_the_proxy_is_what_it_was_with_what_was_sculpted(person):
     np.testing.assert_allclose(places(proxy), as_sculpted, atol=1e-5)
 
 
-@pytest.mark.parametrize("lock", ["shape keys", "edit mode"])
-def test_a_proxy_that_cannot_follow_stays_and_is_outdated(person, lock):
+@pytest.mark.parametrize("lock", ["shape keys", "edit mode", "linked mesh"])
+def test_a_proxy_that_cannot_follow_stays_and_is_outdated(person, lock, tmp_path):
     proxy = proxy_of(person)
     if lock == "shape keys":
         proxy.shape_key_add(name="Basis")
+    elif lock == "linked mesh":
+        bpy.data.libraries.write(str(tmp_path / "meshes.blend"), {proxy.data})
+        with bpy.data.libraries.load(str(tmp_path / "meshes.blend"), link=True) as (_, linked):
+            linked.meshes = [proxy.data.name]
+        proxy.data = linked.meshes[0]
     else:
         bpy.context.view_layer.objects.active = proxy
         bpy.ops.object.mode_set(mode="EDIT")
