@@ -319,7 +319,7 @@ def languages(module: str, python: str) -> Steps:
 
 
 def stalls(module: str, python: str) -> Steps:
-    """A person enters the scene, twice, then a slider is dragged: how long the window stands still."""
+    """A person enters the scene, twice, one is varied, then a slider is dragged: how long the window stands still."""
     yield from begin(module, python)
     yield from show("PRIMDIFFUSION_PT_generate")
     queue = queue_of(module)
@@ -331,6 +331,11 @@ def stalls(module: str, python: str) -> Steps:
         print(f"a person is made: {measured.end()}", flush=True)
     yield "stalls_person"
     select(armatures()[0])
+    measured = Stalls()
+    press("primdiffusion.vary", seed=SECOND_SEED)
+    yield from wait(lambda: not queue.busy, 240)
+    yield 3.0
+    print(f"a person is varied: {measured.end()}", flush=True)
     settings = armatures()[0].primdiffusion_human
     yield 2.0
     measured = Stalls()

@@ -103,7 +103,7 @@ def test_an_edit_writes_its_volumes_in_another_thread(person, monkeypatch):
     assert sorted(by) == [(False, COUNT), (True, 0)]
 
 
-def test_only_what_the_edit_changes_is_written_and_read(person, tmp_path, monkeypatch):
+def test_only_what_the_edit_changes_is_written_and_read(person, monkeypatch):
     monkeypatch.setattr(MEANWHILE, 0.0)
     before = set(shown(person).values())
     queue.add(bpy.context, RedressWork.of(person, 2, {"region": ["top"], "seed": FINE}))
@@ -139,11 +139,11 @@ def test_an_edit_that_changes_nothing_has_nothing_to_read(person):
 
 
 def test_a_person_removed_meanwhile_is_said_so_and_no_file_stays(varied, tmp_path):
-    drive_from = {path.name for path in shown(varied).values()}
+    before = {path.name for path in shown(varied).values()}
     remove_human(varied)
     drive()
     assert "was removed while the edit was under way" in error_of("vary")
-    assert {path.name for path in (tmp_path / "shot_humans").rglob("*.vdb")} == drive_from
+    assert {path.name for path in (tmp_path / "shot_humans").rglob("*.vdb")} == before
 
 
 def test_a_person_renamed_meanwhile_is_edited(varied):
@@ -304,18 +304,16 @@ def test_a_script_that_does_not_wait_for_the_volumes_gets_the_whole_edit(person)
     before = shown(person)
     vary(person)
     while not queue.ready:
-        queue.tick()
+        assert follow() is not None
         time.sleep(0.01)
-    follow()
-    if queue.ready:
-        bpy.ops.primdiffusion.take_result()
-    drive()
+    bpy.ops.primdiffusion.take_result()
+    assert follow() is None
     assert not set(shown(person).values()) & set(before.values())
     check_whole(person)
 
 
 @pytest.fixture
-def lost(person, tmp_path, monkeypatch):
+def lost(person, monkeypatch):
     """The person after five volumes were lost while Blender was closed, and were asked for; about to be read."""
     monkeypatch.setattr(MEANWHILE, 0.0)
     bpy.ops.wm.save_mainfile()

@@ -87,9 +87,8 @@ def test_volumes_that_blender_has_not_read_are_not_read_to_be_counted(person, mo
 def test_volumes_whose_files_are_missing_are_not_counted(person):
     noted = json.loads(person[MARK])["most_overlapping"]
     reshape(person, small(person))
-    next(
-        thing for thing in person.all_objects if thing.type == "VOLUME"
-    ).data.filepath = "//nowhere/prim_0000_0123456789ab.vdb"
+    volume = next(thing.data for thing in person.all_objects if thing.type == "VOLUME")
+    volume.filepath = "//nowhere/prim_0000_0123456789ab.vdb"
     bpy.context.view_layer.update()
     assert overlapping_now(person) == noted
 
