@@ -94,7 +94,7 @@ class RegenerateWork(Work):
         """Where the lost ones were."""
         return place_of(self.target.found())
 
-    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Show them where the lost ones were. Raises ValueError where another checkpoint has made somebody else."""
         person, human = self.target.found(), Path(result["human"])
         made, before = read_human(human).meta, json.loads(person[MARK])
@@ -104,7 +104,7 @@ class RegenerateWork(Work):
                     f"{person.name!r} was made by the checkpoint {before.get('checkpoint')!r}, and this one is "
                     f"{made.get('checkpoint')!r}: choose that one in the preferences, or it would be somebody else"
                 )
-        show_in_place(person, result)
+        show_in_place(context, person, result)
         _look()
         return f"{person.name} generated again from seed {self.made['seed']} in {result['seconds']:.1f} s"
 

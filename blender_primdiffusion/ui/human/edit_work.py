@@ -12,7 +12,6 @@ import numpy as np
 
 from ...scene.beforehand import Place
 from ...scene.edited import place_of
-from ...scene.grid_cache import free_unused_grids
 from ...scene.human import overlap_warning, person_file
 from ...worker.sentence import sentence
 from ..jobs.person import show_in_place
@@ -67,9 +66,7 @@ class EditWork(Work):
     def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Show the edited person in the place of the one that was; in which scene does not matter."""
         person = self.target.found()
-        done = show_in_place(person, result)
-        context.view_layer.update()  # what is evaluated holds the grids of before
-        free_unused_grids()
+        done = show_in_place(context, person, result)
         shape = ", the body's shape too" if done.reshaped else ""
         news = f"{self.made} in {result['seconds']:.1f} s; {done.volumes} of {done.of} volumes of {person.name} changed"
         warnings = (*result.get("warnings", ()), done.warning, overlap_warning(person))

@@ -60,10 +60,12 @@ class Building:
         if written is None or self._read == len(written.files):
             return False  # where it failed, the operator tries again and tells why
         if may_read:
-            from ...scene.grid_cache import read_headers
+            from ...scene.grid_cache import free_unused_grids, read_headers
             from ...scene.grid_warming import read_grids
 
             if self._read == 0:
+                if not self._entry.work.new_person:  # those of before; freed later, the new ones would be read twice
+                    free_unused_grids()
                 read_headers(path for path in written.files if path.is_file())
             self._read += read_grids(written.files[self._read :], READ_S)
         return self._read < len(written.files)

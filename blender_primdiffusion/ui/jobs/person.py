@@ -11,6 +11,7 @@ import bpy
 from ...scene.beside import stand_beside_others
 from ...scene.build import build_human, build_written
 from ...scene.edited import Replaced, replace_by_written, replace_person
+from ...scene.grid_cache import free_unused_grids
 from ...scene.human import overlap_warning
 from ...worker.sentence import sentence
 from .building import building
@@ -39,10 +40,13 @@ def build_person(
     return collection, " ".join([sentence(notice), *map(sentence, warnings)])
 
 
-def show_in_place(person: bpy.types.Collection, result: dict[str, Any]) -> Replaced:
+def show_in_place(context: bpy.types.Context, person: bpy.types.Collection, result: dict[str, Any]) -> Replaced:
     """Show the person of the child's `result` where `person` is. Raises as `replace_person` does."""
     human, file = Path(result["human"]), Path(result["person"])
     written = building.take(human)
-    if written is None:
-        return replace_person(person, human, file)
-    return replace_by_written(person, written, file)
+    if written is not None:
+        return replace_by_written(person, written, file)
+    done = replace_person(person, human, file)
+    context.view_layer.update()  # what is evaluated holds the grids of before
+    free_unused_grids()
+    return done
