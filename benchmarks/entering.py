@@ -70,11 +70,12 @@ def enter(human: Path) -> dict[str, float]:
 
 
 def edit(person: bpy.types.Collection, human: Path, file: Path) -> dict[str, float]:
-    """Likewise, of somebody who becomes the one of `human`; what is evaluated holds grids until it is so anew."""
+    """Likewise, of somebody who becomes the one of `human`; grids of before are freed first, as in a window."""
+    freed = milliseconds(free_unused_grids)
     written, figures = prepare(human, place_of(person))
+    figures["free_ms"] = freed
     figures["enter_swap_ms"] = milliseconds(lambda: replace_by_written(person, written, file))
     figures["enter_evaluate_ms"] = milliseconds(bpy.context.view_layer.update)
-    figures["enter_free_ms"] = milliseconds(free_unused_grids)
     figures["enter_undo_ms"] = milliseconds(lambda: bpy.ops.ed.undo_push(message="Vary Human"))
     return figures
 
