@@ -29,6 +29,21 @@ def messages(*tables: Iterable[tuple[str, ...]]) -> Messages:
 
 
 def register() -> None:
+    """Let the words be known to Blender once it has started: the tables would be a tenth of what enabling takes.
+
+    Without a window nothing is shown, and no timer runs.
+    """
+    bpy.app.timers.register(make_known, persistent=True)
+
+
+def unregister() -> None:
+    """Undo `register` and `make_known`."""
+    if bpy.app.timers.is_registered(make_known):
+        bpy.app.timers.unregister(make_known)
+    bpy.app.translations.unregister(__package__)
+
+
+def make_known() -> None:
     """Make the words known to Blender."""
     from . import tooltips_of_options, tooltips_of_settings
     from .choices import CHOICES
@@ -38,8 +53,12 @@ def register() -> None:
 
     tooltips = (TOOLTIPS, tooltips_of_settings.TOOLTIPS, tooltips_of_options.TOOLTIPS)
     bpy.app.translations.register(__package__, messages(LABELS, CHOICES, REFUSALS, *tooltips))
+    if bpy.app.translations.locale in LANGUAGES:
+        _draw_again()
 
 
-def unregister() -> None:
-    """Undo `register`."""
-    bpy.app.translations.unregister(__package__)
+def _draw_again() -> None:
+    """What was drawn before the words were known is English."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            area.tag_redraw()
