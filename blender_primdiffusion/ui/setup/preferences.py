@@ -7,7 +7,7 @@ import bpy
 from ...places import EXTENSION, set_up_folder
 from .drawing import draw_cost, draw_news, draw_progress, draw_text
 from .known import gigabytes, known, machine
-from .session import session
+from .session import redraw, session
 
 _WIDTH = 90
 """Characters in a line of the preferences' window as it opens."""
@@ -17,6 +17,11 @@ _COMPUTE = (
     ("CUDA", "NVIDIA (CUDA)", "Large download; needs an NVIDIA card and driver"),
     ("APPLE", "Apple", "For Apple Silicon; computes on its processor"),
 )
+
+
+def _redraw(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
+    """Sidebars are grey, or not, by what is chosen here."""
+    redraw()
 
 
 class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
@@ -32,6 +37,7 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         description="Python 3.11 or newer with PrimDiffusion's packages (torch), used instead of the private "
         "environment; empty: the private environment",
         subtype="FILE_PATH",
+        update=_redraw,
     )
     checkpoint: bpy.props.StringProperty(
         name="Checkpoint",
