@@ -85,6 +85,11 @@ def overlap_warning(collection: bpy.types.Collection) -> str | None:
     )
 
 
+def overlap_warning_in(scene: bpy.types.Scene, collection: bpy.types.Collection) -> str | None:
+    """The same where Cycles is the scene's engine: it is a matter of Cycles alone, and others need not be told."""
+    return overlap_warning(collection) if scene.render.engine == "CYCLES" else None
+
+
 def armature_of(collection: bpy.types.Collection) -> bpy.types.Object:
     """The person's armature object; ValueError when the collection is no person or lost it."""
     for candidate in collection.objects:

@@ -18,7 +18,15 @@ from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attach import attach_volumes
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving
-from blender_primdiffusion.scene.human import MARK, armature_of, folder_of, humans, overlap_warning, remove_human
+from blender_primdiffusion.scene.human import (
+    MARK,
+    armature_of,
+    folder_of,
+    humans,
+    overlap_warning,
+    overlap_warning_in,
+    remove_human,
+)
 from blender_primdiffusion.scene.human_file import HumanFileError
 from blender_primdiffusion.scene.keyframes import keyframe_poses
 from blender_primdiffusion.scene.volumes import VolumeWriteError
@@ -118,6 +126,16 @@ def test_provenance_and_overlaps_are_kept_on_the_collection(person):
     assert overlap_warning(collection) is None
     collection[MARK] = json.dumps({**stored, "most_overlapping": 40})
     assert "draws only 31" in overlap_warning(collection)
+
+
+def test_overlaps_are_told_to_those_who_render_with_cycles_alone(person):
+    collection, _ = person
+    collection[MARK] = json.dumps({**json.loads(collection[MARK]), "most_overlapping": 40})
+    scene = bpy.context.scene
+    scene.render.engine = "BLENDER_WORKBENCH"
+    assert overlap_warning_in(scene, collection) is None
+    scene.render.engine = "CYCLES"
+    assert "draws only 31" in overlap_warning_in(scene, collection)
 
 
 def test_saving_and_loading_keeps_volumes_pose_and_relative_paths(person, tmp_path):

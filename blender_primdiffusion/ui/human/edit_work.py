@@ -12,7 +12,7 @@ import numpy as np
 
 from ...scene.beforehand import Place
 from ...scene.edited import place_of
-from ...scene.human import overlap_warning, person_file
+from ...scene.human import overlap_warning_in, person_file
 from ...worker.sentence import sentence
 from ..jobs.person import show_in_place
 from ..jobs.target import Target
@@ -69,7 +69,7 @@ class EditWork(Work):
         done = show_in_place(context, person, result)
         shape = ", the body's shape too" if done.reshaped else ""
         news = f"{self.made} in {result['seconds']:.1f} s; {done.volumes} of {done.of} volumes of {person.name} changed"
-        warnings = (*result.get("warnings", ()), done.warning, overlap_warning(person))
+        warnings = (*result.get("warnings", ()), done.warning, overlap_warning_in(context.scene, person))
         return " ".join([f"{news}{shape}.", *(sentence(text) for text in warnings if text)])
 
     def to_json(self) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from ...scene.beside import stand_beside_others
 from ...scene.build import build_human, build_written
 from ...scene.edited import Replaced, replace_by_written, replace_person
 from ...scene.grid_cache import free_unused_grids
-from ...scene.human import overlap_warning
+from ...scene.human import overlap_warning_in
 from ...worker.sentence import sentence
 from .building import building
 
@@ -34,7 +34,7 @@ def build_person(
         collection = build_human(context, human, name, keep)
     stand_beside_others(context, collection)
     warnings = list(result.get("warnings", ()))
-    if context.scene.render.engine == "CYCLES" and (overlap := overlap_warning(collection)):
+    if overlap := overlap_warning_in(context.scene, collection):
         warnings.append(overlap)
     notice = f"{made} in {result['seconds']:.1f} s, built in {time.monotonic() - began:.1f} s"
     return collection, " ".join([sentence(notice), *map(sentence, warnings)])

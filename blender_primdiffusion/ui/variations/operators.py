@@ -7,7 +7,7 @@ from typing import Any
 
 import bpy
 
-from ...scene.human import overlap_warning
+from ...scene.human import overlap_warning_in
 from ...worker.sentence import sentence
 from ..generate.asking import Asking, last_seed
 from ..generate.quality import STEPS_AND_SAMPLER
@@ -157,8 +157,9 @@ class PRIMDIFFUSION_OT_build_variation(bpy.types.Operator):
         if failure:
             self.report({"ERROR"}, told(f"{len(built)} of {len(wanted)} people were built. {failure}"))
             return {"FINISHED"} if built else {"CANCELLED"}
-        for warning in filter(None, map(overlap_warning, built)):
-            self.report({"WARNING"}, told(sentence(warning)))
+        for person in built:
+            if warning := overlap_warning_in(context.scene, person):
+                self.report({"WARNING"}, told(sentence(warning)))
         return {"FINISHED"}
 
 
