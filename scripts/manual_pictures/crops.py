@@ -44,8 +44,8 @@ STACKS = {"set_up_progress": ("set_up_real_0", "set_up_real_1", "set_up_real_2")
 DIALOGS = {"motion_dialog": "motion_dialog"}
 WINDOW_PART = (0, 24, 1320, 1190)
 """Of the main window, pixels: without the properties and the timeline."""
-PREFERENCES_PART = (172, 222, 872, 573)
-"""Of the preferences' window, pixels: what is the extension's."""
+PREFERENCES_PART = (172, 222, 872, 548)
+"""Of the preferences' window, pixels: what is the extension's, down to a whole row."""
 _STACKED_ROWS = 130
 """Of the preferences' part: down to the end of the backend's box, while it is at work."""
 _WINDOW_WIDTH = 880
