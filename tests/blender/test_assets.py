@@ -186,6 +186,7 @@ def test_what_cannot_be_an_asset_is_said(addon, tmp_path):
 def test_the_panel_offers_what_makes_sense(person):
     def buttons() -> set[str]:
         layout = MagicMock()
+        layout.row.return_value = layout
         PRIMDIFFUSION_PT_assets.draw(SimpleNamespace(layout=layout), bpy.context)
         return {call.args[0].partition(".")[2] for call in layout.operator.call_args_list}
 

@@ -404,7 +404,7 @@ def test_the_import_shows_what_it_finds_before_anything_is_done(addon, armature,
     assert {"Ann", "SMPL-H", "120", "z"} <= set(labels)
     assert "bones" not in settings
     (tmp_path / "bad.bvh").write_text("HIERARCHY")
-    assert any("is not a BVH file" in label for label in drawn(str(tmp_path / "bad.bvh"))[0])
+    assert "is not a BVH file" in " ".join(drawn(str(tmp_path / "bad.bvh"))[0])  # lines break where the path ends
     assert drawn("")[0] == ["Ann"]
     from test_motion_bvh import motion_of, write_bvh
 

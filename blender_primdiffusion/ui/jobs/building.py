@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 READ_S = 0.05
 """Of reading grids between two times that the window is drawn."""
+_SHOWN_STEPS = 20
+"""Of the bar: to draw a window takes long, on some machines longer than READ_S."""
 _WRITING = 0.6
 """How much of the time goes by until all is written."""
 
@@ -24,6 +26,7 @@ class Building:
         self._human: Path | None = None
         self._writing: Writing | None = None
         self._read = 0
+        self._shown = 0
 
     @property
     def fraction(self) -> float:
@@ -36,6 +39,17 @@ class Building:
         if written is None or not written.files:
             return 1.0
         return _WRITING + (1 - _WRITING) * self._read / len(written.files)
+
+    @property
+    def reading(self) -> bool:
+        """Grids are to be read, and nothing else is waited for."""
+        written = self._writing.result if self._writing is not None and self._writing.over else None
+        return written is not None and self._read < len(written.files)
+
+    def moved(self) -> bool:
+        """Whether the bar has come a step further since this was asked last."""
+        before, self._shown = self._shown, int(_SHOWN_STEPS * self.fraction)
+        return self._shown != before
 
     def begin(self, entry: Entry, result: dict[str, Any]) -> None:
         """Start, once, on the person that `entry` shows of the child's `result`, if it shows any."""
@@ -79,7 +93,7 @@ class Building:
         if self._writing is not None:
             self._writing.stop()
         self._entry = self._human = self._writing = None
-        self._read = 0
+        self._read = self._shown = 0
 
 
 def _place(work: Work) -> Place | None:

@@ -57,6 +57,8 @@ def follow() -> float | None:
     changed |= so_far.show(queue.job.picture if queue.job is not None else None)
     if changed:
         redraw()
+    if building.reading and not in_the_way():
+        return 0.0  # whatever the user does meanwhile comes first all the same
     return TICK_S if queue.busy else None
 
 
@@ -112,7 +114,7 @@ def _nearer() -> bool:
     building.begin(queue.current, queue.job.result or {})
     waits = bool(in_the_way())
     if building.goes_on(may_read=not waits):
-        return True
+        return building.moved()
     if not waits:
         enter()
     return not waits
