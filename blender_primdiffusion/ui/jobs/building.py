@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 READ_S = 0.05
 """Of reading grids between two times that the window is drawn."""
-_SHOWN_STEPS = 20
+_SHOWN_STEPS = 10
 """Of the bar: to draw a window takes long, on some machines longer than READ_S."""
 _WRITING = 0.6
 """How much of the time goes by until all is written."""
