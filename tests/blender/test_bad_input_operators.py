@@ -29,7 +29,7 @@ from blender_primdiffusion.ui.jobs.work import Work
 
 ELSEWHERE = {"open_manual", "repair_backend", "test_backend", "set_up_backend", "make_pose_assets", "copy_diagnostics"}
 """Open a browser, set up, write a library or a text: whatever is in the scene, it stays as it is."""
-_BLENDER_LISTS = {"window_managers", "workspaces", "screens", "texts", "palettes", "brushes", "libraries"}
+_BLENDER_LISTS = {"window_managers", "workspaces", "screens", "texts", "palettes", "brushes", "libraries", "all_ids"}
 """Blender's own, or where an operator says something. A linked person's library is one of theirs."""
 
 
