@@ -7,7 +7,7 @@ import dataclasses
 import json
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import bpy
@@ -63,6 +63,18 @@ class Written:
     def whole(self) -> bool:
         """Nobody has removed a file since."""
         return all(path.is_file() for path in self.files)
+
+    @contextlib.contextmanager
+    def entering(self, home: Callable[[], Path]) -> Iterator[None]:
+        """A block that puts the person into the scene. The files go where it fails, and where the person's folder,
+        `home` after the block, is another meanwhile: the block has written them there once more."""
+        try:
+            yield
+        except BaseException:
+            self.discard()
+            raise
+        if (now := home()) != self.home:
+            self.discard(but=now.parent)  # where the body's file is
 
     def discard(self, but: Path | None = None) -> None:
         """Nobody shows them: remove the files that were written, but not those in the folder `but`.

@@ -47,13 +47,8 @@ def build_written(
 ) -> bpy.types.Collection:
     """As `build_human`, quickly, of a person whose volumes are written: where they are, or, if somebody else has taken
     that place meanwhile, as copies elsewhere."""
-    try:
+    with written.entering(lambda: folder_of(person)):
         person = _build(context, written.baked, written, name, keep)
-    except BaseException:
-        written.discard()
-        raise
-    if folder_of(person) != written.home:
-        written.discard(but=folder_of(person).parent)  # where the body's file is
     return person
 
 

@@ -84,14 +84,8 @@ def replace_person(collection: bpy.types.Collection, human_npz: Path, person: Pa
 def replace_by_written(collection: bpy.types.Collection, written: Written, person: Path) -> Replaced:
     """As `replace_person`, quickly, by somebody whose volumes are written: where `place_of` said, or, if the person has
     gone elsewhere meanwhile, there once more."""
-    try:
-        done = _replace(collection, written.baked, person)
-    except BaseException:
-        written.discard()
-        raise
-    if (home := home_of(collection)) != written.home:
-        written.discard(but=home.parent)  # where the body's file is
-    return done
+    with written.entering(lambda: home_of(collection)):
+        return _replace(collection, written.baked, person)
 
 
 def place_of(collection: bpy.types.Collection) -> Place:

@@ -33,14 +33,8 @@ def restore_written(collection: bpy.types.Collection, written: Written, person: 
     shown = [thing for objects in volumes_of(collection).values() for thing in objects]
     made = {path.resolve() for path in written.made}
     lost = _lost(collection) | {thing for thing in shown if volume_path(thing.data).resolve() in made}
-    try:
-        count = _restore(collection, written.baked, lost, person)
-    except BaseException:
-        written.discard()
-        raise
-    if (home := home_of(collection)) != written.home:
-        written.discard(but=home.parent)  # where the body's file is
-    return count
+    with written.entering(lambda: home_of(collection)):
+        return _restore(collection, written.baked, lost, person)
 
 
 def place_of_lost(collection: bpy.types.Collection) -> Place:

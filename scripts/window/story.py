@@ -5,12 +5,14 @@ Every scene is told the name of the extension's module and the backend's Python,
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
 import bpy
+from beginnings import armatures, begin, cancel_all, people_file, queue_of, select, with_people
 from panels import show, sidebar, view, wide_view
 from press import Steps, invoke, press, wait
 from stalls import Stalls
@@ -222,7 +224,7 @@ def captures(module: str, python: str) -> Steps:
     yield from begin(module, python)
     yield from show("PRIMDIFFUSION_PT_captures", "PRIMDIFFUSION_PT_captures_cameras", "PRIMDIFFUSION_PT_captures_poses")
     for name in ("people", "out"):
-        folder = Path("/tmp/shots") / {"people": "scans", "out": "captures"}[name]
+        folder = Path(tempfile.gettempdir()) / "shots" / {"people": "scans", "out": "captures"}[name]
         folder.mkdir(exist_ok=True, parents=True)
         setattr(bpy.context.scene.primdiffusion_captures, name, str(folder))
     press("primdiffusion.preview_rig")
@@ -343,74 +345,6 @@ def stalls(module: str, python: str) -> Steps:
         settings.betas[0] = 0.2 * move
         yield 0.01
     print(f"a slider is dragged: {measured.end()}", flush=True)
-
-
-def begin(module: str, python: str) -> Steps:
-    """A new file, a backend."""
-    bpy.ops.wm.read_homefile(use_factory_startup=True)
-    yield 1.5
-    bpy.context.preferences.addons[module].preferences.backend_python = python
-    for thing in list(bpy.data.objects):
-        if thing.type == "MESH":
-            bpy.data.objects.remove(thing)
-
-
-def with_people(module: str, python: str, *seeds: int) -> Steps:
-    """A file with these people, made once."""
-    yield from begin(module, python)
-    path = people_file(module, len(seeds))
-    if path.is_file():
-        bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False)
-    else:
-        for seed in seeds:
-            press("primdiffusion.generate", seed=seed)
-        yield from wait(lambda: not queue_of(module).busy, 400)
-        bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    leave_out_volumes()
-    yield 1.0
-    select(armatures()[0])
-
-
-def leave_out_volumes() -> None:
-    """Out of the view layer: the engine does not need them, and each person's take a gigabyte."""
-    waiting = [bpy.context.view_layer.layer_collection]
-    while waiting:
-        layer = waiting.pop()
-        waiting += layer.children
-        if layer.name.endswith("_primitives"):
-            layer.exclude = True
-
-
-def people_file(module: str, count: int = 1) -> Path:
-    """Beside the installed extension: gone with it."""
-    folder = Path(import_module(module).__file__).parents[3]
-    return folder / f"people_{count}.blend"
-
-
-def queue_of(module: str):
-    """The line of works."""
-    return import_module(f"{module}.ui.jobs.queue").queue
-
-
-def cancel_all(module: str) -> Steps:
-    """Empty the line."""
-    queue = queue_of(module)
-    while queue.busy:
-        press("primdiffusion.cancel")
-        yield 0.3
-
-
-def armatures() -> list[bpy.types.Object]:
-    """Of the people, in the order of their making."""
-    return sorted((thing for thing in bpy.context.scene.objects if thing.type == "ARMATURE"), key=lambda t: t.name)
-
-
-def select(armature: bpy.types.Object) -> None:
-    """The person of whom the panels tell."""
-    for thing in bpy.context.view_layer.objects:
-        thing.select_set(False)
-    armature.select_set(True)
-    bpy.context.view_layer.objects.active = armature
 
 
 def paint(armature: bpy.types.Object) -> None:
