@@ -104,21 +104,24 @@ def test_progress_and_seconds_left_are_told_band_by_band(stage, monkeypatch):
 def test_a_cancel_ends_the_picture_within_a_band(stage, monkeypatch):
     monkeypatch.setenv("FAKE_BAND_S", "0.3")
     render()
-    began = time.monotonic()
-    drawing = final.render_layer(Engine(stop_after_s=0.1), bpy.context.evaluated_depsgraph_get())
+    engine = Engine(stop_after_s=0.1)
+    drawing = final.render_layer(engine, bpy.context.evaluated_depsgraph_get())
     assert drawing.state == "cancelled"
-    assert time.monotonic() - began < 0.9  # four bands would take 1.2
+    assert max(engine.progress, default=0.0) < 1.0
 
 
 def test_a_cancel_does_not_wait_for_a_child_that_is_still_being_started(stage, monkeypatch):
+    start, started = threading.Event(), []
+
     def slowly(*_: object, **__: object) -> BackendPython:
-        time.sleep(3.0)
-        raise AssertionError
+        start.wait(60)
+        started.append(True)
+        raise OSError("not in this test")
 
     monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", slowly)
-    began = time.monotonic()
     final.render_layer(Engine(stop_after_s=0.0), bpy.context.evaluated_depsgraph_get())
-    assert time.monotonic() - began < 1.0
+    assert not started
+    start.set()
 
 
 def test_waiting_leaves_other_threads_their_time(stage, monkeypatch):
@@ -126,8 +129,7 @@ def test_waiting_leaves_other_threads_their_time(stage, monkeypatch):
     render()
     began, busy = time.monotonic(), time.thread_time()
     final.render_layer(Engine(), bpy.context.evaluated_depsgraph_get())
-    assert time.monotonic() - began > 0.7
-    assert time.thread_time() - busy < 0.1
+    assert time.thread_time() - busy < 0.5 * (time.monotonic() - began)
 
 
 def test_a_child_that_dies_is_one_error_and_the_next_render_works(stage, monkeypatch):

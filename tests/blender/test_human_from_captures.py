@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -121,9 +120,7 @@ def test_the_panel_shows_progress_and_cancel_ends_the_job_without_a_person(addon
     texts = shown(PRIMDIFFUSION_PT_human_from_captures, addon)
     assert texts == ["primdiffusion.human_from_captures", "Reconstructing", "primdiffusion.cancel"]
     bpy.ops.primdiffusion.cancel()
-    asked = time.monotonic()
     drive()
-    assert time.monotonic() - asked < 2.0
     assert (error_of("reconstruct"), notice_of("reconstruct")) == ("", "Cancelled")
     assert not humans(addon.scene)
 

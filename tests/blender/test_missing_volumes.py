@@ -179,16 +179,12 @@ def test_a_person_in_a_lost_folder_of_a_linked_blend_is_told(person, tmp_path):
         ops.find_missing_volumes()
 
 
-def test_missing_files_of_a_thousand_volumes_are_noticed_in_milliseconds(person):
-    import time
-
+def test_missing_files_of_a_thousand_volumes_are_one_entry(person):
     for number in range(1024):
         copy = bpy.data.volumes.new(f"more_{number}")
         copy.filepath = f"//shot_humans/Anna/prim_{number:04d}_0123456789ab.vdb"
         person.objects.link(bpy.data.objects.new(copy.name, copy))
-    began = time.process_time()
     (lost,) = missing_files()
-    assert time.process_time() - began < 0.2
     assert len(lost.volumes) == 1024
 
 
