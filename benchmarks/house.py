@@ -1,0 +1,263 @@
+"""Figures of the source tree: sizes by room, import circles, hidden imports, threads, ambiguous names, stray tests.
+
+    python benchmarks/house.py
+    python benchmarks/house.py --walk --json docs/results/house.json    # --walk: also run Generate and count the files
+
+The source is parsed, never imported. What is counted is printed above the figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import io
+import json
+import subprocess
+import sys
+import tempfile
+import tokenize
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import record
+
+ROOT = Path(__file__).resolve().parents[1]
+PROGRAMS = {"backend": ROOT / "backend" / "primdiffusion", "extension": ROOT / "blender_primdiffusion"}
+TESTS = {"backend": ROOT / "tests" / "backend", "extension": ROOT / "tests" / "blender"}
+"""tests/contract is about both programs at once, so it mirrors neither."""
+SUITE = ROOT / "docs" / "results" / "suite.json"
+THREAD_MODULES = {"threading", "_thread", "concurrent.futures", "multiprocessing"}
+FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
+NO_REASON = ("noqa", "type:", "fmt:", "pyright:")
+"""Comments for tools."""
+
+
+@dataclass(frozen=True)
+class Import:
+    """An import statement."""
+
+    targets: tuple[str, ...]
+    """Dotted names; of `from a import b` the name a.b, which may be a module or something in a."""
+    first_line: int
+    last_line: int
+    in_function: bool
+
+
+@dataclass(frozen=True)
+class Module:
+    """A parsed file of the product."""
+
+    program: str
+    path: Path
+    name: str
+    """Dotted."""
+    source: str
+    imports: tuple[Import, ...]
+    classes: frozenset[str]
+
+    @property
+    def room(self) -> str:
+        """The package below the program's own, "top" for files directly in it."""
+        parts = self.path.relative_to(PROGRAMS[self.program]).parts
+        return parts[0] if len(parts) > 1 else "top"
+
+    @property
+    def lines(self) -> int:
+        """Lines of the file, with blank ones and comments."""
+        return len(self.source.splitlines())
+
+
+def main() -> None:
+    """Print the findings and the figures."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
+    parser.add_argument("--walk", action="store_true", help="generate in Blender and count the files passed (walk.py)")
+    arguments = parser.parse_args()
+    modules = parsed()
+    findings = {
+        "import_circles": import_circles(modules),
+        "hidden_imports": hidden_imports(modules),
+        "threads_in_extension": threads_in_extension(modules),
+        "names_with_two_meanings": names_with_two_meanings(modules),
+        "tests_without_source": tests_without_source(),
+    }
+    for name, found in findings.items():
+        print(f"{name}:", *(found or ["none"]), sep="\n  ", end="\n\n")
+    figures: dict[str, float | None] = {**sizes(modules), **{name: len(found) for name, found in findings.items()}}
+    figures["test_minutes"] = json.loads(SUITE.read_text())["test_minutes"] if SUITE.is_file() else None
+    figures |= walk() if arguments.walk else {"walk_extension_files": None, "walk_backend_files": None}
+    record.tell(figures, arguments.json)
+
+
+def parsed() -> list[Module]:
+    """All Python files of both programs."""
+    modules = []
+    for program, folder in PROGRAMS.items():
+        for path in sorted(folder.rglob("*.py")):
+            source = path.read_text(encoding="utf-8")
+            parts = path.relative_to(folder.parent).with_suffix("").parts
+            is_package = parts[-1] == "__init__"
+            name = ".".join(parts[:-1] if is_package else parts)
+            tree = ast.parse(source, str(path))
+            package = name if is_package else name.rpartition(".")[0]
+            classes = frozenset(node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+            modules.append(Module(program, path, name, source, tuple(_imports(tree, package)), classes))
+    return modules
+
+
+def sizes(modules: list[Module]) -> dict[str, float | None]:
+    """Lines and files of the product, of each program and of each room."""
+    lines: dict[str, float | None] = defaultdict(int)
+    files: dict[str, float | None] = defaultdict(int)
+    for module in modules:
+        for part in ("product", module.program, f"{module.program}_{module.room}"):
+            lines[f"{part}_lines"] += module.lines
+            files[f"{part}_files"] += 1
+    by_part: dict[str, float | None] = {}
+    for name in sorted(lines, key=lambda name: (name != "product_lines", name)):
+        count = name.replace("_lines", "_files")
+        by_part |= {name: lines[name], count: files[count]}
+    return by_part
+
+
+def import_circles(modules: list[Module]) -> list[str]:
+    """Groups of modules that import each other: at the top of files, in functions, under `if TYPE_CHECKING`.
+
+    Packages that an import passes on its way to a module are left out.
+    """
+    names = {module.name for module in modules}
+    graph: dict[str, set[str]] = {}
+    for module in modules:
+        targets = (target for each in module.imports for target in each.targets)
+        known = (target if target in names else target.rpartition(".")[0] for target in targets)
+        graph[module.name] = {target for target in known if target in names} - {module.name}
+    return [" <-> ".join(sorted(group)) for group in _circles(graph)]
+
+
+def hidden_imports(modules: list[Module]) -> list[str]:
+    """Imports in functions without a comment that says why: beside them, or above them or the imports they follow."""
+    found = []
+    for module in modules:
+        comments = _comments(module.source)
+        explained_line = -1
+        for each in sorted((i for i in module.imports if i.in_function), key=lambda i: i.first_line):
+            above = comments.get(each.first_line - 1, (True, False)) == (False, True)
+            if above or explained_line == each.first_line - 1:
+                explained_line = each.last_line
+            elif not any(line in comments for line in range(each.first_line, each.last_line + 1)):
+                found.append(f"{module.path.relative_to(ROOT)}:{each.first_line} {', '.join(each.targets)}")
+    return found
+
+
+def threads_in_extension(modules: list[Module]) -> list[str]:
+    """Files of the extension that import a module of threads or processes."""
+    return [
+        str(module.path.relative_to(ROOT))
+        for module in modules
+        if module.program == "extension"
+        and any(
+            target == name or target.startswith(f"{name}.")
+            for each in module.imports
+            for target in each.targets
+            for name in THREAD_MODULES
+        )
+    ]
+
+
+def names_with_two_meanings(modules: list[Module]) -> list[str]:
+    """Public names of classes that two or more modules define."""
+    homes: dict[str, list[str]] = defaultdict(list)
+    for module in modules:
+        for name in module.classes:
+            if not name.startswith("_"):
+                homes[name].append(module.name)
+    return [f"{name}: {', '.join(where)}" for name, where in sorted(homes.items()) if len(where) > 1]
+
+
+def tests_without_source() -> list[str]:
+    """Test files whose path names no source file.
+
+    `render/test_march.py` is the test of `render/march.py`, `render/test_march_gradients.py` of one aspect of it.
+    """
+    found = []
+    for program, folder in TESTS.items():
+        for path in sorted(folder.rglob("test_*.py")):
+            words = path.stem.split("_")[1:]
+            beside = PROGRAMS[program] / path.parent.relative_to(folder)
+            names = ("_".join(words[:count]) for count in range(len(words), 0, -1))
+            if not any((beside / f"{name}.py").is_file() for name in names):
+                found.append(str(path.relative_to(ROOT)))
+    return found
+
+
+def walk() -> Mapping[str, float | None]:
+    """Run walk.py in a process of its own and read its figures."""
+    with tempfile.TemporaryDirectory(prefix="primdiffusion_house_") as folder:
+        path = Path(folder) / "walk.json"
+        subprocess.run([sys.executable, str(ROOT / "benchmarks" / "walk.py"), "--json", str(path)], check=True)
+        figures = json.loads(path.read_text())
+    return {name: figures[name] for name in ("walk_extension_files", "walk_backend_files")}
+
+
+def _imports(tree: ast.AST, package: str, in_function: bool = False) -> Iterator[Import]:
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            targets = tuple(_targets(node, package))
+            yield Import(targets, node.lineno, node.end_lineno or node.lineno, in_function)
+        else:
+            yield from _imports(node, package, in_function or isinstance(node, FUNCTIONS))
+
+
+def _targets(node: ast.Import | ast.ImportFrom, package: str) -> Iterator[str]:
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+        return
+    parents = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+    origin = ".".join([*parents, *([node.module] if node.module else [])])
+    yield from (f"{origin}.{alias.name}" for alias in node.names)
+
+
+def _comments(source: str) -> dict[int, tuple[bool, bool]]:
+    """Lines with a comment for readers -> (code before it, True)."""
+    found = {}
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        words = token.string.lstrip("# ")
+        if token.type == tokenize.COMMENT:
+            reason = words.partition("  ")[2] if words.startswith(NO_REASON) else words
+            if reason:
+                found[token.start[0]] = (bool(token.line[: token.start[1]].strip()), True)
+    return found
+
+
+def _circles(graph: Mapping[str, set[str]]) -> list[set[str]]:
+    """Strongly connected components of two or more (Tarjan 1972)."""
+    order: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    circles: list[set[str]] = []
+
+    def visit(node: str) -> None:
+        order[node] = low[node] = len(order)
+        stack.append(node)
+        for target in sorted(graph[node]):
+            if target not in order:
+                visit(target)
+                low[node] = min(low[node], low[target])
+            elif target in stack:
+                low[node] = min(low[node], order[target])
+        if low[node] == order[node]:
+            start = stack.index(node)
+            if len(stack) - start > 1:
+                circles.append(set(stack[start:]))
+            del stack[start:]
+
+    for node in sorted(graph):
+        if node not in order:
+            visit(node)
+    return circles
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,35 @@
+"""How long `make test` takes on each Blender.
+
+    python benchmarks/suite.py --json docs/results/suite.json
+
+Run it on a quiet machine whose environments are set up (`make test` before). Ends with an error when a test fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+from pathlib import Path
+
+import record
+
+ROOT = Path(__file__).resolve().parents[1]
+BLENDERS = ("5.0", "4.5", "5.2")
+
+
+def main() -> None:
+    """Time the targets one after the other."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
+    arguments = parser.parse_args()
+    figures: dict[str, float | None] = {}
+    for version in BLENDERS:
+        with record.measured() as took:
+            subprocess.run(["make", f"test-{version}"], cwd=ROOT, check=True)
+        figures[f"test_minutes_{version.replace('.', '_')}"] = took.seconds / 60
+    total = sum(minutes for minutes in figures.values() if minutes is not None)
+    record.tell({"test_minutes": total, **figures}, arguments.json)
+
+
+if __name__ == "__main__":
+    main()
