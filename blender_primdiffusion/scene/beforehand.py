@@ -1,13 +1,12 @@
-"""What of building a person needs none of Blender's data: done in a thread, so that the window goes on."""
+"""Write a person's volumes in slices of time before the person enters the scene, so that the window stays usable."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import json
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import bpy
@@ -16,10 +15,6 @@ import numpy as np
 from . import shape_file, volumes
 from .human_file import HumanFile, read_human
 from .overlap import most_overlapping
-
-
-class Stopped(Exception):
-    """Nobody waits for this person any more."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -96,25 +91,32 @@ def bake(human_npz: str | Path) -> Baked:
     return Baked(human, grids, provenance(human, grids))
 
 
-def write(human_npz: Path, place: Place, step: Callable[[float], None]) -> Written:
-    """Bake, and write the volumes, and the body's file beside their folder; `step` hears what fraction is done.
+def writing(human_npz: Path, place: Place) -> Generator[float, None, Written]:
+    """Bake, and write the volumes, and the body's file beside their folder, in steps of some milliseconds (baking takes
+    longer); yields what fraction is done.
 
     Of somebody in the scene, volumes whose file is there are not written again.
 
-    Raises HumanFileError, VolumeWriteError and what `step` raises, and then leaves no files.
+    Raises HumanFileError and VolumeWriteError; then, and when it is closed early, no files are left.
     """
     began = time.monotonic()
-    step(0.0)
-    baked, home = bake(human_npz), place.home
-    which = range(len(baked.grids.density)) if place.which is None else place.which
-    files = {k: home / volumes.file_name(baked.grids, k, bpy.app.version) for k in which}
+    yield 0.0
+    human = read_human(human_npz)
+    yield 0.0
+    grids = volumes.bake(human.density, human.rgb, human.half_extent)
+    yield 0.0
+    baked, home = Baked(human, grids, provenance(human, grids)), place.home
+    yield 0.0
+    which = range(len(grids.density)) if place.which is None else place.which
+    files = {k: home / volumes.file_name(grids, k, bpy.app.version) for k in which}
     absent = [k for k, path in files.items() if place.which is None or not path.is_file()]
     existing = next(parent for parent in (home, *home.parents) if parent.exists())
-    model = baked.human.shape_model
+    model = human.shape_model
     body = () if model is None else (home.parent / shape_file.file_name(model),)
     with contextlib.ExitStack() as undone:
-        new = undone.enter_context(volumes.written(baked.grids, home, which=absent, step=step))
-        made = tuple(path for path in (*new, *body) if not path.exists())
+        staging = undone.enter_context(volumes.staged(home))
+        yield from staging.write(grids, absent)
+        made = tuple(path for path in (*staging.paths, *body) if not path.exists())
         if model is not None:
             undone.enter_context(shape_file.kept(model, home.parent))
     unread = tuple(path for path in files.values() if path not in place.shown)
@@ -122,27 +124,34 @@ def write(human_npz: Path, place: Place, step: Callable[[float], None]) -> Writt
 
 
 class Writing:
-    """`write` in a thread."""
+    """`writing`, a slice of time at a time."""
 
     def __init__(self, human_npz: Path, place: Place) -> None:
-        bpy.utils.expose_bundled_modules()  # not for threads
         self.fraction = 0.0
         self.result: Written | None = None
         """None until it is done, and where it has failed."""
         self.error: Exception | None = None
-        self._wanted, self._lock = True, threading.Lock()
-        self._thread = threading.Thread(target=self._run, args=(human_npz, place), name="volumes")
-        self._thread.start()
+        self.over = False
+        """Done, failed or stopped."""
+        self._steps = writing(human_npz, place)
 
-    @property
-    def over(self) -> bool:
-        """Done or failed."""
-        return not self._thread.is_alive()
+    def work(self, seconds: float) -> None:
+        """Write for about `seconds`, one step at least."""
+        end = time.monotonic() + seconds
+        while not self.over:
+            try:
+                self.fraction = next(self._steps)
+            except StopIteration as done:
+                self.result, self.over = done.value, True
+            except Exception as error:  # the operator tries again and reports why it fails
+                self.error, self.over = error, True
+            if time.monotonic() >= end:
+                return
 
     def take(self) -> Written | None:
-        """What was written, whose files are the caller's from now on; None where that has failed, or somebody has
-        removed some. Waits for the end."""
-        self._thread.join()
+        """What was written, whose files are the caller's from now on; None where that has failed, or some files were
+        removed. Writes what is left to write."""
+        self.work(float("inf"))
         written, self.result = self.result, None
         if written is not None and not written.whole():
             written.discard()
@@ -150,29 +159,12 @@ class Writing:
         return written
 
     def stop(self) -> None:
-        """Have it end soon and leave no files; does not wait."""
-        with self._lock:
-            self._wanted = False
-            if self.result is not None:
-                self.result.discard()
-                self.result = None
-
-    def _run(self, human_npz: Path, place: Place) -> None:
-        try:
-            result = write(human_npz, place, self._step)
-        except Exception as error:  # whoever asked decides: the thread has nobody to tell
-            self.error = error
-            return
-        with self._lock:
-            if self._wanted:
-                self.result = result
-            else:
-                result.discard()
-
-    def _step(self, fraction: float) -> None:
-        if not self._wanted:
-            raise Stopped
-        self.fraction = fraction
+        """End it and leave no files."""
+        self._steps.close()
+        self.over = True
+        if self.result is not None:
+            self.result.discard()
+            self.result = None
 
 
 def provenance(human: HumanFile, grids: volumes.Grids) -> str:

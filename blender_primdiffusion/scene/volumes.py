@@ -7,7 +7,7 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -109,41 +109,65 @@ def file_name(grids: Grids, k: int, blender_version: tuple[int, ...]) -> str:
     return f"prim_{k:04d}_{digest.hexdigest()[:12]}.vdb"
 
 
-@contextmanager
-def written(
-    grids: Grids,
-    folder: Path,
-    keep: Mapping[str, Path] | None = None,
-    which: Sequence[int] | None = None,
-    step: Callable[[float], None] = lambda _fraction: None,
-) -> Iterator[list[Path]]:
-    """Write the VDBs in a hidden part of `folder`, and move them into it when the block ends well.
+class Staging:
+    """A hidden part of a person's folder, whose files move into it together; made by `staged`."""
 
-    `which` primitives, None for all. The files in `keep` are copied there too, under the names given. Yields the final
-    paths, one for each written primitive, which exist only after the block. When the block or a write fails, neither
-    the files nor folders made for them remain. Raises VolumeWriteError when the folder cannot be written or the disk is
-    full, and what `step` raises, which hears before each file what fraction is written.
+    def __init__(self, hidden: Path, folder: Path):
+        self._hidden, self._folder = hidden, folder
+        self.names: list[str] = []
+        """Of the files written or copied so far."""
+
+    @property
+    def paths(self) -> list[Path]:
+        """Where the files will be."""
+        return [self._folder / name for name in self.names]
+
+    def write(self, grids: Grids, which: Sequence[int]) -> Iterator[float]:
+        """Write a VDB for each of `which` primitives; yields before each what fraction is written.
+
+        Raises VolumeWriteError.
+        """
+        bpy.utils.expose_bundled_modules()
+        for number, k in enumerate(which):
+            yield number / len(which)
+            try:
+                self.names.append(_write_file(grids, k, self._hidden))
+            except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
+                raise _write_error(self._folder, error) from error
+
+    def copy(self, files: Mapping[str, Path]) -> None:
+        """Add copies of `files` under the names given. Raises VolumeWriteError."""
+        try:
+            for name, path in files.items():
+                shutil.copyfile(path, self._hidden / name)
+                self.names.append(name)
+        except OSError as error:
+            raise _write_error(self._folder, error) from error
+
+
+@contextmanager
+def staged(folder: Path) -> Iterator[Staging]:
+    """A place for new files of `folder`, which move into it when the block ends well.
+
+    When the block or a move fails, neither the files nor folders made for them remain. Raises VolumeWriteError when
+    the folder cannot be written or the disk is full.
     """
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=".writing_", dir=folder))
+        hidden = Path(tempfile.mkdtemp(prefix=".writing_", dir=folder))
     except OSError as error:
         remove_empty(folder, existing)
         raise _write_error(folder, error) from error
     published: list[Path] = []
     try:
-        try:
-            names = _write_files(grids, staging, range(len(grids.density)) if which is None else which, step)
-            kept = [Path(shutil.copyfile(path, staging / name)).name for name, path in (keep or {}).items()]
-        except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
-            raise _write_error(folder, error) from error
-        yield [folder / name for name in names]
-        for name in [*names, *kept]:
-            if not (folder / name).exists():
-                published.append(folder / name)
+        staging = Staging(hidden, folder)
+        yield staging
+        for path in staging.paths:
+            if not path.exists():
+                published.append(path)
             try:
-                os.replace(staging / name, folder / name)
+                os.replace(hidden / path.name, path)
             except OSError as error:
                 raise _write_error(folder, error) from error
     except BaseException:
@@ -151,35 +175,46 @@ def written(
             path.unlink(missing_ok=True)
         raise
     finally:
-        shutil.rmtree(staging, ignore_errors=True)
+        shutil.rmtree(hidden, ignore_errors=True)
         remove_empty(folder, existing)
 
 
-def _write_files(grids: Grids, folder: Path, which: Sequence[int], step: Callable[[float], None]) -> list[str]:
-    bpy.utils.expose_bundled_modules()
-    import openvdb  # Blender's own, importable only after the line above
+@contextmanager
+def written(
+    grids: Grids, folder: Path, keep: Mapping[str, Path] | None = None, which: Sequence[int] | None = None
+) -> Iterator[list[Path]]:
+    """Write the VDBs of `which` primitives, None for all, and copy the files in `keep` beside them, as `staged` does.
 
-    names = []
-    for k in which:
-        step(len(names) / len(which))
-        transform = openvdb.createLinearTransform(index_to_local(grids.half_extent[k], bpy.app.version).tolist())
-        written_part = tuple(slice(a, b + 1) for a, b in zip(grids.first[k], grids.last[k], strict=True))
-        start = tuple((grids.first[k] - PAD).tolist())
-        density, colour = openvdb.FloatGrid(), openvdb.Vec3SGrid()
-        density.name, density.gridClass = "density", openvdb.GridClass.FOG_VOLUME
-        colour.name = "Cd"
-        for grid, values, tolerance in (
-            (density, grids.density[k], _ALL_ACTIVE),
-            (colour, grids.colour[k], (_ALL_ACTIVE,) * 3),
-        ):
-            part = np.ascontiguousarray(values[written_part], dtype=np.float32)
-            grid.copyFromArray(part, ijk=start, tolerance=tolerance)
-            grid.transform = transform
-            grid.saveFloatAsHalf = True
-        name = file_name(grids, k, bpy.app.version)
-        openvdb.write(str(folder / name), grids=[density, colour])
-        names.append(name)
-    return names
+    Yields the final paths of the VDBs, which exist only after the block.
+    """
+    with staged(folder) as staging:
+        for _ in staging.write(grids, range(len(grids.density)) if which is None else which):
+            pass
+        paths = staging.paths
+        staging.copy(keep or {})
+        yield paths
+
+
+def _write_file(grids: Grids, k: int, folder: Path) -> str:
+    import openvdb  # Blender's own, importable only after bpy.utils.expose_bundled_modules()
+
+    transform = openvdb.createLinearTransform(index_to_local(grids.half_extent[k], bpy.app.version).tolist())
+    written_part = tuple(slice(a, b + 1) for a, b in zip(grids.first[k], grids.last[k], strict=True))
+    start = tuple((grids.first[k] - PAD).tolist())
+    density, colour = openvdb.FloatGrid(), openvdb.Vec3SGrid()
+    density.name, density.gridClass = "density", openvdb.GridClass.FOG_VOLUME
+    colour.name = "Cd"
+    for grid, values, tolerance in (
+        (density, grids.density[k], _ALL_ACTIVE),
+        (colour, grids.colour[k], (_ALL_ACTIVE,) * 3),
+    ):
+        part = np.ascontiguousarray(values[written_part], dtype=np.float32)
+        grid.copyFromArray(part, ijk=start, tolerance=tolerance)
+        grid.transform = transform
+        grid.saveFloatAsHalf = True
+    name = file_name(grids, k, bpy.app.version)
+    openvdb.write(str(folder / name), grids=[density, colour])
+    return name
 
 
 def _write_error(folder: Path, error: BaseException) -> VolumeWriteError:

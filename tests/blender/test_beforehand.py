@@ -19,8 +19,10 @@ from blender_primdiffusion.scene.shape import shape_model_of
 from blender_primdiffusion.scene.volumes import VolumeWriteError
 
 
-def silent(_fraction: float) -> None:
-    """Nobody listens."""
+def written_at_once(human_npz: Path, place: Place) -> beforehand.Written:
+    written = beforehand.Writing(human_npz, place).take()
+    assert written is not None
+    return written
 
 
 @pytest.fixture
@@ -51,7 +53,7 @@ def state(person):
 
 
 def test_a_person_written_before_is_the_one_that_is_built_at_once(saved_scene, source, keep, tmp_path):
-    written = beforehand.write(source, Place(home_of_next("Anna")), silent)
+    written = written_at_once(source, Place(home_of_next("Anna")))
     early = build_written(saved_scene, written, "Anna", [keep])
     late = build_human(saved_scene, source, "Berta", [keep])
     saved_scene.view_layer.update()
@@ -70,7 +72,7 @@ def test_the_next_home_is_the_one_the_next_person_gets(saved_scene, source):
 
 
 def test_a_place_taken_meanwhile_is_left_to_who_has_it(saved_scene, source, keep, tmp_path):
-    written = beforehand.write(source, Place(home_of_next("Anna")), silent)
+    written = written_at_once(source, Place(home_of_next("Anna")))
     bpy.data.collections.new("Anna")
     person = build_written(saved_scene, written, "Anna", [keep])
     assert person.name == "Anna.001"
@@ -82,7 +84,7 @@ def test_a_place_taken_meanwhile_is_left_to_who_has_it(saved_scene, source, keep
 
 def test_a_file_saved_meanwhile_has_the_person_beside_it(empty_scene, tmp_path):
     source = synthetic_shape.write(tmp_path / "human.npz")
-    written = beforehand.write(source, Place(home_of_next("Anna")), silent)
+    written = written_at_once(source, Place(home_of_next("Anna")))
     (tmp_path / "film").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film" / "shot.blend"))
     person = build_written(empty_scene, written, "Anna")
@@ -96,14 +98,14 @@ def test_a_file_saved_meanwhile_has_the_person_beside_it(empty_scene, tmp_path):
 def test_discarding_leaves_what_others_had(saved_scene, source, tmp_path):
     person = build_human(saved_scene, source, "Anna")
     before = on_disk(tmp_path)
-    again = beforehand.write(source, Place(folder_of(person)), silent)  # as after the person was deleted and made again
+    again = written_at_once(source, Place(folder_of(person)))  # as after the person was deleted and made again
     again.discard()
-    beforehand.write(source, Place(home_of_next("Anna")), silent).discard()
+    written_at_once(source, Place(home_of_next("Anna"))).discard()
     assert on_disk(tmp_path) == before
 
 
 def test_a_file_that_the_system_keeps_is_no_reason_to_leave_the_others(saved_scene, source, monkeypatch):
-    written, unlink = beforehand.write(source, Place(home_of_next("Anna")), silent), Path.unlink
+    written, unlink = written_at_once(source, Place(home_of_next("Anna"))), Path.unlink
 
     def as_on_windows(path: Path, missing_ok: bool = False) -> None:
         if path == written.files[2]:
@@ -115,23 +117,9 @@ def test_a_file_that_the_system_keeps_is_no_reason_to_leave_the_others(saved_sce
     assert [path for path in written.made if path.exists()] == [written.files[2]]
 
 
-def test_a_person_nobody_waits_for_leaves_no_files(saved_scene, source, tmp_path):
-    before, done = on_disk(tmp_path), []
-
-    def stop(fraction: float) -> None:
-        done.append(fraction)
-        if fraction > 0.5:
-            raise beforehand.Stopped
-
-    with pytest.raises(beforehand.Stopped):
-        beforehand.write(source, Place(home_of_next("Anna")), stop)
-    assert 0.5 < done[-1] < 0.7
-    assert on_disk(tmp_path) == before
-
-
 def test_a_failure_while_building_removes_what_was_written(saved_scene, source, tmp_path, monkeypatch):
     before = on_disk(tmp_path)
-    written = beforehand.write(source, Place(home_of_next("Anna")), silent)
+    written = written_at_once(source, Place(home_of_next("Anna")))
 
     def failing(*_):
         raise MemoryError("no memory for the volumes")
@@ -144,43 +132,48 @@ def test_a_failure_while_building_removes_what_was_written(saved_scene, source, 
     assert not bpy.data.collections
 
 
-def test_the_thread_writes_what_the_call_writes(saved_scene, source, tmp_path):
+def test_slices_write_a_file_at_a_time(saved_scene, source):
     writing = beforehand.Writing(source, Place(home_of_next("Anna")))
-    writing._thread.join(30)
-    assert writing.over
+    fractions = []
+    while not writing.over:
+        writing.work(0.0)
+        fractions.append(writing.fraction)
     assert writing.error is None
     assert writing.result is not None
     assert writing.result.whole()
-    assert writing.fraction > 0.5
+    assert fractions == sorted(fractions)
+    assert len(set(fractions)) >= len(writing.result.files)
     writing.result.files[3].unlink()
     assert not writing.result.whole()
 
 
-@pytest.mark.parametrize("wait_s", [0.0, 0.02, 30.0])
-def test_a_stopped_thread_leaves_no_files_however_far_it_was(saved_scene, tmp_path, wait_s):
+@pytest.mark.parametrize("steps", [0, 1, 5, 40, 1000])
+def test_stopped_writing_leaves_no_files_however_far_it_was(saved_scene, tmp_path, steps):
     source = synthetic.write(tmp_path / "human.npz", 64)
     before = on_disk(tmp_path)
     writing = beforehand.Writing(source, Place(home_of_next("Anna")))
-    writing._thread.join(wait_s)
+    for _ in range(steps):
+        writing.work(0.0)
+    assert (on_disk(tmp_path) != before) == (steps >= 5)
     writing.stop()
-    writing._thread.join(30)
+    assert writing.over
     assert writing.result is None
     assert on_disk(tmp_path) == before
 
 
-def test_the_thread_keeps_its_failure_for_who_asks(saved_scene, tmp_path):
+def test_writing_keeps_its_failure_for_its_caller(saved_scene, tmp_path):
     (tmp_path / "bad.npz").write_bytes(b"nothing")
     bad = beforehand.Writing(tmp_path / "bad.npz", Place(home_of_next("Anna")))
     (tmp_path / "shot_humans").write_text("in the way")
     full = beforehand.Writing(synthetic.write(tmp_path / "human.npz", 2), Place(home_of_next("Anna")))
     for writing in (bad, full):
-        writing._thread.join(30)
+        assert writing.take() is None
     assert isinstance(bad.error, HumanFileError)
     assert isinstance(full.error, VolumeWriteError)
 
 
 def test_grids_read_before_are_there_when_volumes_show_them_and_nothing_else_is(saved_scene, source):
-    written = beforehand.write(source, Place(home_of_next("Anna")), silent)
+    written = written_at_once(source, Place(home_of_next("Anna")))
     read = 0
     while read < len(written.files):
         count = read_grids(written.files[read:], 0.0)
@@ -196,6 +189,6 @@ def test_grids_read_before_are_there_when_volumes_show_them_and_nothing_else_is(
 
 
 def test_a_missing_file_is_no_reason_not_to_read_the_others(saved_scene, source):
-    written = beforehand.write(source, Place(home_of_next("Anna")), silent)
+    written = written_at_once(source, Place(home_of_next("Anna")))
     written.files[0].unlink()
     assert read_grids(written.files, 60.0) == len(written.files)

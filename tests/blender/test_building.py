@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from pathlib import Path
 
@@ -31,7 +30,7 @@ COUNT = 12
 def on_their_way(addon, tmp_path, monkeypatch):
     """A person whose volumes are written, and whose grids are about to be read."""
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared.npz", COUNT)))
-    monkeypatch.setattr("blender_primdiffusion.ui.jobs.building.READ_S", 0.0)
+    monkeypatch.setattr("blender_primdiffusion.ui.jobs.building.SLICE_S", 0.0)
     bpy.ops.ed.undo_push(message="before")
     queue.add(addon, GenerateWork(7, 1))
     until(lambda: 0.6 < building.fraction < 1.0)
@@ -59,23 +58,19 @@ def check_whole(person: bpy.types.Collection) -> None:
     assert not list(folder_of(person).glob(".writing_*"))
 
 
-def test_what_is_not_blenders_is_done_in_another_thread(addon, monkeypatch):
-    by, write = [], volumes._write_files
-    monkeypatch.setattr(
-        volumes,
-        "_write_files",
-        lambda grids, folder, which, step: (
-            by.append((threading.current_thread(), len(which))) or write(grids, folder, which, step)
-        ),
-    )
+def test_no_tick_writes_more_than_its_slice(addon, monkeypatch):
+    monkeypatch.setattr("blender_primdiffusion.ui.jobs.building.SLICE_S", 0.0)
+    written, write_file, ticks = [], volumes._write_file, [0]
+    monkeypatch.setattr(volumes, "_write_file", lambda *args: written.append(ticks[0]) or write_file(*args))
     queue.add(addon, GenerateWork(7, 1))
-    drive()
-    assert [count for thread, count in by if thread is threading.main_thread()] == [0]
-    assert [count for thread, count in by if thread is not threading.main_thread()] == [8]
+    while follow() is not None:
+        ticks[0] += 1
+    assert len(written) == len(set(written)) == 8
+    assert len(humans(addon.scene)) == 1
 
 
 def test_the_bar_goes_on_while_volumes_are_written_and_read(addon, monkeypatch):
-    monkeypatch.setattr("blender_primdiffusion.ui.jobs.building.READ_S", 0.0)
+    monkeypatch.setattr("blender_primdiffusion.ui.jobs.building.SLICE_S", 0.0)
     queue.add(addon, GenerateWork(7, 1))
     seen = []
     while follow() is not None:

@@ -4,7 +4,6 @@ meanwhile."""
 from __future__ import annotations
 
 import json
-import threading
 import time
 from pathlib import Path
 
@@ -30,7 +29,7 @@ COUNT = 12
 """Primitives of the synthetic person."""
 OF_THE_REGION = 2
 """Primitives that the fake child changes where a region is given."""
-MEANWHILE = "blender_primdiffusion.ui.jobs.building.READ_S"
+MEANWHILE = "blender_primdiffusion.ui.jobs.building.SLICE_S"
 
 
 @pytest.fixture
@@ -88,19 +87,14 @@ def check_drawn(person) -> None:
     assert [(len(volume.grids), volume.grids.error_message) for volume in drawn] == [(2, "")] * COUNT
 
 
-def test_an_edit_writes_its_volumes_in_another_thread(person, monkeypatch):
-    by, write = [], volumes._write_files
-    monkeypatch.setattr(
-        volumes,
-        "_write_files",
-        lambda grids, folder, which, step: (
-            by.append((threading.current_thread() is threading.main_thread(), len(which)))
-            or write(grids, folder, which, step)
-        ),
-    )
+def test_an_edit_writes_its_volumes_in_slices(person, monkeypatch):
+    monkeypatch.setattr(MEANWHILE, 0.0)
+    written, write_file, ticks = [], volumes._write_file, [0]
+    monkeypatch.setattr(volumes, "_write_file", lambda *args: written.append(ticks[0]) or write_file(*args))
     vary(person)
-    drive()
-    assert sorted(by) == [(False, COUNT), (True, 0)]
+    while follow() is not None:
+        ticks[0] += 1
+    assert len(written) == len(set(written)) == COUNT
 
 
 def test_only_what_the_edit_changes_is_written_and_read(person, monkeypatch):
@@ -275,7 +269,7 @@ def test_a_full_disk_is_told_and_leaves_scene_and_disk_as_they_were(person, tmp_
         raise OSError("no space left on device")
 
     before, files = shown(person), on_disk(tmp_path)
-    monkeypatch.setattr(volumes, "_write_files", full)
+    monkeypatch.setattr(volumes, "_write_file", full)
     vary(person)
     drive()
     assert "no space left" in error_of("vary")

@@ -1,4 +1,4 @@
-"""A person on their way into the scene: volumes written and read before the operator's turn, so that it is short."""
+"""Write and load volumes in slices of time before the operator runs, so that the operator returns quickly."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ if TYPE_CHECKING:
     from .queue import Entry
     from .work import Work
 
-READ_S = 0.05
-"""Of reading grids between two times that the window is drawn."""
+SLICE_S = 0.05
+"""Of writing volumes or reading grids between two times that the window is drawn."""
 _SHOWN_STEPS = 10
-"""Of the bar: to draw a window takes long, on some machines longer than READ_S."""
+"""Of the bar: to draw a window takes long, on some machines longer than SLICE_S."""
 _WRITING = 0.6
 """How much of the time goes by until all is written."""
 
@@ -41,10 +41,12 @@ class Building:
         return _WRITING + (1 - _WRITING) * self._read / len(written.files)
 
     @property
-    def reading(self) -> bool:
-        """Grids are to be read, and nothing else is waited for."""
-        written = self._writing.result if self._writing is not None and self._writing.over else None
-        return written is not None and self._read < len(written.files)
+    def busy(self) -> bool:
+        """Volumes are to be written or grids to be read."""
+        if self._writing is None:
+            return False
+        written = self._writing.result
+        return not self._writing.over or (written is not None and self._read < len(written.files))
 
     def moved(self) -> bool:
         """Whether the bar has come a step further since this was asked last."""
@@ -64,16 +66,18 @@ class Building:
             self._human = Path(result["human"])
             self._writing = Writing(self._human, place)
 
-    def goes_on(self, *, may_read: bool) -> bool:
-        """Whether there is more to do before the operator's turn; reads some grids where that is allowed now."""
+    def goes_on(self, *, may_work: bool) -> bool:
+        """Whether there is more to do before the operator runs; does some of it where that is allowed now."""
         if self._writing is None:
             return False
         if not self._writing.over:
-            return True
+            if may_work:
+                self._writing.work(SLICE_S)
+            return self.busy
         written = self._writing.result
         if written is None or self._read == len(written.files):
-            return False  # where it failed, the operator tries again and tells why
-        if may_read:
+            return False  # where it failed, the operator tries again and reports why
+        if may_work:
             from ...scene.grid_cache import free_unused_grids, read_headers
             from ...scene.grid_warming import read_grids
 
@@ -81,7 +85,7 @@ class Building:
                 if not self._entry.work.new_person:  # those of before; freed later, the new ones would be read twice
                     free_unused_grids()
                 read_headers(path for path in written.files if path.is_file())
-            self._read += read_grids(written.files[self._read :], READ_S)
+            self._read += read_grids(written.files[self._read :], SLICE_S)
         return self._read < len(written.files)
 
     def take(self, human: Path) -> Written | None:

@@ -57,7 +57,7 @@ def follow() -> float | None:
     changed |= so_far.show(queue.job.picture if queue.job is not None else None)
     if changed:
         redraw()
-    if building.reading and not in_the_way():
+    if building.busy and not in_the_way():
         return 0.0  # whatever the user does meanwhile comes first all the same
     return TICK_S if queue.busy else None
 
@@ -113,7 +113,7 @@ def _nearer() -> bool:
     """Bring the answer nearer to the scene, and into it at last; True when something visible changed."""
     building.begin(queue.current, queue.job.result or {})
     waits = bool(in_the_way())
-    if building.goes_on(may_read=not waits):
+    if building.goes_on(may_work=not waits):
         return building.moved()
     if not waits:
         enter()
