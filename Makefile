@@ -1,4 +1,5 @@
 # `make demo` and `make test` set everything up themselves in .venv; nothing else on the machine is touched.
+# `make help` prints the comments that begin with two #.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
@@ -30,11 +31,17 @@ PYTEST_BLENDER := $(PYTEST) tests/blender --confcutdir tests/blender
 # Containers set it, and hundreds of child processes would each compile the backend anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-5.0 test-4.5 test-5.2 test-all lint setup figures clean
+.PHONY: help demo test test-5.0 test-4.5 test-5.2 test-all lint setup clean
 
+## demo: generate a person in Blender, walk it, render it: see demo_out/
 demo: $(READY)
 	$(BIN)/python benchmarks/demo.py --out demo_out
 
+## help: this list
+help:
+	@awk '/^## / { name = $$2; sub(/:$$/, "", name); sub(/^## [^:]*: /, ""); printf "make %-11s%s\n", name, $$0 }' $(MAKEFILE_LIST)
+
+## test: the tests on Blender 5.0, 4.5 and 5.2; options for pytest: make test TEST_ARGS="-x -k motion"
 # One after the other, also with -j: they share the cores.
 test:
 	@$(ROOM) $(VENV_MB) $(VENV45_MB) $(if $(PYTHON313),$(VENV52_MB))
@@ -42,12 +49,15 @@ test:
 	$(MAKE) test-4.5
 	$(MAKE) test-5.2
 
+## test-5.0: all tests but the slow ones, on Blender 5.0
 test-5.0: $(READY_TO_TEST)
 	$(ONE_THREAD) $(BIN)/python $(PYTEST) $(TEST_ARGS)
 
+## test-4.5: the tests of the extension on Blender 4.5
 test-4.5: $(VENV45)/ready
 	$(ONE_THREAD) $(VENV45)/bin/python $(PYTEST_BLENDER) $(TEST_ARGS)
 
+## test-5.2: the tests of the extension on Blender 5.2, where a Python 3.13 is found
 # Without torch, which has its builds for one version of Python each: the backend's own process runs in .venv.
 ifeq ($(PYTHON313),)
 test-5.2:
@@ -57,15 +67,18 @@ test-5.2: $(VENV52)/ready $(READY_TO_TEST)
 	$(ONE_THREAD) PRIMDIFFUSION_PYTHON=$(CURDIR)/$(BIN)/python $(VENV52)/bin/python $(PYTEST_BLENDER) $(TEST_ARGS)
 endif
 
+## test-all: the slow tests too, on Blender 5.0
 test-all: $(READY_TO_TEST)
 	$(BIN)/python -m pytest -m "not gpu" $(TEST_ARGS)
 
+## lint: ruff, import contracts, types
 lint: $(READY_TO_TEST)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/pyright
 
+## setup: the environment .venv, with what tests and lint need
 setup: $(READY_TO_TEST)
 
 $(READY): pyproject.toml requirements.lock
@@ -95,5 +108,6 @@ $(VENV52)/ready: requirements52.lock
 	$(VENV52)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements52.lock
 	touch $@
 
+## clean: remove demo_out, build and dist
 clean:
 	rm -rf demo_out build dist

@@ -1,0 +1,42 @@
+"""Files at the root of the checkout that repeat each other agree."""
+
+import json
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def libraries(name: str) -> list[str]:
+    return re.findall(r"\blib[a-z]+\d?(?:-\d+|\d+)\b", (ROOT / name).read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("name", ["README.md", "Dockerfile"])
+def test_the_system_libraries_are_those_of_continuous_integration(name):
+    assert len(libraries(".ci/run")) == 9
+    assert libraries(name) == libraries(".ci/run")
+
+
+def test_the_container_runs_the_commands_of_the_readme():
+    commands = re.findall(r"^    make (\w+)", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    (run,) = re.findall(r"^CMD (.*)$", (ROOT / "Dockerfile").read_text(encoding="utf-8"), re.MULTILINE)
+    assert json.loads(run) == ["make", *commands]
+
+
+def test_the_citation_has_the_projects_version_and_licence():
+    citation = dict(re.findall(r"^(\w+): (.+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert (citation["version"], citation["license"]) == (project["version"], project["license"])
+
+
+def test_help_lists_every_target_that_has_no_file():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    (phony,) = re.findall(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)
+    command = ["make", "--no-print-directory", "help"]
+    printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    listed = [line.split()[1] for line in printed.stdout.splitlines()]
+    assert sorted(listed) == sorted(phony.split())
