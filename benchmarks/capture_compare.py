@@ -11,10 +11,10 @@ from PIL import Image
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.multisample import shoot
 from primdiffusion.capture.people_files import read_person
-from primdiffusion.capture.picture_files import DEPTH_UNIT
 from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.capture.sheet import default_joints, joints_of
 from primdiffusion.capture.subject import JPEG_QUALITY, sit, srgb_bytes
+from primdiffusion.formats.picture_files import DEPTH_UNIT
 
 SAME_DEPTH_M = 0.002
 

@@ -33,8 +33,8 @@ from primdiffusion.capture.people_files import find_people, read_person
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import Captures, open_captures
-from primdiffusion.capture.rig import Rig
 from primdiffusion.capture.subject import begin, draw_frames, sit
+from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes

@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from primdiffusion.body.model import JOINT_NAMES, BodyPose
+from primdiffusion.body.model import BodyPose
 from primdiffusion.evaluation.portraits import PORTRAITS, camera_of
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, framing, generate, place

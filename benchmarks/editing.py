@@ -19,13 +19,14 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
-from primdiffusion.body.model import JOINT_NAMES, BodyPose
+from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.model import DEFAULT_STEPS, DiffusionModel
 from primdiffusion.editing.inpaint import harmonise, inpaint
 from primdiffusion.editing.interpolate import interpolate
 from primdiffusion.editing.regions import DISJOINT, PARTS, region_of
 from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.machine import best_device

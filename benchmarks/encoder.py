@@ -24,10 +24,10 @@ from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import Captures, open_captures
-from primdiffusion.capture.rig import Rig
 from primdiffusion.encoder.encode import EncoderModel
 from primdiffusion.evaluation.image_metrics import Lpips, load_lpips
 from primdiffusion.evaluation.reconstruction import EvaluationSettings, Means, evaluate, summary, table
+from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes

@@ -8,7 +8,8 @@ import bpy
 import numpy as np
 import torch
 from mathutils import Matrix
-from primdiffusion.body.model import JOINT_NAMES, BodyPose, default_body
+from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.anchors import anchor_skin_weights, attach, default_anchors
 

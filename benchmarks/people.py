@@ -19,8 +19,9 @@ from typing import TypeVar
 import numpy as np
 import torch
 from PIL import Image
-from primdiffusion.body.model import JOINT_NAMES, BodyPose, J, default_body
+from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.capture.rasterise import Picture, rasterise
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh

@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from primdiffusion.body.model import JOINT_NAMES, BodyPose, J, default_body
+from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.capture.rasterise import draw, shade
 from primdiffusion.capture.soup import Soup, flatten
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh

@@ -24,7 +24,7 @@ from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.capture.rig import Rig
+from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, place
 from primdiffusion.machine import best_device

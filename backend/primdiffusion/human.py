@@ -22,7 +22,7 @@ from torch import Tensor
 
 from primdiffusion import __version__
 from primdiffusion.body.measures import betas_of_measures
-from primdiffusion.body.model import JOINT_NAMES, BodyModel, BodyPose, PosedBody, default_body
+from primdiffusion.body.model import BodyModel, BodyPose, PosedBody, default_body
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import (
     DEFAULT_GUIDANCE,
@@ -32,6 +32,7 @@ from primdiffusion.diffusion.model import (
     sample,
 )
 from primdiffusion.diffusion.samplers import Step
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.rotation import polar

@@ -25,7 +25,8 @@ import safetensors
 import safetensors.torch
 import torch
 
-from primdiffusion.body.model import JOINT_NAMES, BodyModel
+from primdiffusion.body.model import BodyModel
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.human import Human, body_of
 from primdiffusion.primitives.anchors import Anchors, anchor_skin_weights, attach
 from primdiffusion.primitives.primitives import K, Payload, S

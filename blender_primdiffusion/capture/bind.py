@@ -11,9 +11,9 @@ from mathutils.bvhtree import BVHTree
 from mathutils.kdtree import KDTree
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from ..scene.armature import build_armature
 from ..scene.convention import points_to_backend, points_to_blender
-from ..scene.joints import JOINT_NAMES
 from .body import Body, blend
 from .fit import fit_surface, vertex_normals
 from .parameters import Parameters, read_parameters

@@ -7,8 +7,8 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
+from ..formats.camera_rig import View
 from ..scene.convention import points_to_backend, points_to_blender
-from .rig import View
 
 _SENSOR_MM = 36.0
 _FROM_OPENCV = np.diag([1.0, -1.0, -1.0])

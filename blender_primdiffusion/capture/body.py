@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.joints import PARENTS
 from ..motion.arrays import ArrayFileError, read_npz
 from ..motion.skeleton import chain, joint_positions
 from ..places import backend_module_path
-from ..scene.joints import PARENTS
 
 BETAS = 10
 """Shape components in use."""

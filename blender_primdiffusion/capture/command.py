@@ -18,8 +18,8 @@ from collections.abc import Callable, Sequence
 import bpy
 
 from ..console import CANCELLED, DONE, FAILED, UNUSABLE, duration, stdout_of_our_own, stopped_by_signals
+from ..formats.capture_layout import CaptureFolderError
 from .job import CaptureError, Progress, run
-from .layout import CaptureFolderError
 from .options import MARK, UsageError, parse, settings_of
 from .report import Report, report_path
 from .scan import ScanError, ScanFile, find_scans

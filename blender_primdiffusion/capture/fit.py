@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.joints import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES
 from .body import Body
 
 _RIDGE_M = 0.008

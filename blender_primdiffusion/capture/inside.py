@@ -10,8 +10,8 @@ from mathutils import Vector
 from mathutils.bvhtree import BVHTree
 from numpy.typing import NDArray
 
+from ..formats.camera_rig import View
 from ..scene.convention import points_to_blender
-from .rig import View
 
 TOUCHING_M = 0.02
 """Nearer than this to a surface a camera counts as inside."""

@@ -13,14 +13,14 @@ from typing import Protocol
 import bpy
 import numpy as np
 
+from ..formats.camera_rig import View, bounding_sphere
+from ..formats.capture_layout import claim, complete, view_seed
 from ..motion.motion import Motion
 from .body import Body, read_body
 from .inside import cameras_inside
-from .layout import claim, complete, view_seed
 from .passes import write_passes
 from .poses import choose_poses
 from .report import Report
-from .rig import View, bounding_sphere
 from .scan import Scan, ScanFile, load_scan
 from .settings import CaptureSettings
 from .shots import shoot_centres, shoot_colours

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, NoReturn, get_args
 
 import numpy as np
 
+from ..formats.camera_rig import Arrangement, Rig, View
 from .blender_camera import CameraError
 from .names import LAYOUTS, PASSES
-from .rig import Arrangement, Rig, View
 from .settings import Background, CaptureSettings, Device, Light
 
 if TYPE_CHECKING:

@@ -10,10 +10,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.capture_layout import picture_path, replacing
+from ..formats.picture_files import depth_steps, is_whole_picture, normal_bytes, write_png
 from ..scene.convention import points_to_backend
 from .exr import read_exr
-from .layout import picture_path, replacing
-from .picture_files import depth_steps, is_whole_picture, normal_bytes, write_png
 from .surfaces import PART
 
 JPEG_QUALITY = 95

@@ -6,7 +6,7 @@ import dataclasses
 import json
 from pathlib import Path
 
-from .layout import replacing
+from ..formats.capture_layout import replacing
 
 
 @dataclasses.dataclass

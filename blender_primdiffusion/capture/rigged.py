@@ -9,8 +9,8 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
-from ..scene.joints import JOINT_NAMES
 from .scan_files import ScanError, ScanFile
 from .skeleton import Skeleton
 

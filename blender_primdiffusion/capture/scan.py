@@ -9,11 +9,11 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from ..motion.bones import BoneMap, map_bones
 from ..motion.rest_alignment import facing, rig_from_smpl
 from ..motion.rotation import to_axis_angle
 from ..scene.convention import points_to_blender
-from ..scene.joints import JOINT_NAMES
 from ..scene.quaternion import matrix_to_quaternion
 from .belongings import Belongings
 from .bind import bind_static

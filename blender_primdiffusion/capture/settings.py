@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from ..scene.joints import JOINT_NAMES
-from .layout import ENDINGS
+from ..formats.camera_rig import Rig, View
+from ..formats.capture_layout import ENDINGS
+from ..formats.joints import JOINT_NAMES
+from ..formats.picture_files import DEPTH_UNIT
 from .names import LAYOUTS, PASSES
-from .picture_files import DEPTH_UNIT
-from .rig import Rig, View
 
 Light = Literal["uniform", "dome", "hdri"]
 Background = Literal["black", "transparent"]

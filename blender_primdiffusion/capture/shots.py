@@ -6,9 +6,9 @@ from pathlib import Path
 
 import bpy
 
+from ..formats.camera_rig import View
 from .blender_camera import aim
 from .passes import Centres, Colours, read_centres, read_colours
-from .rig import View
 from .stage import Stage, StageError
 
 _NARROWEST_PX = 0.01

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES, PARENTS
 from ..motion.skeleton import chain
-from ..scene.joints import JOINT_NAMES, PARENTS
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -9,8 +9,8 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.camera_rig import bounding_sphere
 from ..scene.convention import points_to_backend
-from .rig import bounding_sphere
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..motion.arrays import ArrayFileError, read_npz
-from ..motion.motion import Motion
-from .camera_files import write_cameras, write_colmap, write_nerf, write_opencv
-from .layout import (
+from ..formats.camera_files import write_cameras, write_colmap, write_nerf, write_opencv
+from ..formats.camera_rig import View
+from ..formats.capture_layout import (
     COMPLETE_FILE,
     RELEASED_REFERENCE,
     SMPL_FOLDER,
@@ -25,8 +24,9 @@ from .layout import (
     write_list,
     write_smpl,
 )
-from .picture_files import is_whole_picture
-from .rig import View
+from ..formats.picture_files import is_whole_picture
+from ..motion.arrays import ArrayFileError, read_npz
+from ..motion.motion import Motion
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

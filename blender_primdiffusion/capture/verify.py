@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from .layout import (
+from ..formats.capture_layout import (
     COMPLETE_FILE,
     DATASET_FILE,
     ENDINGS,
@@ -17,7 +17,7 @@ from .layout import (
     picture_path,
     read_about,
 )
-from .picture_files import is_whole_picture
+from ..formats.picture_files import is_whole_picture
 from .subject import list_subjects, remove_damaged
 
 

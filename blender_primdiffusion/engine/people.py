@@ -10,9 +10,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from ..scene.convention import transforms_to_backend
 from ..scene.human import BETAS, MARK, person_file
-from ..scene.joints import JOINT_NAMES
 from .visible import visible_instances
 
 SMALLEST_SCALE = 1e-4

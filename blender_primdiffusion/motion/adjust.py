@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.joints import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES
 from ..scene.quaternion import continuous_quaternions, matrix_to_quaternion
 from .motion import Motion
 from .rotation import from_quaternion

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
-from ..scene.joints import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES
 
 _SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist", "hand")
 RIGS: dict[str, dict[str, str]] = {

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.joints import JOINT_NAMES, PARENTS
+from ..formats.joints import JOINT_NAMES, PARENTS
 from .bones import BoneMap, UnknownBonesError, chosen_bones, map_bones
 from .motion import Detected, Motion
 from .rest_alignment import facing, rig_from_smpl

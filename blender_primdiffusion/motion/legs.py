@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.joints import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES
 from .rotation import about_axis
 from .skeleton import REST_JOINTS
 

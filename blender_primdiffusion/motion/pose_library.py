@@ -9,9 +9,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from ..scene.armature import bone_bases, rest_rotations
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
-from ..scene.joints import JOINT_NAMES
 from ..scene.quaternion import matrix_to_quaternion
 from .adjust import leg_ratio, slerp
 from .library_poses import LIBRARY

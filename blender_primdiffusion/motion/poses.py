@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.joints import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES
 from .motion import Motion
 from .rotation import about_axis
 from .skeleton import FLOOR, REST_JOINTS, joint_positions

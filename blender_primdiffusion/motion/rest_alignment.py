@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.joints import JOINT_NAMES, PARENTS
+from ..formats.joints import JOINT_NAMES, PARENTS
 from .rotation import about_axis, between
 from .skeleton import REST_JOINTS
 

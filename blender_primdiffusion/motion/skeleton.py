@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.joints import JOINT_NAMES, PARENTS
+from ..formats.joints import JOINT_NAMES, PARENTS
 
 _LEFT = {
     "hip": (0.114, -0.236, 0.011), "knee": (0.139, -0.643, 0.019), "ankle": (0.139, -1.089, -0.007),

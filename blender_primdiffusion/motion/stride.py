@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.joints import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES
 from .adjust import leg_ratio
 from .motion import Motion
 from .skeleton import joint_positions

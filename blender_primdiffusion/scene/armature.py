@@ -10,8 +10,8 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES, PARENTS
 from .convention import points_to_blender, rotations_to_blender
-from .joints import JOINT_NAMES, PARENTS
 from .quaternion import matrix_to_quaternion
 
 _TOWARDS = {"pelvis": "spine1", "spine3": "neck"}

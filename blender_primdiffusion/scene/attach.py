@@ -10,8 +10,8 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from .folders import stored_path
-from .joints import JOINT_NAMES
 from .quaternion import matrix_to_quaternion
 from .relationship_lines import hide_relationship_lines
 

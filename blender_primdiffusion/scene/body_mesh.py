@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from .joints import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import bpy
 
-from .joints import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES
 
 
 @dataclasses.dataclass(frozen=True)

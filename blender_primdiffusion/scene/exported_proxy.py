@@ -13,11 +13,11 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from .body_mesh import MARK as BODY_MARK
 from .body_mesh import build_body_mesh
 from .convention import points_to_blender
 from .human import armature_of, person_file_name
-from .joints import JOINT_NAMES
 
 MARK = "primdiffusion_proxy"
 """Custom property of a proxy object: the person's file that it was made of and the shape that it shows, as JSON."""

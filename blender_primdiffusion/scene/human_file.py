@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .joints import JOINT_NAMES, PARENTS
+from ..formats.joints import JOINT_NAMES, PARENTS
 from .shape_model import FIELDS, INTEGERS, ShapeModel, faulty_field
 
 FORMAT_VERSION = 2

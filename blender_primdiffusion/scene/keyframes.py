@@ -6,9 +6,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from .actions import action_curves, last_key
 from .armature import bone_bases, rest_rotations
-from .joints import JOINT_NAMES
 from .quaternion import continuous_quaternions
 
 _LINEAR = 1

@@ -14,12 +14,12 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from . import shape_file
 from .armature import move_rest_joints
 from .body_mesh import body_of
 from .convention import frames_to_blender, points_to_blender
 from .human import BETAS, MARK, armature_of, folders_of, volume_path
-from .joints import JOINT_NAMES
 from .quaternion import matrix_to_quaternion
 from .shape_model import SAME_BETAS, Rest, ShapeModel
 from .shape_names import BETAS as COUNT

@@ -8,7 +8,7 @@ import pathlib
 
 import numpy as np
 from linear_model import LinearModel
-from skeleton import JOINT_NAMES, PARENTS
+from primdiffusion.formats.joints import JOINT_NAMES, PARENTS
 
 GRAIN = 2.0**-17
 """Metres (7.6 micrometres): the grid that stored lengths are rounded to, so that the files compress."""
@@ -44,7 +44,7 @@ def smpl_arrays(
     """The body in SMPL's file format, with its texture coordinates and its vertices' numbers in the base mesh."""
     uv, uv_faces = visible.compact_uv()
     template = rounded(linear.mean[visible.vertices])
-    parents = PARENTS.copy()
+    parents = np.array(PARENTS)
     parents[0] = 2**32 - 1
     return {
         "v_template": template,

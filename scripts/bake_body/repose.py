@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from skeleton import JOINT_NAMES, PARENTS
+from primdiffusion.formats.joints import JOINT_NAMES, PARENTS
 
 PELVIS_AT_REST = np.array([0.0, -0.22, 0.02])
 """Where SMPL's template has its pelvis, metres."""

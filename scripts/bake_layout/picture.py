@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from numpy import ndarray as Array
 from PIL import Image
-from primdiffusion.body.model import JOINT_NAMES, BodyPose, default_body
+from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.surface import vertex_normals
 from primdiffusion.geometry.uv_atlas import UvRaster, rasterise_uv
 from primdiffusion.primitives.anchors import CHARTS, Anchors, attach

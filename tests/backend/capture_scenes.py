@@ -4,10 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from primdiffusion.body.model import JOINT_NAMES, default_body
+from primdiffusion.body.model import default_body
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.rasterised import PASSES, Job, render
-from primdiffusion.capture.rig import Rig
+from primdiffusion.formats.camera_rig import Rig
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.people.gltf import Skeleton, glb
 

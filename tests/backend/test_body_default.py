@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from primdiffusion.body.model import JOINT_NAMES, J, default_body
+from primdiffusion.body.model import J, default_body
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.people.base_mesh import load_base_mesh
 
 FLIP = np.array([-1.0, 1.0, 1.0], np.float32)

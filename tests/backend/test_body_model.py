@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import smplx
 import torch
-from primdiffusion.body.model import JOINT_NAMES, BodyModel, BodyPose, J, default_body
+from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from smplx.lbs import lbs
 

@@ -11,8 +11,8 @@ from capture_scenes import captured
 from primdiffusion.capture.dataset import CaptureDataset, Position, SampleSettings, batches
 from primdiffusion.capture.pack import open_pack, pack, pack_path
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.capture.rig import View
 from primdiffusion.capture.windows import Window, resample, through, whole
+from primdiffusion.formats.camera_rig import View
 from primdiffusion.geometry.records import TensorRecord
 
 SETTINGS = SampleSettings(conditioning=2, targets=1, size=16)

@@ -11,7 +11,7 @@ from primdiffusion.capture.figure import figure_of
 from primdiffusion.capture.multisample import shoot
 from primdiffusion.capture.rasterise import rasterise
 from primdiffusion.capture.reader import as_camera
-from primdiffusion.capture.rig import View, look_at
+from primdiffusion.formats.camera_rig import View, look_at
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 
 REST = np.tile(np.eye(4), (24, 1, 1))

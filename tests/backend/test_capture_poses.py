@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.capture import layout
 from primdiffusion.capture.plain_npz import NpzError
 from primdiffusion.capture.poses import MotionFileError, built_in_poses, choose_poses, read_motion
+from primdiffusion.formats import capture_layout
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 
 THETA = np.random.default_rng(0).uniform(-0.5, 0.5, (5, 72))
@@ -54,8 +54,8 @@ def test_one_pose_is_a_motion_of_one_frame(tmp_path):
 
 
 def test_a_captures_parameters_are_a_motion(tmp_path):
-    layout.write_smpl(tmp_path, THETA[:, :3], THETA[:, 3:], np.zeros(10), np.zeros((5, 3)))
-    assert_turns(read_motion(tmp_path / layout.SMPL_FOLDER / layout.SMPL_PLAIN_FILE))
+    capture_layout.write_smpl(tmp_path, THETA[:, :3], THETA[:, 3:], np.zeros(10), np.zeros((5, 3)))
+    assert_turns(read_motion(tmp_path / capture_layout.SMPL_FOLDER / capture_layout.SMPL_PLAIN_FILE))
 
 
 @pytest.mark.parametrize("rate", [{}, {"mocap_framerate": 120.0}])

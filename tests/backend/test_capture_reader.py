@@ -13,7 +13,6 @@ from PIL import Image
 from primdiffusion import cli
 from primdiffusion.body.model import BodyPose
 from primdiffusion.body.smpl_pickle import UnsafePickleError
-from primdiffusion.capture import layout
 from primdiffusion.capture.multisample import shoot
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.plain_npz import NpzError, read_npz
@@ -22,6 +21,7 @@ from primdiffusion.capture.reader import CaptureFileError, open_captures
 from primdiffusion.capture.sheet import default_joints, draw_sheet, reprojection_error
 from primdiffusion.capture.subject import sit
 from primdiffusion.capture.verify import verify
+from primdiffusion.formats import capture_layout
 
 NAME = "person_000000"
 
@@ -83,12 +83,12 @@ def test_joints_project_to_where_the_file_says(root):
 
 def as_released(root):
     """What the authors' files are: no dataset.json, no plain twin, no other passes."""
-    (root / layout.DATASET_FILE).unlink()
-    for name in (root / layout.LIST_FILE).read_text().split():
+    (root / capture_layout.DATASET_FILE).unlink()
+    for name in (root / capture_layout.LIST_FILE).read_text().split():
         for thing in (root / name).iterdir():
-            if thing.name not in ("img", "mask", "cameras.json", layout.SMPL_FOLDER):
+            if thing.name not in ("img", "mask", "cameras.json", capture_layout.SMPL_FOLDER):
                 shutil.rmtree(thing) if thing.is_dir() else thing.unlink()
-        (root / name / layout.SMPL_FOLDER / layout.SMPL_PLAIN_FILE).unlink()
+        (root / name / capture_layout.SMPL_FOLDER / capture_layout.SMPL_PLAIN_FILE).unlink()
 
 
 def test_the_released_layout_is_read_through_its_pickle(root):
@@ -107,7 +107,7 @@ def test_the_released_layout_is_read_through_its_pickle(root):
 @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
 def test_any_protocol_of_the_pickle_is_read(root, protocol):
     as_released(root)
-    path = root / NAME / layout.SMPL_FOLDER / layout.SMPL_FILE
+    path = root / NAME / capture_layout.SMPL_FOLDER / capture_layout.SMPL_FILE
     content = np.load(path, allow_pickle=True)["smpl"]
     with zipfile.ZipFile(path, "w") as archive, archive.open("smpl.npy", "w") as member:
         np.lib.format.write_array_header_1_0(member, {"descr": "|O", "fortran_order": False, "shape": ()})
@@ -122,7 +122,7 @@ def test_a_pickle_that_would_run_code_is_refused(root, tmp_path):
             return (open, (str(tmp_path / "trapped"), "w"))
 
     as_released(root)
-    path = root / NAME / layout.SMPL_FOLDER / layout.SMPL_FILE
+    path = root / NAME / capture_layout.SMPL_FOLDER / capture_layout.SMPL_FILE
     np.savez(path, smpl=np.array({"global_orient": Trap()}, dtype=object))
     with pytest.raises(UnsafePickleError, match="open"):
         open_captures(root).subject(NAME)
@@ -132,16 +132,16 @@ def test_a_pickle_that_would_run_code_is_refused(root, tmp_path):
 @pytest.mark.parametrize("content", [{}, {"global_orient": "up"}, [1, 2], {"global_orient": np.zeros((3, 3))}])
 def test_a_pickle_without_parameters_is_refused_by_name(root, content):
     as_released(root)
-    path = root / NAME / layout.SMPL_FOLDER / layout.SMPL_FILE
+    path = root / NAME / capture_layout.SMPL_FOLDER / capture_layout.SMPL_FILE
     np.savez(path, smpl=np.array(content, dtype=object))
-    with pytest.raises(NpzError, match=layout.SMPL_FILE):
+    with pytest.raises(NpzError, match=capture_layout.SMPL_FILE):
         open_captures(root).subject(NAME)
 
 
 @pytest.mark.parametrize("name", ["../../etc", "/etc", ".ssh", "a/b", "..", "a b"])
 def test_a_list_that_names_folders_outside_is_refused(root, name):
-    (root / layout.LIST_FILE).write_text(f"{NAME}\n{name}\n")
-    with pytest.raises(CaptureFileError, match=layout.LIST_FILE):
+    (root / capture_layout.LIST_FILE).write_text(f"{NAME}\n{name}\n")
+    with pytest.raises(CaptureFileError, match=capture_layout.LIST_FILE):
         open_captures(root)
 
 
@@ -192,7 +192,7 @@ def test_an_npz_that_claims_petabytes_is_refused(tmp_path):
         ("cameras.json", b'{"camera0000": {"K": [[1]]}}', "not a list of cameras"),
         ("cameras.json", b"{}", "names no camera"),
         ("cameras.json", b"{", "cannot be read"),
-        (f"{layout.SMPL_FOLDER}/{layout.SMPL_PLAIN_FILE}", 100, "no whole .npz"),
+        (f"{capture_layout.SMPL_FOLDER}/{capture_layout.SMPL_PLAIN_FILE}", 100, "no whole .npz"),
     ],
 )
 def test_wrong_and_missing_files_are_named(root, file, content, why):
@@ -238,9 +238,9 @@ def test_damage_is_found_and_repaired_so_that_only_it_is_made_again(root, capsys
     assert end.value.code == 1
     assert str(cut) in capsys.readouterr().out
     assert not stray.exists()
-    gone = [layout.picture_path(root / NAME, "img", camera, frame) for camera, frame in ((1, 2), (3, 0))]
+    gone = [capture_layout.picture_path(root / NAME, "img", camera, frame) for camera, frame in ((1, 2), (3, 0))]
     assert not any(path.exists() for path in gone)
-    assert layout.picture_path(root / NAME, "img", 0, 0).exists()
+    assert capture_layout.picture_path(root / NAME, "img", 0, 0).exists()
     assert open_captures(root).subjects == ("person_000001",)
     assert sorted(outcome.what for outcome in render(small_job(root.parent))) == ["done", "skipped"]
     assert verify(root) == []

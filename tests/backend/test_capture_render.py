@@ -14,12 +14,12 @@ import psutil
 import pytest
 from capture_scenes import box_person, captured, save_person, small_job
 from primdiffusion import cli
-from primdiffusion.capture import layout
 from primdiffusion.capture.command import parse_shard
 from primdiffusion.capture.glb import GlbError, read_glb
 from primdiffusion.capture.people_files import find_people, read_person
 from primdiffusion.capture.rasterised import render
 from primdiffusion.capture.verify import verify
+from primdiffusion.formats import capture_layout
 
 NAMES = ["person_000000", "person_000001"]
 
@@ -96,8 +96,8 @@ def test_people_are_found_in_folders_of_their_own_and_as_files(tmp_path):
 
 def test_captures_have_the_layouts_files_and_are_whole(tmp_path):
     root = captured(tmp_path)
-    assert (root / layout.LIST_FILE).read_text().split() == NAMES
-    about = layout.read_about(root)
+    assert (root / capture_layout.LIST_FILE).read_text().split() == NAMES
+    about = capture_layout.read_about(root)
     assert (about["renderer"], about["light"], about["frames"], about["rig"]["count"]) == (
         "rasteriser",
         "uniform",
@@ -106,9 +106,11 @@ def test_captures_have_the_layouts_files_and_are_whole(tmp_path):
     )
     for name in NAMES:
         subject = root / name
-        assert layout.damaged(subject) == []
+        assert capture_layout.damaged(subject) == []
         for kind in ("img", "mask", "depth", "normal", "part"):
-            pictures = [layout.picture_path(subject, kind, camera, frame) for camera in range(4) for frame in range(3)]
+            pictures = [
+                capture_layout.picture_path(subject, kind, camera, frame) for camera in range(4) for frame in range(3)
+            ]
             assert all(path.is_file() for path in pictures)
             assert sum(path.is_file() for path in (subject / kind).rglob("*")) == 12
         frames = {p.name for p in (subject / "nerf").iterdir()} & {p.name for p in (subject / "colmap").iterdir()}
@@ -133,9 +135,9 @@ def test_few_people_are_shared_out_to_many_workers(tmp_path):
 def test_what_is_there_is_kept_and_what_is_missing_is_made(tmp_path):
     root = captured(tmp_path)
     before = everything(root)
-    lost = layout.picture_path(root / NAMES[1], "depth", 2, 1)
+    lost = capture_layout.picture_path(root / NAMES[1], "depth", 2, 1)
     lost.unlink()
-    kept = layout.picture_path(root / NAMES[1], "depth", 2, 2)
+    kept = capture_layout.picture_path(root / NAMES[1], "depth", 2, 2)
     kept_at = kept.stat().st_mtime_ns
     assert {outcome.subject: outcome.what for outcome in render(small_job(tmp_path))} == {
         NAMES[0]: "skipped",
@@ -164,7 +166,7 @@ list(render(small_job(Path({str(tmp_path)!r}), frames=12)))
         time.sleep(0.002)
     os.kill(child.pid, signal.SIGKILL)
     child.wait()
-    assert not (job.out / NAMES[1] / layout.COMPLETE_FILE).exists()
+    assert not (job.out / NAMES[1] / capture_layout.COMPLETE_FILE).exists()
     assert {outcome.what for outcome in render(job)} <= {"done", "skipped"}
     assert everything(job.out) == expected
     assert verify(job.out) == []
@@ -173,7 +175,7 @@ list(render(small_job(Path({str(tmp_path)!r}), frames=12)))
 def test_what_a_killed_process_left_half_written_goes(tmp_path):
     job = small_job(tmp_path)
     left = job.out / NAMES[0] / "img/camera0000/.0000.4242.partial.jpg"
-    layout.claim(job.out, job.about)
+    capture_layout.claim(job.out, job.about)
     left.parent.mkdir(parents=True)
     left.write_bytes(b"half")
     list(render(job))
@@ -238,13 +240,13 @@ def test_one_that_fails_leaves_the_others_alone_and_is_reported(tmp_path):
     report = json.loads((job.out / "report.json").read_text())
     assert report["done"] == [NAMES[1]]
     assert "person.glb" in report["failed"][0]["why"]
-    assert (job.out / layout.LIST_FILE).read_text().split() == [NAMES[1]]
+    assert (job.out / capture_layout.LIST_FILE).read_text().split() == [NAMES[1]]
 
 
 def test_another_person_or_pose_in_the_same_folder_is_refused(tmp_path):
     captured(tmp_path, people=1)
     job = small_job(tmp_path, people=1)
-    (job.out / NAMES[0] / layout.COMPLETE_FILE).unlink()
+    (job.out / NAMES[0] / capture_layout.COMPLETE_FILE).unlink()
     turned = job.poses.map(lambda values: values.flip(0))
     (outcome,) = render(dataclasses.replace(job, poses=turned))
     assert outcome.what == "failed"
@@ -253,7 +255,7 @@ def test_another_person_or_pose_in_the_same_folder_is_refused(tmp_path):
 
 def test_other_settings_in_the_same_folder_are_refused(tmp_path):
     captured(tmp_path, people=1)
-    with pytest.raises(layout.CaptureFolderError, match="samples is 9, wanted is 25"):
+    with pytest.raises(capture_layout.CaptureFolderError, match="samples is 9, wanted is 25"):
         list(render(small_job(tmp_path, people=1, samples=5)))
 
 
@@ -269,7 +271,7 @@ def test_the_command_renders_a_shard_and_exits_with_1_on_failure(tmp_path, capsy
         cli.main([*line, "--shard", "1/2"])
     assert end.value.code == 1
     assert "1 of 2 people failed" in capsys.readouterr().err
-    assert (tmp_path / "out" / layout.RELEASED_REFERENCE / "complete.json").exists()
+    assert (tmp_path / "out" / capture_layout.RELEASED_REFERENCE / "complete.json").exists()
     assert {path.name for path in (tmp_path / "out").glob("report*")} == {"report-0-of-2.json", "report-1-of-2.json"}
 
 

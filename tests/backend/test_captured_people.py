@@ -9,8 +9,8 @@ from capture_scenes import captured
 from diffusion_people import write_people
 from primdiffusion import cli
 from primdiffusion.capture.conditioning import captured_person
-from primdiffusion.capture.layout import picture_path
 from primdiffusion.capture.reader import open_captures
+from primdiffusion.formats.capture_layout import picture_path
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.training.captured_people import EncodeSettings, encode_people, frames_of_looks, read_cards
 from primdiffusion.training.encoder_checkpoint import load_encoder

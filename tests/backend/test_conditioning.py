@@ -18,11 +18,11 @@ from primdiffusion.capture.conditioning import (
     default_betas,
     spread_cameras,
 )
-from primdiffusion.capture.layout import picture_path, write_smpl
 from primdiffusion.capture.rasterised import render
 from primdiffusion.capture.reader import CaptureFileError, Subject, open_captures
-from primdiffusion.capture.rig import Rig
 from primdiffusion.capture.smpl_parameters import SmplParameters
+from primdiffusion.formats.camera_rig import Rig
+from primdiffusion.formats.capture_layout import picture_path, write_smpl
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 
 FIRST = "person_000000"

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from primdiffusion.body.model import JOINT_NAMES, default_body
+from primdiffusion.body.model import default_body
 from primdiffusion.editing.regions import (
     DISJOINT,
     PARTS,
@@ -12,6 +12,7 @@ from primdiffusion.editing.regions import (
     region_from_weights,
     region_of,
 )
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.primitives.anchors import attach, build_anchors, default_anchors
 from primdiffusion.primitives.primitives import GRID, K
 from primdiffusion.primitives.stand import Stand

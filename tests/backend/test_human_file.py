@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from primdiffusion.body.model import JOINT_NAMES, default_body
+from primdiffusion.body.model import default_body
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.human import Human, generate, place
 from primdiffusion.human_file import HumanFileError, export_for_blender, load_human, save_human
 from primdiffusion.primitives.primitives import K

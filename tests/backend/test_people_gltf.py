@@ -9,7 +9,8 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
-from primdiffusion.body.model import JOINT_NAMES, BodyPose, J, default_body
+from primdiffusion.body.model import BodyPose, J, default_body
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.people.gltf import Skeleton, UnwritableMesh, glb
 

@@ -13,10 +13,10 @@ from capture_scenes import box, captured, save_person, small_job
 from PIL import Image
 from primdiffusion import cli
 from primdiffusion.capture.conditioning import captured_person, choose_subject, conditioning_views
-from primdiffusion.capture.layout import LIST_FILE, SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE, picture_path
 from primdiffusion.capture.rasterised import render
 from primdiffusion.encoder.encode import EncoderModel
 from primdiffusion.encoder.network import Encoder
+from primdiffusion.formats.capture_layout import LIST_FILE, SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE, picture_path
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.human import place
 from primdiffusion.human_file import load_human

@@ -14,7 +14,7 @@ from primdiffusion.capture.dataset import Views, stack
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.capture.rig import Rig
+from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.human import Human, framing, place

@@ -6,10 +6,10 @@ import sys
 from pathlib import Path
 
 import bpy
+from blender_primdiffusion.formats.camera_rig import Rig
 from capture_person import NamedPerson, load_painted, two_poses
 
 from blender_primdiffusion.capture.job import run
-from blender_primdiffusion.capture.rig import Rig
 from blender_primdiffusion.capture.settings import CaptureSettings
 
 PEOPLE = [NamedPerson("anna"), NamedPerson("bert")]

@@ -36,7 +36,7 @@ report = {
     "bones": len(armature.data.bones),
     "files": len(list(Path(blend).parent.rglob("*.vdb"))),
     "written_into_the_addon": [p.name for p in installed.rglob("*") if p.suffix in (".nbi", ".nbc")]
-    + [str(p) for p in (installed / "backend").rglob("*.pyc")],
+    + [str(p) for p in (installed / "backend").rglob("*.pyc") if "formats" not in p.parts],  # which Blender imports
     "backend_in_zip": (installed / "backend" / "primdiffusion" / "human.py").is_file(),
     "seconds": seconds,
 }

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 from mathutils import Matrix
 
 from blender_primdiffusion.capture.body import Body, skin, skinning_transforms
 from blender_primdiffusion.motion.rotation import about_axis
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.joints import JOINT_NAMES
 
 MIXAMO = {
     "pelvis": "mixamorig:Hips", "spine1": "mixamorig:Spine", "spine2": "mixamorig:Spine1", "spine3": "mixamorig:Spine2",

@@ -15,9 +15,9 @@ import psutil
 import pytest
 import scan_fixtures
 
-from blender_primdiffusion.capture import layout
 from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.capture.verify import verify
+from blender_primdiffusion.formats import capture_layout
 
 pytest.importorskip("ray", reason="Ray is not installed")
 ROOT = Path(__file__).resolve().parents[2]
@@ -55,7 +55,7 @@ def test_a_killed_workers_person_is_finished_by_another_and_no_view_is_lost_or_d
     assert verify(out) == []
     assert len(list(out.glob("*/img/*/*.jpg"))) == 3 * 2 * 4
     assert all(path.stat().st_ino == inode for path, inode in written.items()), "a whole view was rendered again"
-    assert (out / layout.LIST_FILE).read_text().split() == list(NAMES)
+    assert (out / capture_layout.LIST_FILE).read_text().split() == list(NAMES)
     assert not list(out.rglob(".*partial*"))
 
 

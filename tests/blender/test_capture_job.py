@@ -16,21 +16,21 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from capture_child import PEOPLE, small
-from capture_person import NamedPerson, files_of, load_painted, plain, two_poses
-
-from blender_primdiffusion.capture import passes
-from blender_primdiffusion.capture.belongings import data_blocks
-from blender_primdiffusion.capture.job import CaptureError, run
-from blender_primdiffusion.capture.layout import (
+from blender_primdiffusion.formats.camera_rig import Rig, look_at
+from blender_primdiffusion.formats.capture_layout import (
     COMPLETE_FILE,
     LIST_FILE,
     RELEASED_REFERENCE,
     CaptureFolderError,
     picture_path,
 )
+from capture_child import PEOPLE, small
+from capture_person import NamedPerson, files_of, load_painted, plain, two_poses
+
+from blender_primdiffusion.capture import passes
+from blender_primdiffusion.capture.belongings import data_blocks
+from blender_primdiffusion.capture.job import CaptureError, run
 from blender_primdiffusion.capture.report import Report
-from blender_primdiffusion.capture.rig import Rig, look_at
 from blender_primdiffusion.capture.settings import CaptureSettings
 from blender_primdiffusion.capture.verify import repair, verify
 from blender_primdiffusion.motion.motion import Motion

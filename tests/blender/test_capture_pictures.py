@@ -8,6 +8,10 @@ import bpy
 import numpy as np
 import pytest
 import trimesh
+from blender_primdiffusion.formats.camera_rig import Rig, View, look_at
+from blender_primdiffusion.formats.capture_layout import picture_path
+from blender_primdiffusion.formats.joints import JOINT_NAMES
+from blender_primdiffusion.formats.picture_files import DEPTH_UNIT
 from bpy_extras.object_utils import world_to_camera_view
 from capture_person import NamedPerson, PaintedPerson, load_painted, plain, shader_of, two_poses
 from mathutils import Vector
@@ -18,16 +22,12 @@ from blender_primdiffusion.capture.blender_camera import aim, view_of
 from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.capture.inside import cameras_inside
 from blender_primdiffusion.capture.job import run
-from blender_primdiffusion.capture.layout import picture_path
 from blender_primdiffusion.capture.passes import srgb_bytes
-from blender_primdiffusion.capture.picture_files import DEPTH_UNIT
-from blender_primdiffusion.capture.rig import Rig, View, look_at
 from blender_primdiffusion.capture.settings import CaptureSettings
 from blender_primdiffusion.capture.shots import shoot_centres, shoot_colours
 from blender_primdiffusion.capture.stage import Stage
 from blender_primdiffusion.capture.surfaces import mark_parts, prepare_materials
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.joints import JOINT_NAMES
 
 SIZE = 64
 POSES = two_poses()

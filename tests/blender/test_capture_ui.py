@@ -13,18 +13,18 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
+from blender_primdiffusion.formats.capture_layout import picture_path
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 from capture_person import FACES, _few_faces, chequers, files_of
 
 import blender_primdiffusion
 from blender_primdiffusion.capture import launch
 from blender_primdiffusion.capture.belongings import data_blocks
 from blender_primdiffusion.capture.body import read_body
-from blender_primdiffusion.capture.layout import picture_path
 from blender_primdiffusion.capture.options import MARK, UsageError, parse, settings_of
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.joints import JOINT_NAMES
 from blender_primdiffusion.ui.captures.operators import RIG
 from blender_primdiffusion.ui.captures.session import captures
 from blender_primdiffusion.ui.captures.settings import words_of

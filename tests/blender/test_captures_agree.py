@@ -8,13 +8,13 @@ import pytest
 pytest.importorskip("torch", reason="the backend has another Python than this Blender")
 
 import torch
+from blender_primdiffusion.formats.camera_rig import Rig, bounding_sphere
 from primdiffusion.body.model import BodyPose
-from primdiffusion.capture import rig as backend_rig
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.subject import sit
+from primdiffusion.formats import camera_rig as backend_rig
 from test_scan_rigs import load, own_person
 
-from blender_primdiffusion.capture.rig import Rig, bounding_sphere
 from blender_primdiffusion.motion.poses import built_in_poses
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 
 from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.motion.motion import Motion
@@ -18,7 +19,6 @@ from blender_primdiffusion.motion.rotation import (
     to_axis_angle,
 )
 from blender_primdiffusion.motion.skeleton import FLOOR, REST_JOINTS, chain, joint_positions, unchain
-from blender_primdiffusion.scene.joints import JOINT_NAMES
 
 RNG = np.random.default_rng(7)
 

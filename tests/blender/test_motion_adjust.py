@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scan_fixtures
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 from test_motion_bvh import motion_of, write_bvh
 
 from blender_primdiffusion.motion.adjust import cut, from_origin, in_place, leg_ratio, on_floor, resample, slerp
@@ -12,7 +13,6 @@ from blender_primdiffusion.motion.files import MotionFileError, read_motion
 from blender_primdiffusion.motion.motion import Motion
 from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, to_axis_angle
 from blender_primdiffusion.motion.skeleton import REST_JOINTS
-from blender_primdiffusion.scene.joints import JOINT_NAMES
 
 REST = np.tile(np.eye(3), (24, 1, 1))
 

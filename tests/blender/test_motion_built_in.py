@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 
 from blender_primdiffusion.motion.built_in_motions import MOTIONS, built_in_motion
 from blender_primdiffusion.motion.legs import FootTrack, joint, reach
 from blender_primdiffusion.motion.rotation import to_axis_angle
 from blender_primdiffusion.motion.skeleton import FLOOR, REST_JOINTS, chain, joint_positions
-from blender_primdiffusion.scene.joints import JOINT_NAMES
 
 ANKLES = [JOINT_NAMES.index("left_ankle"), JOINT_NAMES.index("right_ankle")]
 KNEES = [JOINT_NAMES.index("left_knee"), JOINT_NAMES.index("right_knee")]

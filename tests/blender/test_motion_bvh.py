@@ -8,6 +8,7 @@ import bpy
 import numpy as np
 import pytest
 import scan_fixtures
+from blender_primdiffusion.formats.joints import JOINT_NAMES, PARENTS
 
 from blender_primdiffusion.motion.bvh import parse_bvh
 from blender_primdiffusion.motion.files import MotionFileError, read_motion
@@ -15,7 +16,6 @@ from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, t
 from blender_primdiffusion.motion.skeleton import REST_JOINTS, chain, joint_positions
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.joints import JOINT_NAMES, PARENTS
 from blender_primdiffusion.scene.keyframes import keyframe_poses
 
 Rotation = pytest.importorskip("scipy.spatial.transform").Rotation

@@ -120,7 +120,7 @@ def test_json_is_read(tmp_path, content):
 
 
 def test_the_released_plain_twin_is_read_and_the_pickled_one_refused(tmp_path):
-    from blender_primdiffusion.capture.layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE, write_smpl
+    from blender_primdiffusion.formats.capture_layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE, write_smpl
 
     write_smpl(tmp_path, THETA[:, 0], THETA[:, 1:].reshape(FRAMES, 69), np.zeros(10), MOVE)
     motion = read_motion(tmp_path / SMPL_FOLDER / SMPL_PLAIN_FILE)

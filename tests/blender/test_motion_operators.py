@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 
 from blender_primdiffusion.motion.files import read_motion
 from blender_primdiffusion.motion.pose_library import current_pose, rest_joints
@@ -20,7 +21,6 @@ from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.human import armature_of
-from blender_primdiffusion.scene.joints import JOINT_NAMES
 from blender_primdiffusion.ui.motion.import_motion import PRIMDIFFUSION_OT_import_motion, look_at
 from blender_primdiffusion.ui.motion.panels import PRIMDIFFUSION_MT_actions, PRIMDIFFUSION_PT_motion
 from blender_primdiffusion.ui.motion.under_cursor import nearest_to

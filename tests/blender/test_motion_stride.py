@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 
 from blender_primdiffusion.motion.adjust import scale_places
 from blender_primdiffusion.motion.amass_file import write_amass
@@ -17,7 +18,6 @@ from blender_primdiffusion.motion.skeleton import REST_JOINTS, joint_positions
 from blender_primdiffusion.motion.stride import stride_ratio
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.joints import JOINT_NAMES
 from blender_primdiffusion.ui.motion.placing import Placement, place_motion
 from blender_primdiffusion.ui.motion.settings import FACTS
 

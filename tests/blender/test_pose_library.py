@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 
 from blender_primdiffusion.motion.own_poses import PoseFileError, load_pose, own_poses, save_pose
 from blender_primdiffusion.motion.pose_library import (
@@ -24,7 +25,6 @@ from blender_primdiffusion.motion.skeleton import joint_positions
 from blender_primdiffusion.scene.actions import action_curves
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of
-from blender_primdiffusion.scene.joints import JOINT_NAMES
 from blender_primdiffusion.ui.assets.thumbnails import clay_figure, picture_of_file
 from blender_primdiffusion.ui.motion import pose_pictures
 from blender_primdiffusion.ui.motion.panels import PRIMDIFFUSION_PT_poses

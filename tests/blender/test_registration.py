@@ -12,7 +12,7 @@ MOST_MODULES = 120
 LATE = (
     "scene.build", "scene.edited", "scene.merged", "scene.shape", "scene.shape_model", "scene.surface", "scene.volumes",
     "scene.human_file", "scene.memory", "scene.collect", "scene.exported_human", "scene.exported_proxy",
-    "capture.settings", "capture.rig", "motion.poses", "engine.viewport", "engine.studio", "worker.client",
+    "capture.settings", "formats.camera_rig", "motion.poses", "engine.viewport", "engine.studio", "worker.client",
     "worker.environment", "worker.job", "worker.kept_works", "ui.generate.work", "ui.human.edit_work",
     "ui.translations.labels", "ui.translations.tooltips",
 )  # fmt: skip

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import scan_fixtures
 import synthetic
+from blender_primdiffusion.formats.camera_rig import bounding_sphere
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 
 from blender_primdiffusion.capture.body import read_body
-from blender_primdiffusion.capture.rig import bounding_sphere
 from blender_primdiffusion.capture.scan import Scan, ScanError, find_scans, load_scan
 from blender_primdiffusion.motion.bones import RIGS, UnknownBonesError, map_bones
 from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle
-from blender_primdiffusion.scene.joints import JOINT_NAMES
 
 BODY = read_body()
 RNG = np.random.default_rng(0)

@@ -1,29 +1,40 @@
-"""The file format both programs write, and the cameras of a rig."""
+"""The file format both programs write, and the cameras of a camera_rig."""
 
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
-from primdiffusion.capture import camera_files, layout, picture_files, rig
 from primdiffusion.capture.poses import built_in_poses
+from primdiffusion.formats import camera_files, camera_rig, capture_layout, picture_files
 from primdiffusion.geometry.camera import look_at
 from scipy.spatial.transform import Rotation
 
 from blender_primdiffusion.motion import poses as motion_poses
 
 ROOT = Path(__file__).resolve().parents[2]
-SMALL = rig.Rig(count=7, width=40, height=60)
+SMALL = camera_rig.Rig(count=7, width=40, height=60)
 
 
-@pytest.mark.parametrize("name", ["rig.py", "layout.py", "camera_files.py", "picture_files.py"])
-def test_both_programs_hold_the_same_file(name):
-    here = (ROOT / "backend/primdiffusion/capture" / name).read_bytes()
-    assert (ROOT / "blender_primdiffusion/capture" / name).read_bytes() == here
+def test_the_extension_imports_the_backends_formats_and_nothing_else_of_it():
+    names = [path.stem for path in (ROOT / "backend/primdiffusion/formats").glob("[a-z]*.py")]
+    program = f"""
+import importlib, sys
+sys.modules["torch"] = sys.modules["primdiffusion"] = None  # importing them fails
+for name in {names}:
+    module = importlib.import_module(f"blender_primdiffusion.formats.{{name}}")
+    print(name, module.__file__)
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    files = dict(line.split(maxsplit=1) for line in done.stdout.splitlines())
+    assert files == {name: str(ROOT / f"backend/primdiffusion/formats/{name}.py") for name in names}
+    assert "capture_layout" in files
 
 
 def test_both_programs_have_the_same_poses():
@@ -37,7 +48,7 @@ def test_every_camera_sees_the_whole_sphere_and_has_its_centre_in_the_middle(arr
     generator = np.random.default_rng(0)
     points = generator.standard_normal((500, 3))
     points = target + radius * points / np.linalg.norm(points, axis=1, keepdims=True)
-    views = rig.Rig(arrangement, 36, width=300, height=500).views(target, radius)
+    views = camera_rig.Rig(arrangement, 36, width=300, height=500).views(target, radius)
     assert len(views) == 36
     for view in views:
         middle, depth = view.project(target)
@@ -52,14 +63,14 @@ def test_every_camera_sees_the_whole_sphere_and_has_its_centre_in_the_middle(arr
 
 def test_a_camera_is_the_backends_camera():
     position, target = np.array([1.0, 2.0, 3.0]), np.array([0.2, 0.9, 0.1])
-    ours = rig.look_at(position, target, 0.6, 320, 200)
+    ours = camera_rig.look_at(position, target, 0.6, 320, 200)
     theirs = look_at(torch.tensor(position), torch.tensor(target), vertical_fov=0.6, width=320, height=200)
     assert np.allclose(ours.intrinsics, theirs.intrinsics)
     assert np.allclose(np.c_[ours.rotation, ours.translation], theirs.world_to_camera)
 
 
 def test_a_camera_straight_above_is_possible():
-    view = rig.look_at(np.array([0.0, 5.0, 0.0]), np.zeros(3), 0.6, 10, 10)
+    view = camera_rig.look_at(np.array([0.0, 5.0, 0.0]), np.zeros(3), 0.6, 10, 10)
     assert np.isfinite(view.rotation).all()
     assert np.allclose(view.project(np.zeros(3))[0], 5)
 
@@ -67,12 +78,12 @@ def test_a_camera_straight_above_is_possible():
 @pytest.mark.parametrize("wrong", [{"count": 0}, {"vertical_fov": 0.0}, {"width": 0}, {"elevations": (90.0,)}])
 def test_impossible_rigs_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
-        rig.Rig(**wrong)
+        camera_rig.Rig(**wrong)
 
 
 def test_colmaps_quaternions_and_nerfs_matrices_are_the_same_cameras(tmp_path):
     subject = tmp_path / "one"
-    views = rig.Rig("sphere", 9).views(np.zeros(3), 1.0)
+    views = camera_rig.Rig("sphere", 9).views(np.zeros(3), 1.0)
     camera_files.write_colmap(subject, views, 3)
     camera_files.write_nerf(subject, views, 3)
     lines = (subject / "colmap/0003/images.txt").read_text().splitlines()[1::2]
@@ -100,45 +111,47 @@ def test_pngs_are_what_another_reader_reads(tmp_path):
 
 def test_smpl_parameters_are_read_plain_and_as_the_released_code_does(tmp_path):
     generator = np.random.default_rng(0)
-    layout.write_smpl(tmp_path, *(generator.random(shape) for shape in ((4, 3), (4, 69), (10,), (4, 3))))
-    plain = np.load(tmp_path / layout.SMPL_FOLDER / layout.SMPL_PLAIN_FILE, allow_pickle=False)
-    pickled = np.load(tmp_path / layout.SMPL_FOLDER / layout.SMPL_FILE, allow_pickle=True)["smpl"].item()
+    capture_layout.write_smpl(tmp_path, *(generator.random(shape) for shape in ((4, 3), (4, 69), (10,), (4, 3))))
+    plain = np.load(tmp_path / capture_layout.SMPL_FOLDER / capture_layout.SMPL_PLAIN_FILE, allow_pickle=False)
+    pickled = np.load(tmp_path / capture_layout.SMPL_FOLDER / capture_layout.SMPL_FILE, allow_pickle=True)[
+        "smpl"
+    ].item()
     assert set(plain.files) == set(pickled) == {"global_orient", "body_pose", "betas", "transl"}
     assert all(np.array_equal(plain[name], pickled[name]) for name in pickled)
 
 
 def test_a_folder_is_claimed_once(tmp_path):
-    layout.claim(tmp_path / "a", {"seed": 1, "size": (3, 4)})
-    layout.claim(tmp_path / "a", {"seed": 1, "size": (3, 4)})
-    with pytest.raises(layout.CaptureFolderError, match="its seed is 1, wanted is 2"):
-        layout.claim(tmp_path / "a", {"seed": 2, "size": (3, 4)})
+    capture_layout.claim(tmp_path / "a", {"seed": 1, "size": (3, 4)})
+    capture_layout.claim(tmp_path / "a", {"seed": 1, "size": (3, 4)})
+    with pytest.raises(capture_layout.CaptureFolderError, match="its seed is 1, wanted is 2"):
+        capture_layout.claim(tmp_path / "a", {"seed": 2, "size": (3, 4)})
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "thesis.tex").touch()
-    with pytest.raises(layout.CaptureFolderError, match="not empty"):
-        layout.claim(tmp_path / "b", {"seed": 1})
+    with pytest.raises(capture_layout.CaptureFolderError, match="not empty"):
+        capture_layout.claim(tmp_path / "b", {"seed": 1})
 
 
 def test_damage_is_found(tmp_path):
     views = SMALL.views(np.zeros(3), 1.0)
     camera_files.write_cameras(tmp_path, views)
-    layout.write_joints(tmp_path, views, np.zeros((2, 24, 3)))
+    capture_layout.write_joints(tmp_path, views, np.zeros((2, 24, 3)))
     for camera in range(3):
-        picture_files.write_png(layout.picture_path(tmp_path, "mask", camera, 0), np.zeros((60, 40), np.uint8))
-    assert layout.damaged(tmp_path) == [f"{tmp_path}: not finished"]
-    layout.complete(tmp_path)
-    assert layout.damaged(tmp_path) == []
-    paths = [layout.picture_path(tmp_path, "mask", camera, 0) for camera in range(3)]
+        picture_files.write_png(capture_layout.picture_path(tmp_path, "mask", camera, 0), np.zeros((60, 40), np.uint8))
+    assert capture_layout.damaged(tmp_path) == [f"{tmp_path}: not finished"]
+    capture_layout.complete(tmp_path)
+    assert capture_layout.damaged(tmp_path) == []
+    paths = [capture_layout.picture_path(tmp_path, "mask", camera, 0) for camera in range(3)]
     paths[0].unlink()
     paths[1].write_bytes(paths[1].read_bytes()[:-5])
     changed = bytearray(paths[2].read_bytes())
     changed[40] ^= 1
     paths[2].write_bytes(changed)
-    assert [sentence.split(": ")[1] for sentence in layout.damaged(tmp_path)] == [
+    assert [sentence.split(": ")[1] for sentence in capture_layout.damaged(tmp_path)] == [
         "missing",
         f"{paths[1].stat().st_size} bytes instead of {paths[1].stat().st_size + 5}",
         "altered",
     ]
-    assert len(layout.damaged(tmp_path, checksums=False)) == 2
+    assert len(capture_layout.damaged(tmp_path, checksums=False)) == 2
     assert not picture_files.is_whole_picture(paths[1])
 
 
@@ -153,7 +166,7 @@ def test_depth_far_or_absent_is_nothing():
 
 
 def test_pictures_have_noise_of_their_own():
-    seeds = {layout.view_seed(0, f"p{p}", f, c) for p in range(5) for f in range(5) for c in range(5)}
+    seeds = {capture_layout.view_seed(0, f"p{p}", f, c) for p in range(5) for f in range(5) for c in range(5)}
     assert len(seeds) == 125
     assert all(0 <= seed < 2**31 for seed in seeds)
 
@@ -163,8 +176,8 @@ def test_a_completion_mark_cannot_name_files_elsewhere(tmp_path):
     subject.mkdir()
     (tmp_path / "thesis.tex").write_text("mine")
     for name in ("../thesis.tex", str(tmp_path / "thesis.tex"), "a/../../thesis.tex"):
-        (subject / layout.COMPLETE_FILE).write_text(json.dumps({name: [1, 1]}))
-        assert layout.damage(subject) == {subject: "not finished"}
+        (subject / capture_layout.COMPLETE_FILE).write_text(json.dumps({name: [1, 1]}))
+        assert capture_layout.damage(subject) == {subject: "not finished"}
 
 
 def test_pngs_have_alpha(tmp_path):

@@ -12,15 +12,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from primdiffusion.body.skinning import relative_rotations, rigid_matrix, skin, world_from_joints, world_from_rest
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 
-JOINT_NAMES = (
-    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
-    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
-    "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand",
-)  # fmt: skip
-"""SMPL's 24 joints in SMPL's order."""
 J = len(JOINT_NAMES)
 """Joints of a body."""
 

@@ -13,11 +13,11 @@ import tyro
 from tqdm import tqdm
 
 from primdiffusion.body.model import BodyPose
-from primdiffusion.capture import layout
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import MotionFileError, choose_poses, read_motion, read_motions
 from primdiffusion.capture.rasterised import PASSES, Job, render
-from primdiffusion.capture.rig import Arrangement, Rig
+from primdiffusion.formats import capture_layout
+from primdiffusion.formats.camera_rig import Arrangement, Rig
 
 DESCRIPTION = "Pictures of people from many sides, to train on."
 
@@ -67,7 +67,7 @@ class RenderCaptures:
         index, count = parse_shard(self.shard)
         people = find_people(self.people)
         if self.released_reference:
-            people = {**people, layout.RELEASED_REFERENCE: next(iter(people.values()))}
+            people = {**people, capture_layout.RELEASED_REFERENCE: next(iter(people.values()))}
         names = sorted(people)[index::count]
         if self.pose_count == 0 and len(self.poses) != 1:
             raise ValueError("pose_count 0 takes all frames of one motion file: give one with --poses")
@@ -158,7 +158,7 @@ class InfoOfCaptures:
     """Say what a folder of captures holds, as JSON."""
 
     root: tyro.conf.Positional[Path]
-    """Folder of captures, of this program or in the released layout."""
+    """Folder of captures, of this program or in the released capture_layout."""
 
     def run(self) -> None:
         """Prints one JSON object."""

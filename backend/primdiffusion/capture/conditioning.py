@@ -13,13 +13,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.body.model import default_body
-from primdiffusion.capture import layout
 from primdiffusion.capture.dataset import Views, stack
 from primdiffusion.capture.people_files import LARGEST_BETA
 from primdiffusion.capture.reader import CAMERAS_FILE, Captures, Subject, as_camera, open_captures
-from primdiffusion.capture.rig import View
 from primdiffusion.capture.sheet import default_joints, joints_of
 from primdiffusion.capture.windows import resample, through, whole
+from primdiffusion.formats import capture_layout
+from primdiffusion.formats.camera_rig import View
 
 LARGEST_SIDE = 512
 """Pixels a side of what the encoder is trained on; larger pictures are averaged down to it."""
@@ -86,7 +86,7 @@ def choose_subject(path: str | Path, subject: str | None = None) -> tuple[Captur
     """
     path = Path(path).absolute()
     if (path / CAMERAS_FILE).is_file():
-        about = layout.read_about(path.parent) if (path.parent / layout.DATASET_FILE).is_file() else {}
+        about = capture_layout.read_about(path.parent) if (path.parent / capture_layout.DATASET_FILE).is_file() else {}
         captures = Captures(path.parent, (path.name,), about)
     else:
         captures = open_captures(path)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from primdiffusion.capture.figure import PosedFigure
-from primdiffusion.capture.rig import View
+from primdiffusion.formats.camera_rig import View
 from primdiffusion.geometry.srgb import decode_srgb
 
 NEAR = 1e-3

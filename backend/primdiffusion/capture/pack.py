@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from primdiffusion.capture import layout
 from primdiffusion.capture.reader import CaptureFileError, Captures, Subject
+from primdiffusion.formats import capture_layout
 
 FOLDER, FORMAT, VERSION = "packed", "primdiffusion-packed-captures", 1
 
@@ -53,7 +53,7 @@ def pack_subject(subject: Subject) -> None:
         raise CaptureFileError(f"{subject.folder} has pictures of several sizes: these cannot be packed")
     stamp = source_stamp(subject)
     shape = (subject.frames, len(subject.views), *sizes.pop(), 4)
-    with layout.replacing(pack_path(subject)) as path:
+    with capture_layout.replacing(pack_path(subject)) as path:
         array = np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=shape)
         for frame in range(shape[0]):
             for camera in range(shape[1]):
@@ -61,7 +61,7 @@ def pack_subject(subject: Subject) -> None:
                 array[frame, camera, ..., 3] = subject.picture("mask", frame, camera)
         array.flush()
         del array
-    with layout.replacing(pack_path(subject).with_suffix(".json")) as path:
+    with capture_layout.replacing(pack_path(subject).with_suffix(".json")) as path:
         path.write_text(json.dumps({"format": FORMAT, "version": VERSION, "source": stamp}), encoding="utf-8")
 
 
@@ -88,7 +88,7 @@ def pack_path(subject: Subject) -> Path:
 def source_stamp(subject: Subject) -> str:
     """A digest that changes when pictures do: of the completion mark, or of all names, sizes and times without one."""
     digest = hashlib.sha256()
-    mark = subject.folder / layout.COMPLETE_FILE
+    mark = subject.folder / capture_layout.COMPLETE_FILE
     if mark.is_file():
         digest.update(mark.read_bytes())
     else:

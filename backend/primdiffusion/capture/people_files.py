@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from primdiffusion.body.model import JOINT_NAMES, J, default_body
+from primdiffusion.body.model import J, default_body
 from primdiffusion.capture.glb import Glb, GlbError, read_glb
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 

@@ -11,15 +11,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from primdiffusion.body.model import JOINT_NAMES, BodyPose
-from primdiffusion.capture import layout, picture_files
+from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.people_files import read_person
-from primdiffusion.capture.rig import Rig
 from primdiffusion.capture.subject import Sitting, begin, draw_frames, sit
 from primdiffusion.failures import describe
+from primdiffusion.formats import capture_layout, picture_files
+from primdiffusion.formats.camera_rig import Rig
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.worker_process import begin_worker
 
-PASSES = tuple(kind for kind in layout.ENDINGS if kind in ("img", "mask", "depth", "normal", "part"))
+PASSES = tuple(kind for kind in capture_layout.ENDINGS if kind in ("img", "mask", "depth", "normal", "part"))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -87,7 +88,7 @@ def render(job: Job, workers: int = 1) -> Iterator[Outcome]:
         raise ValueError(f"passes {unknown or '()'} cannot be rendered: choose of {', '.join(PASSES)}")
     if workers < 1:
         raise ValueError(f"{workers} workers: one process or more")
-    layout.claim(job.out, job.about)
+    capture_layout.claim(job.out, job.about)
     outcomes: list[Outcome] = []
     for outcome in _outcomes(job, workers):
         outcomes.append(outcome)
@@ -98,13 +99,13 @@ def render(job: Job, workers: int = 1) -> Iterator[Outcome]:
 
 def finished_subjects(root: Path) -> list[str]:
     """Names of the folders with a completion mark."""
-    return sorted(path.parent.name for path in root.glob(f"*/{layout.COMPLETE_FILE}"))
+    return sorted(path.parent.name for path in root.glob(f"*/{capture_layout.COMPLETE_FILE}"))
 
 
 def _outcomes(job: Job, workers: int) -> Iterator[Outcome]:
     waiting = []
     for name in job.people:
-        if layout.damaged(job.out / name, checksums=False):
+        if capture_layout.damaged(job.out / name, checksums=False):
             waiting.append(name)
         else:
             yield Outcome(name, "skipped")
@@ -163,13 +164,13 @@ def _finish(job: Job, name: str, outcomes: Sequence[Outcome]) -> Outcome:
     failed = next((outcome for outcome in outcomes if outcome.what == "failed"), None)
     if failed is not None:
         return failed
-    layout.complete(job.out / name)
+    capture_layout.complete(job.out / name)
     return Outcome(name, "done", views=sum(outcome.views for outcome in outcomes))
 
 
 def _note(job: Job, outcomes: Sequence[Outcome]) -> None:
     """The list of subjects and the report, as far as it is."""
-    layout.write_list(job.out, finished_subjects(job.out))
+    capture_layout.write_list(job.out, finished_subjects(job.out))
     report = {
         "done": [outcome.subject for outcome in outcomes if outcome.what == "done"],
         "failed": [{"subject": "", "what": "poses", "why": why} for why in job.unread_poses]
@@ -180,5 +181,5 @@ def _note(job: Job, outcomes: Sequence[Outcome]) -> None:
         ],
         "skipped": [outcome.subject for outcome in outcomes if outcome.what == "skipped"],
     }
-    with layout.replacing(job.out / f"{job.part}.json") as path:
+    with capture_layout.replacing(job.out / f"{job.part}.json") as path:
         path.write_text(json.dumps(report, indent=1), encoding="utf-8")

@@ -15,11 +15,11 @@ from PIL import Image
 from torch import Tensor
 
 from primdiffusion.body.model import BodyPose
-from primdiffusion.capture import layout
 from primdiffusion.capture.people_files import SUBJECT_NAME
-from primdiffusion.capture.picture_files import DEPTH_UNIT
-from primdiffusion.capture.rig import View
 from primdiffusion.capture.smpl_parameters import SmplParameters, read_smpl
+from primdiffusion.formats import capture_layout
+from primdiffusion.formats.camera_rig import View
+from primdiffusion.formats.picture_files import DEPTH_UNIT
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord
 
@@ -79,7 +79,7 @@ class Subject:
             FileNotFoundError: there is none.
             CaptureFileError: it is damaged, or of another size than the camera's.
         """
-        path = layout.picture_path(self.folder, kind, camera, frame)
+        path = capture_layout.picture_path(self.folder, kind, camera, frame)
         view = self.views[camera]
         return read_picture(path, kind, view.width, view.height)
 
@@ -151,8 +151,8 @@ def open_captures(root: str | Path) -> Captures:
     root = Path(root)
     if not root.is_dir():
         raise FileNotFoundError(f"there is no folder of captures {root}: check the path")
-    about = layout.read_about(root) if (root / layout.DATASET_FILE).exists() else {}
-    listed = root / layout.LIST_FILE
+    about = capture_layout.read_about(root) if (root / capture_layout.DATASET_FILE).exists() else {}
+    listed = root / capture_layout.LIST_FILE
     if listed.is_file():
         names = [line.strip() for line in listed.read_text(encoding="utf-8", errors="replace").splitlines()]
         names = sorted({name for name in names if name})
@@ -231,7 +231,7 @@ def _read_views(folder: Path) -> list[View]:
 def _size(folder: Path, camera: int, intrinsics: np.ndarray) -> tuple[int, int]:
     """Width and height of a camera's pictures, from the header of its first."""
     for kind in ("img", "mask"):
-        pictures = sorted((folder / kind / f"camera{camera:04d}").glob(f"[0-9]*{layout.ENDINGS[kind]}"))
+        pictures = sorted((folder / kind / f"camera{camera:04d}").glob(f"[0-9]*{capture_layout.ENDINGS[kind]}"))
         for path in pictures[:1]:
             try:
                 with Image.open(path, formats=("JPEG", "PNG")) as picture:

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw
 
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.capture.layout import replacing
 from primdiffusion.capture.plain_npz import NpzError, read_npz
 from primdiffusion.capture.reader import Captures, Subject
-from primdiffusion.capture.rig import View
+from primdiffusion.formats.camera_rig import View
+from primdiffusion.formats.capture_layout import replacing
 
 BONE, JOINT = (255, 255, 255), (255, 64, 64)
 

@@ -12,8 +12,8 @@ from jaxtyping import Float32
 
 from primdiffusion.body.model import BodyPose, J
 from primdiffusion.body.smpl_pickle import BodyFileError, array_of_objects, as_array, load_restricted
-from primdiffusion.capture.layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE
 from primdiffusion.capture.plain_npz import NpzError, read_member, read_npz
+from primdiffusion.formats.capture_layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE
 
 KEYS = ("global_orient", "body_pose", "betas", "transl")
 

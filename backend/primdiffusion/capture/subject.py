@@ -13,13 +13,13 @@ from jaxtyping import Float
 from PIL import Image
 
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.capture import camera_files, layout, picture_files
 from primdiffusion.capture.figure import Figure, figure_of
 from primdiffusion.capture.multisample import Shot, shoot
 from primdiffusion.capture.people_files import SkinnedPerson
 from primdiffusion.capture.plain_npz import NpzError, read_npz
-from primdiffusion.capture.rig import Rig, View, bounding_sphere
 from primdiffusion.capture.texture_pyramid import BYTE_OF_LINEAR, encode_bytes
+from primdiffusion.formats import camera_files, capture_layout, picture_files
+from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
 
 JPEG_QUALITY = 95
@@ -81,8 +81,8 @@ def begin(subject: Path, sitting: Sitting) -> None:
     theta = matrix_to_axis_angle(sitting.poses.joint_rotation).numpy().reshape(len(sitting.skinning), -1)
     translation = sitting.poses.translation.numpy()
     _refuse_others(subject, theta, sitting.betas, translation)
-    layout.write_smpl(subject, theta[:, :3], theta[:, 3:], sitting.betas, translation)
-    layout.write_joints(subject, sitting.views, sitting.joints)
+    capture_layout.write_smpl(subject, theta[:, :3], theta[:, 3:], sitting.betas, translation)
+    capture_layout.write_joints(subject, sitting.views, sitting.joints)
     camera_files.write_cameras(subject, sitting.views)
     camera_files.write_opencv(subject, sitting.views)
     for frame in range(len(theta)):
@@ -114,15 +114,17 @@ def last_pass(passes: Sequence[str]) -> str:
 
 def is_drawn(subject: Path, passes: Sequence[str], camera: int, frame: int) -> bool:
     """Whether all pictures of a view are there and whole."""
-    return all(picture_files.is_whole_picture(layout.picture_path(subject, kind, camera, frame)) for kind in passes)
+    return all(
+        picture_files.is_whole_picture(capture_layout.picture_path(subject, kind, camera, frame)) for kind in passes
+    )
 
 
 def write_shot(subject: Path, passes: Sequence[str], camera: int, frame: int, shot: Shot) -> None:
     """The pictures of one view, each written whole, the one that marks the view as done last."""
     for kind in sorted(passes, key=lambda kind: kind == last_pass(passes)):
-        path = layout.picture_path(subject, kind, camera, frame)
+        path = capture_layout.picture_path(subject, kind, camera, frame)
         if kind == "img":
-            with layout.replacing(path) as partial:
+            with capture_layout.replacing(path) as partial:
                 Image.fromarray(srgb_bytes(shot.rgb)).save(partial, quality=JPEG_QUALITY, subsampling=0)
         elif kind == "mask":
             picture_files.write_png(path, np.round(shot.coverage.clip(0, 1) * 255).astype(np.uint8))
@@ -142,7 +144,7 @@ def srgb_bytes(linear: np.ndarray) -> np.ndarray:
 
 
 def _refuse_others(subject: Path, theta: np.ndarray, betas: np.ndarray, translation: np.ndarray) -> None:
-    path = subject / layout.SMPL_FOLDER / layout.SMPL_PLAIN_FILE
+    path = subject / capture_layout.SMPL_FOLDER / capture_layout.SMPL_PLAIN_FILE
     wanted = {"global_orient": theta[:, :3], "body_pose": theta[:, 3:], "betas": betas[None], "transl": translation}
     try:
         present = read_npz(path, tuple(wanted))
@@ -150,6 +152,6 @@ def _refuse_others(subject: Path, theta: np.ndarray, betas: np.ndarray, translat
         return  # nothing yet, or cut short: it is written anew
     for name, values in wanted.items():
         if present[name].shape != values.shape or not np.allclose(present[name], values, atol=1e-5):
-            raise layout.CaptureFolderError(
+            raise capture_layout.CaptureFolderError(
                 f"{subject} holds another person or other poses ({name} differ): choose another folder, or remove it"
             )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from primdiffusion.capture import layout
+from primdiffusion.formats import capture_layout
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,17 +26,17 @@ def verify(root: Path, *, checksums: bool = True) -> list[Finding]:
     """Everything wrong with the captures of a folder; empty where nothing is. Without `checksums` only sizes count.
 
     Raises:
-        CaptureFolderError: it holds no captures of our layout.
+        CaptureFolderError: it holds no captures of our capture_layout.
     """
-    layout.read_about(root)
+    capture_layout.read_about(root)
     findings = []
     for subject in subject_folders(root):
-        damage = layout.damage(subject, checksums=checksums)
+        damage = capture_layout.damage(subject, checksums=checksums)
         findings += [Finding(path, what) for path, what in damage.items()]
         findings += [Finding(path, "left by a killed process") for path in _leftovers(subject)]
-    listed = root / layout.LIST_FILE
+    listed = root / capture_layout.LIST_FILE
     names = listed.read_text(encoding="utf-8", errors="replace").split() if listed.is_file() else []
-    there = [path.name for path in subject_folders(root) if (path / layout.COMPLETE_FILE).is_file()]
+    there = [path.name for path in subject_folders(root) if (path / capture_layout.COMPLETE_FILE).is_file()]
     if sorted(names) != sorted(there):
         findings.append(Finding(listed, f"names {len(names)} subjects, finished are {len(there)}"))
     return findings
@@ -48,19 +48,21 @@ def repair(root: Path, findings: list[Finding]) -> None:
     The list is written anew. What was removed is made again by the command that rendered it. Raises OSError.
     """
     for finding in findings:
-        if finding.path.is_dir() or finding.path == root / layout.LIST_FILE:
+        if finding.path.is_dir() or finding.path == root / capture_layout.LIST_FILE:
             continue
         subject = root / finding.path.relative_to(root).parts[0]
         for path in _of_the_same_view(subject, finding.path):
             path.unlink(missing_ok=True)
         if not finding.path.name.startswith("."):
-            (subject / layout.COMPLETE_FILE).unlink(missing_ok=True)
-    layout.write_list(root, [path.name for path in subject_folders(root) if (path / layout.COMPLETE_FILE).is_file()])
+            (subject / capture_layout.COMPLETE_FILE).unlink(missing_ok=True)
+    capture_layout.write_list(
+        root, [path.name for path in subject_folders(root) if (path / capture_layout.COMPLETE_FILE).is_file()]
+    )
 
 
 def subject_folders(root: Path) -> list[Path]:
     """Folders that a renderer began, finished or not."""
-    marks = ("cameras.json", layout.COMPLETE_FILE)
+    marks = ("cameras.json", capture_layout.COMPLETE_FILE)
     return sorted(
         path
         for path in root.iterdir()
@@ -75,6 +77,6 @@ def _leftovers(subject: Path) -> list[Path]:
 def _of_the_same_view(subject: Path, path: Path) -> list[Path]:
     """The file and, of a picture, the other passes: the img tells that a view is done, so it goes with any of them."""
     parts = path.relative_to(subject).parts
-    if len(parts) != 3 or parts[0] not in layout.ENDINGS or path.name.startswith("."):
+    if len(parts) != 3 or parts[0] not in capture_layout.ENDINGS or path.name.startswith("."):
         return [path]
-    return [subject / kind / parts[1] / f"{path.stem}{ending}" for kind, ending in layout.ENDINGS.items()]
+    return [subject / kind / parts[1] / f"{path.stem}{ending}" for kind, ending in capture_layout.ENDINGS.items()]

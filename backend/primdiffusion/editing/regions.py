@@ -14,7 +14,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from primdiffusion.body.model import JOINT_NAMES, BodyModel, default_body
+from primdiffusion.body.model import BodyModel, default_body
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.surface import surface_points
 from primdiffusion.primitives.anchors import Anchors, anchor_skin_weights, attach, default_anchors, default_texels
 from primdiffusion.primitives.primitives import GRID, K, S

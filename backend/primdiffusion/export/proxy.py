@@ -10,11 +10,11 @@ from jaxtyping import Float, Float32, Float64, Int64, UInt8
 from numpy import ndarray as Array
 from torch import Tensor
 
-from primdiffusion.body.model import JOINT_NAMES
 from primdiffusion.export.apart import apart
 from primdiffusion.export.field import Field, look_along, pack_field, weights_at
 from primdiffusion.export.simplify import simplified, unwrapped
 from primdiffusion.export.surface import Surface, outside_surface
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.geometry.uv_atlas import rasterise_uv

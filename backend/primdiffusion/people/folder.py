@@ -24,7 +24,8 @@ import numpy as np
 import psutil
 import torch
 
-from primdiffusion.body.model import JOINT_NAMES, default_body
+from primdiffusion.body.model import default_body
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.gltf import Skeleton, glb

@@ -11,8 +11,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from primdiffusion.body.model import JOINT_NAMES, BodyPose
+from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.samplers import Step
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.human import Human, framing, place
 from primdiffusion.render.image import rgba_to_png, to_png
 from primdiffusion.render.march import march

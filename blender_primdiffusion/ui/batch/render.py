@@ -18,10 +18,10 @@ from pathlib import Path
 
 import bpy
 
-from ...capture.layout import replacing
 from ...capture.report import Report
 from ...engine import studio
 from ...engine.engine import ENGINE
+from ...formats.capture_layout import replacing
 from ...scene.folders import humans_folder
 from ...scene.human import humans, volume_path
 from ...scene.preview import fit_cycles_to_volumes, new_camera

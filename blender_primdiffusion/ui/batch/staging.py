@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ...capture.layout import replacing
+from ...formats.capture_layout import replacing
 
 
 @contextmanager

@@ -190,7 +190,7 @@ def _sphere_around(context: bpy.types.Context) -> tuple[NDArray[np.float64], flo
     """Of the active object and what hangs on it; of a person at the origin where there is none."""
     import numpy as np
 
-    from ...capture.rig import bounding_sphere
+    from ...formats.camera_rig import bounding_sphere
     from ...scene.convention import points_to_backend
 
     active = context.active_object

@@ -12,7 +12,7 @@ _CAMERAS_FILE = "cameras.json"
 
 def subjects_in(folder: Path) -> list[str]:
     """Names of the people in a dataset of captures; none where the folder is one subject's own, or cannot be read."""
-    from ...capture.layout import LIST_FILE
+    from ...formats.capture_layout import LIST_FILE
 
     try:
         if (folder / _CAMERAS_FILE).is_file():

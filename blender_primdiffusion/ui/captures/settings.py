@@ -13,7 +13,7 @@ from ...capture.names import LAYOUTS, PASSES
 from ..translations import CONTEXT
 
 if TYPE_CHECKING:
-    from ...capture.rig import Rig
+    from ...formats.camera_rig import Rig
 
 _PASS_NAMES = {
     "img": ("Colour", "What the camera sees, over black"),
@@ -152,7 +152,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
 
     def rig(self) -> Rig:
         """The rig asked for. Raises ValueError where it is the scene's cameras, or impossible."""
-        from ...capture.rig import Rig
+        from ...formats.camera_rig import Rig
 
         if self.arrangement == "custom":
             raise ValueError("the scene's cameras are no rig: they stand where they stand")

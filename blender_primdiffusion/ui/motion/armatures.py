@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import bpy
 
+from ...formats.joints import JOINT_NAMES
 from ...scene.human import armature_of, human_of, humans
-from ...scene.joints import JOINT_NAMES
 from ..jobs.target import named_person, selected_person
 from ..translations.told import told
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 from bpy_extras.io_utils import ImportHelper
 
-from ...scene.joints import JOINT_NAMES
+from ...formats.joints import JOINT_NAMES
 from ...worker.sentence import sentence
 from ..jobs.drawing import draw_lines
 from ..translations.told import told

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import bpy
 
+from ...formats.joints import JOINT_NAMES
 from ...motion.own_poses import delete_pose, load_pose, own_poses, save_pose
-from ...scene.joints import JOINT_NAMES
 from ..translations.told import told
 from .armatures import OnArmature, warn_of_rest
 from .pose_pictures import draw_picture, look_again, poses_folder

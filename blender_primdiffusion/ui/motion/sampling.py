@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ...formats.joints import JOINT_NAMES
 from ...motion.motion import Motion
 from ...motion.pose_library import rest_joints
 from ...motion.rotation import nearest
@@ -16,7 +17,6 @@ from ...motion.skeleton import unchain
 from ...scene.armature import rest_rotations
 from ...scene.convention import BLENDER_FROM_BACKEND, points_to_backend
 from ...scene.human import BETAS
-from ...scene.joints import JOINT_NAMES
 from .armatures import scene_fps
 
 

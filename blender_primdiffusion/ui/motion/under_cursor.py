@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import bpy
 
+from ...formats.joints import JOINT_NAMES
 from ...scene.human import armature_of, humans
-from ...scene.joints import JOINT_NAMES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -1,8 +1,4 @@
-"""The pictures of a capture as values of files, and PNGs without an imaging library.
-
-This file is the same in the backend and in the extension, which import nothing of each other: numpy and the standard
-library only.
-"""
+"""The pictures of a capture as values of files, and PNGs without an imaging library."""
 
 from __future__ import annotations
 
@@ -14,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .layout import replacing
+from .capture_layout import replacing
 
 DEPTH_UNIT = 0.00025
 """Metres a step of a depth file: up to 16.38 m."""

@@ -17,9 +17,8 @@
     root/{id}/colmap/FFFF/{cameras,images,points3D}.txt    picture names relative to root/{id}/img
     root/{id}/complete.json                        every file's size and CRC-32: written last
 
-This file is the same in the backend and in the extension, which import nothing of each other: numpy and the standard
-library only. World: metres, y up, the person faces +z. Files are written under a temporary name, then renamed; several
-processes may write different subjects, or views, of one dataset. `camera_files` and `picture_files` write the rest.
+World: metres, y up, the person faces +z. Files are written under a temporary name, then renamed; several processes may
+write different subjects, or views, of one dataset. `camera_files` and `picture_files` write the rest.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .rig import View
+from .camera_rig import View
 
 FORMAT, VERSION = "primdiffusion-captures", 1
 ENDINGS = {"img": ".jpg", "mask": ".png", "depth": ".png", "normal": ".png", "part": ".png", "rgba": ".png"}

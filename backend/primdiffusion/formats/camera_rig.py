@@ -1,7 +1,7 @@
 """Where the cameras of a capture stand: rings, spheres, hemispheres around a person.
 
-This file is the same in the backend and in the extension, which import nothing of each other: numpy only. World:
-metres, y up, the person faces +z. Cameras as OpenCV has them: x right, y down, z forward, pixel centres at +0.5.
+World: metres, y up, the person faces +z. Cameras as OpenCV has them: x right, y down, z forward, pixel centres at
++0.5.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""SMPL's joints, which are the bones of people: names and order alone, for whoever needs no numbers."""
+"""SMPL's joints, which are the bones of people."""
 
 from __future__ import annotations
 

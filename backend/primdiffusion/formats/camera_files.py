@@ -1,8 +1,4 @@
-"""The cameras of a capture as the projects that read them want them: released code, OpenCV, NeRF, COLMAP.
-
-This file is the same in the backend and in the extension, which import nothing of each other: numpy and the standard
-library only.
-"""
+"""The cameras of a capture as the projects that read them want them: released code, OpenCV, NeRF, COLMAP."""
 
 from __future__ import annotations
 
@@ -14,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .layout import picture_path, replacing, write_npz
-from .rig import View
+from .camera_rig import View
+from .capture_layout import picture_path, replacing, write_npz
 
 _FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 
