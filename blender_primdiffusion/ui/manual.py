@@ -6,8 +6,6 @@ from pathlib import Path
 
 import bpy
 
-from .translations.told import told
-
 MISSING = "the manual's page {!r} is not there: install the extension's zip again"
 _FOLDERS = (("manual", ".html"), ("../docs/manual", ".md"))
 """Where pages may be, from the extension's folder: in an installed zip, in a checkout."""
@@ -29,10 +27,10 @@ class PRIMDIFFUSION_OT_open_manual(bpy.types.Operator):
 
         path = page_file(self.page) or page_file("index")
         if path is None:
-            self.report({"ERROR"}, told(MISSING.format(self.page)))
+            self.report({"ERROR"}, MISSING.format(self.page))
             return {"CANCELLED"}
         if not webbrowser.open(path.as_uri() + (f"#{self.anchor}" if self.anchor else "")):
-            self.report({"ERROR"}, told(f"no browser could be started: open {path} by hand"))
+            self.report({"ERROR"}, f"no browser could be started: open {path} by hand")
             return {"CANCELLED"}
         return {"FINISHED"}
 

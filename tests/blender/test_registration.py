@@ -14,7 +14,6 @@ LATE = (
     "scene.human_file", "scene.memory", "scene.collect", "scene.exported_human", "scene.exported_proxy",
     "capture.settings", "formats.camera_rig", "motion.poses", "engine.viewport", "engine.studio", "worker.client",
     "worker.environment", "worker.job", "worker.kept_works", "ui.generate.work", "ui.human.edit_work",
-    "ui.translations.labels", "ui.translations.tooltips",
 )  # fmt: skip
 """Modules of ours that registering must not import: they bring others along, or numpy."""
 CHILD = """

@@ -9,7 +9,6 @@ import bpy
 from ...scene.human import humans
 from ..jobs.follow import submit
 from ..jobs.target import Target, named_person, selected_person
-from ..translations.told import told
 
 _HUMAN = "Name of the person (of their collection); empty: the selected one"
 _PICTURE = "A picture file for it; empty: one is drawn"
@@ -35,7 +34,7 @@ class _OfPerson:
             person = named_person(context, self.human) if self.human else selected_person(context)
             return self.act(context, person)
         except (ValueError, OSError) as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
 
 
@@ -54,7 +53,7 @@ class PRIMDIFFUSION_OT_mark_human_as_asset(_OfPerson, bpy.types.Operator):
         target = Target.of(person)
         if not self.picture:
             return submit(self, context, HumanAssetWork(target))
-        self.report({"INFO"}, told(mark_human(person, Path(bpy.path.abspath(self.picture)))))
+        self.report({"INFO"}, mark_human(person, Path(bpy.path.abspath(self.picture))))
         bpy.ops.ed.undo_push(message=HumanAssetWork.undo)
         return {"FINISHED"}
 
@@ -75,7 +74,7 @@ class PRIMDIFFUSION_OT_mark_pose_as_asset(_OfPerson, bpy.types.Operator):
         work = PoseAssetWork.of(person, self.name.strip() or "Pose")
         if not self.picture:
             return submit(self, context, work)
-        self.report({"INFO"}, told(work.marked(Path(bpy.path.abspath(self.picture)))))
+        self.report({"INFO"}, work.marked(Path(bpy.path.abspath(self.picture))))
         bpy.ops.ed.undo_push(message=PoseAssetWork.undo)
         return {"FINISHED"}
 
@@ -116,7 +115,7 @@ class PRIMDIFFUSION_OT_make_pose_assets(bpy.types.Operator):
         try:
             path, count = write_pose_library(context, folder)
         except (ValueError, OSError) as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, told(f"{count} poses are in {path}, and in the Asset Browser"))
+        self.report({"INFO"}, f"{count} poses are in {path}, and in the Asset Browser")
         return {"FINISHED"}

@@ -11,7 +11,6 @@ import bpy
 from mathutils import Vector
 
 from ..jobs.follow import redraw
-from ..translations.told import told
 from .session import Busy, captures
 from .settings import words_of
 
@@ -53,7 +52,7 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
             settings_of(parse(words))  # what is impossible is said at once
             captures.start(words)
         except (Busy, OSError, ValueError, RuntimeError) as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         bpy.app.timers.register(follow, first_interval=_TICK_S, persistent=True)
         return {"FINISHED"}
@@ -78,7 +77,7 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
         if report.failed:
             first, path = report.failed[0], report_path(settings.out, settings.shard)
             who = first["subject"] or first["what"]
-            self.report({"ERROR"}, told(f"{len(report.failed)} failed; {who}: {first['why']} (all: {path})"))
+            self.report({"ERROR"}, f"{len(report.failed)} failed; {who}: {first['why']} (all: {path})")
             return {"CANCELLED"}
         return {"FINISHED"}
 
@@ -131,12 +130,12 @@ class PRIMDIFFUSION_OT_verify_captures(bpy.types.Operator):
             root = parse(words).out
             wrong = repair(root) if self.repair else verify(root)
         except (Busy, OSError, ValueError) as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         for sentence in wrong:
             print(f"PrimDiffusion: {sentence}")
         if wrong and not self.repair:
-            self.report({"ERROR"}, told(f"{len(wrong)} problems; the first: {wrong[0]}"))
+            self.report({"ERROR"}, f"{len(wrong)} problems; the first: {wrong[0]}")
             return {"CANCELLED"}
         return {"FINISHED"}
 
@@ -159,7 +158,7 @@ class PRIMDIFFUSION_OT_preview_rig(bpy.types.Operator):
         try:
             rig = context.scene.primdiffusion_captures.rig()
         except ValueError as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         collection = bpy.data.collections.new(RIG)
         context.scene.collection.children.link(collection)

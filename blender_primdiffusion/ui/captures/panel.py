@@ -8,7 +8,6 @@ import bpy
 
 from ..jobs.drawing import draw_lines
 from ..manual import draw_manual_button
-from ..translations.told import told
 from .operators import RIG
 from .session import captures
 
@@ -43,7 +42,7 @@ class PRIMDIFFUSION_PT_captures(_InSidebar, bpy.types.Panel):
         column.prop(asked, "out")
         if captures.busy:
             left = f" ({_minutes(captures.eta_s)} left)" if captures.eta_s else ""
-            layout.progress(factor=captures.fraction, text=told(f"{captures.message}{left}"), translate=False)
+            layout.progress(factor=captures.fraction, text=f"{captures.message}{left}", translate=False)
             layout.operator("primdiffusion.cancel_captures", icon="CANCEL")
         else:
             layout.operator("primdiffusion.render_captures", icon="RENDER_ANIMATION")

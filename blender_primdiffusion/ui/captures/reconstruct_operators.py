@@ -5,7 +5,6 @@ from __future__ import annotations
 import bpy
 
 from ..jobs.follow import submit
-from ..translations.told import told
 
 
 class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
@@ -38,7 +37,7 @@ class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
         folder = bpy.path.abspath(self.directory or asked.capture)
         subject = self.subject or ("" if self.directory else asked.subject)  # the panel's is somebody of its folder
         if not folder:
-            self.report({"ERROR"}, told("choose the folder of captures first"))
+            self.report({"ERROR"}, "choose the folder of captures first")
             return {"CANCELLED"}
         frame, views = self.frame if self.frame >= 0 else asked.frame, self.views or asked.views
         return submit(self, context, ReconstructWork(folder, subject, frame, views))

@@ -10,7 +10,6 @@ from ...scene.human import armature_of, humans
 from ..jobs.follow import submit
 from ..jobs.target import Target, named_person, selected_person
 from ..translations import CONTEXT
-from ..translations.told import told
 from .destination import check_writable, destination
 from .settings import FORMATS, HUMAN_ENDINGS, MODEL_ENDINGS, SHOWN
 
@@ -38,7 +37,7 @@ class _OfPerson:
             person = named_person(context, self.human) if self.human else selected_person(context)
             return self.act(context, person)
         except (ValueError, OSError) as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
 
     def chosen(self, context: bpy.types.Context, name: str):
@@ -58,7 +57,7 @@ class _ToFile(_OfPerson):
         try:
             person = named_person(context, self.human) if self.human else selected_person(context)
         except ValueError as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         if not self.filepath:
             self.filepath = bpy.path.clean_name(person.name) + self.endings(context)[0]
@@ -247,7 +246,7 @@ class PRIMDIFFUSION_OT_export_human(_ToFile, bpy.types.Operator):
         write_human(
             context, person, path, scene_frames(context.scene, True) if self.chosen(context, "motion") else None
         )
-        self.report({"INFO"}, told(f"Exported {person.name} to {path.name}"))
+        self.report({"INFO"}, f"Exported {person.name} to {path.name}")
         return {"FINISHED"}
 
 
@@ -287,7 +286,7 @@ class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
                 raise FileNotFoundError(f"there is no file {str(path)!r}: choose a .human file")
             motion_in(read_tensors(path))
         except (ValueError, OSError) as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         at = tuple(self.location) if self.properties.is_property_set("location") else None
         return submit(self, context, ImportHumanWork(str(path), at))

@@ -8,7 +8,6 @@ import bpy
 
 from ..jobs.follow import submit
 from ..jobs.target import Target, named_person, selected_person
-from ..translations.told import told
 from .watching import look
 
 
@@ -39,16 +38,16 @@ class _Find:
                 bpy.ops.ed.undo_push(message="Find Missing Volumes")
             restored, left = self._restore(context, directory)
         except OSError as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         finally:
             look()
         if left:
             done = repaired or brought or restored
-            self.report({"WARNING" if done else "ERROR"}, told("; ".join(left)))
+            self.report({"WARNING" if done else "ERROR"}, "; ".join(left))
             return {"FINISHED"} if done else {"CANCELLED"}
         news = f"{repaired + brought} files found" if lost else "No files of people are missing"
-        self.report({"INFO"}, told(news))
+        self.report({"INFO"}, news)
         return {"FINISHED"}
 
     def _restore(self, context: bpy.types.Context, directory: Path | None) -> tuple[int, list[str]]:
@@ -125,7 +124,7 @@ class PRIMDIFFUSION_OT_generate_again(bpy.types.Operator):
             else:
                 raise ValueError(f"the file of {person.name!r} is there, {there.name!r}: press Find Missing Volumes")
         except ValueError as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return submit(self, context, work)
 
@@ -145,15 +144,15 @@ class PRIMDIFFUSION_OT_collect_files(bpy.types.Operator):
         try:
             done = collect_files()
         except (OSError, ValueError) as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         look()
         where = humans_folder().name
         if done.volumes:
             size = f"{done.files} files, {done.size / 1e6:.1f} MB"
-            self.report({"INFO"}, told(f"{done.volumes} volumes are in {where!r} now ({size} copied); save this file"))
+            self.report({"INFO"}, f"{done.volumes} volumes are in {where!r} now ({size} copied); save this file")
         else:
-            self.report({"INFO"}, told(f"All files of people are in {where!r} already"))
+            self.report({"INFO"}, f"All files of people are in {where!r} already")
         return {"FINISHED"}
 
 

@@ -6,7 +6,6 @@ import bpy
 
 from ..jobs.follow import submit
 from ..jobs.queue import queue
-from ..translations.told import told
 from .asking import Asking, last_seed
 from .settings import random_seed
 
@@ -36,7 +35,7 @@ class PRIMDIFFUSION_OT_generate(Asking, bpy.types.Operator):
             last = last_seed(seed, count)
             sampling = self.sampling(settings)
         except ValueError as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         for each in range(seed, last + 1):
             renews = from_panel and not settings.keep_seed and each == last

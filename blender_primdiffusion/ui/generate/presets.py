@@ -8,7 +8,6 @@ import bpy
 from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
 
-from ..translations.told import told
 from .attributes import CATEGORIES, SCALARS
 
 SUBDIR = "primdiffusion/generate"
@@ -58,13 +57,11 @@ class PRIMDIFFUSION_OT_use_generate_preset(bpy.types.Operator):
         try:
             bpy.utils.execfile(str(path))
         except OSError as error:
-            self.report({"ERROR"}, told(f"The preset cannot be read: {error}. Choose another one"))
+            self.report({"ERROR"}, f"The preset cannot be read: {error}. Choose another one")
             return {"CANCELLED"}
         except (TypeError, AttributeError, SyntaxError) as error:
             name = bpy.path.display_name(path.name)
-            self.report(
-                {"ERROR"}, told(f"The preset {name!r} does not suit this checkpoint or version: {error}. Remove it")
-            )
+            self.report({"ERROR"}, f"The preset {name!r} does not suit this checkpoint or version: {error}. Remove it")
             return {"CANCELLED"}
         PRIMDIFFUSION_PT_generate_presets.bl_label = bpy.path.display_name(path.name)
         return {"FINISHED"}

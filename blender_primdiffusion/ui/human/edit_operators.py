@@ -16,7 +16,6 @@ from ..generate.attributes import asked, parsed
 from ..jobs.follow import submit
 from ..jobs.target import named_person, selected_person
 from ..translations import CONTEXT
-from ..translations.told import told
 from .edit_settings import TRANSFER_ITEMS, parts_property
 
 if TYPE_CHECKING:
@@ -48,7 +47,7 @@ class _Edit:
             steps = self.chosen("steps", context.scene.primdiffusion)
             work = self.work().of(person, steps, self.params(context, person))
         except (OSError, ValueError) as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return submit(self, context, work)
 

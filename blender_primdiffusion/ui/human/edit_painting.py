@@ -6,7 +6,6 @@ import bpy
 
 from ...scene.body_mesh import MARK, body_of
 from ..jobs.target import selected_person
-from ..translations.told import told
 
 
 class PRIMDIFFUSION_OT_paint_region(bpy.types.Operator):
@@ -28,7 +27,7 @@ class PRIMDIFFUSION_OT_paint_region(bpy.types.Operator):
                 raise ValueError(f"the body mesh of {person.name!r} was deleted: choose parts by name instead")
             start_painting(context, body, settings.vertex_group)
         except ValueError as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         settings.region = "PAINTED"
         return {"FINISHED"}

@@ -6,7 +6,6 @@ import bpy
 
 from ...scene.human import armature_of, remove_human
 from ..jobs.target import named_person, selected_person
-from ..translations.told import told
 
 _HUMAN = "Name of the person (of their collection); empty: the selected one"
 
@@ -23,7 +22,7 @@ class _Whole:
         try:
             self.do(context, self.meant(context))
         except ValueError as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return {"FINISHED"}
 

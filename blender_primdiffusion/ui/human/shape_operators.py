@@ -10,7 +10,6 @@ import bpy
 from ...scene.shape_names import BETAS
 from ..jobs.target import named_person, selected_person
 from ..translations import CONTEXT
-from ..translations.told import told
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,10 +33,10 @@ class _Shape:
             person = named_person(context, self.human) if self.human else selected_person(context)
             warning = reshape(person, self.betas_for(context, person))
         except (OSError, ValueError) as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         if warning:
-            self.report({"WARNING"}, told(warning))
+            self.report({"WARNING"}, warning)
         return {"FINISHED"}
 
     def betas_for(self, context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 
 import bpy
+from bpy.app.translations import pgettext_iface
 
 from ...scene.human import BETAS, MARK, armature_of
 from ...worker.sentence import sentence
 from ..jobs.drawing import draw_lines
 from ..jobs.target import selected_person
-from ..translations.told import told
 
 _SHOWN = ("seed", "steps", "sampler", "guidance", "checkpoint", "version")
 """Of the provenance, in this order."""
@@ -59,7 +59,7 @@ class PRIMDIFFUSION_PT_shape(_InHuman, bpy.types.Panel):
         layout.prop(settings, "weight")
         shown = in_the_scene(context.scene, armature, settings.height)
         if shown:
-            layout.label(text=told(f"In the scene: {shown}"), icon="BLANK1", translate=False)
+            layout.label(text=f"In the scene: {shown}", icon="BLANK1", translate=False)
         column = layout.column(align=True)
         for index, name in enumerate(names):
             column.prop(settings, "betas", index=index, text=name, slider=True)
@@ -89,7 +89,7 @@ class PRIMDIFFUSION_PT_details(_InHuman, bpy.types.Panel):
         person = selected_person(context)
         column = self.layout.column(align=True)
         for name, value in details(person):
-            column.label(text=f"{told(name)}: {told(value)}", translate=False)
+            column.label(text=f"{pgettext_iface(name)}: {value}", translate=False)
 
 
 def details(person: bpy.types.Collection) -> list[tuple[str, str]]:

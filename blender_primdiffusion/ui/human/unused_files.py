@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import bpy
 
-from ..translations.told import told
-
 
 class PRIMDIFFUSION_OT_remove_unused_files(bpy.types.Operator):
     """Delete files in the folder of people beside this file that nobody shows now. Undo of edits, and other .blend \
@@ -35,6 +33,6 @@ files that share the folder, will miss them"""
                 path.unlink()
                 removed += 1
             except OSError as error:
-                self.report({"WARNING"}, told(f"{str(path)!r} could not be removed ({error})"))
-        self.report({"INFO"}, told(f"Removed {removed} files ({size / 1e6:.1f} MB) from {str(humans_folder())!r}"))
+                self.report({"WARNING"}, f"{str(path)!r} could not be removed ({error})")
+        self.report({"INFO"}, f"Removed {removed} files ({size / 1e6:.1f} MB) from {str(humans_folder())!r}")
         return {"FINISHED"}

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 import bpy
 
 from ...places import EXTENSION, backend_module_path, preference
-from ..translations.told import told
 from .memory import device_line
 from .queue import queue
 
@@ -92,8 +91,8 @@ class PRIMDIFFUSION_OT_copy_diagnostics(bpy.types.Operator):
         if bpy.app.background:
             block = bpy.data.texts.get(TEXT) or bpy.data.texts.new(TEXT)
             block.from_string(text)
-            self.report({"INFO"}, told(f"the text {TEXT!r} holds them"))
+            self.report({"INFO"}, f"the text {TEXT!r} holds them")
         else:
             context.window_manager.clipboard = text
-            self.report({"INFO"}, told("copied: paste it into the report, and read it first"))
+            self.report({"INFO"}, "copied: paste it into the report, and read it first")
         return {"FINISHED"}

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ...places import EXTENSION
-from ..translations.told import told
 from .building import building
 from .entering import in_the_way
 from .pictures import so_far
@@ -43,7 +42,7 @@ def draw_job(
             layout.template_icon(icon_value=so_far.icon, scale=_PICTURE_SCALE)
         _draw_progress(layout)
     if waiting := sum(entry.work.kind == kind for entry in queue.waiting):
-        layout.label(text=told(f"In Line: {waiting}"), icon="SORTTIME", translate=False)
+        layout.label(text=f"In Line: {waiting}", icon="SORTTIME", translate=False)
     if (outcome := queue.outcomes.get(kind)) is not None:
         _draw_outcome(layout, outcome)
     return props
@@ -52,7 +51,7 @@ def draw_job(
 def draw_lines(layout: bpy.types.UILayout, text: str, icon: str) -> None:
     """A sentence in the interface's language, on as many lines as it needs."""
     column = layout.column(align=True)
-    for number, line in enumerate(_wrapped(told(text))):
+    for number, line in enumerate(_wrapped(text)):
         column.label(text=line, icon=icon if number == 0 else "BLANK1", translate=False)
 
 
@@ -66,7 +65,7 @@ def _draw_progress(layout: bpy.types.UILayout) -> None:
     """What is at work: how far it is, how long it will take, Cancel."""
     row = layout.row(align=True)
     row.progress(
-        factor=building.fraction if queue.ready else queue.job.fraction, text=told(_progress_text()), translate=False
+        factor=building.fraction if queue.ready else queue.job.fraction, text=_progress_text(), translate=False
     )
     row.operator("primdiffusion.cancel", text="", icon="CANCEL").number = 0
 
@@ -79,7 +78,7 @@ def draw_in_line(layout: bpy.types.UILayout) -> None:
     for entry in queue.in_line:
         row = column.row(align=True)
         icon = "PLAY" if entry is queue.current else "SORTTIME"
-        row.label(text=told(entry.work.label), icon=icon, translate=False)
+        row.label(text=entry.work.label, icon=icon, translate=False)
         row.operator("primdiffusion.cancel", text="", icon="X").number = entry.number
         if entry.work.not_kept_because:
             draw_lines(column, f"Not kept over a restart: {entry.work.not_kept_because}", "BLANK1")
@@ -92,7 +91,7 @@ def draw_ended(layout: bpy.types.UILayout) -> None:
     column = layout.column(align=True)
     for outcome in queue.ended:
         icon = "ERROR" if outcome.error is not None else "CHECKMARK" if outcome.went_well else "CANCEL"
-        column.label(text=told(outcome.entry.work.label), icon=icon, translate=False)
+        column.label(text=outcome.entry.work.label, icon=icon, translate=False)
 
 
 def _draw_outcome(layout: bpy.types.UILayout, outcome: Outcome) -> None:

@@ -6,7 +6,6 @@ import time
 
 import bpy
 
-from ..translations.told import told
 from .building import building
 from .entering import enter, in_the_way
 from .memory import release_when_idle
@@ -35,7 +34,7 @@ def submit(
         return {"FINISHED"}
     outcome = _wait_for(queue.add_awaited(context, work, scene))
     if outcome.error is not None:
-        operator.report({"ERROR"}, told(outcome.sentence))
+        operator.report({"ERROR"}, outcome.sentence)
         return {"CANCELLED"}
     print(f"PrimDiffusion: {outcome.notice}", flush=True)
     return {"FINISHED"}

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ..translations.told import told
 from . import memory
 from .follow import redraw, submit
 from .kept import home_of, is_open, meant_for, work_of
@@ -40,7 +39,7 @@ class PRIMDIFFUSION_OT_cancel(bpy.types.Operator):
         """Ask; the timer sees it through."""
         if not queue.cancel(self.number):
             which = f"work {self.number} is not in line any more" if self.number else "nothing is under way yet"
-            self.report({"ERROR"}, told(which))
+            self.report({"ERROR"}, which)
             return {"CANCELLED"}
         redraw()
         return {"FINISHED"}
@@ -68,7 +67,7 @@ class PRIMDIFFUSION_OT_try_again(bpy.types.Operator):
         outcome = queue.outcomes.get(self.kind) if self.kind else queue.last
         if outcome is None or outcome.error is None:
             why = f"no work {self.kind!r} has failed" if self.kind else "the last work went well"
-            self.report({"ERROR"}, told(why))
+            self.report({"ERROR"}, why)
             return {"CANCELLED"}
         return submit(self, context, outcome.entry.work)
 
@@ -120,7 +119,7 @@ class PRIMDIFFUSION_OT_resume_works(_OfWorksLeft, bpy.types.Operator):
         only when their file is given."""
         taken = queue.kept.take(self.is_of_the_place if self.names_a_place else home_of)
         if not taken:
-            self.report({"ERROR"}, told(_nothing_taken()))
+            self.report({"ERROR"}, _nothing_taken())
             return {"CANCELLED"}
         unknown, states = [], []
         for kept in taken:
@@ -131,7 +130,7 @@ class PRIMDIFFUSION_OT_resume_works(_OfWorksLeft, bpy.types.Operator):
             else:
                 states.append(submit(self, context, work, home_of(kept)))
         if unknown:
-            self.report({"WARNING"} if states else {"ERROR"}, told("; ".join(unknown)))
+            self.report({"WARNING"} if states else {"ERROR"}, "; ".join(unknown))
         redraw()
         return {"FINISHED"} if {"FINISHED"} in states else {"CANCELLED"}
 
@@ -168,9 +167,9 @@ class PRIMDIFFUSION_OT_release_memory(bpy.types.Operator):
         try:
             freed = memory.release()
         except RuntimeError as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, told(freed))
+        self.report({"INFO"}, freed)
         redraw()
         return {"FINISHED"}
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ..translations.told import told
 from .drawing import draw_ended, draw_in_line, draw_lines
 from .kept import home_of, is_open, meant_for
 from .memory import device_line
@@ -72,13 +71,13 @@ def _draw_left(layout: bpy.types.UILayout, works: list[KeptWork]) -> None:
     """Works that were asked for in one place, and what can be done with them."""
     first, column = works[0], layout.column(align=True)
     at_home = home_of(first) is not None
-    column.label(text=told(f"For {meant_for(first)}"), icon="FILE_BLEND", translate=False)
+    column.label(text=f"For {meant_for(first)}", icon="FILE_BLEND", translate=False)
     for kept in works[:_SHOWN_LEFT]:
-        column.label(text=told(kept.label), icon="TIME", translate=False)
+        column.label(text=kept.label, icon="TIME", translate=False)
     if len(works) > _SHOWN_LEFT:
-        column.label(text=told(f"and {len(works) - _SHOWN_LEFT} more"), translate=False)
+        column.label(text=f"and {len(works) - _SHOWN_LEFT} more", translate=False)
     if not is_open(first.blend) and os.path.isfile(first.blend):
-        words = told(f"Open {bpy.path.basename(first.blend)}")
+        words = f"Open {bpy.path.basename(first.blend)}"
         opening = layout.operator("wm.open_mainfile", text=words, translate=False, icon="FILE_FOLDER")
         opening.filepath, opening.display_file_selector = first.blend, False
     row = layout.row(align=True)

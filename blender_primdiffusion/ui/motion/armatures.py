@@ -7,7 +7,6 @@ import bpy
 from ...formats.joints import JOINT_NAMES
 from ...scene.human import armature_of, human_of, humans
 from ..jobs.target import named_person, selected_person
-from ..translations.told import told
 
 
 def target_armature(context: bpy.types.Context, person: str = "") -> bpy.types.Object:
@@ -30,7 +29,7 @@ def target_armature(context: bpy.types.Context, person: str = "") -> bpy.types.O
 def warn_of_rest(operator: bpy.types.Operator, armature: bpy.types.Object) -> None:
     """Say so where the armature does not show how it is posed."""
     if armature.data.pose_position == "REST":
-        operator.report({"WARNING"}, told(f"{armature.name!r} shows its rest position: switch it to Pose Position"))
+        operator.report({"WARNING"}, f"{armature.name!r} shows its rest position: switch it to Pose Position")
 
 
 def scene_fps(scene: bpy.types.Scene) -> float:
@@ -59,7 +58,7 @@ class OnArmature:
         try:
             return self.on(context, target_armature(context, self.person))
         except (ValueError, OSError) as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:

@@ -12,7 +12,6 @@ from bpy_extras.io_utils import ImportHelper
 from ...formats.joints import JOINT_NAMES
 from ...worker.sentence import sentence
 from ..jobs.drawing import draw_lines
-from ..translations.told import told
 from .armatures import OnArmature, target_armature
 from .options import WhereTo
 from .under_cursor import person_under
@@ -167,7 +166,7 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
             self.report(
                 {"WARNING"}, f"{armature.name!r} shows its rest position: switch to Pose Position to see it move"
             )
-        self.report({"INFO"}, told(f"{motion.name}: {len(motion)} frames of the file on frames {first:g} to {last:g}"))
+        self.report({"INFO"}, f"{motion.name}: {len(motion)} frames of the file on frames {first:g} to {last:g}")
         return {"FINISHED"}
 
     def axis(self) -> str:
@@ -213,6 +212,6 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
         for label, text in look.facts.items():
             row = box.split(factor=0.4)
             row.label(text=label)
-            row.label(text=told(text), translate=False)
+            row.label(text=text, translate=False)
         if look.error:
             draw_lines(box, sentence(look.error), "ERROR")

@@ -8,7 +8,6 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ..translations import CONTEXT
-from ..translations.told import told
 from .armatures import OnArmature, scene_fps
 from .options import WhereTo
 
@@ -115,7 +114,7 @@ class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operato
         motion, betas, pelvis = sample_motion(context, armature, first, last)
         path = Path(bpy.path.abspath(self.filepath))
         write_amass(path, motion, betas, pelvis)
-        self.report({"INFO"}, told(f"{len(motion)} frames of {armature.name!r} written to {path.name!r}"))
+        self.report({"INFO"}, f"{len(motion)} frames of {armature.name!r} written to {path.name!r}")
         return {"FINISHED"}
 
 

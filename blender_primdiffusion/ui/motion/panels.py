@@ -11,7 +11,6 @@ from ...scene.actions import action_curves, loops
 from ...worker.sentence import sentence
 from ..jobs.drawing import draw_lines
 from ..manual import draw_manual_button
-from ..translations.told import told
 from .armatures import target_armature
 from .pose_pictures import poses_folder
 from .settings import FACTS, moves_bones
@@ -63,7 +62,7 @@ class PRIMDIFFUSION_PT_motion(_InSidebar, bpy.types.Panel):
         for label, text in facts_of(action).items():
             row = box.split(factor=0.4)
             row.label(text=label)
-            row.label(text=told(text), translate=False)
+            row.label(text=text, translate=False)
         start, end = action.frame_range
         row = box.split(factor=0.4)
         row.label(text="In the Scene")

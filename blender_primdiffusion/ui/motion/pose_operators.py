@@ -8,7 +8,6 @@ import bpy
 
 from ...formats.joints import JOINT_NAMES
 from ...motion.own_poses import delete_pose, load_pose, own_poses, save_pose
-from ..translations.told import told
 from .armatures import OnArmature, warn_of_rest
 from .pose_pictures import draw_picture, look_again, poses_folder
 
@@ -54,7 +53,7 @@ class _Posing(OnArmature):
             key_pose(armature, context.scene.frame_current, changed)
         locked = len(joints) - len(changed)
         if locked:
-            self.report({"WARNING"}, told(f"{locked} locked bones of {armature.name!r} stayed as they were"))
+            self.report({"WARNING"}, f"{locked} locked bones of {armature.name!r} stayed as they were")
         warn_of_rest(self, armature)
         return {"FINISHED"}
 
@@ -178,10 +177,10 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
         try:
             draw_picture(path, rotations)
         except OSError as error:
-            self.report({"WARNING"}, told(f"The pose {name!r} has no picture: {error}"))
+            self.report({"WARNING"}, f"The pose {name!r} has no picture: {error}")
         look_again()
         context.scene.primdiffusion_motion.pose = name
-        self.report({"INFO"}, told(f"The pose {name!r} is in the library"))
+        self.report({"INFO"}, f"The pose {name!r} is in the library")
         return {"FINISHED"}
 
 
@@ -204,13 +203,13 @@ class PRIMDIFFUSION_OT_delete_pose(bpy.types.Operator):
         name = self.pose_name or settings.pose
         own = own_poses(poses_folder())
         if name not in own:
-            self.report({"ERROR"}, told(f"{name!r} is no pose of your own: only those can be deleted"))
+            self.report({"ERROR"}, f"{name!r} is no pose of your own: only those can be deleted")
             return {"CANCELLED"}
         try:
             delete_pose(own[name])
             look_again()
         except OSError as error:
-            self.report({"ERROR"}, told(f"{str(own[name])!r} could not be deleted ({error.strerror or error})"))
+            self.report({"ERROR"}, f"{str(own[name])!r} could not be deleted ({error.strerror or error})")
             return {"CANCELLED"}
         settings.property_unset("pose")
         return {"FINISHED"}

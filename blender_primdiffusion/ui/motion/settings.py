@@ -6,7 +6,6 @@ import bpy
 
 from ...scene.actions import action_curves
 from ..translations import CONTEXT
-from ..translations.told import told
 from .armatures import target_armature
 from .pose_pictures import pose_items
 
@@ -57,7 +56,7 @@ class PRIMDIFFUSION_OT_use_action(bpy.types.Operator):
             if not moves_bones(action):
                 raise ValueError(f"the action {self.action!r} moves no bones of a person")
         except ValueError as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         animation = armature.animation_data_create()
         animation.action = action

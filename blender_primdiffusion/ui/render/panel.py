@@ -12,7 +12,6 @@ from ...worker.sentence import sentence
 from ..jobs.drawing import draw_job, draw_lines
 from ..jobs.target import selected_person
 from ..manual import draw_manual_button
-from ..translations.told import told
 from .person_operators import ATTACHMENT_ITEMS
 
 
@@ -127,8 +126,8 @@ class PRIMDIFFUSION_PT_memory(_OfPerson, bpy.types.Panel):
 
         memory = person_memory(person)
         column = self.layout.column(align=True)
-        column.label(text=told(f"Files: {memory.files / 1e6:.0f} MB"), translate=False, icon="DISK_DRIVE")
-        column.label(text=told(f"Volumes, once drawn: {memory.grids / 1e6:.0f} MB"), translate=False, icon="MEMORY")
+        column.label(text=f"Files: {memory.files / 1e6:.0f} MB", translate=False, icon="DISK_DRIVE")
+        column.label(text=f"Volumes, once drawn: {memory.grids / 1e6:.0f} MB", translate=False, icon="MEMORY")
 
 
 def outdated(person: bpy.types.Collection, scene: bpy.types.Scene) -> bool:

@@ -10,7 +10,6 @@ from ...scene.attachment import attachment_before_merge, attachment_of, set_atta
 from ...scene.human import armature_of, humans
 from ..jobs.follow import submit
 from ..jobs.target import Target, named_person, selected_person
-from ..translations.told import told
 
 if TYPE_CHECKING:
     from .merge_work import Moment
@@ -45,7 +44,7 @@ class _OfPerson:
         try:
             return self.run(context, named_person(context, self.human) if self.human else selected_person(context))
         except (ValueError, OSError) as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:

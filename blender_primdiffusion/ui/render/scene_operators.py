@@ -9,7 +9,6 @@ from mathutils import Euler, Vector
 
 from ...engine.engine import ENGINE
 from ...scene.human import human_of
-from ..translations.told import told
 
 _SAMPLES = 4
 _YAW = math.radians(20)
@@ -42,9 +41,7 @@ class PRIMDIFFUSION_OT_set_up_cycles(bpy.types.Operator):
 
         scene = context.scene
         if not hasattr(scene, "cycles"):
-            self.report(
-                {"ERROR"}, told("Cycles is switched off: enable the add-on Cycles Render Engine in the preferences")
-            )
+            self.report({"ERROR"}, "Cycles is switched off: enable the add-on Cycles Render Engine in the preferences")
             return {"CANCELLED"}
         scene.render.engine = "CYCLES"
         bounces = scene.cycles.max_bounces
@@ -70,7 +67,7 @@ class PRIMDIFFUSION_OT_add_camera(bpy.types.Operator):
         try:
             extent = people_extent(scene) if person is None else posed_extent(person)
         except ValueError as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         camera = new_camera(scene)
         camera.name = camera.data.name = "Human Camera"

@@ -8,7 +8,6 @@ import bpy
 
 from ...places import EXTENSION
 from ...worker.sentence import sentence
-from ..translations.told import told
 from .known import chosen, cost, known
 from .session import session
 
@@ -76,5 +75,5 @@ def draw_news(layout: bpy.types.UILayout, width: int) -> None:
 def draw_text(layout: bpy.types.UILayout, text: str, icon: str, width: int) -> None:
     """A sentence over as many lines as it needs."""
     column = layout.column(align=True)
-    for number, line in enumerate(textwrap.wrap(told(text), width)):
+    for number, line in enumerate(textwrap.wrap(text, width)):
         column.label(text=line, icon=icon if number == 0 else "BLANK1", translate=False)

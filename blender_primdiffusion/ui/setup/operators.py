@@ -10,7 +10,6 @@ import bpy
 
 from ...places import set_up_folder
 from ...worker.sentence import sentence
-from ..translations.told import told
 from . import known
 from .session import redraw, see_through, session
 
@@ -27,7 +26,7 @@ def _begin(operator: bpy.types.Operator, kind: Kind, make_plan: Callable[[], Pla
             _release_environment()
         session.start(kind, plan)
     except (ValueError, OSError) as error:
-        operator.report({"ERROR"}, told(sentence(error)))
+        operator.report({"ERROR"}, sentence(error))
         return {"CANCELLED"}
     return see_through(operator)
 
@@ -59,14 +58,14 @@ class PRIMDIFFUSION_OT_set_up_backend(bpy.types.Operator):
         try:
             compute = known.chosen()[0]
         except (ValueError, OSError) as error:
-            self.report({"ERROR"}, told(sentence(error)))
+            self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
         now = known.known()
         if now.state == "ready" and now.about.get("compute") == compute:
-            self.report({"INFO"}, told(f"{now.line}; press Repair to check it"))
+            self.report({"INFO"}, f"{now.line}; press Repair to check it")
             return {"FINISHED"}
         if not bpy.app.online_access:
-            self.report({"ERROR"}, told(OFFLINE))
+            self.report({"ERROR"}, OFFLINE)
             return {"CANCELLED"}
         from .plans import plan_of_set_up
 
@@ -92,7 +91,7 @@ class PRIMDIFFUSION_OT_install_from_folder(bpy.types.Operator):
         """As Set Up Backend."""
         folder = Path(bpy.path.abspath(self.directory)) if self.directory else None
         if folder is None or not folder.is_dir():
-            self.report({"ERROR"}, told(f"{self.directory!r} is no folder: choose the one that holds the wheels"))
+            self.report({"ERROR"}, f"{self.directory!r} is no folder: choose the one that holds the wheels")
             return {"CANCELLED"}
         from .plans import plan_of_set_up
 
@@ -156,7 +155,7 @@ class PRIMDIFFUSION_OT_remove_backend(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Without asking when called from Python."""
         if not any(path.exists() for path in (set_up_folder().environment, set_up_folder().wheels)):
-            self.report({"ERROR"}, told("There is no backend to remove: none was set up here"))
+            self.report({"ERROR"}, "There is no backend to remove: none was set up here")
             return {"CANCELLED"}
         from .plans import plan_of_removal
 
@@ -174,7 +173,7 @@ class PRIMDIFFUSION_OT_test_backend(bpy.types.Operator):
         """With a window a timer follows; in background mode this waits."""
         now = known.known()
         if not now.usable:
-            self.report({"ERROR"}, told(f"{now.line}: press Set Up Backend first, or name a Python"))
+            self.report({"ERROR"}, f"{now.line}: press Set Up Backend first, or name a Python")
             return {"CANCELLED"}
         from .plans import plan_of_test
 

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ..translations.told import told
-
 if TYPE_CHECKING:
     from ...worker.setup_job import Kind, SetUpJob
     from ...worker.setup_steps import Plan
@@ -83,7 +81,7 @@ def see_through(operator: bpy.types.Operator) -> set[str]:
     finally:
         session.cancel()
     if session.error:
-        operator.report({"ERROR"}, told(session.error))
+        operator.report({"ERROR"}, session.error)
         return {"CANCELLED"}
     print(f"PrimDiffusion: {session.notice}", flush=True)
     return {"FINISHED"}

@@ -6,6 +6,7 @@ import random
 from typing import Any
 
 import bpy
+from bpy.app.translations import pgettext_tip
 
 from ...scene.human import overlap_warning_in
 from ...worker.sentence import sentence
@@ -13,12 +14,12 @@ from ..generate.asking import Asking, last_seed
 from ..generate.quality import STEPS_AND_SAMPLER
 from ..generate.settings import LARGEST_SEED
 from ..jobs.follow import redraw, submit
-from ..translations.told import told
 from .icons import icons
 from .sheet import Variation, sheet
 
 _SELECTED = "Which one, counted from 0; -1: those that are selected"
 _SKIP = {"SKIP_SAVE"}
+_BUILD_ALL = "Add all of these people to the scene, side by side"
 
 
 class _Variations(Asking):
@@ -58,7 +59,7 @@ class PRIMDIFFUSION_OT_variations(_Variations, bpy.types.Operator):
             seeds = self.seeds(context, self.seed if self.seed >= 0 else first)
             sampling = self.sheet_sampling(context)
         except ValueError as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return _submit(self, context, seeds, sampling)
 
@@ -88,7 +89,7 @@ class PRIMDIFFUSION_OT_more_like_variation(_Variations, bpy.types.Operator):
             seeds = self.seeds(context, self.seed)
             sampling = self.sheet_sampling(context)
         except ValueError as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         amount = self.amount if self.given("amount") else context.scene.primdiffusion_variations.amount
         title = f"Like seed {around[0].seed}"
@@ -115,7 +116,7 @@ class PRIMDIFFUSION_OT_select_variation(bpy.types.Operator):
         try:
             variation = sheet.at(self.index)
         except ValueError as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         variation.chosen = not variation.chosen
         redraw()
@@ -140,14 +141,14 @@ class PRIMDIFFUSION_OT_build_variation(bpy.types.Operator):
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         """The tooltip."""
-        return told("Add all of these people to the scene, side by side" if properties.build_all else str(cls.__doc__))
+        return pgettext_tip(_BUILD_ALL if properties.build_all else str(cls.__doc__))
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Takes seconds for each; one step of undo for all."""
         try:
             wanted = list(sheet.variations) if self.build_all else _targets(self.index)
         except ValueError as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
@@ -155,11 +156,11 @@ class PRIMDIFFUSION_OT_build_variation(bpy.types.Operator):
         if built:
             bpy.ops.ed.undo_push(message="Build Variation" if len(built) == 1 else f"Build {len(built)} Variations")
         if failure:
-            self.report({"ERROR"}, told(f"{len(built)} of {len(wanted)} people were built. {failure}"))
+            self.report({"ERROR"}, f"{len(built)} of {len(wanted)} people were built. {failure}")
             return {"FINISHED"} if built else {"CANCELLED"}
         for person in built:
             if warning := overlap_warning_in(context.scene, person):
-                self.report({"WARNING"}, told(sentence(warning)))
+                self.report({"WARNING"}, sentence(warning))
         return {"FINISHED"}
 
 
@@ -186,7 +187,7 @@ class PRIMDIFFUSION_OT_use_variation_seed(bpy.types.Operator):
             if sheet.around:
                 raise ValueError("these are variants of a person, whom no seed alone makes again: build what you want")
         except ValueError as error:
-            self.report({"ERROR"}, told(str(error)))
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         settings = context.scene.primdiffusion
         settings.seed, settings.keep_seed = wanted[0].seed, True

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import bpy
+from bpy.app.translations import pgettext_iface
 
 from ..jobs.drawing import draw_job
 from ..jobs.queue import queue
 from ..manual import draw_manual_button
-from ..translations.told import told
 from .icons import icons
 from .sheet import sheet
 
@@ -80,7 +80,7 @@ def _draw_coming(layout: bpy.types.UILayout, columns: tuple[int, float], work: V
 
 
 def _draw_sheet(layout: bpy.types.UILayout, columns: tuple[int, float]) -> None:
-    layout.label(text=told(f"{sheet.title}: {len(sheet.variations)}"), translate=False)
+    layout.label(text=f"{sheet.title}: {len(sheet.variations)}", translate=False)
     grid = _grid(layout, columns[0])
     for index, variation in enumerate(sheet.variations):
         cell = grid.column(align=True)
@@ -102,7 +102,7 @@ def _draw_choice(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) 
     chosen.enabled = number > 0
     chosen.operator(
         "primdiffusion.build_variation",
-        text=told(f"Build Selected ({number})"),
+        text=f"{pgettext_iface('Build Selected')} ({number})",
         translate=False,
         icon="OUTLINER_OB_ARMATURE",
     )
