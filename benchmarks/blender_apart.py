@@ -16,7 +16,6 @@ os.environ["BLENDER_USER_RESOURCES"] = _FOLDER
 
 
 def remove() -> None:
-    """Both folders."""
     bpy = sys.modules.get("bpy")
     if bpy is not None:
         shutil.rmtree(bpy.app.tempdir, ignore_errors=True)

@@ -21,8 +21,6 @@ SAME_DEPTH_M = 0.002
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """Of one view."""
-
     mask_iou: float
     """Of the masks over one half."""
     squared: float

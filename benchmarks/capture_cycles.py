@@ -16,8 +16,6 @@ MARK = b"PRIMDIFFUSION "
 
 @dataclasses.dataclass(frozen=True)
 class Moment:
-    """When a view was done."""
-
     wall_s: float
     processor_s: float
     """Of the process so far."""

@@ -48,7 +48,6 @@ GROWTH_VIEWS, GROWTH_FROM = 200, 20
 
 
 def main() -> None:
-    """Measures, prints and, if asked, writes the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
     parser.add_argument("--people", type=int, default=3, help="how many are compared")

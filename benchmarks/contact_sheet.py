@@ -34,7 +34,6 @@ Picture = Callable[[Human], np.ndarray]
 
 
 def main() -> None:
-    """Generates, draws, saves."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=64)
     parser.add_argument("--first-seed", type=int, default=0)
@@ -84,7 +83,6 @@ def lowered_arms() -> BodyPose:
 
 
 def relaxed(human: Human, width: int, height: int) -> np.ndarray:
-    """From the front."""
     primitives = place(human, lowered_arms())
     return seen(primitives, framing(primitives, 0.0, width, height))
 

@@ -110,7 +110,6 @@ def cycles(arguments: argparse.Namespace) -> dict[str, float]:
 
 
 def main() -> None:
-    """One stage, its figures into a JSON file."""
     parser = argparse.ArgumentParser(description=__doc__)
     stages = parser.add_subparsers(required=True)
     making = stages.add_parser("person")

@@ -36,7 +36,6 @@ def share_on_body(position: torch.Tensor) -> float:
 
 
 def main() -> None:
-    """Draws the five pictures and times the first."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--human", type=Path, required=True)
     parser.add_argument("--frame", type=int, required=True, help="frame of the walk, counted from 0")

@@ -89,7 +89,6 @@ def measure(quick: bool) -> dict[str, float | int | None]:
 
 
 def main() -> None:
-    """Measures, prints and, if asked, writes the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--quick", action="store_true", help="under a minute")

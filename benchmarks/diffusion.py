@@ -60,7 +60,6 @@ PAPER = (
 
 
 def main() -> None:
-    """Measures, prints and, if asked, writes figures and table."""
     arguments = parsed()
     path = arguments.checkpoint or default_checkpoint()
     model = load_checkpoint(arguments.checkpoint)
@@ -89,7 +88,6 @@ def main() -> None:
 
 
 def parsed() -> argparse.Namespace:
-    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--people", type=Path, help="folder of the payloads that the model was trained on")
     parser.add_argument("--holdout", type=float, default=0.08, help="share of them that was held out")
@@ -204,8 +202,6 @@ def table_of(rows: Mapping[str, Likeness], judge: Judge | None) -> str:
 
 
 def progress(what: str) -> Callable[[int, int], None]:
-    """Prints now and then."""
-
     def report(done: int, total: int) -> None:
         if done % 100 == 0 or done == total:
             print(what, done, "of", total, flush=True)
@@ -214,7 +210,6 @@ def progress(what: str) -> Callable[[int, int], None]:
 
 
 def epoch(number: int, loss: float) -> None:
-    """Prints."""
     print("features, epoch", number, f"loss {loss:.3f}", flush=True)
 
 

@@ -49,7 +49,6 @@ MARGIN = 0.09
 
 
 def main() -> None:
-    """Draws and saves what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--people", type=Path, required=True, help="folder of the payloads that were trained on")
     parser.add_argument("--holdout", type=float, default=0.08)
@@ -104,7 +103,6 @@ def neighbours(
 
 
 def stored(path: Path, colouring: int) -> Primitives:
-    """A person on disk."""
     person = read_person(path)
     return Primitives.place(rest_frames(person.betas.numpy()), payload_of(person, colouring))
 

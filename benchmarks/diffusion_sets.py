@@ -41,12 +41,10 @@ def gaussian(model: DiffusionModel, seeds: Sequence[int]) -> Iterator[Human]:
 
 
 def placed(people: Iterator[Human]) -> Iterator[Primitives]:
-    """In T pose."""
     return (place(human) for human in people)
 
 
 def voxels(model: VoxelModel, seeds: Sequence[int]) -> Iterator[Primitives]:
-    """The baseline's."""
     return (model.primitives(grid) for grid in model.sample(seeds))
 
 

@@ -43,7 +43,6 @@ def timed(model: DiffusionModel, seed: int) -> tuple[float, float, list[float]]:
 
 
 def main() -> None:
-    """Measures and writes."""
     imported = time.perf_counter()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkpoint", type=Path, help="without it the package's default")

@@ -54,7 +54,6 @@ SAVE_EVERY = 60.0
 
 
 def main() -> None:
-    """Prepares and trains as far as the time allows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--people", type=Path, required=True, help="folder of payloads")
     parser.add_argument("--out", type=Path, required=True, help="folder for grids, states and model")
@@ -172,8 +171,6 @@ class Run(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """Of one network."""
-
     steps: int
     seconds: float
 

@@ -57,7 +57,6 @@ class Studio:
         self.people = [generate(model, seed, steps) for seed in range(4)]
 
     def took(self, name: str, edit: Callable[[], Human]) -> Human:
-        """The edited person."""
         began = time.perf_counter()
         edited = edit()
         self.seconds[f"{name}_seconds"].append(time.perf_counter() - began)
@@ -83,7 +82,6 @@ class Studio:
             yield f"amount {amount}", varied
 
     def inpainted(self) -> Iterator[Shown]:
-        """Regions made anew, whatever fits."""
         person = self.people[0]
         yield "before", person
         for parts, seed in (
@@ -181,7 +179,6 @@ def sheet(rows: list[tuple[str, list[tuple[str, np.ndarray]]]], height: int) -> 
 
 
 def main() -> None:
-    """Edits, draws, saves."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkpoint", type=Path, help="without it the package's")
     parser.add_argument("--height", type=int, default=270, help="pixels of each picture")

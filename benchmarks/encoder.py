@@ -70,7 +70,6 @@ class Quality(NamedTuple):
 
 
 def main() -> None:
-    """Measures, prints and, if asked, writes figures and table."""
     arguments = parsed()
     with tempfile.TemporaryDirectory() as scratch:
         sets = {name: getattr(arguments, name) for name in ("train", "heldout")}
@@ -106,7 +105,6 @@ def main() -> None:
 
 
 def parsed() -> argparse.Namespace:
-    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--train", type=Path, help="captures of people that the encoder was trained on")
     parser.add_argument("--heldout", type=Path, help="captures of other people")

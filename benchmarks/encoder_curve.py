@@ -31,7 +31,6 @@ def last_doubling(curve: list[tuple[int, float]]) -> float:
 
 
 def main() -> None:
-    """Draws and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--metrics", type=Path, required=True, help="metrics.jsonl of a run")
     parser.add_argument("--plot", type=Path, help="PNG to write")

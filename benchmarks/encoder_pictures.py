@@ -95,7 +95,6 @@ def sheet(rows: list[tuple[str, list[np.ndarray]]], cell: int) -> Image.Image:
 
 
 def main() -> None:
-    """Draws and saves."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--train", type=Path, help="captures of people that the encoder was trained on")
     parser.add_argument("--heldout", type=Path, help="captures of other people")

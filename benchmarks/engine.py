@@ -157,7 +157,6 @@ def pixel_error(human: Human, armature: bpy.types.Object, rotations: np.ndarray)
 
 
 def main() -> None:
-    """Measures, prints and, if asked, writes the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()

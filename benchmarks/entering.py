@@ -35,14 +35,12 @@ from blender_primdiffusion.ui.jobs.building import READ_S
 
 
 def milliseconds(does: Callable[[], object]) -> float:
-    """Of one call."""
     began = time.perf_counter()
     does()
     return 1000 * (time.perf_counter() - began)
 
 
 def new_file(folder: Path, name: str) -> None:
-    """An empty one, saved."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / name))
     bpy.ops.ed.undo_push(message="before")
@@ -81,7 +79,6 @@ def edit(person: bpy.types.Collection, human: Path, file: Path) -> dict[str, flo
 
 
 def main() -> None:
-    """Measure."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()

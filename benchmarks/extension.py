@@ -70,7 +70,6 @@ def measure(python: Path, arguments: argparse.Namespace) -> dict[str, float | st
 
 
 def version(python: Path) -> str:
-    """Of the bpy of this interpreter."""
     command = [str(python), "-c", "import bpy; print('bpy', bpy.app.version_string)"]
     lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
     return next(line.removeprefix("bpy ") for line in lines if line.startswith("bpy "))

@@ -81,7 +81,6 @@ def figures(rounds: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Print them."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     print(json.dumps(figures(parser.parse_args().rounds), indent=1), flush=True)

@@ -36,8 +36,6 @@ NO_REASON = ("noqa", "type:", "fmt:", "pyright:")
 
 @dataclass(frozen=True)
 class Import:
-    """An import statement."""
-
     targets: tuple[str, ...]
     """Dotted names; of `from a import b` the name a.b, which may be a module or something in a."""
     first_line: int
@@ -70,7 +68,6 @@ class Module:
 
 
 def main() -> None:
-    """Print the findings and the figures."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
     parser.add_argument("--walk", action="store_true", help="generate in Blender and count the files passed (walk.py)")

@@ -187,7 +187,6 @@ def from_script(script: str, names: tuple[str, ...], *arguments: str) -> Figures
 
 
 def main() -> None:
-    """Measures, prints and, if asked, writes figures, table and plot."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--table", type=Path, help="markdown file for the table of scenes")

@@ -55,7 +55,6 @@ def leaves(record: Any) -> Any:
 
 
 def forward_ms(boxes: Primitives, camera: Camera, settings: MarchSettings, shapes: Shapes = Shapes()) -> float:  # noqa: B008
-    """Of a picture without gradients."""
     from cuda_ceilings import median_ms
 
     with torch.no_grad():
@@ -185,7 +184,6 @@ def print_sweep() -> None:
 
 
 def main() -> None:
-    """Measures, prints and, if asked, writes the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--kernels", action="store_true", help="also print what each kernel takes")

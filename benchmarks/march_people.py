@@ -134,7 +134,6 @@ def crowd(person: Primitives, count: int) -> Primitives:
 
 
 def generated(seeds: tuple[int, ...]) -> list[Human]:
-    """People of the default checkpoint."""
     model = load_checkpoint()
     return [generate(model, seed) for seed in seeds]
 

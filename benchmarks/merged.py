@@ -104,12 +104,10 @@ def rendered(path: Path) -> tuple[np.ndarray, float]:
 
 
 def psnr(one: np.ndarray, other: np.ndarray) -> float:
-    """Decibels."""
     return float(-10 * np.log10(((one.astype(np.float64) - other) ** 2).mean()))
 
 
 def main() -> None:
-    """Measures, prints and, if asked, writes the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--pictures", type=Path, required=True, help="folder for the PNGs")

@@ -70,7 +70,6 @@ def camera_at(bounds: np.ndarray, yaw: float, pitch: float) -> Camera:
 
 
 def compare(drawn: Picture, marched: Rendering) -> dict[str, float]:
-    """Figures of one picture."""
     first, second = drawn.alpha > 0.5, marched.alpha.numpy() > 0.5
     squared = (displayed(drawn.rgb) - displayed(marched.rgb.numpy())) ** 2
     rows, columns = np.nonzero(first)
@@ -96,7 +95,6 @@ def psnr(squared: np.ndarray) -> float:
 
 
 def bent() -> BodyPose:
-    """The pose of BENDS."""
     theta = torch.zeros(J, 3)
     for joint, axis_angle in BENDS.items():
         theta[JOINT_NAMES.index(joint)] = torch.tensor(axis_angle, dtype=torch.float32)
@@ -156,7 +154,6 @@ def timed(call: Callable[[], Result]) -> tuple[Result, float]:
 
 
 def main() -> None:
-    """Measures, prints and, if asked, writes the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
     parser.add_argument("--json", type=Path, help="file for the figures")

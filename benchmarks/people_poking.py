@@ -66,7 +66,6 @@ def farthest(poses: np.ndarray, count: int) -> list[np.ndarray]:
 
 
 def main() -> None:
-    """Measures, prints and, if asked, writes the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
     parser.add_argument("--count", type=int, default=32)

@@ -94,7 +94,6 @@ def light(normal: np.ndarray, way: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    """Draws and saves."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
     parser.add_argument("--out", type=Path, required=True, help="picture to write")

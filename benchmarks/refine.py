@@ -45,7 +45,6 @@ QUICK_STEPS = 60
 
 
 def main() -> None:
-    """Measures, prints and, if asked, writes the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
     parser.add_argument("--steps", type=int, default=RefineSettings().steps, help="of each refinement")

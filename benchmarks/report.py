@@ -48,7 +48,6 @@ def section(name: str) -> str:
 
 
 def main() -> None:
-    """All sections whose file is there."""
     head = "# Results\n\nMade by `benchmarks/report.py` from `docs/results`; the commands make the files anew.\n\n"
     present = [name for name in SOURCES if (RESULTS / f"{name}.json").is_file()]
     (ROOT / "docs" / "results.md").write_text(head + "\n\n".join(map(section, present)) + "\n", encoding="utf-8")

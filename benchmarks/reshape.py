@@ -32,14 +32,12 @@ MOVES, QUICK_MOVES = 30, 5
 
 
 def milliseconds(does: Callable[[], object]) -> float:
-    """Of one call."""
     began = time.perf_counter()
     does()
     return 1000 * (time.perf_counter() - began)
 
 
 def main() -> None:
-    """Build a person, move their sliders, tell the figures."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path)
     parser.add_argument("--quick", action="store_true")

@@ -35,7 +35,6 @@ GREY = (0.35, 0.35, 0.35)
 
 
 def main() -> None:
-    """Reshape, look, compare."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path)
     parser.add_argument("--quick", action="store_true")

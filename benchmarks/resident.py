@@ -20,7 +20,6 @@ def trim() -> None:
 
 
 def resident_mb() -> float:
-    """Of this process."""
     return psutil.Process().memory_info().rss / 1e6
 
 

@@ -18,7 +18,6 @@ BLENDERS = ("5.0", "4.5", "5.2")
 
 
 def main() -> None:
-    """Time the targets one after the other."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
     arguments = parser.parse_args()

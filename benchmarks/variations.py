@@ -35,7 +35,6 @@ class Counter:
         self.pictures = 0
 
     def __call__(self, *_: object, **more: Any) -> None:
-        """One report."""
         self.pictures += "picture" in more
 
 
@@ -75,7 +74,6 @@ def contact_sheet(folder: Path, out: Path) -> None:
 
 
 def main() -> None:
-    """Measure, print, keep."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path)
     parser.add_argument("--out", type=Path, help="PNG of the contact sheet of 8 people")

@@ -39,7 +39,6 @@ class Trace:
         sys.setprofile(self._profile)
 
     def stop(self) -> None:
-        """Trace no more."""
         sys.setprofile(None)
         threading.setprofile(None)
 
@@ -57,7 +56,6 @@ class Trace:
 
 
 def main() -> None:
-    """Generate a person in Blender and print the files passed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
     arguments = parser.parse_args()

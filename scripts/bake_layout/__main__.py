@@ -27,7 +27,6 @@ FIGURE = ROOT / "docs/pictures/layout.png"
 
 
 def main() -> None:
-    """Cut, flatten, draw into the grid, write, report."""
     body = read_body()
     sheet, region = cut_into_regions(left_half(body.vertices, body.faces), body.joints)
     flats = lay_out(sheet, region)
@@ -56,7 +55,6 @@ def main() -> None:
 
 
 def read_body() -> Body:
-    """The default body in its rest pose."""
     with np.load(ROOT / "backend/primdiffusion/body/data/body.npz") as stored:
         joints = dict(zip(stored["joint_names"].tolist(), stored["J"].astype(np.float64), strict=True))
         return Body(stored["v_template"].astype(np.float64), stored["f"].astype(np.int64), joints)

@@ -81,8 +81,6 @@ def lay_out(sheet: Sheet, region: Array) -> dict[str, Flat]:
 
 
 class _Regions:
-    """Look-ups on the cut sheet."""
-
     def __init__(self, sheet: Sheet, region: Array) -> None:
         self.sheet, self.region, self.points = sheet, region, sheet.points
         self.copies = {radius: smoothed(sheet, radius) for radius in sorted(set(SMOOTHING.values()))}

@@ -27,8 +27,6 @@ class NoWheel(RuntimeError):
 
 @dataclasses.dataclass(frozen=True)
 class Wheel:
-    """A file that a lock names."""
-
     filename: str
     sha256: str
     bytes: int

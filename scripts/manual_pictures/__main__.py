@@ -20,7 +20,6 @@ PICTURES = ROOT / "docs" / "manual" / "pictures"
 
 
 def main(words: list[str]) -> None:
-    """One of the four."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("walk", "stills", "boxes", "window"))
     parser.add_argument("shots", type=Path, nargs="?", help="folder of the window's pictures")

@@ -55,12 +55,10 @@ def leave_out_volumes() -> None:
 
 
 def armature_of(person: bpy.types.Collection) -> bpy.types.Object:
-    """What is posed and placed."""
     return next(thing for thing in person.objects if thing.type == "ARMATURE")
 
 
 def pose(person: bpy.types.Collection, name: str) -> None:
-    """From the library."""
     bpy.context.view_layer.objects.active = armature_of(person)
     bpy.ops.primdiffusion.apply_pose(pose_name=name)
 
@@ -103,7 +101,6 @@ def look(scene: bpy.types.Scene, stand: tuple, at: tuple, lens: float = 50.0) ->
 
 
 def render(scene: bpy.types.Scene, path: Path, size: tuple[int, int]) -> Path:
-    """A PNG."""
     scene.render.resolution_x, scene.render.resolution_y = size
     scene.render.resolution_percentage = 100
     scene.render.image_settings.file_format = "PNG"

@@ -17,7 +17,6 @@ _TILE = 0.5
 
 
 def stills(scratch: Path, out: Path, only: list[str]) -> None:
-    """All of them, or those named."""
     for name, still in STILLS.items():
         if not only or name in only:
             folder = scratch / name
@@ -99,7 +98,6 @@ def _stage(folder: Path, seed: int, name: str) -> bpy.types.Scene:
 
 
 def _row(paths: list[Path]) -> Image.Image:
-    """Side by side."""
     pictures = [Image.open(path).convert("RGB") for path in paths]
     row = Image.new("RGB", (sum(p.width for p in pictures), max(p.height for p in pictures)))
     x = 0

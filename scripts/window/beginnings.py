@@ -10,7 +10,6 @@ from press import Steps, press, wait
 
 
 def begin(module: str, python: str) -> Steps:
-    """A new file, a backend."""
     bpy.ops.wm.read_homefile(use_factory_startup=True)
     yield 1.5
     bpy.context.preferences.addons[module].preferences.backend_python = python
@@ -52,12 +51,10 @@ def people_file(module: str, count: int = 1) -> Path:
 
 
 def queue_of(module: str):
-    """The line of works."""
     return import_module(f"{module}.ui.jobs.queue").queue
 
 
 def cancel_all(module: str) -> Steps:
-    """Empty the line."""
     queue = queue_of(module)
     while queue.busy:
         press("primdiffusion.cancel")

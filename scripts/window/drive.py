@@ -42,7 +42,6 @@ def play() -> Iterator[float]:
 
 
 def perform(steps: Iterator) -> Iterator[float]:
-    """A scene, step by step."""
     for step in steps:
         if isinstance(step, str):
             yield from photograph(step)
@@ -100,7 +99,6 @@ FAILED: list[str] = []
 
 
 def tick() -> float | None:
-    """The timer."""
     try:
         return next(STEPS)
     except StopIteration:

@@ -36,7 +36,6 @@ def free_display() -> str:
 
 
 def arguments() -> argparse.Namespace:
-    """Of the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--blender", default="blender", help="the program, inside --chroot if that is given")
     parser.add_argument("--chroot", type=Path, help="folder of a system that has Blender (debootstrap)")
@@ -83,7 +82,6 @@ def do(asked: dict, out: Path, display: str) -> None:
 
 
 def main() -> int:
-    """Build, start, wait."""
     asked = arguments()
     asked.out.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix=".window_", dir=ROOT / "build" if (ROOT / "build").is_dir() else ROOT))

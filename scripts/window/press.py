@@ -30,7 +30,6 @@ def invoke(operator: str, **given: object) -> set[str]:
 
 
 def wait(over: Callable[[], bool], most_s: float) -> Steps:
-    """Until something is over."""
     began = time.monotonic()
     while not over() and time.monotonic() - began < most_s:
         yield 0.1

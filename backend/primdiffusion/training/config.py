@@ -184,9 +184,9 @@ class RunConfig(Protocol):
     """Any run's settings: a dataclass that says where its folder and its data are."""
 
     @property
-    def run(self) -> Path: ...  # noqa: D102
+    def run(self) -> Path: ...
     @property
-    def data(self) -> Path: ...  # noqa: D102
+    def data(self) -> Path: ...
 
 
 def check_resumable(saved: str, config: RunConfig) -> None:

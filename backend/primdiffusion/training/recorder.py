@@ -54,11 +54,11 @@ class Every(Protocol):
     """When a run is to be seen, in steps."""
 
     @property
-    def log_every(self) -> int: ...  # noqa: D102
+    def log_every(self) -> int: ...
     @property
-    def evaluate_every(self) -> int: ...  # noqa: D102
+    def evaluate_every(self) -> int: ...
     @property
-    def pictures_every(self) -> int: ...  # noqa: D102
+    def pictures_every(self) -> int: ...
 
 
 class Recorder(ABC):

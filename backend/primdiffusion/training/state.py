@@ -19,17 +19,17 @@ class OptimiserConfig(Protocol):
     """What of a run's settings the optimiser needs; as in `PhaseConfig`."""
 
     @property
-    def steps(self) -> int: ...  # noqa: D102
+    def steps(self) -> int: ...
     @property
-    def learning_rate(self) -> float: ...  # noqa: D102
+    def learning_rate(self) -> float: ...
     @property
-    def weight_decay(self) -> float: ...  # noqa: D102
+    def weight_decay(self) -> float: ...
     @property
-    def gradient_clip(self) -> float: ...  # noqa: D102
+    def gradient_clip(self) -> float: ...
     @property
-    def ema(self) -> float: ...  # noqa: D102
+    def ema(self) -> float: ...
     @property
-    def evaluate_every(self) -> int: ...  # noqa: D102
+    def evaluate_every(self) -> int: ...
 
 
 class NotFiniteError(FloatingPointError, ValueError):
