@@ -27,9 +27,8 @@ from record import tell
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from blender_primdiffusion.scene.beforehand import Place, Written, write
 from blender_primdiffusion.scene.build import build_human, build_written, home_of_next
-from blender_primdiffusion.scene.edited import place_of, replace_by_written, replace_person
-from blender_primdiffusion.scene.grid_cache import free_unused_grids
-from blender_primdiffusion.scene.grid_warming import read_grids
+from blender_primdiffusion.scene.edit import place_of, replace_by_written, replace_person
+from blender_primdiffusion.scene.grid_cache import free_unused_grids, read_grids
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui.jobs.building import READ_S
 

@@ -13,8 +13,7 @@ from ..formats.joints import JOINT_NAMES
 from ..motion.bones import BoneMap, map_bones
 from ..motion.rest_alignment import facing, rig_from_smpl
 from ..motion.rotation import to_axis_angle
-from ..scene.convention import points_to_blender
-from ..scene.quaternion import matrix_to_quaternion
+from ..scene.convention import matrix_to_quaternion, points_to_blender
 from .belongings import Belongings
 from .bind import bind_static
 from .body import Body

@@ -12,9 +12,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.body_mesh import MARK as BODY_MARK
 from ..scene.convention import points_to_backend
-from ..scene.exported_proxy import MARK as PROXY_MARK
+from ..scene.human import BODY_MARK
+from ..scene.proxy import PROXY_MARK
 from .visible import visible_instances
 
 SOLID_TYPES = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})

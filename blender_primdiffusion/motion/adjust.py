@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from ..scene.quaternion import continuous_quaternions, matrix_to_quaternion
+from ..scene.convention import continuous_quaternions, matrix_to_quaternion
 from .motion import Motion
 from .rotation import from_quaternion
 from .skeleton import REST_JOINTS, joint_positions

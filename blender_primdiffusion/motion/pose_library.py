@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
 from ..scene.armature import bone_bases, rest_rotations
-from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
-from ..scene.quaternion import matrix_to_quaternion
+from ..scene.convention import BLENDER_FROM_BACKEND, matrix_to_quaternion, points_to_backend
 from .adjust import leg_ratio, slerp
 from .library_poses import LIBRARY
 from .poses import grounding

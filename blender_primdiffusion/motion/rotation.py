@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.quaternion import matrix_to_quaternion
+from ..scene.convention import matrix_to_quaternion
 
 
 def from_axis_angle(vector: NDArray) -> NDArray[np.float64]:

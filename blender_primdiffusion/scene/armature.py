@@ -11,8 +11,7 @@ from mathutils import Vector
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
-from .convention import points_to_blender, rotations_to_blender
-from .quaternion import matrix_to_quaternion
+from .convention import matrix_to_quaternion, points_to_blender, rotations_to_blender
 
 _TOWARDS = {"pelvis": "spine1", "spine3": "neck"}
 """Which child a bone points at, where a joint has several."""

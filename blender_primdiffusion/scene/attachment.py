@@ -24,7 +24,7 @@ def set_attachment(collection: bpy.types.Collection, mode: str) -> None:
     `merged.show_merged` in one pose. Raises ValueError or FileNotFoundError, with what to do, before anything changes;
     makes no undo step, its caller does.
     """
-    from .edited import check_editable
+    from .human import check_editable
     from .merged import merged_of
     from .surface import build_surface, carrier_of, primitives_of
 

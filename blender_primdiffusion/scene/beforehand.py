@@ -12,9 +12,10 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from . import shape_file, volumes
-from .human_file import HumanFile, read_human
+from . import volumes
+from .human_npz import HumanFile, read_human
 from .overlap import most_overlapping
+from .shape import body_file_name, saved_body_file
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -112,13 +113,13 @@ def writing(human_npz: Path, place: Place) -> Generator[float, None, Written]:
     absent = [k for k, path in files.items() if place.which is None or not path.is_file()]
     existing = next(parent for parent in (home, *home.parents) if parent.exists())
     model = human.shape_model
-    body = () if model is None else (home.parent / shape_file.file_name(model),)
+    body = () if model is None else (home.parent / body_file_name(model),)
     with contextlib.ExitStack() as undone:
         staging = undone.enter_context(volumes.staged(home))
         yield from staging.write(grids, absent)
         made = tuple(path for path in (*staging.paths, *body) if not path.exists())
         if model is not None:
-            undone.enter_context(shape_file.kept(model, home.parent))
+            undone.enter_context(saved_body_file(model, home.parent))
     unread = tuple(path for path in files.values() if path not in place.shown)
     return Written(baked, home, unread, made, existing, began)
 

@@ -1,4 +1,4 @@
-"""A person comes to be: from human.npz to one collection in the scene."""
+"""Build a human in the scene: one collection with armature, body mesh and volumes."""
 
 from __future__ import annotations
 
@@ -8,23 +8,28 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import bpy
+import numpy as np
+from mathutils import Matrix
+from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from . import volumes
 from .armature import build_armature
-from .attach import attach_volumes
 from .beforehand import Baked, Written, bake
-from .body_mesh import build_body_mesh
-from .convention import frames_to_blender, points_to_blender
-from .folders import humans_folder
+from .convention import frames_to_blender, matrix_to_quaternion, points_to_blender
+from .files import HOME, PERSON, folder_of, free_name, humans_folder, stored_path, volume_path
 from .grid_cache import read_headers
-from .human import BETAS, HOME, MARK, PERSON, folder_of, volume_path
+from .human import BETAS, BODY_MARK, MARK, armature_of, humans
 from .material import volume_material
-from .placing_files import free_name
-from .shape_file import body_kept
+from .shape import saved_body
 
 _NAME_LENGTH = 40
 _ABOUT_BETAS = "Shape of the body. The sliders in the sidebar set it; keys and drivers move the engine's picture alone"
 _KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials")
+GAP_M = 0.2
+"""Between the hands of two people in the T pose."""
+_FLESH_M = 0.1
+"""Around bones."""
 
 
 def build_human(
@@ -82,7 +87,7 @@ def _build(
         kept = {free_name(path, home, path.name): path for path in keep}
         with (
             _volumes(baked, written, home, kept) as files,
-            body_kept(collection, human.shape_model, home.parent),
+            saved_body(collection, human.shape_model, home.parent),
         ):
             attach_volumes(
                 label,
@@ -126,3 +131,142 @@ def _nothing_left_on_failure() -> Iterator[None]:
         new = [thing for kind in _KINDS for thing in getattr(bpy.data, kind) if thing not in before[kind]]
         bpy.data.batch_remove(new)
         raise
+
+
+def build_body_mesh(
+    name: str,
+    armature: bpy.types.Object,
+    vertices: NDArray,
+    faces: NDArray,
+    uv_corner: NDArray,
+    skin_weights: NDArray,
+) -> bpy.types.Object:
+    """A mesh object, linked to no collection: vertices [V, 3] z up in the armature's space, faces [F, 3], uv [F, 3, 2].
+
+    Vertex groups carry skin_weights [V, 24]; the Armature modifier blends matrices linearly (preserve volume off), as
+    SMPL does. It is hidden in renders and in the viewport: the volumes are what one looks at.
+    """
+    import numpy as np  # not for those who ask for `body_of` alone: Blender starts without it
+
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(len(vertices))
+    mesh.vertices.foreach_set("co", np.asarray(vertices, np.float32).ravel())
+    mesh.loops.add(faces.size)
+    mesh.loops.foreach_set("vertex_index", np.asarray(faces, np.int32).ravel())
+    mesh.polygons.add(len(faces))
+    mesh.polygons.foreach_set("loop_start", np.arange(0, faces.size, 3, dtype=np.int32))
+    uv_layer = mesh.uv_layers.new(name="UVMap")
+    uv_layer.data.foreach_set("uv", np.asarray(uv_corner, np.float32).ravel())
+    mesh.update(calc_edges=True)
+    if mesh.validate():
+        raise ValueError(f"the body surface of {name!r} has impossible faces; generate the person again")
+    mesh.shade_smooth()
+
+    body = bpy.data.objects.new(name, mesh)
+    for joint, bone in enumerate(JOINT_NAMES):
+        group = body.vertex_groups.new(name=bone)
+        for vertex in np.flatnonzero(skin_weights[:, joint]):
+            group.add([int(vertex)], float(skin_weights[vertex, joint]), "REPLACE")
+    body.parent = armature
+    modifier = body.modifiers.new("Armature", "ARMATURE")
+    modifier.object = armature
+    modifier.use_deform_preserve_volume = False
+    body[BODY_MARK] = True
+    body.hide_render = True
+    body.hide_viewport = True
+    return body
+
+
+def attach_volumes(
+    name: str,
+    armature: bpy.types.Object,
+    collection: bpy.types.Collection,
+    files: Sequence[Path],
+    position: NDArray,
+    rotation: NDArray,
+    weights: NDArray,
+    material: bpy.types.Material,
+) -> list[bpy.types.Object]:
+    """A Volume object for each file, in `collection`, at rest where position [K, 3] and rotation [K, 3, 3] (z up) say.
+
+    Parented to the armature, with an Armature constraint of one target per non-zero weight [K, 24] and preserve volume
+    off: the evaluated matrix is A (sum_j w_j G_j) [rotation | position], with the armature object's matrix A and SMPL's
+    skinning transforms G_j. It shears where joints bend, as linear blending does. Turns off the viewports' relationship
+    lines, of which there would be some thousand.
+    """
+    hide_relationship_lines()
+    quaternions = matrix_to_quaternion(rotation)
+    objects = []
+    for k, path in enumerate(files):
+        label = f"{name}_prim_{k:04d}"
+        volume = bpy.data.volumes.new(label)
+        volume.filepath = stored_path(path)
+        volume.render.space = "WORLD"
+        volume.materials.append(material)
+        primitive = bpy.data.objects.new(label, volume)
+        primitive.parent = armature
+        primitive.matrix_parent_inverse = Matrix.Identity(4)
+        primitive.rotation_mode = "QUATERNION"
+        primitive.location = position[k]
+        primitive.rotation_quaternion = quaternions[k]
+        constraint = primitive.constraints.new("ARMATURE")
+        constraint.use_deform_preserve_volume = False
+        for joint in np.flatnonzero(weights[k]):
+            target = constraint.targets.new()
+            target.target = armature
+            target.subtarget = JOINT_NAMES[joint]
+            target.weight = weights[k, joint]
+        collection.objects.link(primitive)
+        objects.append(primitive)
+    return objects
+
+
+def hide_relationship_lines() -> None:
+    """Turn the overlay off in the 3D viewports of all workspaces; Overlays > Relationship Lines shows them again."""
+    for screen in bpy.data.screens:
+        for area in screen.areas:
+            for space in area.spaces:
+                if space.type == "VIEW_3D":
+                    space.overlay.show_relationship_lines = False
+
+
+def stand_beside_others(context: bpy.types.Context, collection: bpy.types.Collection) -> None:
+    """Move a person who has just been built along the world's x axis, as little as is needed to stand free.
+
+    Looks at where the bones of the scene's people are as posed; nobody else moves. Evaluates the scene where somebody
+    else is in it. Raises ValueError as `armature_of` does.
+    """
+    armature = armature_of(collection)
+    others = [
+        thing
+        for person in humans(context.scene)
+        if person != collection
+        for thing in person.objects
+        if thing.type == "ARMATURE" and thing.data.bones
+    ]
+    if others:
+        context.view_layer.update()
+        armature.location.x += _shift(_ground(armature), [_ground(other) for other in others])
+
+
+def _shift(own: NDArray[np.float64], others: list[NDArray[np.float64]]) -> float:
+    """The smallest move in x, metres, after which the rectangle `own` is GAP_M or more from all others; right first."""
+    places = [0.0]
+    for other in others:
+        places += [other[1, 0] + GAP_M - own[0, 0], other[0, 0] - GAP_M - own[1, 0]]
+    free = [x for x in places if not any(_meet(own + np.array([x, 0.0]), other) for other in others)]
+    return min(free, key=lambda x: (round(abs(x), 6), x < 0))  # beyond the outermost there is always room
+
+
+def _meet(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    """Whether two rectangles are nearer than GAP_M in x while they overlap in y."""
+    gap = np.array([GAP_M - 1e-6, 0.0])
+    return bool(((one[0] < other[1] + gap) & (other[0] < one[1] + gap)).all())
+
+
+def _ground(armature: bpy.types.Object) -> NDArray[np.float64]:
+    """Lowest and highest x and y in the world [2, 2] of the bones as posed, with flesh around them."""
+    to_world = np.array(armature.matrix_world)
+    bones = [(bone.head, bone.tail) for bone in armature.pose.bones]
+    ends = np.array(bones, np.float64).reshape(-1, 3) @ to_world[:3, :3].T + to_world[:3, 3]
+    return np.array([ends.min(0)[:2] - _FLESH_M, ends.max(0)[:2] + _FLESH_M])

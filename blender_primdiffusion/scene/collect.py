@@ -7,18 +7,33 @@ appended, or saved under another name elsewhere, keep theirs where they were unt
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
 import bpy
 from bpy.app.handlers import persistent
 
-from .folders import TEMPORARY, humans_folder, stored_path
-from .human import HOME, MARK, PERSON, folders_of, person_file_name, volume_path
-from .merged import sequence_files
-from .placing_files import free_name, put_copy
-from .shape_file import BODY_FILE
-from .volumes import VolumeWriteError
+from .files import (
+    HOME,
+    MERGED_VDB,
+    PERSON,
+    PRIMITIVE_VDB,
+    TEMPORARY,
+    VolumeWriteError,
+    folders_of,
+    free_name,
+    humans_folder,
+    person_file_name,
+    put_copy,
+    sequence_files,
+    stored_path,
+    volume_path,
+)
+from .human import MARK
+from .shape import BODY_FILE, BODY_NPZ, body_files
+
+_PERSON = re.compile(r"person(_[0-9a-f]{12})?\.human\.safetensors")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +98,28 @@ def collect_before_saving(blend_path: str, *_: object) -> None:
             f"PrimDiffusion: volumes stay in {humans_folder('')}: they could not be copied beside the .blend ({error})"
         )
     note_folders()
+
+
+def unused(folder: Path) -> list[Path]:
+    """Files of people in `folder` that nothing in the .blend, as it is now, points to: of earlier states of people.
+
+    Undo may still want them, and so may other .blend files that share the folder.
+    """
+    if not folder.is_dir():
+        return []
+    used = {path.resolve() for volume in bpy.data.volumes if volume.filepath for path in sequence_files(volume)}
+    kept = people_files() | body_files()
+    found = []
+    for path in sorted(folder.rglob("*")):
+        of_people = any(pattern.fullmatch(path.name) for pattern in (PRIMITIVE_VDB, _PERSON, BODY_NPZ, MERGED_VDB))
+        if of_people and path.name not in kept and path.resolve() not in used:
+            found.append(path)
+    return found
+
+
+def people_files() -> set[str]:
+    """Names of the backend's files that people of this .blend use, those linked included."""
+    return {person_file_name(collection) for collection in bpy.data.collections if MARK in collection}
 
 
 def _local() -> list[bpy.types.Volume]:

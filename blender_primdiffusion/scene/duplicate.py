@@ -1,16 +1,18 @@
-"""Another person like one in the scene: objects, bones and mesh of their own, the same volumes and files."""
+"""Duplicate and rename humans: all of their parts, and what points to these."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
 from typing import Any
 
 import bpy
 
-from .human import armature_of
-from .node_inputs import node_inputs, set_node_input
-from .rename import keep_surface, part_name
-from .shape import volumes_of
+from .human import armature_of, volumes_of
+from .surface import build_surface, carrier_of, node_inputs, set_node_input
+
+LONGEST = 40
+"""Characters; parts of people add to it, and Blender's names end at 63."""
 
 
 def duplicate_human(collection: bpy.types.Collection) -> bpy.types.Collection:
@@ -41,6 +43,47 @@ def duplicate_human(collection: bpy.types.Collection) -> bpy.types.Collection:
     _name_parts(collection, twin, twins)
     keep_surface(twin)
     return twin
+
+
+def rename_human(collection: bpy.types.Collection, name: str) -> None:
+    """Call a person `name`, and their armature, body mesh and volumes after it; files on disk keep their names.
+
+    Parts that somebody has renamed keep their names. Blender adds a number where the name is taken. Raises ValueError
+    for an empty name and for a person who is linked.
+    """
+    armature = armature_of(collection)
+    name = name.strip()[:LONGEST]
+    if not name:
+        raise ValueError(f"the person {collection.name!r} needs a name: type one")
+    linked = next((thing.library for thing in (collection, armature) if thing.library is not None), None)
+    if linked is not None:
+        raise ValueError(f"the person {collection.name!r} is linked from {linked.filepath!r}: rename them there")
+    before = collection.name
+    collection.name = name
+    parts = [*collection.children_recursive, *collection.all_objects]
+    shared = {thing.data for thing in collection.all_objects if thing.data is not None}
+    for part in [*parts, *shared]:
+        new = part_name(part.name, before, collection.name)
+        if part.library is None and new != part.name:
+            part.name = new
+    keep_surface(collection)
+
+
+def part_name(name: str, before: str, after: str) -> str:
+    """What a part is called once the person who was `before` is `after`."""
+    if name == before or name.startswith(f"{before}_"):
+        return after + name[len(before) :]
+    return name
+
+
+def keep_surface(collection: bpy.types.Collection) -> None:
+    """Have a person attached to their surface show the same volumes after names have changed: its nodes sort by name.
+
+    Where the body mesh or the body's file is gone nothing can be kept, and nothing is shown there either.
+    """
+    if carrier_of(collection) is not None:
+        with contextlib.suppress(ValueError, FileNotFoundError):
+            build_surface(collection)
 
 
 def _copy_children(copy: bpy.types.Collection, twins: dict[Any, Any]) -> None:

@@ -13,11 +13,16 @@ them (benchmarks/extension_bare.py).
 from __future__ import annotations
 
 import ctypes
+import dataclasses
+import functools
 import sys
-from collections.abc import Iterable
+import time
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import bpy
+
+from .files import volume_path
 
 _LEAST_MB = 1
 
@@ -46,3 +51,66 @@ def read_headers(files: Iterable[Path]) -> None:
         for path in files:
             volume.filepath = str(path)
             volume.grids.load()
+
+
+def read_grids(files: Sequence[Path], most_s: float) -> int:
+    """Have Blender read the grids of as many files as it can in `most_s` seconds; how many these were, one at least.
+
+    They are kept in its cache (see `grid_cache`); the .blend is not touched.
+    """
+    end = time.monotonic() + most_s
+    with bpy.data.temp_data() as beside:  # removing a volume from bpy.data has Blender evaluate the scene anew
+        volume = beside.volumes.new("PrimDiffusion")
+        for count, path in enumerate(files, 1):
+            if path.is_file():  # of one that is missing Blender would keep the error
+                volume.filepath = str(path)
+                for grid in volume.grids if volume.grids.load() else ():
+                    grid.load()
+            if time.monotonic() > end:
+                return count
+    return len(files)
+
+
+def read_again(volume: bpy.types.Volume) -> None:
+    """Have Blender show a volume whose file was missing when it looked: it looks no more, and keeps the error until
+    grids are unloaded that were read."""
+    volume.grids.load()
+    volume.grids.unload()
+    volume.update_tag()
+
+
+@dataclasses.dataclass(frozen=True)
+class Memory:
+    """Bytes of a person's volumes."""
+
+    files: int
+    """On disk."""
+    grids: int
+    """In memory once drawn: of the trees of voxels, as the files' own headers tell them. Most of it is the tree's upper
+    nodes, which have one size whatever they hold. Cycles makes copies of its own while it renders."""
+
+
+def person_memory(collection: bpy.types.Collection) -> Memory:
+    """Of all volumes that the person shows or hides; files that are missing count nothing.
+
+    Reads the files' headers once, about .2 s for 1024 of them, and remembers them by their names.
+    """
+    paths = {volume_path(thing.data) for thing in collection.all_objects if thing.type == "VOLUME"}
+    return _memory_of(tuple(sorted(paths)))
+
+
+@functools.lru_cache(maxsize=64)
+def _memory_of(paths: Sequence[Path]) -> Memory:
+    bpy.utils.expose_bundled_modules()
+    import openvdb  # Blender's own, importable only after the line above
+
+    files = grids = 0
+    for path in paths:
+        if not path.is_file():
+            continue
+        files += path.stat().st_size
+        try:
+            grids += sum(grid.metadata.get("file_mem_bytes", 0) for grid in openvdb.readAllGridMetadata(str(path)))
+        except (OSError, RuntimeError):
+            continue  # a damaged file takes no memory
+    return Memory(files, grids)

@@ -1,93 +1,23 @@
-"""People of a scene: who they are, where their files are, and how they leave. How they come to be is in `build`."""
+"""A human in the scene: a marked collection that holds an armature, a body mesh and volumes."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections import defaultdict
 
 import bpy
 
-from .folders import humans_folder
+from .files import PRIMITIVE_VDB, volume_path
 
 MARK = "primdiffusion_human"
 """Custom property of a person's collection: its provenance as JSON."""
 BETAS = "primdiffusion_betas"
 """Custom property of a person's armature: the body's shape, which the engine draws and which may be animated."""
-PERSON_FILE = "person.human.safetensors"
-"""The person as the backend keeps it, beside the volumes."""
-PERSON = "primdiffusion_person_file"
-"""Custom property of a person's collection: the name of the backend's file since the person was edited. It goes back
-and forth with undo, as the paths of the volumes do."""
-HOME = "primdiffusion_folder"
-"""Custom property of a person's collection: the absolute folder of their files when the .blend was last saved. Paths
-of volumes are relative to the .blend, which may be moved alone, or opened as a copy in a temporary folder."""
-CYCLES_LIMIT = 31
-"""Volumes that Cycles draws at a point."""
-
-
-class MissingPersonFile(FileNotFoundError):
-    """The backend's file of a person is not where it should be."""
-
-    kind = "missing_volumes"
-    """By which panels find the remedy."""
-
-
-def folder_of(collection: bpy.types.Collection) -> Path:
-    """Where a person's files live: `<blendname>_humans/<collection name>` (see `humans_folder`)."""
-    return humans_folder() / bpy.path.clean_name(collection.name)
-
-
-def person_file(collection: bpy.types.Collection) -> Path:
-    """The backend's own file of a person: beside their volumes, wherever these are now, else in `folder_of`.
-
-    Volumes keep their paths when a collection is renamed and when a .blend is saved elsewhere. Raises FileNotFoundError
-    with a sentence that names the person and the file.
-    """
-    name, folders = person_file_name(collection), folders_of(collection)
-    for folder in folders:
-        if (folder / name).is_file():
-            return folder / name
-    raise MissingPersonFile(
-        f"the file of the person {collection.name!r} is missing: {str(folders[0] / name)!r}; put it back beside "
-        "the person's volumes, press Find Missing Volumes in the panel Human, or generate the person again"
-    )
-
-
-def folders_of(collection: bpy.types.Collection) -> list[Path]:
-    """Where a person's files may be: beside the volumes as they are now, else `folder_of`."""
-    volume = next((thing.data for thing in collection.all_objects if thing.type == "VOLUME"), None)
-    beside = [volume_path(volume).parent] if volume is not None and volume.filepath else []
-    return [*beside, folder_of(collection)]
-
-
-def person_file_name(collection: bpy.types.Collection) -> str:
-    """The name of `person_file`, which is another one after each edit."""
-    return str(collection.get(PERSON, PERSON_FILE))
-
-
-def volume_path(volume: bpy.types.Volume) -> Path:
-    """The absolute path of a volume's file."""
-    return Path(bpy.path.abspath(volume.filepath, library=volume.library))
-
-
-def overlap_warning(collection: bpy.types.Collection) -> str | None:
-    """A sentence for the user when Cycles will drop volumes of this person in their shape of now, else None."""
-    from .overlap_now import overlapping_now
-
-    try:
-        most = overlapping_now(collection)
-    except (ValueError, KeyError, TypeError):  # changed by hand
-        return None
-    if most <= CYCLES_LIMIT:
-        return None
-    return (
-        f"up to {most} volumes of {collection.name!r} overlap at a point and Cycles draws only {CYCLES_LIMIT}; "
-        "render with PrimDiffusion (Exact)"
-    )
-
-
-def overlap_warning_in(scene: bpy.types.Scene, collection: bpy.types.Collection) -> str | None:
-    """The same where Cycles is the scene's engine: it is a matter of Cycles alone, and others need not be told."""
-    return overlap_warning(collection) if scene.render.engine == "CYCLES" else None
+BETA_COUNT = 10
+"""Numbers in a shape."""
+LARGEST_BETA = 5.0
+"""Beyond, bodies of linear shape models fall apart."""
+BODY_MARK = "primdiffusion_body"
+"""Custom property of a body mesh: the engine leaves it out, shown or hidden."""
 
 
 def armature_of(collection: bpy.types.Collection) -> bpy.types.Object:
@@ -96,6 +26,20 @@ def armature_of(collection: bpy.types.Collection) -> bpy.types.Object:
         if MARK in collection and candidate.type == "ARMATURE":
             return candidate
     raise ValueError(f"the collection {collection.name!r} holds no generated person; select one that does")
+
+
+def body_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
+    """The body mesh of a person; None when it was deleted."""
+    return next((thing for thing in collection.all_objects if thing.type == "MESH" and BODY_MARK in thing), None)
+
+
+def volumes_of(collection: bpy.types.Collection) -> dict[int, list[bpy.types.Object]]:
+    """A person's volume objects by primitive, which the name of the file tells whatever the object is called now."""
+    found = defaultdict(list)
+    for thing in collection.all_objects:
+        if thing.type == "VOLUME" and (match := PRIMITIVE_VDB.fullmatch(volume_path(thing.data).name)):
+            found[int(match[1])].append(thing)
+    return dict(found)
 
 
 def humans(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
@@ -121,9 +65,27 @@ def human_of(thing: bpy.types.Object | None, scene: bpy.types.Scene) -> bpy.type
     return None
 
 
-def people_files() -> set[str]:
-    """Names of the backend's files that people of this .blend use, those linked included."""
-    return {person_file_name(collection) for collection in bpy.data.collections if MARK in collection}
+def own_data(thing: bpy.types.Object, collection: bpy.types.Collection):
+    """An object's data, copied first where another person's objects show it too (duplicates share data)."""
+    if thing.data.users > 1:
+        users = bpy.data.user_map(subset=[thing.data])[thing.data]
+        if any(isinstance(user, bpy.types.Object) and user not in set(collection.all_objects) for user in users):
+            thing.data = thing.data.copy()
+    return thing.data
+
+
+def check_editable(collection: bpy.types.Collection) -> None:
+    """Raises ValueError, with what to do, for a person that lives in another .blend or has lost its armature."""
+    armature = armature_of(collection)
+    parts = [collection, armature, armature.data, *(thing.data for thing in collection.all_objects if thing.data)]
+    linked = next((part.library for part in parts if part.library is not None), None)
+    if linked is not None:
+        raise ValueError(
+            f"the person {collection.name!r} is linked from {linked.filepath!r}: edit it there, or make it local with "
+            "Object > Relations > Make Local > All"
+        )
+    if not volumes_of(collection):
+        raise ValueError(f"the person {collection.name!r} has no volumes left; generate a person again")
 
 
 def remove_human(collection: bpy.types.Collection) -> None:

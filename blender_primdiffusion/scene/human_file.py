@@ -1,178 +1,142 @@
-"""human.npz, the backend's result: read without pickle and checked before anything in the scene is touched."""
+""".human files: a person as the backend keeps them (safetensors), with the shape they have now and how they move.
+
+The file is the backend's own, which reads it as any other: what is added has names of its own (`motion.*`). Reading and
+writing needs numpy alone: eight bytes of length, a JSON header, then plain arrays.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import zlib
+import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.joints import JOINT_NAMES, PARENTS
-from .shape_model import FIELDS, INTEGERS, ShapeModel, faulty_field
-
-FORMAT_VERSION = 2
-"""The newest that is read; 1 knows the person in one shape only."""
-VOXELS = 8
-"""Voxels along a side of a primitive."""
-
-
-class HumanFileError(ValueError):
-    """A human.npz cannot be used; the message is one sentence with the remedy."""
+"""What is read: the same format under either name."""
+_LARGEST_HEADER = 1 << 20
+_METADATA = "__metadata__"
+_DTYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U8": "|u1", "BF16": "<u2"}
+_MOTION = {"motion.frames": ("F",), "motion.rotations": ("F", 24, 3, 3), "motion.translations": ("F", 3)}
+_REMEDY = "choose a .human file, or export the person again"
 
 
 @dataclasses.dataclass(frozen=True)
-class HumanFile:
-    """A generated person at rest, in the backend's axes (y up, metres); see `convention` for Blender's."""
+class HumanMotion:
+    """How the person moves; one frame is a pose."""
 
-    meta: dict[str, object]
-    """Provenance: seed, steps, checkpoint, full_density, version."""
-    betas: NDArray[np.float64]
-    """Body shape [10]."""
-    joints: NDArray[np.float64]
-    """Rest joints [24, 3]."""
-    vertices: NDArray[np.float64]
-    """Shaped rest surface [V, 3]."""
-    faces: NDArray[np.int64]
-    """Triangles [F, 3]."""
-    uv_corner: NDArray[np.float64]
-    """Texture coordinates of each triangle corner [F, 3, 2], v up."""
-    skin_weights: NDArray[np.float64]
-    """Rows sum to one [V, 24]."""
-    position: NDArray[np.float64]
-    """Primitive centres [K, 3]."""
-    rotation: NDArray[np.float64]
-    """Local to world [K, 3, 3]; columns T, B, N."""
-    half_extent: NDArray[np.float64]
-    """Half sides along T, B, N [K, 3]."""
-    primitive_weights: NDArray[np.float64]
-    """Skinning of each primitive [K, 24]; rows sum to one."""
-    rgb: NDArray[np.float32]
-    """Linear colour [K, D, H, W, 3]; D along N, H along B, W along T."""
-    density: NDArray[np.float32]
-    """Opacity per metre [K, D, H, W], before the marcher's window."""
-    shape_model: ShapeModel | None = None
-    """How all of this follows other betas; None in files of format version 1."""
+    frames: NDArray[np.float32]
+    """Frame numbers [F], increasing."""
+    rotations: NDArray[np.float32]
+    """Of the joints [F, 24, 3, 3]; y up."""
+    translations: NDArray[np.float32]
+    """[F, 3], metres, y up."""
+    fps: float
 
 
-_SHAPES: dict[str, tuple[int | str, ...]] = {
-    "betas": (10,), "joints": (24, 3), "vertices": ("V", 3), "faces": ("F", 3), "uv_corner": ("F", 3, 2),
-    "skin_weights": ("V", 24), "position": ("K", 3), "rotation": ("K", 3, 3), "half_extent": ("K", 3),
-    "primitive_weights": ("K", 24), "rgb": ("K", VOXELS, VOXELS, VOXELS, 3), "density": ("K", VOXELS, VOXELS, VOXELS),
-}  # fmt: skip
-_DTYPES: dict[str, type] = {"faces": np.int64, "rgb": np.float32, "density": np.float32}
-_SAME_SURFACE = 1e-4
-"""Metres the person's own surface may be from what the shape model gives for their betas."""
-_REMEDY = "generate the person again"
+@dataclasses.dataclass(frozen=True)
+class HumanTensors:
+    """A .human file taken apart."""
+
+    metadata: dict[str, str]
+    arrays: dict[str, tuple[str, tuple[int, ...], bytes]]
+    """By name: safetensors' dtype, shape, bytes."""
 
 
-def read_human(path: str | Path) -> HumanFile:
-    """Read and check a human.npz.
+def read_tensors(path: Path) -> HumanTensors:
+    """Raises ValueError for a file of another kind or a damaged one, OSError."""
+    data = path.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    try:
+        if not 2 <= length <= min(_LARGEST_HEADER, len(data) - 8):
+            raise ValueError("it has no header")
+        header = json.loads(data[8 : 8 + length])
+        metadata = header.pop(_METADATA, {})
+        arrays = {}
+        for name, about in header.items():
+            begin, end = about["data_offsets"]
+            raw = data[8 + length + begin : 8 + length + end]
+            if len(raw) != end - begin:
+                raise ValueError("it is truncated")
+            arrays[name] = (str(about["dtype"]), tuple(about["shape"]), raw)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path.name!r} holds no person ({error}); {_REMEDY}") from error
+    if metadata.get("format") != "primdiffusion.human":
+        raise ValueError(f"{path.name!r} holds no person but something else; {_REMEDY}")
+    return HumanTensors(metadata, arrays)
 
-    Raises HumanFileError when the file is missing, truncated, of another version, or holds arrays of the wrong shape,
-    NaN, weights that do not sum to one, or frames that are not rotations.
+
+def reshaped(human: HumanTensors, betas: NDArray, growth: NDArray | None) -> HumanTensors:
+    """The person with another shape [10], on which their boxes are `growth` [K, 3] times as large (None: as they are).
+
+    Raises ValueError for a file that holds another number of boxes.
     """
-    import zipfile  # slow to import, and not needed to register
+    arrays = {**human.arrays, "betas": _stored(np.asarray(betas, np.float32))}
+    if growth is not None:
+        dtype, shape, raw = human.arrays.get("delta_scale", ("", (), b""))
+        if dtype != "F32" or shape != growth.shape:
+            given, wanted = f"{dtype}{list(shape)}", f"F32{list(growth.shape)}"
+            raise ValueError(f"the person's file holds sizes of boxes as {given}, not {wanted}; {_REMEDY}")
+        arrays["delta_scale"] = _stored((_loaded(dtype, shape, raw) * growth).astype(np.float32))
+    return HumanTensors(human.metadata, arrays)
 
-    path = Path(path)
-    if not path.is_file():
-        raise HumanFileError(f"there is no human file at {str(path)!r}; {_REMEDY}")
+
+def with_motion(human: HumanTensors, motion: HumanMotion | None) -> HumanTensors:
+    """The person with a motion; None takes it away."""
+    metadata = {name: text for name, text in human.metadata.items() if name != "motion"}
+    arrays = {name: array for name, array in human.arrays.items() if name not in _MOTION}
+    if motion is not None:
+        metadata["motion"] = json.dumps({"fps": motion.fps})
+        for name, array in zip(_MOTION, (motion.frames, motion.rotations, motion.translations), strict=True):
+            arrays[name] = _stored(np.asarray(array, np.float32))
+    return HumanTensors(metadata, arrays)
+
+
+def motion_in(human: HumanTensors) -> HumanMotion | None:
+    """The motion that a file holds. Raises ValueError for one that is damaged."""
+    if "motion" not in human.metadata:
+        return None
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        raise HumanFileError(f"{path.name!r} is damaged or no human file ({error}); {_REMEDY}") from error
-    version = int(_plain(arrays, "format_version", path))
-    if not 1 <= version <= FORMAT_VERSION:
-        raise HumanFileError(
-            f"{path.name!r} has format version {version}, this add-on reads 1 to {FORMAT_VERSION}; "
-            "use an add-on and a backend of the same release"
-        )
+        fps = float(json.loads(human.metadata["motion"])["fps"])
+        arrays = [_loaded(*human.arrays[name]) for name in _MOTION]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"the motion in the .human file is damaged ({error}); {_REMEDY}") from error
+    frames = len(arrays[0])
+    for array, shape in zip(arrays, _MOTION.values(), strict=True):
+        if array.shape != tuple(frames if s == "F" else s for s in shape) or not np.isfinite(array).all():
+            raise ValueError(f"the motion in the .human file is damaged; {_REMEDY}")
+    if frames == 0 or not 0 < fps < 1e4 or np.any(np.diff(arrays[0]) <= 0):
+        raise ValueError(f"the motion in the .human file has no order of frames; {_REMEDY}")
+    return HumanMotion(*arrays, fps)
+
+
+def write_tensors(path: Path, human: HumanTensors) -> None:
+    """Writes the file whole or not at all. Raises OSError."""
+    header: dict[str, object] = {_METADATA: human.metadata}
+    offset = 0
+    sizes = {name: np.dtype(_DTYPES.get(dtype, "u1")).itemsize for name, (dtype, _, _) in human.arrays.items()}
+    ordered = sorted(human.arrays, key=lambda name: (-sizes[name], name))  # the widest first: so all are aligned
+    for name in ordered:
+        dtype, shape, raw = human.arrays[name]
+        header[name] = {"dtype": dtype, "shape": list(shape), "data_offsets": [offset, offset + len(raw)]}
+        offset += len(raw)
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    unfinished = path.with_name(f".{path.name}.part")
     try:
-        meta = json.loads(str(_plain(arrays, "meta", path)))
-    except json.JSONDecodeError as error:
-        raise HumanFileError(f"the field 'meta' of {path.name!r} is not JSON ({error}); {_REMEDY}") from error
-    _check_skeleton(arrays, path)
-    sizes: dict[str, int] = {}
-    human = _checked_values(HumanFile(meta=meta, **_shaped_fields(arrays, path, _SHAPES, sizes)), path)
-    if version == 1:
-        return human
-    fields = _shaped_fields(arrays, path, FIELDS, sizes)
-    dtypes = {name: np.int32 if name in INTEGERS else np.float32 for name in FIELDS}
-    model = ShapeModel(**{name: value.astype(dtypes[name]) for name, value in fields.items()})
-    return dataclasses.replace(human, shape_model=_checked_shape(model, human, path))
+        with unfinished.open("wb") as file:
+            file.write(len(text).to_bytes(8, "little") + text)
+            for name in ordered:
+                file.write(human.arrays[name][2])
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
-def _plain(arrays: dict[str, NDArray], name: str, path: Path) -> Any:
-    value = _field(arrays, name, path)
-    if value.size != 1:
-        raise HumanFileError(f"the field {name!r} of {path.name!r} holds {value.size} values instead of one; {_REMEDY}")
-    return value.reshape(())[()]
+def _stored(array: NDArray[np.float32]) -> tuple[str, tuple[int, ...], bytes]:
+    return "F32", array.shape, np.ascontiguousarray(array, "<f4").tobytes()
 
 
-def _field(arrays: dict[str, NDArray], name: str, path: Path) -> NDArray:
-    if name not in arrays:
-        raise HumanFileError(f"{path.name!r} has no field {name!r}; {_REMEDY}")
-    return arrays[name]
-
-
-def _check_skeleton(arrays: dict[str, NDArray], path: Path) -> None:
-    names = tuple(str(name) for name in _field(arrays, "joint_names", path).ravel())
-    parents = tuple(int(parent) for parent in _field(arrays, "parents", path).ravel())
-    if names != JOINT_NAMES or parents != PARENTS:
-        raise HumanFileError(f"the skeleton of {path.name!r} is not SMPL's 24 joints; choose a body in SMPL format")
-
-
-def _shaped_fields(
-    arrays: dict[str, NDArray], path: Path, shapes: dict[str, tuple[int | str, ...]], sizes: dict[str, int]
-) -> dict[str, NDArray]:
-    """Every array of `shapes` with its dtype; those named by letters are equal among the fields, `sizes` keeps them."""
-    fields: dict[str, NDArray] = {}
-    for name, shape in shapes.items():
-        value = _field(arrays, name, path)
-        fits = value.ndim == len(shape) and value.dtype.kind in "fiu"
-        for wanted, given in zip(shape, value.shape, strict=False):
-            fits = fits and given == (sizes.setdefault(wanted, given) if isinstance(wanted, str) else wanted)
-        if not fits or value.size == 0:
-            want = tuple(sizes.get(s, s) if isinstance(s, str) else s for s in shape)
-            raise HumanFileError(
-                f"the field {name!r} of {path.name!r} is {value.dtype} {value.shape} instead of numbers of shape "
-                f"{want}; {_REMEDY}"
-            )
-        fields[name] = value.astype(_DTYPES.get(name, np.float64))
-    return fields
-
-
-def _checked_values(human: HumanFile, path: Path) -> HumanFile:
-    for name in _SHAPES:
-        if not np.isfinite(getattr(human, name)).all():
-            raise HumanFileError(f"the field {name!r} of {path.name!r} holds NaN or infinite values; {_REMEDY}")
-    gram = np.swapaxes(human.rotation, -1, -2) @ human.rotation
-    faults = {
-        "faces": human.faces.min() < 0 or human.faces.max() >= len(human.vertices),
-        "half_extent": human.half_extent.min() <= 0,
-        "density": human.density.min() < 0,
-        "rotation": np.abs(gram - np.eye(3)).max() > 1e-3 or np.linalg.det(human.rotation).min() < 0,
-        "skin_weights": not _rows_are_weights(human.skin_weights),
-        "primitive_weights": not _rows_are_weights(human.primitive_weights),
-    }
-    for name, faulty in faults.items():
-        if faulty:
-            raise HumanFileError(f"the field {name!r} of {path.name!r} holds impossible values; {_REMEDY}")
-    return human
-
-
-def _checked_shape(model: ShapeModel, human: HumanFile, path: Path) -> ShapeModel:
-    name = faulty_field(model)
-    if name is None and np.abs(model.rest(human.betas).vertices - human.vertices).max() > _SAME_SURFACE:
-        name = "shape_basis"
-    if name is not None:
-        raise HumanFileError(f"the field {name!r} of {path.name!r} holds impossible values; {_REMEDY}")
-    return model
-
-
-def _rows_are_weights(weights: NDArray) -> bool:
-    return bool(weights.min() >= 0 and np.abs(weights.sum(-1) - 1).max() < 1e-3)
+def _loaded(dtype: str, shape: tuple[int, ...], raw: bytes) -> NDArray:
+    return np.frombuffer(raw, _DTYPES[dtype]).reshape(shape)

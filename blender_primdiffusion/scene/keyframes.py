@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from .actions import action_curves, last_key
 from .armature import bone_bases, rest_rotations
-from .quaternion import continuous_quaternions
+from .convention import continuous_quaternions
 
 _LINEAR = 1
 """Value of LINEAR in the enumeration Keyframe.interpolation, as foreach_set wants it."""

@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import json
 import os
-import re
 import shutil
 import zlib
 from collections.abc import Sequence
@@ -16,21 +15,18 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .folders import stored_path
-from .gain import person_material
-from .human import armature_of, folders_of, person_file_name, volume_path
-from .volumes import VolumeWriteError
+from .files import VolumeWriteError, folders_of, person_file_name, stored_path
+from .human import armature_of
+from .material import person_material
 
 MARK = "primdiffusion_merged"
 """Custom property of a merged object: its `MergedState` as JSON."""
-FILE = re.compile(r"merged_[0-9a-f]{12}(_\d{4,})?\.vdb")
-"""Names of merged files; those of a sequence end in the frame, counted from 1."""
 _DECIMALS = 4
 """Of matrices, in digests: a tenth of a millimetre."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Grid:
+class MergedGrid:
     """What the child merges; z up, in the armature's space."""
 
     density: NDArray[np.float16]
@@ -59,13 +55,13 @@ class MergedState:
         return self.poses[index] == digest
 
 
-def read_grid(path: Path) -> Grid:
+def read_grid(path: Path) -> MergedGrid:
     """Reads the child's file. Raises ValueError for a damaged one, OSError."""
     import zipfile  # slow to import, and not needed to register
 
     try:
         with np.load(path, allow_pickle=False) as stored:
-            grid = Grid(stored["density"], stored["colour"], stored["origin"], float(stored["voxel"]))
+            grid = MergedGrid(stored["density"], stored["colour"], stored["origin"], float(stored["voxel"]))
     except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"the merged grid {path.name!r} is damaged ({error}); merge again") from error
     if grid.density.ndim != 3 or grid.colour.shape != (*grid.density.shape, 3) or grid.origin.shape != (3,):
@@ -73,14 +69,14 @@ def read_grid(path: Path) -> Grid:
     return grid
 
 
-def index_to_local(grid: Grid, blender_version: tuple[int, ...]) -> NDArray[np.float64]:
+def index_to_local(grid: MergedGrid, blender_version: tuple[int, ...]) -> NDArray[np.float64]:
     """VDB's row-vector transform [4, 4]; Cycles before 5.0 draws half a voxel too high on each axis (see `volumes`)."""
     transform = np.diag([grid.voxel] * 3 + [1.0])
     transform[3, :3] = grid.origin - (0.5 * grid.voxel if blender_version < (5, 0) else 0.0)
     return transform
 
 
-def write_grid(grid: Grid, path: Path) -> str:
+def write_grid(grid: MergedGrid, path: Path) -> str:
     """Writes `density` and `Cd` as half floats; returns a digest of what they hold. Needs no bpy: any thread may write.
 
     `bpy.utils.expose_bundled_modules()` must have been called before. Raises VolumeWriteError.
@@ -181,15 +177,6 @@ def pose_digest(collection: bpy.types.Collection, joints: NDArray, betas: Sequen
     digest = hashlib.sha256(f"{person_file_name(collection)} {shape}".encode())
     digest.update(rounded.tobytes())
     return digest.hexdigest()[:16]
-
-
-def sequence_files(volume: bpy.types.Volume) -> list[Path]:
-    """All files of a volume: those of a merged sequence, else its one."""
-    path = volume_path(volume)
-    match = FILE.fullmatch(path.name)
-    if match is None or match[1] is None:
-        return [path]
-    return sorted(path.parent.glob(path.name.replace(match[1], "_*")))
 
 
 def _write_error(folder: Path, error: BaseException) -> VolumeWriteError:

@@ -9,23 +9,62 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import bpy
 import numpy as np
 
-from . import merged, shape_file
-from .exported_human import read_tensors
-from .folders import humans_folder, stored_path
-from .human import HOME, MARK, PERSON_FILE, folder_of, folders_of, person_file_name, volume_path
-from .listing import Listing
-from .placing_files import put_copy
-from .shape import PRIMITIVE, generated_betas
+from .files import (
+    HOME,
+    MERGED_VDB,
+    PERSON_FILE,
+    PRIMITIVE_VDB,
+    folder_of,
+    folders_of,
+    humans_folder,
+    person_file_name,
+    put_copy,
+    stored_path,
+    volume_path,
+)
+from .human import MARK
+from .human_file import read_tensors
+from .shape import BODY_FILE, generated_betas
 
 _DEEPEST = 6
 _MOST_FOLDERS = 20_000
 _SAME_BETAS = 1e-4
+
+
+class Listing:
+    """Names of files by folder, as they were when the folder was first asked for."""
+
+    def __init__(self) -> None:
+        self._names: dict[Path, frozenset[str]] = {}
+
+    def names(self, folder: Path) -> frozenset[str]:
+        """Everything in a folder; nothing for one that is not there or may not be read."""
+        if folder not in self._names:
+            try:
+                self._names[folder] = frozenset(os.listdir(folder))
+            except OSError:
+                self._names[folder] = frozenset()
+        return self._names[folder]
+
+    def __contains__(self, path: Path) -> bool:
+        return path.name in self.names(path.parent)
+
+    def found(self, wanted: Iterable[str], folders: Iterable[Path]) -> dict[str, Path]:
+        """Where the wanted names are; of several folders, the first that has it. Stops when all are found."""
+        left, places = set(wanted), {}
+        for folder in folders:
+            if not left:
+                break
+            for name in left & self.names(folder):
+                places[name] = folder / name
+            left -= places.keys()
+        return places
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +105,7 @@ def missing_files() -> list[Lost]:
             continue
         single, several = _without_files(person, listing)
         near = folders_of(person)
-        name, body = person_file_name(person), str(person.get(shape_file.BODY_FILE, ""))
+        name, body = person_file_name(person), str(person.get(BODY_FILE, ""))
         has_person = any(folder / name in listing for folder in near)
         has_body = not body or any(place / body in listing for folder in near for place in (folder.parent, folder))
         if single or several or not (has_person and has_body):
@@ -151,9 +190,9 @@ def _without_files(
     single, several = [], []
     for volume in {thing.data: None for thing in person.all_objects if thing.type == "VOLUME"}:
         path = volume_path(volume)
-        if PRIMITIVE.fullmatch(path.name) and path not in listing:
+        if PRIMITIVE_VDB.fullmatch(path.name) and path not in listing:
             single.append(volume)
-        elif merged.FILE.fullmatch(path.name) and not {*_sequence_names(volume)} <= listing.names(path.parent):
+        elif MERGED_VDB.fullmatch(path.name) and not {*_sequence_names(volume)} <= listing.names(path.parent):
             several.append(volume)
     return single, several
 
@@ -161,7 +200,7 @@ def _without_files(
 def _sequence_names(volume: bpy.types.Volume) -> list[str]:
     """Names of all files of a merged volume, there or not."""
     name = volume_path(volume).name
-    match = merged.FILE.fullmatch(name)
+    match = MERGED_VDB.fullmatch(name)
     if match is None or match[1] is None or not volume.is_sequence:
         return [name]
     width = len(match[1]) - 1

@@ -1,22 +1,33 @@
-"""How a body at rest, its joints and the primitives on it follow its shape; the backend's `body` and `anchors` are the
-twins."""
+"""How a body at rest, its joints and primitives, its height and weight follow its shape. Twins of the backend's `body`,
+`anchors` and `body.measures`.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .shape_names import BETAS
+from .human import BETA_COUNT, LARGEST_BETA
 
 _TINY = 1e-12
 """What the backend divides by at least when it normalises."""
-
 SHARE = 0.5
 """Exponent of the surface's stretch by which boxes grow; the backend's `reshaping.SHARE`."""
 SAME_BETAS = 1e-5
 """Betas that differ by less are the same body."""
+DENSITY = 985.0
+"""kg/m^3 of a living person with air in the lungs."""
+MOST_CORRECTIONS = 20
+_TOLERANCE = np.array([1e-4, 1e-2])
+"""Metres, kilograms."""
+DEFAULT_BODY_VERTICES = 12196
+"""Only the body that comes with the extension has as many."""
+_CLEAR = {0: "Stature", 1: "Shoulders", 3: "Waist", 5: "Girth"}
+"""What single betas of the default body do; the others change several things a little."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -101,7 +112,8 @@ class ShapeModel:
 
 
 FIELDS: dict[str, tuple[int | str, ...]] = {
-    "template": ("V", 3), "shape_basis": ("V", 3, BETAS), "joint_template": (24, 3), "joint_basis": (24, 3, BETAS),
+    "template": ("V", 3), "shape_basis": ("V", 3, BETA_COUNT),
+    "joint_template": (24, 3), "joint_basis": (24, 3, BETA_COUNT),
     "faces": ("F", 3), "face": ("K",), "barycentric": ("K", 3),
     "stencil_vertex": ("K", "m"), "stencil_du": ("K", "m"), "stencil_dv": ("K", "m"),
 }  # fmt: skip
@@ -121,6 +133,77 @@ def faulty_field(model: ShapeModel) -> str | None:
             return name
     weights = model.barycentric
     return "barycentric" if weights.min() < -1e-3 or np.abs(weights.sum(-1) - 1).max() > 1e-3 else None
+
+
+class Measures(NamedTuple):
+    """Of a bare body at rest."""
+
+    height: float
+    """Metres."""
+    weight: float
+    """Kilograms: the volume within the skin, as heavy as a person."""
+
+
+def measure(model: ShapeModel, betas: NDArray) -> Measures:
+    """Height and weight at these betas [10]."""
+    return _measured(model, tuple(np.asarray(betas, np.float64)))
+
+
+def betas_of_measures(
+    model: ShapeModel, betas: NDArray, height: float | None = None, weight: float | None = None
+) -> NDArray[np.float64]:
+    """The betas [10], moved as little as possible until the body has the given height (m) and weight (kg).
+
+    Newton steps of least length, exact to 0.1 mm and 10 g. Raises ValueError where no body within LARGEST_BETA has
+    these measures.
+    """
+    rows = [row for row, value in enumerate((height, weight)) if value is not None]
+    target = np.array([value for value in (height, weight) if value is not None])
+    moved = np.array(betas, np.float64)
+    for _ in range(MOST_CORRECTIONS if rows else 0):
+        missing = target - np.array(measure(model, moved))[rows]
+        if (np.abs(missing) < _TOLERANCE[rows]).all():
+            break
+        slope = _slope(model, moved)[rows]
+        moved = moved + slope.T @ np.linalg.solve(slope @ slope.T, missing)
+        if not np.abs(moved).max() <= LARGEST_BETA:
+            break
+    else:
+        moved = moved if not rows else moved * np.inf
+    if rows and not np.abs(moved).max() <= LARGEST_BETA:
+        names = (("a height of {:.2f} m", height), ("a weight of {:.0f} kg", weight))
+        asked = " with ".join(text.format(value) for text, value in names if value is not None)
+        raise ValueError(f"no body of this model has {asked}: ask for something more usual")
+    return moved
+
+
+def slider_names(model: ShapeModel) -> list[str]:
+    """A name for each beta [10]: by what it does where that is clear, else by its number, from 1."""
+    clear = _CLEAR if len(model.template) == DEFAULT_BODY_VERTICES else {}
+    return [clear.get(index, f"Shape {index + 1}") for index in range(BETA_COUNT)]
+
+
+@functools.lru_cache(maxsize=64)
+def _measured(model: ShapeModel, betas: tuple[float, ...]) -> Measures:
+    vertices = model.surface(np.array(betas))
+    upright = vertices[:, 1]
+    a, b, c = (vertices[model.faces[:, corner]] for corner in range(3))
+    volume = float(np.einsum("fx,fx->", a, np.cross(b, c))) / 6  # signed tetrahedra to the origin
+    return Measures(float(upright.max() - upright.min()), abs(volume) * DENSITY)
+
+
+def _slope(model: ShapeModel, betas: NDArray) -> NDArray[np.float64]:
+    """Derivatives of height and weight by each beta [2, 10]."""
+    vertices = model.surface(betas)
+    top, sole = np.argmax(vertices[:, 1]), np.argmin(vertices[:, 1])
+    a, b, c = (vertices[model.faces[:, corner]] for corner in range(3))
+    pull = np.zeros_like(vertices)  # of the volume, times 6, by each vertex
+    for corner, cross in enumerate((np.cross(b, c), np.cross(c, a), np.cross(a, b))):
+        for axis in range(3):
+            pull[:, axis] += np.bincount(model.faces[:, corner], cross[:, axis], len(vertices))
+    sign = np.sign(np.einsum("fx,fx->", a, np.cross(b, c)))
+    volume = pull.reshape(-1) @ model.shape_basis.reshape(-1, BETA_COUNT) / 6
+    return np.stack([model.shape_basis[top, 1] - model.shape_basis[sole, 1], sign * DENSITY * volume])
 
 
 def _unit(vectors: NDArray) -> NDArray[np.float64]:

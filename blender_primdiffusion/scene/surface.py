@@ -1,27 +1,34 @@
-"""Attachment to the surface: volumes on the tangent planes of the posed body, anew for every pose (paper sec. 3.1).
+"""Attachment to the surface: volumes on the tangent planes of the posed body, for every pose (paper sec. 3.1).
 
-An object without faces, the carrier, holds the sums that make centres and axes out of the body's vertices; a node group
-evaluates them on the skinned body and puts an instance of each volume there.
+An object without faces, the carrier, has a point for each weight of the sums that give a primitive's centre and axes. A
+node group evaluates them on the skinned body:
+
+    body vertex * weights, summed per primitive -> centre, dP/du, dP/dv
+    T = normalize(dP/du), N = normalize(T x dP/dv) -> an instance of the volume, scaled
 """
 
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .body_mesh import body_of
-from .human import armature_of
-from .node_inputs import set_node_input
-from .shape import betas_of, generated_betas, own_data, shape_model_of, volumes_of
+from .human import armature_of, body_of, own_data, volumes_of
+from .shape import betas_of, generated_betas, shape_model_of
 from .shape_model import ShapeModel
-from .surface_nodes import BODY, FIRST, GROWTH, PICK, PRIMITIVE, VERTEX, VOLUMES, WEIGHTS, surface_group
 
 MARK = "primdiffusion_surface"
 """Custom property of a carrier."""
 _NOBODY = -1
+GROUP_NAME = "PrimDiffusion Boxes on Surface"
+VERTEX, PRIMITIVE, FIRST, PICK, GROWTH = "vertex", "primitive", "first", "pick", "growth"
+WEIGHTS = ("centre_weight", "du_weight", "dv_weight")
+"""Attributes of the carrier's points: see `surface.carrier_mesh`."""
+BODY, VOLUMES = "Body", "Volumes"
+"""Inputs of the group."""
 
 
 def carrier_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
@@ -134,6 +141,111 @@ def carrier_mesh(name: str, model: ShapeModel, pick: NDArray) -> bpy.types.Mesh:
     ):
         mesh.attributes.new(attribute, kind, "POINT").data.foreach_set("value", values)
     return mesh
+
+
+def surface_group() -> bpy.types.NodeTree:
+    """The shared group, made on first use; its inputs are the body's object and the collection of volumes."""
+    existing = bpy.data.node_groups.get(GROUP_NAME)
+    if existing is not None and existing.library is None and existing.bl_idname == "GeometryNodeTree":
+        return existing
+    tree = bpy.data.node_groups.new(GROUP_NAME, "GeometryNodeTree")
+    for name, direction, kind in (
+        ("Geometry", "INPUT", "NodeSocketGeometry"),
+        (BODY, "INPUT", "NodeSocketObject"),
+        (VOLUMES, "INPUT", "NodeSocketCollection"),
+        ("Geometry", "OUTPUT", "NodeSocketGeometry"),
+    ):
+        tree.interface.new_socket(name, in_out=direction, socket_type=kind)
+    _build(tree)
+    return tree
+
+
+def node_inputs(modifier: bpy.types.NodesModifier) -> dict[str, Any]:
+    """Values by identifiers of sockets; sockets without a value (geometry) are left out."""
+    group = modifier.node_group
+    if group is None:
+        return {}
+    items = group.interface.items_tree
+    sockets = [item.identifier for item in items if item.item_type == "SOCKET" and item.in_out == "INPUT"]
+    if bpy.app.version < (5, 2):
+        return {name: modifier[name] for name in sockets if name in modifier}
+    values = {name: getattr(modifier.properties.inputs, name, None) for name in sockets}
+    return {name: value.value for name, value in values.items() if hasattr(value, "value")}
+
+
+def set_node_input(modifier: bpy.types.NodesModifier, socket: str, value: Any) -> None:
+    """Set the input with this identifier."""
+    if bpy.app.version < (5, 2):
+        modifier[socket] = value
+    else:
+        getattr(modifier.properties.inputs, socket).value = value
+
+
+def _build(tree: bpy.types.NodeTree) -> None:
+    made: list[bpy.types.Node] = []
+
+    def node(kind: str, inputs: dict[str | int, object] | None = None, **values: object) -> bpy.types.Node:
+        one = tree.nodes.new(kind)
+        one.location = (180 * (len(made) % 8), -220 * (len(made) // 8))
+        made.append(one)
+        for key, value in values.items():
+            setattr(one, key, value)
+        for key, value in (inputs or {}).items():
+            if isinstance(value, bpy.types.NodeSocket):
+                tree.links.new(value, one.inputs[key])
+            else:
+                one.inputs[key].default_value = value
+        return one
+
+    def attribute(name: str, kind: str) -> bpy.types.NodeSocket:
+        return node("GeometryNodeInputNamedAttribute", {"Name": name}, data_type=kind).outputs["Attribute"]
+
+    given = node("NodeGroupInput").outputs
+    body = node("GeometryNodeObjectInfo", {"Object": given[BODY]}, transform_space="RELATIVE").outputs["Geometry"]
+    vertex = node(
+        "GeometryNodeSampleIndex",
+        {"Geometry": body, "Value": node("GeometryNodeInputPosition").outputs[0], "Index": attribute(VERTEX, "INT")},
+        data_type="FLOAT_VECTOR",
+        domain="POINT",
+    ).outputs["Value"]
+    group = attribute(PRIMITIVE, "INT")
+
+    def summed(weight: str) -> bpy.types.NodeSocket:
+        weighted = node("ShaderNodeVectorMath", {0: vertex, "Scale": attribute(weight, "FLOAT")}, operation="SCALE")
+        total = node(
+            "GeometryNodeAccumulateField",
+            {"Value": weighted.outputs[0], "Group ID": group},
+            data_type="FLOAT_VECTOR",
+            domain="POINT",
+        )
+        return total.outputs["Total"]
+
+    centre, du, dv = (summed(weight) for weight in WEIGHTS)
+    normal = node("ShaderNodeVectorMath", {0: du, 1: dv}, operation="CROSS_PRODUCT").outputs[0]
+    rotation = node(
+        "FunctionNodeAxesToRotation",
+        {"Primary Axis": normal, "Secondary Axis": du},
+        primary_axis="Z",
+        secondary_axis="X",
+    ).outputs["Rotation"]
+    placed = node("GeometryNodeSetPosition", {"Geometry": given["Geometry"], "Position": centre}).outputs["Geometry"]
+    volumes = node(
+        "GeometryNodeCollectionInfo", {"Collection": given[VOLUMES], "Separate Children": True, "Reset Children": True}
+    ).outputs["Instances"]
+    instances = node(
+        "GeometryNodeInstanceOnPoints",
+        {
+            "Points": placed,
+            "Selection": attribute(FIRST, "BOOLEAN"),
+            "Instance": volumes,
+            "Pick Instance": True,
+            "Instance Index": attribute(PICK, "INT"),
+            "Rotation": rotation,
+            "Scale": attribute(GROWTH, "FLOAT_VECTOR"),
+        },
+    )
+    output = node("NodeGroupOutput")
+    tree.links.new(instances.outputs["Instances"], output.inputs["Geometry"])
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

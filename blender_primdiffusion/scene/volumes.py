@@ -15,7 +15,8 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .human_file import VOXELS
+from .files import VolumeWriteError
+from .human_npz import VOXELS
 
 WINDOW_EXPONENT = 8
 FAINTEST = 0.05
@@ -29,10 +30,6 @@ _NEXT_TO_NOTHING = 1e-4
 """Opacity per metre of the one voxel of an empty primitive: Cycles complains of grids without any value."""
 _ALL_ACTIVE = -1.0
 """A tolerance no difference from the background is below: zeros become active voxels too."""
-
-
-class VolumeWriteError(OSError):
-    """VDB files could not be written; nothing was left behind."""
 
 
 @dataclasses.dataclass(frozen=True)

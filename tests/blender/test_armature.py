@@ -9,10 +9,15 @@ import synthetic
 from oracle import TOLERANCE_M, Z_UP, blended_vertices
 
 from blender_primdiffusion.scene.armature import build_armature, pose_from_joint_rotations
-from blender_primdiffusion.scene.body_mesh import build_body_mesh
-from blender_primdiffusion.scene.convention import frames_to_blender, points_to_blender, rotations_to_blender
+from blender_primdiffusion.scene.build import build_body_mesh
+from blender_primdiffusion.scene.convention import (
+    continuous_quaternions,
+    frames_to_blender,
+    matrix_to_quaternion,
+    points_to_blender,
+    rotations_to_blender,
+)
 from blender_primdiffusion.scene.keyframes import keyframe_poses
-from blender_primdiffusion.scene.quaternion import continuous_quaternions, matrix_to_quaternion
 
 
 @pytest.fixture

@@ -15,7 +15,8 @@ import synthetic
 from blender_primdiffusion.motion.pose_library import builtin_poses, current_pose
 from blender_primdiffusion.motion.rotation import from_axis_angle
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.human import MARK, armature_of, humans, person_file, volume_path
+from blender_primdiffusion.scene.files import person_file, volume_path
+from blender_primdiffusion.scene.human import MARK, armature_of, humans
 from blender_primdiffusion.ui.assets.panel import PRIMDIFFUSION_PT_assets
 from blender_primdiffusion.ui.assets.thumbnails import SIDE, clay_figure, picture_of_file
 

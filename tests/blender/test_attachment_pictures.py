@@ -14,7 +14,7 @@ from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import MODES, set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of
-from blender_primdiffusion.scene.merged import Grid, MergedState, merged_folder, publish, show_merged, write_grid
+from blender_primdiffusion.scene.merged import MergedGrid, MergedState, merged_folder, publish, show_merged, write_grid
 from blender_primdiffusion.scene.preview import setup_cycles_preview
 
 COUNT = 6
@@ -39,16 +39,16 @@ def render(path) -> np.ndarray:
     return np.array(image.pixels[:]).reshape(image.size[1], image.size[0], 4)[::-1]
 
 
-def box_grid(voxel: float, low: tuple, high: tuple, density: float, colour: tuple) -> Grid:
+def box_grid(voxel: float, low: tuple, high: tuple, density: float, colour: tuple) -> MergedGrid:
     """One even box [low, high] in the armature's space, metres, on voxel faces, with an empty rim."""
     cells = np.round((np.array(high) - low) / voxel).astype(int)
     filled = np.zeros(cells + 4, np.float16)
     filled[2:-2, 2:-2, 2:-2] = density
     origin = np.array(low) - 1.5 * voxel
-    return Grid(filled, np.broadcast_to(np.float16(colour), (*filled.shape, 3)), origin, voxel)
+    return MergedGrid(filled, np.broadcast_to(np.float16(colour), (*filled.shape, 3)), origin, voxel)
 
 
-def show_grid(person, grid: Grid, tmp_path) -> None:
+def show_grid(person, grid: MergedGrid, tmp_path) -> None:
     digest = write_grid(grid, tmp_path / "grid.vdb")
     files = publish([tmp_path / "grid.vdb"], [digest], merged_folder(person))
     show_merged(person, files, MergedState(("",), grid.voxel))

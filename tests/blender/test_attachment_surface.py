@@ -13,13 +13,11 @@ from oracle import Z_UP, blended_frames, blended_vertices, evaluated_matrices
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import ATTACHMENT, attachment_of, set_attachment
-from blender_primdiffusion.scene.body_mesh import body_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.duplicate import duplicate_human
-from blender_primdiffusion.scene.human import armature_of, folder_of, humans
-from blender_primdiffusion.scene.shape import volumes_of
-from blender_primdiffusion.scene.surface import carrier_of
-from blender_primdiffusion.scene.surface_nodes import GROUP_NAME
+from blender_primdiffusion.scene.files import folder_of
+from blender_primdiffusion.scene.human import armature_of, body_of, humans, volumes_of
+from blender_primdiffusion.scene.surface import GROUP_NAME, carrier_of
 
 COUNT = 12
 

@@ -19,9 +19,8 @@ import synthetic_shape
 from jobs_driven import drive
 from test_missing_volumes import write_person
 
-from blender_primdiffusion.scene.body_mesh import body_of
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import armature_of, humans
+from blender_primdiffusion.scene.human import armature_of, body_of, humans
 from blender_primdiffusion.ui.generate.work import GenerateWork
 from blender_primdiffusion.ui.human.edit_work import VaryWork
 from blender_primdiffusion.ui.jobs.queue import queue

@@ -14,7 +14,8 @@ import pytest
 import synthetic
 
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, NO_BACKEND, UNUSABLE
-from blender_primdiffusion.scene.human import armature_of, humans, person_file, volume_path
+from blender_primdiffusion.scene.files import person_file, volume_path
+from blender_primdiffusion.scene.human import armature_of, humans
 from blender_primdiffusion.ui.batch.asking import NoBackend, ask
 from blender_primdiffusion.ui.batch.command import execute
 from blender_primdiffusion.worker.environment import BackendNotFound

@@ -12,11 +12,10 @@ import synthetic_shape
 from blender_primdiffusion.scene import beforehand, build
 from blender_primdiffusion.scene.beforehand import Place
 from blender_primdiffusion.scene.build import build_human, build_written, home_of_next
-from blender_primdiffusion.scene.grid_warming import read_grids
-from blender_primdiffusion.scene.human import folder_of, volume_path
-from blender_primdiffusion.scene.human_file import HumanFileError
+from blender_primdiffusion.scene.files import VolumeWriteError, folder_of, volume_path
+from blender_primdiffusion.scene.grid_cache import read_grids
+from blender_primdiffusion.scene.human_npz import HumanFileError
 from blender_primdiffusion.scene.shape import shape_model_of
-from blender_primdiffusion.scene.volumes import VolumeWriteError
 
 
 def written_at_once(human_npz: Path, place: Place) -> beforehand.Written:

@@ -12,7 +12,8 @@ from jobs_driven import drive, error_of, notice_of
 
 import blender_primdiffusion
 from blender_primdiffusion.scene import volumes
-from blender_primdiffusion.scene.human import folder_of, humans, person_file, volume_path
+from blender_primdiffusion.scene.files import folder_of, person_file, volume_path
+from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.shape import shape_model_of
 from blender_primdiffusion.ui.generate.work import GenerateWork
 from blender_primdiffusion.ui.jobs import follow as follow_module

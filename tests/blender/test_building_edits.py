@@ -14,7 +14,8 @@ from jobs_driven import drive, error_of, notice_of
 
 import blender_primdiffusion
 from blender_primdiffusion.scene import volumes
-from blender_primdiffusion.scene.human import MARK, folder_of, humans, person_file, remove_human, volume_path
+from blender_primdiffusion.scene.files import folder_of, person_file, volume_path
+from blender_primdiffusion.scene.human import MARK, humans, remove_human
 from blender_primdiffusion.scene.missing import missing_files
 from blender_primdiffusion.ui.files.works import RegenerateWork, RestoreWork, made_from_seed
 from blender_primdiffusion.ui.human.edit_work import RedressWork, VaryWork
@@ -288,7 +289,7 @@ def test_a_damaged_answer_is_told_and_leaves_scene_and_disk_as_they_were(person,
 
 def test_a_failure_in_the_scene_leaves_no_files(varied, tmp_path, monkeypatch):
     before = {path.name for path in shown(varied).values()}
-    monkeypatch.setattr("blender_primdiffusion.scene.edited.named_by_content", lambda _: 1 / 0)
+    monkeypatch.setattr("blender_primdiffusion.scene.edit.named_by_content", lambda _: 1 / 0)
     drive()
     assert error_of("vary")
     assert {path.name for path in (tmp_path / "shot_humans").rglob("*.vdb")} == before

@@ -11,7 +11,8 @@ from unittest.mock import MagicMock
 import bpy
 import pytest
 
-from blender_primdiffusion.scene.human import humans, person_file
+from blender_primdiffusion.scene.files import person_file
+from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui.generate import attributes
 from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_attributes
 from blender_primdiffusion.ui.human import edit_settings

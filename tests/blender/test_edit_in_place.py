@@ -12,13 +12,12 @@ import synthetic
 from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.body_mesh import body_of
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.collect import collect_before_saving
-from blender_primdiffusion.scene.edited import check_editable, replace_person, unused
-from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, folder_of, human_of, humans, person_file
-from blender_primdiffusion.scene.human_file import HumanFileError
-from blender_primdiffusion.scene.volumes import VolumeWriteError
+from blender_primdiffusion.scene.collect import collect_before_saving, unused
+from blender_primdiffusion.scene.edit import replace_person
+from blender_primdiffusion.scene.files import VolumeWriteError, folder_of, person_file
+from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of, check_editable, human_of, humans
+from blender_primdiffusion.scene.human_npz import HumanFileError
 
 COUNT = 12
 TALLER = 1.1

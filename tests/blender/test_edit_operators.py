@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
-from blender_primdiffusion.scene.body_mesh import body_of
-from blender_primdiffusion.scene.human import armature_of, humans, person_file, remove_human
-from blender_primdiffusion.scene.painted import painted_weights
+from blender_primdiffusion.scene.files import person_file
+from blender_primdiffusion.scene.human import armature_of, body_of, humans, remove_human
+from blender_primdiffusion.scene.painting import painted_weights
 from blender_primdiffusion.ui.human import edit_operators, edit_panel
 from blender_primdiffusion.ui.human.edit_work import VaryWork
 from blender_primdiffusion.ui.jobs.follow import follow

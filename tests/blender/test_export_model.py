@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import synthetic
 
-from blender_primdiffusion.scene.exported_model import Frames, write_model
-from blender_primdiffusion.scene.exported_proxy import build_proxy, read_proxy, remove_proxy
+from blender_primdiffusion.scene.export_model import FrameRange, write_model
 from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.keyframes import keyframe_poses
+from blender_primdiffusion.scene.proxy import build_proxy, read_proxy, remove_proxy
 
 EXACT = 1e-4
 """Metres."""
@@ -71,7 +71,7 @@ def textures(mesh):
     return [node.image for node in nodes if node.type == "TEX_IMAGE" and node.image]
 
 
-@pytest.mark.parametrize("frames", [Frames(1, 4), Frames(3, 3)], ids=["animation", "pose"])
+@pytest.mark.parametrize("frames", [FrameRange(1, 4), FrameRange(3, 3)], ids=["animation", "pose"])
 @pytest.mark.parametrize(("kind", "ending"), [("GLB", ".glb"), ("FBX", ".fbx"), ("USD", ".usdc"), ("USD", ".usdz")])
 def test_joints_and_surface_are_where_they_were(moving, store, tmp_path, kind, ending, frames):
     armature = armature_of(moving)
@@ -100,7 +100,7 @@ def test_exporting_leaves_the_scene_as_it_was(moving, store, tmp_path):
     bpy.context.scene.frame_set(2)
     kinds = ("scenes", "objects", "meshes", "armatures", "actions", "materials", "images", "collections")
     before = {kind: {thing.name for thing in getattr(bpy.data, kind)} for kind in kinds}
-    write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", Frames(1, 4))
+    write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", FrameRange(1, 4))
     assert {kind: {thing.name for thing in getattr(bpy.data, kind)} for kind in kinds} == before
     assert bpy.context.scene.frame_current == 2
     assert armature.hide_viewport
@@ -113,7 +113,7 @@ def test_an_exporter_that_is_disabled_is_enabled_for_the_moment(moving, store, t
     proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
     addon_utils.disable("io_scene_fbx")
     try:
-        write_model(bpy.context, armature_of(moving), proxy, tmp_path / "a.fbx", "FBX", Frames(1, 2))
+        write_model(bpy.context, armature_of(moving), proxy, tmp_path / "a.fbx", "FBX", FrameRange(1, 2))
         assert (tmp_path / "a.fbx").is_file()
         assert not addon_utils.check("io_scene_fbx")[1]
     finally:
@@ -125,11 +125,11 @@ def test_an_armature_in_edit_mode_or_without_a_bone_is_refused(moving, store, tm
     armature = armature_of(moving)
     armature.data.bones["head"].name = "skull"
     with pytest.raises(ValueError, match="no bone 'head'"):
-        write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", Frames(1, 1))
+        write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", FrameRange(1, 1))
     armature.data.bones["skull"].name = "head"
     bpy.ops.object.mode_set(mode="EDIT")
     with pytest.raises(ValueError, match="Edit Mode"):
-        write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", Frames(1, 1))
+        write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", FrameRange(1, 1))
     assert not (tmp_path / "a.glb").exists()
 
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import synthetic
 
-from blender_primdiffusion.scene.exported_human import read_tensors
-from blender_primdiffusion.scene.exported_proxy import proxy_of
 from blender_primdiffusion.scene.human import BETAS, armature_of, humans
+from blender_primdiffusion.scene.human_file import read_tensors
 from blender_primdiffusion.scene.keyframes import keyframe_poses
+from blender_primdiffusion.scene.proxy import proxy_of
 from blender_primdiffusion.scene.surface import primitives_of
 
 OPERATORS = bpy.ops.primdiffusion

@@ -13,7 +13,8 @@ import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 import blender_primdiffusion
-from blender_primdiffusion.scene.human import folder_of, humans
+from blender_primdiffusion.scene.files import folder_of
+from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui.generate.operators import PRIMDIFFUSION_OT_generate
 from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_generate
 from blender_primdiffusion.ui.generate.work import GenerateWork

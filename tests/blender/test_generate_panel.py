@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from jobs_driven import drive, shown
 
-from blender_primdiffusion.scene.beside import GAP_M
-from blender_primdiffusion.scene.human import armature_of, humans, person_file
+from blender_primdiffusion.scene.build import GAP_M
+from blender_primdiffusion.scene.files import person_file
+from blender_primdiffusion.scene.human import armature_of, humans
 from blender_primdiffusion.scene.preview import posed_extent
 from blender_primdiffusion.ui.generate import operators, panel, presets, settings
 from blender_primdiffusion.ui.jobs.queue import queue

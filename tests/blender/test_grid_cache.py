@@ -7,8 +7,9 @@ import psutil
 import synthetic
 
 from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.files import volume_path
 from blender_primdiffusion.scene.grid_cache import free_unused_grids, read_headers
-from blender_primdiffusion.scene.human import armature_of, volume_path
+from blender_primdiffusion.scene.human import armature_of
 
 
 def _resident_mb() -> float:

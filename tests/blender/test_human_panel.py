@@ -14,14 +14,14 @@ from jobs_driven import shown
 from oracle import evaluated_matrices
 
 from blender_primdiffusion.scene.attachment import set_attachment
-from blender_primdiffusion.scene.body_mesh import body_of
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, folder_of, humans, person_file
+from blender_primdiffusion.scene.files import folder_of, person_file
+from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of, humans
 from blender_primdiffusion.scene.keyframes import keyframe_poses
-from blender_primdiffusion.scene.node_inputs import node_inputs
-from blender_primdiffusion.scene.shape import betas_of, generated_betas, reshape, shape_model_of
-from blender_primdiffusion.scene.shape_measures import measure
-from blender_primdiffusion.scene.shape_names import slider_names
+from blender_primdiffusion.scene.reshape import reshape
+from blender_primdiffusion.scene.shape import betas_of, generated_betas, shape_model_of
+from blender_primdiffusion.scene.shape_model import measure, slider_names
+from blender_primdiffusion.scene.surface import node_inputs
 from blender_primdiffusion.ui.human.panel import PRIMDIFFUSION_MT_people, PRIMDIFFUSION_PT_human
 from blender_primdiffusion.ui.human.shape_operators import PRIMDIFFUSION_OT_random_shape
 from blender_primdiffusion.ui.human.shape_panel import PRIMDIFFUSION_PT_details, PRIMDIFFUSION_PT_shape

@@ -12,7 +12,8 @@ import bpy
 import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
-from blender_primdiffusion.scene.human import humans, person_file
+from blender_primdiffusion.scene.files import person_file
+from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_generate
 from blender_primdiffusion.ui.generate.work import GenerateWork
 from blender_primdiffusion.ui.jobs import follow as follow_module

@@ -11,8 +11,8 @@ import pytest
 import synthetic_shape
 
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.exported_model import Frames
-from blender_primdiffusion.scene.human import person_file
+from blender_primdiffusion.scene.export_model import FrameRange
+from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.ui.assets.work import HumanAssetWork, PoseAssetWork
 from blender_primdiffusion.ui.captures.reconstruct_work import ReconstructWork
 from blender_primdiffusion.ui.export.mesh_work import AddProxyWork, ExportMeshWork
@@ -51,7 +51,7 @@ def works_about(person: bpy.types.Collection, folder: Path) -> list[Work]:
         MergeWork(target, moment, 0.006),
         MergeFramesWork(target, [moment, moment], 5, 0.006),
         FitGainWork(target, moment),
-        ExportMeshWork(target, 512, 9000, folder / "ä.glb", "GLB", Frames(1, 3)),
+        ExportMeshWork(target, 512, 9000, folder / "ä.glb", "GLB", FrameRange(1, 3)),
         AddProxyWork(target, 512, 9000),
         ExportGaussiansWork(target, folder / "ä.ply", posed_now(context, person), 500),
         ExportVdbSequenceWork(target, folder, "ä", posed_frames(context, person, range_), 1, 0.01),

@@ -19,10 +19,9 @@ from blender_primdiffusion.engine.people import posed_people
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_files
-from blender_primdiffusion.scene.folders import humans_folder
-from blender_primdiffusion.scene.human import MARK, armature_of, folder_of, humans, person_file, volume_path
+from blender_primdiffusion.scene.files import VolumeWriteError, folder_of, humans_folder, person_file, volume_path
+from blender_primdiffusion.scene.human import MARK, armature_of, humans
 from blender_primdiffusion.scene.missing import missing_files
-from blender_primdiffusion.scene.volumes import VolumeWriteError
 
 ops = bpy.ops.primdiffusion
 COUNT = 6
@@ -362,7 +361,7 @@ def test_purging_and_packing_take_nothing_away(person):
 def test_a_full_disk_while_saving_or_collecting_leaves_people_as_they_are(person, tmp_path, monkeypatch):
     import errno
 
-    from blender_primdiffusion.scene import placing_files
+    from blender_primdiffusion.scene import files
 
     where, other = places(person), tmp_path / "other"
     other.mkdir()
@@ -375,7 +374,7 @@ def test_a_full_disk_while_saving_or_collecting_leaves_people_as_they_are(person
             raise OSError(errno.ENOSPC, "No space left on device")
         copied.append(copy(source, destination))
 
-    monkeypatch.setattr(placing_files.shutil, "copyfile", full)
+    monkeypatch.setattr(files.shutil, "copyfile", full)
     with pytest.raises(VolumeWriteError, match="free space"):
         collect_files()
     copied.clear()

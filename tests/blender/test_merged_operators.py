@@ -17,11 +17,11 @@ from blender_primdiffusion import places
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import attachment_of
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.gain import density_gain
-from blender_primdiffusion.scene.human import MARK, armature_of, folder_of, humans, remove_human, volume_path
+from blender_primdiffusion.scene.files import folder_of, sequence_files, volume_path
+from blender_primdiffusion.scene.human import MARK, armature_of, humans, remove_human
 from blender_primdiffusion.scene.keyframes import keyframe_poses
-from blender_primdiffusion.scene.material import DENSITY_GAIN
-from blender_primdiffusion.scene.merged import merged_of, merged_state, sequence_files
+from blender_primdiffusion.scene.material import DENSITY_GAIN, density_gain
+from blender_primdiffusion.scene.merged import merged_of, merged_state
 from blender_primdiffusion.ui.jobs.queue import queue
 from blender_primdiffusion.ui.jobs.target import Target
 from blender_primdiffusion.ui.render import panel

@@ -9,15 +9,19 @@ import synthetic
 
 from blender_primdiffusion.scene.attachment import attachment_before_merge, attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.collect import collect_before_saving
+from blender_primdiffusion.scene.collect import collect_before_saving, unused
 from blender_primdiffusion.scene.duplicate import duplicate_human
-from blender_primdiffusion.scene.edited import unused
-from blender_primdiffusion.scene.gain import density_gain, person_material, set_density_gain
-from blender_primdiffusion.scene.human import folder_of, volume_path
-from blender_primdiffusion.scene.material import DENSITY_GAIN, volume_material
-from blender_primdiffusion.scene.memory import person_memory
+from blender_primdiffusion.scene.files import VolumeWriteError, folder_of, sequence_files, volume_path
+from blender_primdiffusion.scene.grid_cache import person_memory
+from blender_primdiffusion.scene.material import (
+    DENSITY_GAIN,
+    density_gain,
+    person_material,
+    set_density_gain,
+    volume_material,
+)
 from blender_primdiffusion.scene.merged import (
-    Grid,
+    MergedGrid,
     MergedState,
     index_to_local,
     merged_folder,
@@ -27,23 +31,21 @@ from blender_primdiffusion.scene.merged import (
     publish,
     read_grid,
     remove_merged,
-    sequence_files,
     show_merged,
     write_grid,
 )
-from blender_primdiffusion.scene.volumes import VolumeWriteError
 
 bpy.utils.expose_bundled_modules()
 import openvdb  # noqa: E402
 
 
-def grid(seed: int = 0) -> Grid:
+def grid(seed: int = 0) -> MergedGrid:
     rng = np.random.default_rng(seed)
     density = np.zeros((20, 12, 9), np.float16)
     density[3:15, 2:10, 2:7] = rng.uniform(1, 90, (12, 8, 5))
     colour = np.zeros((20, 12, 9, 3), np.float16)
     colour[2:16, 1:11, 1:8] = rng.uniform(0.1, 1, (14, 10, 7, 3))
-    return Grid(density, colour, np.array([-0.3, 0.2, 0.6]), 0.02)
+    return MergedGrid(density, colour, np.array([-0.3, 0.2, 0.6]), 0.02)
 
 
 @pytest.fixture
@@ -231,7 +233,7 @@ def test_memory_is_what_openvdb_says_of_the_loaded_grids(person):
 def test_missing_files_take_no_memory(person):
     for path in folder_of(person).glob("prim_*.vdb"):
         path.rename(path.with_suffix(".gone"))
-    from blender_primdiffusion.scene import memory
+    from blender_primdiffusion.scene import grid_cache
 
-    memory._of.cache_clear()
+    grid_cache._memory_of.cache_clear()
     assert person_memory(person).files == 0

@@ -13,7 +13,8 @@ import synthetic_shape
 from jobs_driven import shown
 
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import HOME, MARK, folder_of, humans, person_file, volume_path
+from blender_primdiffusion.scene.files import HOME, folder_of, person_file, volume_path
+from blender_primdiffusion.scene.human import MARK, humans
 from blender_primdiffusion.scene.missing import missing_files
 from blender_primdiffusion.ui.files.watching import look, state
 from blender_primdiffusion.ui.human.panel import PRIMDIFFUSION_PT_human

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import synthetic_shape
 
-from blender_primdiffusion.scene import overlap_now
+from blender_primdiffusion.scene import overlap
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import MARK, overlap_warning
-from blender_primdiffusion.scene.human_file import read_human
-from blender_primdiffusion.scene.overlap import most_overlapping
-from blender_primdiffusion.scene.overlap_now import overlapping_now
-from blender_primdiffusion.scene.shape import generated_betas, reshape
+from blender_primdiffusion.scene.human import MARK
+from blender_primdiffusion.scene.human_npz import read_human
+from blender_primdiffusion.scene.overlap import most_overlapping, overlap_warning, overlapping_now
+from blender_primdiffusion.scene.reshape import reshape
+from blender_primdiffusion.scene.shape import generated_betas
 from blender_primdiffusion.scene.volumes import bake
 from blender_primdiffusion.ui.human.shape_panel import details
 
@@ -64,7 +64,7 @@ def test_the_count_is_that_of_the_shape_of_now(person, source):
 
 def test_volumes_are_counted_once_for_each_shape(person, monkeypatch):
     asked = []
-    monkeypatch.setattr(overlap_now, "most_overlapping", lambda *boxes: asked.append(boxes) or 50)
+    monkeypatch.setattr(overlap, "most_overlapping", lambda *boxes: asked.append(boxes) or 50)
     reshape(person, small(person))
     bpy.context.view_layer.update()
     assert "up to 50 volumes" in overlap_warning(person)
@@ -80,7 +80,7 @@ def test_volumes_that_blender_has_not_read_are_not_read_to_be_counted(person, mo
     reshape(person, small(person))
     next(thing for thing in person.all_objects if thing.type == "VOLUME").hide_viewport = True
     bpy.context.view_layer.update()
-    monkeypatch.setattr(overlap_now, "most_overlapping", lambda *_: 1 / 0)
+    monkeypatch.setattr(overlap, "most_overlapping", lambda *_: 1 / 0)
     assert overlapping_now(person) == json.loads(person[MARK])["most_overlapping"]
 
 

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import synthetic_shape
 
-from blender_primdiffusion.scene.body_mesh import body_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.edited import replace_person
-from blender_primdiffusion.scene.exported_proxy import build_proxy, is_outdated, proxy_of, read_proxy, shown_betas
-from blender_primdiffusion.scene.shape import betas_of, generated_betas, reshape
+from blender_primdiffusion.scene.edit import replace_person
+from blender_primdiffusion.scene.human import body_of
+from blender_primdiffusion.scene.proxy import build_proxy, is_outdated, proxy_of, read_proxy, shown_betas
+from blender_primdiffusion.scene.reshape import reshape
+from blender_primdiffusion.scene.shape import betas_of, generated_betas
 from blender_primdiffusion.ui.export.mesh_work import AddProxyWork
 from blender_primdiffusion.ui.jobs.target import Target
 

@@ -10,8 +10,8 @@ ROOT = Path(__file__).parents[2]
 MOST_MODULES = 120
 """Of ours. Each costs about half a millisecond; what works, as against what is drawn, is imported when asked for."""
 LATE = (
-    "scene.build", "scene.edited", "scene.merged", "scene.shape", "scene.shape_model", "scene.surface", "scene.volumes",
-    "scene.human_file", "scene.memory", "scene.collect", "scene.exported_human", "scene.exported_proxy",
+    "scene.build", "scene.edit", "scene.merged", "scene.shape", "scene.shape_model", "scene.surface", "scene.volumes",
+    "scene.human_npz", "scene.grid_cache", "scene.collect", "scene.human_file", "scene.proxy", "scene.reshape",
     "capture.settings", "formats.camera_rig", "motion.poses", "engine.viewport", "engine.studio", "worker.client",
     "worker.environment", "worker.job", "worker.kept_works", "ui.generate.work", "ui.human.edit_work",
 )  # fmt: skip

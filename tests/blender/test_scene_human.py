@@ -15,21 +15,13 @@ from oracle import TOLERANCE_M, blended_frames, evaluated_matrices
 
 from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.attach import attach_volumes
-from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.build import attach_volumes, build_human
 from blender_primdiffusion.scene.collect import collect_before_saving
-from blender_primdiffusion.scene.human import (
-    MARK,
-    armature_of,
-    folder_of,
-    humans,
-    overlap_warning,
-    overlap_warning_in,
-    remove_human,
-)
-from blender_primdiffusion.scene.human_file import HumanFileError
+from blender_primdiffusion.scene.files import VolumeWriteError, folder_of
+from blender_primdiffusion.scene.human import MARK, armature_of, humans, remove_human
+from blender_primdiffusion.scene.human_npz import HumanFileError
 from blender_primdiffusion.scene.keyframes import keyframe_poses
-from blender_primdiffusion.scene.volumes import VolumeWriteError
+from blender_primdiffusion.scene.overlap import overlap_warning, overlap_warning_in
 
 KINDS = ("objects", "collections", "volumes", "meshes", "armatures", "materials", "actions")
 

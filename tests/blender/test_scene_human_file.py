@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import synthetic
 
-from blender_primdiffusion.scene.human_file import HumanFileError, read_human
+from blender_primdiffusion.scene.human_npz import HumanFileError, read_human
 
 SPOILED = {
     "NaN or infinite": {"density": np.full((4, 8, 8, 8), np.nan, np.float32)},

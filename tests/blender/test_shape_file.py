@@ -9,14 +9,12 @@ import synthetic
 import synthetic_shape
 
 from blender_primdiffusion.scene import build
-from blender_primdiffusion.scene.attach import attach_volumes
-from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.collect import collect_before_saving
-from blender_primdiffusion.scene.edited import unused
-from blender_primdiffusion.scene.human import folder_of, humans, remove_human
-from blender_primdiffusion.scene.human_file import HumanFileError, read_human
-from blender_primdiffusion.scene.shape import shape_model_of
-from blender_primdiffusion.scene.shape_file import read
+from blender_primdiffusion.scene.build import attach_volumes, build_human
+from blender_primdiffusion.scene.collect import collect_before_saving, unused
+from blender_primdiffusion.scene.files import folder_of
+from blender_primdiffusion.scene.human import humans, remove_human
+from blender_primdiffusion.scene.human_npz import HumanFileError, read_human
+from blender_primdiffusion.scene.shape import read_body_file, shape_model_of
 from blender_primdiffusion.scene.shape_model import FIELDS
 
 SPOILED = {
@@ -86,7 +84,7 @@ def test_a_person_of_an_earlier_version_is_told_to_be_generated_again(saved_scen
 def test_a_missing_or_damaged_file_is_named_with_what_to_do(person):
     path = body_file(person)
     whole = path.read_bytes()
-    read.cache_clear()
+    read_body_file.cache_clear()
     path.write_bytes(whole[:1000])
     with pytest.raises(ValueError, match=r"body_.*damaged.*generate the person again"):
         shape_model_of(person)
@@ -125,5 +123,5 @@ def test_saving_for_the_first_time_brings_the_file_along(empty_scene, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "shöt of two.blend"))
     (person,) = humans(bpy.context.scene)
     assert body_file(person).parent == tmp_path / "shöt of two_humans"
-    read.cache_clear()
+    read_body_file.cache_clear()
     assert shape_model_of(person).template.shape == (736, 3)

@@ -13,14 +13,14 @@ from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matr
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import set_attachment
-from blender_primdiffusion.scene.body_mesh import body_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.edited import replace_person
-from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, humans
+from blender_primdiffusion.scene.duplicate import rename_human
+from blender_primdiffusion.scene.edit import replace_person
+from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of, humans
 from blender_primdiffusion.scene.keyframes import keyframe_poses
-from blender_primdiffusion.scene.rename import rename_human
-from blender_primdiffusion.scene.shape import betas_of, generated_betas, keeps_own_shape, reshape
+from blender_primdiffusion.scene.reshape import reshape
+from blender_primdiffusion.scene.shape import betas_of, generated_betas, keeps_own_shape
 from blender_primdiffusion.scene.surface import build_surface
 
 COUNT = 12

@@ -19,9 +19,8 @@ from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.primitives import K, Payload
 from primdiffusion.reshaping import box_growth
 
-from blender_primdiffusion.scene.human_file import read_human
-from blender_primdiffusion.scene.shape_measures import betas_of_measures, measure
-from blender_primdiffusion.scene.shape_names import slider_names
+from blender_primdiffusion.scene.human_npz import read_human
+from blender_primdiffusion.scene.shape_model import betas_of_measures, measure, slider_names
 
 SHAPES = np.random.default_rng(4).normal(0, 1.2, (4, 10))
 

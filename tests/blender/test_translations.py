@@ -6,7 +6,7 @@ import bpy
 import pytest
 from shown_words import said_by_blender
 
-from blender_primdiffusion.scene.shape_names import BETAS
+from blender_primdiffusion.scene.human import BETA_COUNT
 from blender_primdiffusion.ui import translations
 
 SAME = frozenset(
@@ -31,7 +31,7 @@ def composed() -> set[str]:
     from blender_primdiffusion.ui.jobs.remedies import _REMEDIES
     from blender_primdiffusion.ui.variations.operators import _BUILD_ALL
 
-    sliders = {f"Shape {index + 1}" for index in range(BETAS)} | {"Stature", "Shoulders", "Waist", "Girth"}
+    sliders = {f"Shape {index + 1}" for index in range(BETA_COUNT)} | {"Stature", "Shoulders", "Waist", "Girth"}
     facts = {"Rig", "Up Axis", "Frames", "Frame Rate", "Units", "Bones", "Stride"}
     facts |= {"Volumes", "Files", "Memory once drawn"} | {name.capitalize() for name in _SHOWN}
     menus = {item[1] for name in CATEGORIES for item in menu(name)} | set(LIBRARY)

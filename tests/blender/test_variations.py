@@ -9,7 +9,8 @@ import bpy
 import pytest
 from jobs_driven import drive, error_of, shown, until_running
 
-from blender_primdiffusion.scene.human import armature_of, humans, person_file
+from blender_primdiffusion.scene.files import person_file
+from blender_primdiffusion.scene.human import armature_of, humans
 from blender_primdiffusion.ui.jobs.queue import queue
 from blender_primdiffusion.ui.variations import operators, panel
 from blender_primdiffusion.ui.variations.icons import icons

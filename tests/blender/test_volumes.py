@@ -8,16 +8,9 @@ import pytest
 import synthetic
 
 from blender_primdiffusion.scene import volumes
+from blender_primdiffusion.scene.files import VolumeWriteError
 from blender_primdiffusion.scene.overlap import most_overlapping
-from blender_primdiffusion.scene.volumes import (
-    FAINTEST,
-    VolumeWriteError,
-    bake,
-    file_name,
-    index_to_local,
-    window,
-    written,
-)
+from blender_primdiffusion.scene.volumes import FAINTEST, bake, file_name, index_to_local, window, written
 
 bpy.utils.expose_bundled_modules()
 import openvdb  # noqa: E402

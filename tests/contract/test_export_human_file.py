@@ -13,7 +13,7 @@ from export_people import person
 from primdiffusion.human_file import export_for_blender, load_human, save_human
 from primdiffusion.reshaping import reshaped as reshape_in_backend
 
-from blender_primdiffusion.scene.exported_human import (
+from blender_primdiffusion.scene.human_file import (
     HumanMotion,
     motion_in,
     read_tensors,
@@ -21,7 +21,7 @@ from blender_primdiffusion.scene.exported_human import (
     with_motion,
     write_tensors,
 )
-from blender_primdiffusion.scene.human_file import read_human
+from blender_primdiffusion.scene.human_npz import read_human
 
 
 @pytest.fixture

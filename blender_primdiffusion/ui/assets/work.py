@@ -12,7 +12,8 @@ import numpy as np
 from ...formats.joints import JOINT_NAMES
 from ...motion.pose_library import current_pose
 from ...motion.rotation import to_axis_angle
-from ...scene.human import armature_of, person_file
+from ...scene.files import person_file
+from ...scene.human import armature_of
 from ..jobs.target import Target
 from ..jobs.work import Work
 from .marking import POSE_TAG, human_words, mark, pose_action

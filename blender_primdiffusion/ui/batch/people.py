@@ -15,7 +15,7 @@ from ...motion.files import read_motion
 from ...motion.motion import Motion
 from ...scene.armature import pose_from_joint_rotations
 from ...scene.build import build_human
-from ...scene.human import PERSON_FILE as PERSON_FILE
+from ...scene.files import PERSON_FILE as PERSON_FILE
 from ...scene.human import armature_of, humans
 from ...scene.keyframes import keyframe_poses
 from ...scene.preview import frame_box, framing_distance, people_extent, setup_cycles_preview

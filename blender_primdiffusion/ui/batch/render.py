@@ -22,8 +22,8 @@ from ...capture.report import Report
 from ...engine import studio
 from ...engine.engine import ENGINE
 from ...formats.capture_layout import replacing
-from ...scene.folders import humans_folder
-from ...scene.human import humans, volume_path
+from ...scene.files import humans_folder, volume_path
+from ...scene.human import humans
 from ...scene.preview import fit_cycles_to_volumes, new_camera
 from ...worker.backend import Backend
 from .asking import NoBackend, Stopped, ask, backend_of, check_backend, everywhere

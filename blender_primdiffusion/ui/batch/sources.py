@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
-from ...scene.human import PERSON_FILE
+from ...scene.files import PERSON_FILE
 
 PERSON_ENDINGS = (".human.safetensors", ".human")
 

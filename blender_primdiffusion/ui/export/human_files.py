@@ -8,15 +8,16 @@ import bpy
 import numpy as np
 
 from ...motion.skeleton import unchain
-from ...scene.exported_human import HumanMotion, read_tensors, reshaped, with_motion, write_tensors
-from ...scene.exported_model import Frames
-from ...scene.human import person_file
-from ...scene.shape import betas_of, generated_betas, keeps_own_shape, shape_model_of
-from ...scene.shape_file import BODY_FILE
+from ...scene.export_model import FrameRange
+from ...scene.files import person_file
+from ...scene.human_file import HumanMotion, read_tensors, reshaped, with_motion, write_tensors
+from ...scene.shape import BODY_FILE, betas_of, generated_betas, keeps_own_shape, shape_model_of
 from .posing import posed_frames
 
 
-def write_human(context: bpy.types.Context, person: bpy.types.Collection, path: Path, frames: Frames | None) -> None:
+def write_human(
+    context: bpy.types.Context, person: bpy.types.Collection, path: Path, frames: FrameRange | None
+) -> None:
     """Writes the person with the shape they have now, and their motion on `frames`. Raises ValueError or OSError.
 
     The motion is that of the joints in the armature's space, constraints and layers included; where the object stands
@@ -32,7 +33,7 @@ def write_human(context: bpy.types.Context, person: bpy.types.Collection, path: 
     write_tensors(path, with_motion(human, motion))
 
 
-def _motion(context: bpy.types.Context, person: bpy.types.Collection, frames: Frames) -> HumanMotion:
+def _motion(context: bpy.types.Context, person: bpy.types.Collection, frames: FrameRange) -> HumanMotion:
     from ...scene.convention import points_to_backend
     from ...scene.human import armature_of
 

@@ -9,12 +9,10 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...scene.exported_model import Frames, check_ready, write_model
-from ...scene.exported_proxy import build_proxy, proxy_of, read_proxy, remove_proxy
+from ...scene.export_model import FrameRange, check_ready, write_model
 from ...scene.human import armature_of
-from ...scene.proxy_shape import follow_shape
-from ...scene.shape import betas_of
-from ...scene.shape_file import BODY_FILE
+from ...scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy
+from ...scene.shape import BODY_FILE, betas_of
 from ..jobs.target import Target
 from ..jobs.work import Work
 from .showing import show
@@ -57,7 +55,7 @@ class ExportMeshWork(ProxyWork):
 
     path: Path
     format: str
-    frames: Frames
+    frames: FrameRange
 
     @property
     def label(self) -> str:
@@ -86,7 +84,7 @@ class ExportMeshWork(ProxyWork):
     def from_json(cls, kept: dict[str, Any]) -> ExportMeshWork:
         """What `to_json` gave."""
         read = {"target": Target.from_json(kept["target"]), "path": Path(kept["path"])}
-        return cls(**{**kept, **read, "frames": Frames(**kept["frames"])})
+        return cls(**{**kept, **read, "frames": FrameRange(**kept["frames"])})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,8 +120,8 @@ class AddProxyWork(ProxyWork):
         return cls(**{**kept, "target": Target.from_json(kept["target"])})
 
 
-def scene_frames(scene: bpy.types.Scene, animated: bool) -> Frames:
+def scene_frames(scene: bpy.types.Scene, animated: bool) -> FrameRange:
     """The scene's range, or the current frame alone."""
     if animated:
-        return Frames(scene.frame_start, scene.frame_end)
-    return Frames(scene.frame_current, scene.frame_current)
+        return FrameRange(scene.frame_start, scene.frame_end)
+    return FrameRange(scene.frame_current, scene.frame_current)

@@ -92,7 +92,7 @@ class PRIMDIFFUSION_OT_export_mesh(_ToFile, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """A format that is not given follows the file's ending."""
-        from ...scene.exported_model import check_ready
+        from ...scene.export_model import check_ready
         from .mesh_work import ExportMeshWork, scene_frames
 
         kind = self.chosen(context, "format")
@@ -119,7 +119,7 @@ class PRIMDIFFUSION_OT_add_proxy(_OfPerson, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """In line."""
-        from ...scene.exported_model import check_ready
+        from ...scene.export_model import check_ready
         from .mesh_work import AddProxyWork
 
         target = Target.of(person)
@@ -156,7 +156,7 @@ class PRIMDIFFUSION_OT_remove_proxy(_OfPerson, bpy.types.Operator):
 
     def act(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """At once."""
-        from ...scene.exported_proxy import proxy_of, remove_proxy
+        from ...scene.proxy import proxy_of, remove_proxy
         from .showing import show
 
         show(person, "VOLUMES")
@@ -277,7 +277,7 @@ class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Look into the file, then put it in line; in background mode this waits for the person."""
-        from ...scene.exported_human import motion_in, read_tensors
+        from ...scene.human_file import motion_in, read_tensors
         from .person_work import ImportHumanWork
 
         path = Path(bpy.path.abspath(self.filepath))

@@ -55,7 +55,7 @@ class PRIMDIFFUSION_PT_export_mesh(_InSidebar, bpy.types.Panel):
             person = selected_person(context)
         except ValueError:
             return
-        from ...scene.exported_proxy import is_outdated, proxy_of
+        from ...scene.proxy import is_outdated, proxy_of
         from ...scene.shape import betas_of
         from .showing import shown
 

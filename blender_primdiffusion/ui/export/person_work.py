@@ -11,10 +11,10 @@ import bpy
 import numpy as np
 
 from ...scene.armature import pose_from_joint_rotations
-from ...scene.exported_human import HumanMotion, motion_in, read_tensors
 from ...scene.human import armature_of
+from ...scene.human_file import HumanMotion, motion_in, read_tensors
 from ...scene.keyframes import keyframe_poses
-from ...scene.merged import Grid, read_grid, write_grid
+from ...scene.merged import MergedGrid, read_grid, write_grid
 from ..jobs.kept_poses import packed, unpacked
 from ..jobs.person import build_person
 from ..jobs.target import Target
@@ -189,7 +189,7 @@ def put(source: Path, target: Path) -> None:
         unfinished.unlink(missing_ok=True)
 
 
-def _as_others_read_it(grid: Grid) -> Grid:
+def _as_others_read_it(grid: MergedGrid) -> MergedGrid:
     """`write_grid` moves grids for old versions of Cycles by half a voxel; files for other programs must not be."""
     shift = 0.5 * grid.voxel if bpy.app.version < (5, 0) else 0.0
     return dataclasses.replace(grid, origin=grid.origin + shift)

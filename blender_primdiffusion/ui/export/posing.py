@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 
 from ...engine.people import posed
-from ...scene.exported_model import alone, check_ready
+from ...scene.export_model import alone, check_ready
 from ...scene.human import armature_of
 
 

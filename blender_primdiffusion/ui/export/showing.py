@@ -9,8 +9,8 @@ from ...scene.attachment import attachment_of, set_attachment
 
 def show(person: bpy.types.Collection, what: str) -> None:
     """Switch to `what` of `settings.SHOWN`. Raises ValueError where there is no proxy; makes no undo step."""
-    from ...scene.exported_proxy import proxy_of
     from ...scene.merged import merged_of
+    from ...scene.proxy import proxy_of
     from ...scene.surface import carrier_of, primitives_of
 
     proxy = proxy_of(person)
@@ -26,7 +26,7 @@ def show(person: bpy.types.Collection, what: str) -> None:
 
 def shown(person: bpy.types.Collection) -> str:
     """Which of `settings.SHOWN` holds now."""
-    from ...scene.exported_proxy import proxy_of
+    from ...scene.proxy import proxy_of
 
     proxy = proxy_of(person)
     if proxy is None or proxy.hide_viewport:

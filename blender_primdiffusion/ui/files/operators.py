@@ -112,7 +112,7 @@ class PRIMDIFFUSION_OT_generate_again(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Put it in line; in background mode this waits for the person."""
-        from ...scene.human import person_file
+        from ...scene.files import person_file
         from .works import RegenerateWork, made_from_seed
 
         try:
@@ -139,7 +139,7 @@ class PRIMDIFFUSION_OT_collect_files(bpy.types.Operator):
     def execute(self, _context: bpy.types.Context) -> set[str]:
         """Tell what was copied."""
         from ...scene.collect import collect_files
-        from ...scene.folders import humans_folder
+        from ...scene.files import humans_folder
 
         try:
             done = collect_files()

@@ -10,10 +10,9 @@ from typing import Any
 import bpy
 
 from ...scene.beforehand import Place
-from ...scene.edited import place_of
+from ...scene.edit import place_of, place_of_lost, restore_volumes, restore_written
 from ...scene.human import MARK
-from ...scene.human_file import read_human
-from ...scene.restored import place_of_lost, restore_volumes, restore_written
+from ...scene.human_npz import read_human
 from ..jobs.building import building
 from ..jobs.person import show_in_place
 from ..jobs.target import Target

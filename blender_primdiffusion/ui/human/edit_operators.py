@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
-from ...scene.body_mesh import body_of
-from ...scene.human import humans, person_file
+from ...scene.files import person_file
+from ...scene.human import body_of, humans
 from ..generate.attributes import asked, parsed
 from ..jobs.follow import submit
 from ..jobs.target import named_person, selected_person
@@ -76,7 +76,7 @@ class _Region:
         self, settings: bpy.types.PropertyGroup, person: bpy.types.Collection
     ) -> list[str] | dict[str, list[float]]:
         """Names of parts, or painted weights [V]."""
-        from ...scene.painted import painted_weights
+        from ...scene.painting import painted_weights
 
         given = self.properties.is_property_set
         if given("vertex_group") or (not given("parts") and settings.region == "PAINTED"):

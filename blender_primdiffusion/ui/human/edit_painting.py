@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ...scene.body_mesh import MARK, body_of
+from ...scene.human import BODY_MARK, body_of
 from ..jobs.target import selected_person
 
 
@@ -17,7 +17,7 @@ class PRIMDIFFUSION_OT_paint_region(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """To Weight Paint mode, with the panel's vertex group, made if there is none."""
-        from ...scene.painted import start_painting
+        from ...scene.painting import start_painting
 
         settings = context.scene.primdiffusion_edit
         try:
@@ -48,7 +48,7 @@ class PRIMDIFFUSION_OT_finish_painting(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """The active object is the body mesh."""
-        from ...scene.painted import end_painting
+        from ...scene.painting import end_painting
 
         end_painting(context, context.view_layer.objects.active)
         return {"FINISHED"}
@@ -57,4 +57,4 @@ class PRIMDIFFUSION_OT_finish_painting(bpy.types.Operator):
 def painting(context: bpy.types.Context) -> bool:
     """A person's body mesh is being weight painted."""
     active = context.view_layer.objects.active
-    return active is not None and active.mode == "WEIGHT_PAINT" and MARK in active
+    return active is not None and active.mode == "WEIGHT_PAINT" and BODY_MARK in active

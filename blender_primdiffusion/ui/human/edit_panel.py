@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import bpy
 
-from ...scene.body_mesh import body_of
-from ...scene.human import humans
+from ...scene.human import body_of, humans
 from ...worker.names import SIDED_PARTS, WHOLE_PARTS
 from ..generate.attributes import draw_attributes
 from ..jobs.drawing import draw_job

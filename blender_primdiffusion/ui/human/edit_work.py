@@ -11,8 +11,9 @@ import bpy
 import numpy as np
 
 from ...scene.beforehand import Place
-from ...scene.edited import place_of
-from ...scene.human import overlap_warning_in, person_file
+from ...scene.edit import place_of
+from ...scene.files import person_file
+from ...scene.overlap import overlap_warning_in
 from ...worker.sentence import sentence
 from ..jobs.person import show_in_place
 from ..jobs.target import Target

@@ -70,10 +70,10 @@ class PRIMDIFFUSION_OT_duplicate_human(_Whole, bpy.types.Operator):
 
     def do(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
         """The new person is selected."""
-        from ...scene.beside import stand_beside_others
+        from ...scene.build import stand_beside_others
         from ...scene.duplicate import duplicate_human
-        from ...scene.edited import check_editable
-        from ...scene.painted import leave_mode
+        from ...scene.human import check_editable
+        from ...scene.painting import leave_mode
 
         check_editable(person)
         leave_mode(context)
@@ -102,7 +102,7 @@ class PRIMDIFFUSION_OT_delete_human(_Whole, bpy.types.Operator):
     def do(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
         """Linked people are unlinked by the Outliner, not here: they belong to another file."""
         from ...scene.grid_cache import free_unused_grids
-        from ...scene.painted import leave_mode
+        from ...scene.painting import leave_mode
 
         if person.library is not None:
             raise ValueError(f"the person {person.name!r} is linked: remove them in the Outliner, by Unlink")
@@ -114,7 +114,7 @@ class PRIMDIFFUSION_OT_delete_human(_Whole, bpy.types.Operator):
 
 def select(context: bpy.types.Context, person: bpy.types.Collection) -> None:
     """Make a person's armature active. Raises ValueError for one that cannot be selected in this view layer."""
-    from ...scene.painted import leave_mode
+    from ...scene.painting import leave_mode
 
     armature = armature_of(person)
     if context.view_layer.objects.get(armature.name) != armature:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ...scene.shape_names import BETAS
+from ...scene.human import BETA_COUNT
 from ..jobs.target import named_person, selected_person
 from ..translations import CONTEXT
 
@@ -27,7 +27,7 @@ class _Shape:
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Reports why it cannot be done, and what could not follow."""
-        from ...scene.shape import reshape
+        from ...scene.reshape import reshape
 
         try:
             person = named_person(context, self.human) if self.human else selected_person(context)
@@ -51,7 +51,7 @@ class PRIMDIFFUSION_OT_reshape(_Shape, bpy.types.Operator):
     bl_label = "Reshape Human"
 
     betas: bpy.props.FloatVectorProperty(
-        name="Shape", size=BETAS, description="Standard deviations. Not given: as it is", options={"SKIP_SAVE"}
+        name="Shape", size=BETA_COUNT, description="Standard deviations. Not given: as it is", options={"SKIP_SAVE"}
     )
     height: bpy.props.FloatProperty(name="Height (m)", description="Not given: any", options={"SKIP_SAVE"})
     weight: bpy.props.FloatProperty(name="Weight (kg)", description="Not given: any", options={"SKIP_SAVE"})
@@ -61,7 +61,7 @@ class PRIMDIFFUSION_OT_reshape(_Shape, bpy.types.Operator):
         import numpy as np
 
         from ...scene.shape import betas_of, shape_model_of
-        from ...scene.shape_measures import betas_of_measures
+        from ...scene.shape_model import betas_of_measures
 
         given = self.properties.is_property_set
         betas = np.array(self.betas) if given("betas") else betas_of(person)
@@ -107,7 +107,7 @@ class PRIMDIFFUSION_OT_random_shape(_Shape, bpy.types.Operator):
         """Normal, kept within what looks like people."""
         import numpy as np
 
-        drawn = np.random.default_rng(self.seed).normal(0.0, self.spread, BETAS)
+        drawn = np.random.default_rng(self.seed).normal(0.0, self.spread, BETA_COUNT)
         return np.clip(drawn, -_FARTHEST, _FARTHEST)
 
 

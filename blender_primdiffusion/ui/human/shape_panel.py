@@ -41,8 +41,9 @@ class PRIMDIFFUSION_PT_shape(_InHuman, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         """Reads the scene; changes nothing."""
-        from ...scene.shape import check_shapeable, keeps_own_shape, shape_model_of
-        from ...scene.shape_names import slider_names
+        from ...scene.reshape import check_shapeable
+        from ...scene.shape import keeps_own_shape, shape_model_of
+        from ...scene.shape_model import slider_names
 
         layout = self.layout
         layout.use_property_split = True
@@ -94,8 +95,8 @@ class PRIMDIFFUSION_PT_details(_InHuman, bpy.types.Panel):
 
 def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
     """What Details says: names and values."""
-    from ...scene.memory import person_memory
-    from ...scene.overlap_now import overlapping_now
+    from ...scene.grid_cache import person_memory
+    from ...scene.overlap import overlapping_now
 
     provenance = json.loads(person[MARK])
     lines = [(name.capitalize(), f"{provenance[name]}") for name in _SHOWN if provenance.get(name) not in (None, "")]

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ...scene.human import MARK
-from ...scene.shape_names import BETAS, LARGEST_BETA
+from ...scene.human import BETA_COUNT, LARGEST_BETA, MARK
 
 if TYPE_CHECKING:
-    from ...scene.shape_measures import Measures
+    from ...scene.shape_model import Measures
 
 _NOT_ANIMATED: set[str] = set()
 """Options: each frame would move the bones' rest; the custom property with the betas may be animated instead."""
@@ -29,7 +28,7 @@ def person_of(armature: bpy.types.Object) -> bpy.types.Collection:
 def measures_of(armature: bpy.types.Object) -> Measures:
     """Height and weight as the sliders set them. Raises ValueError or FileNotFoundError where these are not known."""
     from ...scene.shape import betas_of, shape_model_of
-    from ...scene.shape_measures import measure
+    from ...scene.shape_model import measure
 
     person = person_of(armature)
     return measure(shape_model_of(person), betas_of(person))
@@ -43,7 +42,7 @@ def _name(self: PRIMDIFFUSION_PG_human) -> str:
 
 
 def _rename(self: PRIMDIFFUSION_PG_human, name: str) -> None:
-    from ...scene.rename import rename_human
+    from ...scene.duplicate import rename_human
 
     _said(lambda: rename_human(person_of(self.id_data), name))
 
@@ -54,19 +53,19 @@ def _betas(self: PRIMDIFFUSION_PG_human) -> Sequence[float]:
     try:
         return betas_of(person_of(self.id_data)).tolist()
     except ValueError:
-        return (0.0,) * BETAS
+        return (0.0,) * BETA_COUNT
 
 
 def _set_betas(self: PRIMDIFFUSION_PG_human, betas: Sequence[float]) -> None:
     import numpy as np
 
-    from ...scene.shape import reshape
+    from ...scene.reshape import reshape
 
     _said(lambda: reshape(person_of(self.id_data), np.clip(list(betas), -LARGEST_BETA, LARGEST_BETA)))
 
 
 def _measure(self: PRIMDIFFUSION_PG_human) -> Measures:
-    from ...scene.shape_measures import Measures
+    from ...scene.shape_model import Measures
 
     try:
         return measures_of(self.id_data)
@@ -95,8 +94,9 @@ def set_measures(person: bpy.types.Collection, height: float | None = None, weig
 
     Raises ValueError where no body does, and as `reshape`.
     """
-    from ...scene.shape import betas_of, reshape, shape_model_of
-    from ...scene.shape_measures import betas_of_measures
+    from ...scene.reshape import reshape
+    from ...scene.shape import betas_of, shape_model_of
+    from ...scene.shape_model import betas_of_measures
 
     return reshape(person, betas_of_measures(shape_model_of(person), betas_of(person), height, weight))
 
@@ -118,7 +118,7 @@ class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
     betas: bpy.props.FloatVectorProperty(
         name="Shape",
         description="How the body differs from the mean one, in standard deviations of people",
-        size=BETAS,
+        size=BETA_COUNT,
         min=-LARGEST_BETA,
         max=LARGEST_BETA,
         soft_min=-3.0,

@@ -23,8 +23,8 @@ files that share the folder, will miss them"""
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
         """Delete them and say how many and how large they were."""
-        from ...scene.edited import unused
-        from ...scene.folders import humans_folder
+        from ...scene.collect import unused
+        from ...scene.files import humans_folder
 
         removed = size = 0
         for path in unused(humans_folder()):

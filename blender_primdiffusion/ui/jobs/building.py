@@ -78,8 +78,7 @@ class Building:
         if written is None or self._read == len(written.files):
             return False  # where it failed, the operator tries again and reports why
         if may_work:
-            from ...scene.grid_cache import free_unused_grids, read_headers
-            from ...scene.grid_warming import read_grids
+            from ...scene.grid_cache import free_unused_grids, read_grids, read_headers
 
             if self._read == 0:
                 if not self._entry.work.new_person:  # those of before; freed later, the new ones would be read twice

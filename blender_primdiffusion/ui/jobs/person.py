@@ -8,11 +8,10 @@ from typing import Any
 
 import bpy
 
-from ...scene.beside import stand_beside_others
-from ...scene.build import build_human, build_written
-from ...scene.edited import Replaced, replace_by_written, replace_person
+from ...scene.build import build_human, build_written, stand_beside_others
+from ...scene.edit import Replaced, replace_by_written, replace_person
 from ...scene.grid_cache import free_unused_grids
-from ...scene.human import overlap_warning_in
+from ...scene.overlap import overlap_warning_in
 from ...worker.sentence import sentence
 from .building import building
 

@@ -14,8 +14,8 @@ import numpy as np
 from ...engine.people import posed
 from ...formats.joints import JOINT_NAMES
 from ...scene.attachment import set_attachment
-from ...scene.gain import set_density_gain
 from ...scene.human import armature_of
+from ...scene.material import set_density_gain
 from ...scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
 from ..jobs.kept_poses import packed, unpacked
 from ..jobs.target import Target

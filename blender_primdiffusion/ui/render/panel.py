@@ -6,8 +6,8 @@ import bpy
 
 from ...engine.engine import ENGINE
 from ...scene.attachment import MODES, attachment_of
-from ...scene.gain import density_gain
-from ...scene.human import humans, overlap_warning
+from ...scene.human import humans
+from ...scene.material import density_gain
 from ...worker.sentence import sentence
 from ..jobs.drawing import draw_job, draw_lines
 from ..jobs.target import selected_person
@@ -104,6 +104,8 @@ class PRIMDIFFUSION_PT_cycles_look(_OfPerson, bpy.types.Panel):
 
     def draw_person(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
         """The gain, and a warning where volumes are dropped."""
+        from ...scene.overlap import overlap_warning  # numpy, which Blender starts without
+
         if density_gain(person) is None:
             draw_lines(self.layout, "The person's material has no node Density Gain", "INFO")
         else:
@@ -122,7 +124,7 @@ class PRIMDIFFUSION_PT_memory(_OfPerson, bpy.types.Panel):
 
     def draw_person(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
         """On disk, and in memory where drawn as volumes; the engine needs none of it."""
-        from ...scene.memory import person_memory
+        from ...scene.grid_cache import person_memory
 
         memory = person_memory(person)
         column = self.layout.column(align=True)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ...scene.gain import density_gain, set_density_gain
-from ...scene.material import DENSITY_GAIN
+from ...scene.material import DENSITY_GAIN, density_gain, set_density_gain
 
 
 class PRIMDIFFUSION_PG_merging(bpy.types.PropertyGroup):

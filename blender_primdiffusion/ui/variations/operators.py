@@ -8,7 +8,6 @@ from typing import Any
 import bpy
 from bpy.app.translations import pgettext_tip
 
-from ...scene.human import overlap_warning_in
 from ...worker.sentence import sentence
 from ..generate.asking import Asking, last_seed
 from ..generate.quality import STEPS_AND_SAMPLER
@@ -145,6 +144,8 @@ class PRIMDIFFUSION_OT_build_variation(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Takes seconds for each; one step of undo for all."""
+        from ...scene.overlap import overlap_warning_in  # numpy, which Blender starts without
+
         try:
             wanted = list(sheet.variations) if self.build_all else _targets(self.index)
         except ValueError as error:
@@ -233,8 +234,7 @@ def _targets(index: int) -> list[Variation]:
 
 def _build(context: bpy.types.Context, wanted: list[Variation]) -> tuple[list[bpy.types.Collection], str]:
     """Whom it could build before something went wrong, and that in a sentence; empty when nothing did."""
-    from ...scene.beside import stand_beside_others
-    from ...scene.build import build_human
+    from ...scene.build import build_human, stand_beside_others
 
     built: list[bpy.types.Collection] = []
     context.window_manager.progress_begin(0, len(wanted))

@@ -1,8 +1,14 @@
-"""The mesh proxy: a person's clothed surface, textured and skinned to their armature."""
+"""The mesh proxy: a human's clothed surface, textured, skinned to the armature; it follows the shape.
+
+Each vertex moves as the body's surface next to it, so clothes keep their distance from the skin. The betas that a proxy
+shows are stored with it and only the difference is added, so edits by hand stay.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import hashlib
 import json
 import shutil
 import tempfile
@@ -11,18 +17,26 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from mathutils.kdtree import KDTree
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from .body_mesh import MARK as BODY_MARK
-from .body_mesh import build_body_mesh
+from .build import build_body_mesh
 from .convention import points_to_blender
-from .human import armature_of, person_file_name
+from .files import person_file_name
+from .human import BODY_MARK, armature_of, own_data
+from .shape import shape_model_of
+from .shape_model import SAME_BETAS, ShapeModel
 
-MARK = "primdiffusion_proxy"
+PROXY_MARK = "primdiffusion_proxy"
 """Custom property of a proxy object: the person's file that it was made of and the shape that it shows, as JSON."""
 _FORMAT_VERSION = 1
 _SHAPES = {"vertices": ("V", 3), "faces": ("F", 3), "uv_corner": ("F", 3, 2), "skin_weights": ("V", 24)}
+NEIGHBOURS = 12
+"""Vertices of the body that one of the proxy follows."""
+REACH = 0.02
+"""Metres farther than the nearest at which another one's say has fallen to a third: seams of folds are not followed."""
+_KEPT = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +91,7 @@ def build_proxy(
     vertices = points_to_blender(proxy.vertices)
     made = build_body_mesh(name, armature_of(collection), vertices, proxy.faces, proxy.uv_corner, proxy.skin_weights)
     del made[BODY_MARK]
-    made[MARK] = json.dumps(_origin(collection, betas))
+    made[PROXY_MARK] = json.dumps(_origin(collection, betas))
     made.hide_viewport = made.hide_render = False
     made.data.materials.append(_material(name, texture))
     return made
@@ -85,12 +99,12 @@ def build_proxy(
 
 def proxy_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
     """The person's proxy that was added to the scene; None where there is none."""
-    return next((thing for thing in collection.all_objects if thing.type == "MESH" and MARK in thing), None)
+    return next((thing for thing in collection.all_objects if thing.type == "MESH" and PROXY_MARK in thing), None)
 
 
 def is_outdated(collection: bpy.types.Collection, proxy: bpy.types.Object, betas: NDArray | None) -> bool:
     """The person was edited since, or has a shape that the proxy could not follow."""
-    made_of, now = json.loads(proxy[MARK]), _origin(collection, betas)
+    made_of, now = json.loads(proxy[PROXY_MARK]), _origin(collection, betas)
     same_shape = (made_of["betas"] is None) == (now["betas"] is None) and (
         now["betas"] is None or np.allclose(made_of["betas"], now["betas"], atol=1e-4)
     )
@@ -99,13 +113,13 @@ def is_outdated(collection: bpy.types.Collection, proxy: bpy.types.Object, betas
 
 def shown_betas(proxy: bpy.types.Object) -> NDArray[np.float64] | None:
     """The shape [10] that a proxy shows; None where that is not known."""
-    betas = json.loads(proxy[MARK])["betas"]
+    betas = json.loads(proxy[PROXY_MARK])["betas"]
     return None if betas is None else np.array(betas, np.float64)
 
 
 def show_betas(proxy: bpy.types.Object, betas: NDArray) -> None:
     """Note that a proxy shows another shape [10]."""
-    proxy[MARK] = json.dumps({**json.loads(proxy[MARK]), "betas": _rounded(betas)})
+    proxy[PROXY_MARK] = json.dumps({**json.loads(proxy[PROXY_MARK]), "betas": _rounded(betas)})
 
 
 def remove_proxy(proxy: bpy.types.Object) -> None:
@@ -118,6 +132,25 @@ def remove_proxy(proxy: bpy.types.Object) -> None:
     for thing in (mesh, *materials, *images):
         if thing.users == 0:
             bpy.data.batch_remove([thing])
+
+
+def follow_shape(collection: bpy.types.Collection, proxy: bpy.types.Object | None, betas: NDArray) -> None:
+    """Move a person's proxy, if there is one, to the body of these betas [10]; at rest, no pose is touched.
+
+    Some tenths of a second for a mesh that was not met before, a few milliseconds afterwards. One that has shape keys,
+    is in Edit Mode or linked from another file stays as it is, and is said to be outdated. Raises as `shape_model_of`.
+    """
+    shown = None if proxy is None else shown_betas(proxy)
+    if proxy is None or shown is None or not _is_free(proxy):
+        return
+    change = np.asarray(betas, np.float64) - shown
+    if np.abs(change).max() <= SAME_BETAS:
+        return
+    model, mesh = shape_model_of(collection), own_data(proxy, collection)
+    moved = _vertices(mesh) + _basis(_Bound(mesh, shown), model) @ change
+    mesh.vertices.foreach_set("co", moved.astype(np.float32).ravel())
+    mesh.update()
+    show_betas(proxy, betas)
 
 
 def _origin(collection: bpy.types.Collection, betas: NDArray | None) -> dict[str, object]:
@@ -148,3 +181,47 @@ def _material(name: str, texture: Path) -> bpy.types.Material:
     shader.inputs["Roughness"].default_value = 0.9
     shader.inputs["Metallic"].default_value = 0.0
     return material
+
+
+class _Bound:
+    """A mesh as it was met first, known by its faces: which vertices of the body it follows is not found twice."""
+
+    def __init__(self, mesh: bpy.types.Mesh, shown: NDArray) -> None:
+        corners = np.empty(len(mesh.loops), np.int32)
+        mesh.loops.foreach_get("vertex_index", corners)
+        self.digest = hashlib.sha256(corners.tobytes()).hexdigest()
+        self.vertices, self.shown = _vertices(mesh), shown
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Bound) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+
+def _is_free(proxy: bpy.types.Object) -> bool:
+    mesh = proxy.data
+    return mesh.shape_keys is None and mesh.library is None and proxy.library is None and not mesh.is_editmode
+
+
+@functools.lru_cache(maxsize=_KEPT)
+def _basis(bound: _Bound, model: ShapeModel) -> NDArray[np.float64]:
+    """What a unit of each shape coefficient adds to the mesh's vertices [V, 3, 10], z up."""
+    body = points_to_blender(model.surface(bound.shown))
+    tree = KDTree(len(body))
+    for index, point in enumerate(body):
+        tree.insert(point, index)
+    tree.balance()
+    found = [tree.find_n(point, NEIGHBOURS) for point in bound.vertices]
+    index = np.array([[one[1] for one in near] for near in found])
+    distance = np.array([[one[2] for one in near] for near in found])
+    weight = np.exp(-(((distance - distance[:, :1]) / REACH) ** 2))
+    weight /= weight.sum(1, keepdims=True)
+    basis = points_to_blender(np.moveaxis(model.shape_basis, -1, 0)).transpose(1, 2, 0)
+    return np.einsum("vn,vnxb->vxb", weight, basis[index])
+
+
+def _vertices(mesh: bpy.types.Mesh) -> NDArray[np.float64]:
+    flat = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", flat)
+    return flat.reshape(-1, 3).astype(np.float64)

@@ -1,43 +1,27 @@
-"""A person after an edit, in the place of the person before it.
+"""Show an edited human in place of the one before, and restore volumes whose files are lost.
 
-Only what differs is touched. Every file that an edit writes has a new name, in the folder of the person's others: the
-volumes' paths and the name of the person's own file are part of the .blend, so undo and redo go back and forth between
-states whose files all stay. `unused` finds those that no state of this .blend as it is now points to.
+Only what differs is touched. Every file that an edit writes has a new name, in the folder of the human's other files:
+the volumes' paths and the name of the human's own file are part of the .blend, so undo and redo switch between states
+whose files all exist.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import re
 from pathlib import Path
 
 import bpy
 import numpy as np
 
-from . import merged, shape_file, volumes
+from . import volumes
 from .beforehand import Baked, Place, Written, bake
-from .exported_proxy import proxy_of
-from .folders import humans_folder, stored_path
-from .grid_warming import read_again
-from .human import MARK, PERSON, armature_of, folder_of, folders_of, people_files, person_file_name, volume_path
-from .placing_files import named_by_content
-from .proxy_shape import follow_shape
-from .shape import (
-    PRIMITIVE,
-    SAME_BETAS,
-    betas_of,
-    check_shapeable,
-    generated_betas,
-    keeps_own_shape,
-    own_data,
-    show_growth,
-    show_rest,
-    volumes_of,
-)
-from .shape_file import body_files, body_kept
-from .shape_model import Rest
-
-_PERSON = re.compile(r"person(_[0-9a-f]{12})?\.human\.safetensors")
+from .files import PERSON, free_name, home_of, named_by_content, person_file_name, stored_path, volume_path
+from .grid_cache import read_again
+from .human import MARK, armature_of, check_editable, own_data, volumes_of
+from .proxy import follow_shape, proxy_of
+from .reshape import check_shapeable, show_growth, show_rest
+from .shape import betas_of, generated_betas, keeps_own_shape, saved_body
+from .shape_model import SAME_BETAS, Rest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,20 +36,6 @@ class Replaced:
     """The body has another shape: bones, body mesh and places of the volumes have moved."""
     warning: str
     """What could not be done, in a sentence; empty otherwise."""
-
-
-def check_editable(collection: bpy.types.Collection) -> None:
-    """Raises ValueError, with what to do, for a person that lives in another .blend or has lost its armature."""
-    armature = armature_of(collection)
-    parts = [collection, armature, armature.data, *(thing.data for thing in collection.all_objects if thing.data)]
-    linked = next((part.library for part in parts if part.library is not None), None)
-    if linked is not None:
-        raise ValueError(
-            f"the person {collection.name!r} is linked from {linked.filepath!r}: edit it there, or make it local with "
-            "Object > Relations > Make Local > All"
-        )
-    if not volumes_of(collection):
-        raise ValueError(f"the person {collection.name!r} has no volumes left; generate a person again")
 
 
 def replace_person(collection: bpy.types.Collection, human_npz: Path, person: Path) -> Replaced:
@@ -116,7 +86,7 @@ def _replace(collection: bpy.types.Collection, baked: Baked, person: Path) -> Re
         files[k] = home / volumes.file_name(grids, k, bpy.app.version)
     name = named_by_content(person)
     missing = [k for k, path in files.items() if not path.is_file()]
-    with volumes.written(grids, home, {name: person}, missing), body_kept(collection, human.shape_model, home.parent):
+    with volumes.written(grids, home, {name: person}, missing), saved_body(collection, human.shape_model, home.parent):
         pass
     rest = Rest(human.vertices, human.joints, human.position, human.rotation)
     warning = show_rest(collection, rest, human.betas, growth) if reshaped else ""
@@ -138,32 +108,59 @@ def _replace(collection: bpy.types.Collection, baked: Baked, person: Path) -> Re
     return Replaced(changed, sum(map(len, shown.values())), reshaped, warning)
 
 
-def unused(folder: Path) -> list[Path]:
-    """Files of people in `folder` that nothing in the .blend, as it is now, points to: of earlier states of people.
+def restore_volumes(collection: bpy.types.Collection, human_npz: Path, person: Path) -> int:
+    """Write the volumes of a person whose files are missing, point to them, and count them.
 
-    Undo may still want them, and so may other .blend files that share the folder.
+    `human_npz` is what the backend has made of its file `person` of them. Everything else of the person stays: pose,
+    shape, names, and volumes that have their files. The backend's and the body's files are put back too. Raises
+    HumanFileError, VolumeWriteError or ValueError before anything in the scene is touched; makes no undo step.
     """
-    if not folder.is_dir():
-        return []
-    used = {path.resolve() for volume in bpy.data.volumes if volume.filepath for path in merged.sequence_files(volume)}
-    kept = people_files() | body_files()
-    found = []
-    for path in sorted(folder.rglob("*")):
-        of_people = any(pattern.fullmatch(path.name) for pattern in (PRIMITIVE, _PERSON, shape_file.NAME, merged.FILE))
-        if of_people and path.name not in kept and path.resolve() not in used:
-            found.append(path)
-    return found
+    return _restore(collection, bake(human_npz), _lost(collection), person)
 
 
-def home_of(collection: bpy.types.Collection) -> Path:
-    """The folder of the person's files, if it belongs to this .blend.
+def restore_written(collection: bpy.types.Collection, written: Written, person: Path) -> int:
+    """As `restore_volumes`, quickly, where they are written already: to `place_of_lost`, or, if the person has gone
+    elsewhere meanwhile, there once more."""
+    shown = [thing for objects in volumes_of(collection).values() for thing in objects]
+    made = {path.resolve() for path in written.made}
+    lost = _lost(collection) | {thing for thing in shown if volume_path(thing.data).resolve() in made}
+    with written.entering(lambda: home_of(collection)):
+        return _restore(collection, written.baked, lost, person)
 
-    Else (saved under another name, appended from another .blend) a folder of its own, into which all of the person
-    goes, so that nobody is ever in two places.
-    """
-    folders = folders_of(collection)
-    home = next((folder for folder in folders if (folder / person_file_name(collection)).is_file()), folders[0])
-    for own in (humans_folder(), humans_folder("")):
-        if home.resolve().is_relative_to(own.resolve()):
-            return home
-    return folder_of(collection)
+
+def place_of_lost(collection: bpy.types.Collection) -> Place:
+    """Where the volumes of a person go whose files are missing, and which these are."""
+    lost = _lost(collection)
+    which = tuple(k for k, objects in volumes_of(collection).items() if lost.intersection(objects))
+    return Place(home_of(collection), which)
+
+
+def _lost(collection: bpy.types.Collection) -> set[bpy.types.Object]:
+    shown = volumes_of(collection)
+    return {thing for objects in shown.values() for thing in objects if not volume_path(thing.data).is_file()}
+
+
+def _restore(collection: bpy.types.Collection, baked: Baked, lost: set[bpy.types.Object], person: Path) -> int:
+    human, grids = baked.human, baked.grids
+    check_editable(collection)
+    shown = volumes_of(collection)
+    if max(shown) >= len(human.density):
+        raise ValueError(
+            f"the person {collection.name!r} has a volume {max(shown)} and {person.name!r} only {len(human.density)}: "
+            "it is somebody else's file"
+        )
+    home = home_of(collection)
+    files = {k: home / volumes.file_name(grids, k, bpy.app.version) for k in shown}
+    absent = [k for k, objects in shown.items() if lost.intersection(objects) and not files[k].is_file()]
+    name = free_name(person, home, person_file_name(collection))
+    with volumes.written(grids, home, {name: person}, absent), saved_body(collection, human.shape_model, home.parent):
+        pass
+    for k, objects in shown.items():
+        for thing in lost.intersection(objects):
+            thing.data.filepath = stored_path(files[k])
+    if name != person_file_name(collection):
+        collection[PERSON] = name
+    found = {thing.data for thing in lost}
+    for volume in found:
+        read_again(volume)
+    return len(found)

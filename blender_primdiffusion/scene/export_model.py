@@ -19,7 +19,7 @@ from ..formats.joints import JOINT_NAMES
 
 
 @dataclasses.dataclass(frozen=True)
-class Frames:
+class FrameRange:
     """What of the scene's time is written."""
 
     first: int
@@ -48,7 +48,7 @@ def write_model(
     mesh: bpy.types.Object,
     path: Path,
     kind: str,
-    frames: Frames,
+    frames: FrameRange,
 ) -> None:
     """Writes `kind` (GLB, FBX or USD) with everything it needs; a reader never sees half a file.
 
@@ -91,7 +91,7 @@ def alone(context: bpy.types.Context, armature: bpy.types.Object) -> Iterator[bp
 
 @contextmanager
 def _stage(
-    context: bpy.types.Context, armature: bpy.types.Object, mesh: bpy.types.Object, frames: Frames
+    context: bpy.types.Context, armature: bpy.types.Object, mesh: bpy.types.Object, frames: FrameRange
 ) -> Iterator[dict[str, object]]:
     """What to override for a scene with these two, selected."""
     with alone(context, armature) as scene:
@@ -109,7 +109,7 @@ def _stage(
         }  # fmt: skip
 
 
-def _write_glb(path: Path, frames: Frames) -> None:
+def _write_glb(path: Path, frames: FrameRange) -> None:
     with _enabled("io_scene_gltf2", "glTF"):
         _run(
             bpy.ops.export_scene.gltf,
@@ -129,7 +129,7 @@ def _write_glb(path: Path, frames: Frames) -> None:
         )
 
 
-def _write_fbx(path: Path, frames: Frames) -> None:
+def _write_fbx(path: Path, frames: FrameRange) -> None:
     with _enabled("io_scene_fbx", "FBX"):
         _run(
             bpy.ops.export_scene.fbx,
@@ -147,7 +147,7 @@ def _write_fbx(path: Path, frames: Frames) -> None:
         )
 
 
-def _write_usd(path: Path, frames: Frames) -> None:
+def _write_usd(path: Path, frames: FrameRange) -> None:
     if not bpy.app.build_options.usd:
         raise ValueError("this Blender was built without USD: choose glTF or FBX")
     _run(
@@ -161,7 +161,7 @@ def _write_usd(path: Path, frames: Frames) -> None:
     )
 
 
-_EXPORTERS: dict[str, Callable[[Path, Frames], None]] = {"GLB": _write_glb, "FBX": _write_fbx, "USD": _write_usd}
+_EXPORTERS: dict[str, Callable[[Path, FrameRange], None]] = {"GLB": _write_glb, "FBX": _write_fbx, "USD": _write_usd}
 
 
 @contextmanager
