@@ -23,7 +23,6 @@ PANELS = {
     "render": ("render_cycles", "render_surface", "render_merged", "render_outdated"),
     "captures": ("captures_cameras", "captures_output", "captures_human"),
     "export": ("export_before", "export_proxy"),
-    "left": ("left_offered",),
     "missing": ("missing_files",),
     "german_french": ("language_de_generate", "language_fr_generate"),
 }

@@ -273,19 +273,6 @@ def cancelled(module: str, python: str) -> Steps:
     yield "cancelled"
 
 
-def left(module: str, python: str) -> Steps:
-    """Another file is opened while works are in line."""
-    yield from begin(module, python)
-    bpy.ops.wm.save_as_mainfile(filepath=str(people_file(module).with_name("walk.blend")))
-    bpy.context.scene.primdiffusion.count = 3
-    press("primdiffusion.generate")
-    yield 3.0
-    yield from begin(module, python)
-    yield from show("PRIMDIFFUSION_PT_jobs_left", "PRIMDIFFUSION_PT_generate")
-    yield "left_offered"
-    press("primdiffusion.discard_works")
-
-
 def missing(module: str, python: str) -> Steps:
     """The person's files are away."""
     yield from with_people(module, python, FIRST_SEED)
@@ -404,7 +391,6 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "captures": captures,
     "export": export,
     "cancelled": cancelled,
-    "left": left,
     "missing": missing,
     "languages": languages,
     "stalls": stalls,

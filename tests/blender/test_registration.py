@@ -13,7 +13,7 @@ LATE = (
     "scene.build", "scene.edit", "scene.merged", "scene.shape", "scene.shape_model", "scene.surface", "scene.volumes",
     "scene.human_npz", "scene.grid_cache", "scene.collect", "scene.human_file", "scene.proxy", "scene.reshape",
     "capture.settings", "formats.camera_rig", "motion.poses", "engine.viewport", "engine.studio", "worker.client",
-    "worker.environment", "worker.job", "worker.kept_works", "ui.generate.work", "ui.human.edit_work",
+    "worker.environment", "worker.job", "ui.generate.work", "ui.human.edit_work",
 )  # fmt: skip
 """Modules of ours that registering must not import: they bring others along, or numpy."""
 CHILD = """
@@ -40,12 +40,3 @@ def test_registering_imports_few_modules_and_none_that_work():
     assert len(ours) <= MOST_MODULES
     assert not ours & set(LATE)
     assert not modules & {"numpy", "torch", "openvdb", "scipy", "primdiffusion"}
-
-
-def test_each_kind_of_work_is_found_where_it_is_registered(addon):
-    from blender_primdiffusion.ui.jobs import work
-
-    assert "generate" in work._kinds
-    for kind in work._kinds:
-        assert work.registered_kind(kind).kind == kind
-    assert work.registered_kind("of a later version") is None

@@ -50,15 +50,6 @@ class HumanAssetWork(Work):
         """Mark the collection."""
         return mark_human(self.target.found(), folder / _PICTURE)
 
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> HumanAssetWork:
-        """What `to_json` gave."""
-        return cls(Target.from_json(kept["target"]))
-
 
 @dataclasses.dataclass(frozen=True)
 class PoseAssetWork(Work):
@@ -94,15 +85,6 @@ class PoseAssetWork(Work):
     def finish(self, context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
         """Make the action and mark it."""
         return self.marked(folder / _PICTURE)
-
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> PoseAssetWork:
-        """What `to_json` gave."""
-        return cls(**{**kept, "target": Target.from_json(kept["target"])})
 
     def marked(self, picture: Path) -> str:
         """The action of the pose, an asset with this picture; returns the news. Raises OSError, ValueError."""

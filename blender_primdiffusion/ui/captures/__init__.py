@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bpy
 
-from ..jobs.work import register_kind, unregister_kind
 from . import (
     operators,
     panel,
@@ -37,13 +36,11 @@ def register() -> None:
     bpy.types.Scene.primdiffusion_reconstruct = bpy.props.PointerProperty(
         type=reconstruct_settings.PRIMDIFFUSION_PG_reconstruct
     )
-    register_kind("reconstruct", f"{__name__}.reconstruct_work:ReconstructWork")
 
 
 def unregister() -> None:
     """Undo `register`."""
     captures.close()
-    unregister_kind("reconstruct")
     if bpy.app.timers.is_registered(operators.follow):
         bpy.app.timers.unregister(operators.follow)
     del bpy.types.Scene.primdiffusion_reconstruct

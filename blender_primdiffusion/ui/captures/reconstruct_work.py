@@ -42,12 +42,3 @@ class ReconstructWork(Work):
     def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Build the person."""
         return build_person(context, result, "Reconstructed")[1]
-
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> ReconstructWork:
-        """What `to_json` gave."""
-        return cls(**kept)

@@ -76,16 +76,6 @@ class ExportMeshWork(ProxyWork):
         frames = f", {self.frames.last - self.frames.first + 1} frames" if self.frames.animated else ""
         return f"Exported {person.name} to {self.path.name}: {result['triangles']} triangles{frames}, {size:.1f} MB"
 
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return {**dataclasses.asdict(self), "path": str(self.path)}
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> ExportMeshWork:
-        """What `to_json` gave."""
-        read = {"target": Target.from_json(kept["target"]), "path": Path(kept["path"])}
-        return cls(**{**kept, **read, "frames": FrameRange(**kept["frames"])})
-
 
 @dataclasses.dataclass(frozen=True)
 class AddProxyWork(ProxyWork):
@@ -109,15 +99,6 @@ class AddProxyWork(ProxyWork):
         person.objects.link(proxy)
         show(person, "VIEWPORT")
         return f"Mesh proxy of {result['triangles']} triangles for {person.name} in {result['seconds']:.1f} s"
-
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> AddProxyWork:
-        """What `to_json` gave."""
-        return cls(**{**kept, "target": Target.from_json(kept["target"])})
 
 
 def scene_frames(scene: bpy.types.Scene, animated: bool) -> FrameRange:

@@ -15,7 +15,6 @@ from ...scene.human import armature_of
 from ...scene.human_file import HumanMotion, motion_in, read_tensors
 from ...scene.keyframes import keyframe_poses
 from ...scene.merged import MergedGrid, read_grid, write_grid
-from ..jobs.kept_poses import packed, unpacked
 from ..jobs.person import build_person
 from ..jobs.target import Target
 from ..jobs.work import Work
@@ -52,15 +51,6 @@ class ExportGaussiansWork(Work):
         put(Path(result["out"]), self.path)
         size = self.path.stat().st_size / 1e6
         return f"Exported {self.target.name} to {self.path.name}: {result['gaussians']} Gaussians, {size:.1f} MB"
-
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return {**dataclasses.asdict(self), "path": str(self.path)}
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> ExportGaussiansWork:
-        """What `to_json` gave."""
-        return cls(**{**kept, "target": Target.from_json(kept["target"]), "path": Path(kept["path"])})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,24 +94,6 @@ class ExportVdbSequenceWork(Work):
             put(path, self.folder / path.name)
         return f"Exported {len(written)} frames of {self.target.name} to {self.folder.name}: {size:.0f} MB"
 
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        plain = {name: getattr(self, name) for name in ("stem", "first", "voxel")}
-        return {
-            **plain,
-            "target": dataclasses.asdict(self.target),
-            "folder": str(self.folder),
-            "people": packed(self.people),
-        }
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> ExportVdbSequenceWork:
-        """What `to_json` gave."""
-        people = unpacked(kept["people"])
-        return cls(
-            **{**kept, "target": Target.from_json(kept["target"]), "folder": Path(kept["folder"]), "people": people}
-        )
-
 
 @dataclasses.dataclass(frozen=True)
 class ImportHumanWork(Work):
@@ -160,15 +132,6 @@ class ImportHumanWork(Work):
             armature.location.xy = self.at[:2]
             armature.location.z += self.at[2]
         return notice
-
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> ImportHumanWork:
-        """What `to_json` gave."""
-        return cls(str(kept["path"]), None if kept["at"] is None else tuple(kept["at"]))
 
 
 def name_of(path: str) -> str:

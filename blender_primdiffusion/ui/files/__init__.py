@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bpy
 
-from ..jobs.work import register_kind, unregister_kind
 from . import operators, saving, watching
 
 _HANDLERS = (
@@ -16,16 +15,10 @@ _HANDLERS = (
 )
 
 
-WORKS = {"restore_volumes": "RestoreWork", "regenerate": "RegenerateWork"}
-"""Of works, by kind."""
-
-
 def register() -> None:
     """Make the room known to Blender."""
     for cls in operators.CLASSES:
         bpy.utils.register_class(cls)
-    for kind, work in WORKS.items():
-        register_kind(kind, f"{__name__}.works:{work}")
     for name, handler in _HANDLERS:
         getattr(bpy.app.handlers, name).append(handler)
     watching.start()
@@ -37,7 +30,5 @@ def unregister() -> None:
     for name, handler in _HANDLERS:
         if handler in getattr(bpy.app.handlers, name):  # Blender 5.2 clears them before it disables extensions at exit
             getattr(bpy.app.handlers, name).remove(handler)
-    for kind in WORKS:
-        unregister_kind(kind)
     for cls in reversed(operators.CLASSES):
         bpy.utils.unregister_class(cls)

@@ -55,15 +55,6 @@ class RestoreWork(Work):
         _look()
         return f"{count} volumes of {person.name} restored from their file in {result['seconds']:.1f} s"
 
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> RestoreWork:
-        """What `to_json` gave."""
-        return cls(Target.from_json(kept["target"]), kept["file"])
-
 
 @dataclasses.dataclass(frozen=True)
 class RegenerateWork(Work):
@@ -106,15 +97,6 @@ class RegenerateWork(Work):
         show_in_place(context, person, result)
         _look()
         return f"{person.name} generated again from seed {self.made['seed']} in {result['seconds']:.1f} s"
-
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> RegenerateWork:
-        """What `to_json` gave."""
-        return cls(Target.from_json(kept["target"]), kept["made"], kept["checkpoint"])
 
 
 def made_from_seed(person: bpy.types.Collection) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bpy
 
-from ..jobs.work import register_kind, unregister_kind
 from . import attributes, operators, panel, presets, settings
 
 CLASSES = (
@@ -25,12 +24,10 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion = bpy.props.PointerProperty(type=settings.PRIMDIFFUSION_PG_settings)
-    register_kind("generate", f"{__name__}.work:GenerateWork")
 
 
 def unregister() -> None:
     """Undo `register`."""
-    unregister_kind("generate")
     del bpy.types.Scene.primdiffusion
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

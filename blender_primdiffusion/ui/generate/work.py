@@ -54,12 +54,3 @@ class GenerateWork(Work):
         if self.renews_seed:
             context.scene.primdiffusion.seed = random_seed()
         return notice
-
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> GenerateWork:
-        """What `to_json` gave."""
-        return cls(**kept)

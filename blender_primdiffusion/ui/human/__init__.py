@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bpy
 
-from ..jobs.work import register_kind, unregister_kind
 from . import (
     edit_operators,
     edit_painting,
@@ -33,8 +32,6 @@ CLASSES = (
     shape_panel.PRIMDIFFUSION_PT_details,
     *edit_panel.SUB_PANELS,
 )
-WORKS = {"vary": "VaryWork", "inpaint": "RedressWork", "transfer": "TransferWork", "interpolate": "BlendWork"}
-"""Of edit_work, by kind."""
 
 
 def register() -> None:
@@ -43,14 +40,10 @@ def register() -> None:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion_edit = bpy.props.PointerProperty(type=edit_settings.PRIMDIFFUSION_PG_edit)
     bpy.types.Object.primdiffusion_human = bpy.props.PointerProperty(type=shape_settings.PRIMDIFFUSION_PG_human)
-    for kind, work in WORKS.items():
-        register_kind(kind, f"{__name__}.edit_work:{work}")
 
 
 def unregister() -> None:
     """Undo `register`."""
-    for kind in WORKS:
-        unregister_kind(kind)
     del bpy.types.Object.primdiffusion_human
     del bpy.types.Scene.primdiffusion_edit
     for cls in reversed(CLASSES):

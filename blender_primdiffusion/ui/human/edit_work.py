@@ -73,15 +73,6 @@ class EditWork(Work):
         warnings = (*result.get("warnings", ()), done.warning, overlap_warning_in(context.scene, person))
         return " ".join([f"{news}{shape}.", *(sentence(text) for text in warnings if text)])
 
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> EditWork:
-        """What `to_json` gave."""
-        return cls(**{**kept, "target": Target.from_json(kept["target"])})
-
 
 class VaryWork(EditWork):
     """Vary."""

@@ -11,24 +11,17 @@ CLASSES = (
     *operators.CLASSES,
     entering.PRIMDIFFUSION_OT_take_result,
     diagnostics.PRIMDIFFUSION_OT_copy_diagnostics,
-    panel.PRIMDIFFUSION_PT_jobs_left,
     panel.PRIMDIFFUSION_PT_jobs,
 )
-_TIMERS = (follow.follow, follow.watch, follow.look_for_left)
+_TIMERS = (follow.follow, follow.watch)
 
 
 @persistent
-def set_aside_before_loading(*_: object) -> None:
-    """Handler of load_pre: what was asked for in one file must not appear in another by itself."""
-    queue.queue.set_aside()
+def drop_before_loading(*_: object) -> None:
+    """Handler of load_pre: the results of jobs belong into the file that is being closed."""
+    queue.queue.drop()
     building.building.close()
     pictures.so_far.show(None)
-
-
-@persistent
-def follow_the_file(*_: object) -> None:
-    """Handler of save_post: what is in line is kept for the file by its name of now."""
-    queue.queue.file_saved()
 
 
 @persistent
@@ -38,10 +31,9 @@ def watch_after_loading(*_: object) -> None:
 
 
 _HANDLERS = (
-    ("load_pre", set_aside_before_loading),
+    ("load_pre", drop_before_loading),
     ("load_post", watch_after_loading),
     ("load_post_fail", watch_after_loading),
-    ("save_post", follow_the_file),
 )
 
 
@@ -52,7 +44,6 @@ def register() -> None:
     for name, handler in _HANDLERS:
         getattr(bpy.app.handlers, name).append(handler)
     if not bpy.app.background:
-        bpy.app.timers.register(follow.look_for_left, first_interval=follow.LOOK_AFTER_S, persistent=True)
         follow.keep_watching()
 
 

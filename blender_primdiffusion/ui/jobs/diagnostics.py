@@ -36,7 +36,7 @@ def _lines() -> Iterator[str]:
     yield "Set in the preferences: " + (", ".join(filter(preference, _PATHS)) or "nothing")
     yield f"Device {device_line()}"
     yield f"Memory {info.get('memory_gb', '?')} GB, {info.get('memory_free_gb', '?')} GB free at the backend's start"
-    yield f"Running: {queue.child_pid is not None}; in line: {len(queue.waiting)}; left: {len(queue.kept.left)}"
+    yield f"Running: {queue.child_pid is not None}; queued: {len(queue.waiting)}"
     if queue.current is not None:
         yield f"At work: {queue.current.work.label}: {queue.job.state}, {queue.job.message}"
     if (outcome := queue.last) is not None:

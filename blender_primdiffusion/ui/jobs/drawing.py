@@ -80,8 +80,6 @@ def draw_in_line(layout: bpy.types.UILayout) -> None:
         icon = "PLAY" if entry is queue.current else "SORTTIME"
         row.label(text=entry.work.label, icon=icon, translate=False)
         row.operator("primdiffusion.cancel", text="", icon="X").number = entry.number
-        if entry.work.not_kept_because:
-            draw_lines(column, f"Not kept over a restart: {entry.work.not_kept_because}", "BLANK1")
 
 
 def draw_ended(layout: bpy.types.UILayout) -> None:

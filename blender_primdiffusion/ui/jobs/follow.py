@@ -15,24 +15,17 @@ from .work import Work
 
 TICK_S = 0.1
 WATCH_S = 0.25
-LOOK_AFTER_S = 1.0
-"""Registering reads no files; nor need Blender's start wait for it."""
 _TOLD_S = 1.0
 """Between lines of progress on the console in background mode."""
 
 
-def submit(
-    operator: bpy.types.Operator, context: bpy.types.Context, work: Work, scene: bpy.types.Scene | None = None
-) -> set[str]:
-    """Put `work` in line for a scene, that of `context` if none is given.
-
-    With a window a timer sees it through, in background mode this waits for its end.
-    """
+def submit(operator: bpy.types.Operator, context: bpy.types.Context, work: Work) -> set[str]:
+    """Queue `work` for the scene of `context`; with a window a timer follows it, in background mode this waits."""
     if not bpy.app.background:
-        queue.add(context, work, scene)
+        queue.add(context, work)
         keep_following()
         return {"FINISHED"}
-    outcome = _wait_for(queue.add_awaited(context, work, scene))
+    outcome = _wait_for(queue.add(context, work))
     if outcome.error is not None:
         operator.report({"ERROR"}, outcome.sentence)
         return {"CANCELLED"}
@@ -68,13 +61,6 @@ def watch() -> float:
     elif queue.listen() or release_when_idle(time.monotonic()):
         redraw()
     return WATCH_S
-
-
-def look_for_left() -> None:
-    """The timer after registration: works that an earlier Blender has left are offered."""
-    queue.kept.look()
-    if queue.kept.left:
-        redraw()
 
 
 def keep_watching() -> None:

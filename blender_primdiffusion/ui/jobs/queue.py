@@ -15,14 +15,12 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ...places import new_backend, preference
-from .kept import Kept, kept_work
 from .remedies import defect_in_the_scene, error_in_the_scene
 from .work import Work
 
 if TYPE_CHECKING:
     from ...worker.backend import Backend
     from ...worker.job import Job, JobError
-    from ...worker.kept_works import KeptWork
 
 CANCELLED = "Cancelled"
 GONE = "The scene {!r} was deleted meanwhile: nothing was added. Undo the deletion and try again."
@@ -41,8 +39,6 @@ class Entry:
     """For as long as the file is open."""
     asked_at: float
     """time.monotonic()."""
-    kept: KeptWork | None
-    """What would re-create it; None where that is not wanted."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +77,6 @@ class Queue:
         self.last: Outcome | None = None
         self.ended: collections.deque[Outcome] = collections.deque(maxlen=_REMEMBERED)
         """The last of any kind, the latest first."""
-        self.kept = Kept()
         self.child_news = ""
         """How the child ended between works; empty when it did not."""
         self.idle_since = time.monotonic()
@@ -107,18 +102,12 @@ class Queue:
         """An answer waits to be put into the scene, by `finish`."""
         return self.job is not None and self.job.state == "done"
 
-    def add(self, context: bpy.types.Context, work: Work, scene: bpy.types.Scene | None = None) -> Entry:
-        """Put `work` in line for a scene, that of `context` if none is given; Blender sees it through some time, even
-        after a restart."""
-        entry = self._entry(scene or context.scene, work)
-        entry.kept = kept_work(work, entry.scene, bpy.data.filepath)
-        self._append(entry)
-        return entry
-
-    def add_awaited(self, context: bpy.types.Context, work: Work, scene: bpy.types.Scene | None = None) -> Entry:
-        """As `add`, for a script that waits for it, and with which it ends."""
-        entry = self._entry(scene or context.scene, work)
-        self._append(entry)
+    def add(self, context: bpy.types.Context, work: Work) -> Entry:
+        """Queue `work` for the scene of `context`."""
+        scene = context.scene
+        entry = Entry(next(self._numbers), work, scene.name, scene.session_uid, time.monotonic())
+        self.waiting.append(entry)
+        self.outcomes.pop(work.kind, None)
         return entry
 
     def tick(self) -> bool:
@@ -168,7 +157,6 @@ class Queue:
         left = [entry for entry in self.waiting if entry.number != number]
         found = len(left) < len(self.waiting)
         self.waiting = collections.deque(left)
-        self._save()
         return found
 
     def listen(self) -> bool:
@@ -195,26 +183,19 @@ class Queue:
         self._backend.release()
         return pid
 
-    def set_aside(self) -> None:
-        """Drop all works and end the child, as another file is loaded; what is kept is offered from now on."""
-        if self.busy:
-            self.kept.set_aside()
-        self._drop()
-
-    def file_saved(self) -> None:
-        """The open file may have another name now, and scenes too: what is in line is kept for these."""
-        scenes = {scene.session_uid: scene.name for scene in bpy.data.scenes}
-        for entry in self.in_line:
-            entry.scene = scenes.get(entry.scene_uid, entry.scene)
-            if entry.kept is not None:
-                entry.kept = dataclasses.replace(entry.kept, blend=bpy.data.filepath, scene=entry.scene)
-        if self.busy:
-            self._save()
+    def drop(self) -> None:
+        """Drop all jobs and end the child."""
+        self.waiting.clear()
+        self.current = self.job = None
+        self.child_news = ""
+        self._clear_folder()
+        if self._backend is not None:
+            self._backend.shutdown()
+            self._backend = None
 
     def close(self) -> None:
-        """Drop all works and end the child: the extension is going. What is kept stays on disk."""
-        self.kept.close()
-        self._drop()
+        """End the child and forget all jobs: the extension is being disabled."""
+        self.drop()
         self.outcomes.clear()
         self.ended.clear()
         self.last = None
@@ -229,26 +210,6 @@ class Queue:
     def log(self) -> tuple[str, ...]:
         """The last lines that the child wrote to stderr."""
         return self._backend.log if self._backend is not None else ()
-
-    def _entry(self, scene: bpy.types.Scene, work: Work) -> Entry:
-        return Entry(next(self._numbers), work, scene.name, scene.session_uid, time.monotonic(), None)
-
-    def _append(self, entry: Entry) -> None:
-        self.waiting.append(entry)
-        self.outcomes.pop(entry.work.kind, None)
-        self._save()
-
-    def _save(self) -> None:
-        self.kept.save(entry.kept for entry in self.in_line if entry.kept is not None)
-
-    def _drop(self) -> None:
-        self.waiting.clear()
-        self.current = self.job = None
-        self.child_news = ""
-        self._clear_folder()
-        if self._backend is not None:
-            self._backend.shutdown()
-            self._backend = None
 
     def _begin(self, entry: Entry) -> None:
         from ...worker.job import Job
@@ -268,7 +229,6 @@ class Queue:
         self.current = self.job = None
         self.idle_since = time.monotonic()
         self._clear_folder()
-        self._save()
         return outcome
 
     def _clear_folder(self) -> None:

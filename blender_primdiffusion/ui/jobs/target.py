@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import bpy
 
@@ -15,8 +14,8 @@ from ...scene.human import human_of, humans
 class Target:
     """A person as they were when the edit began. Undo may replace Blender's objects, so none is kept."""
 
-    uid: int | None
-    """Of the collection, for as long as the file is open; None once it was closed: then the name counts."""
+    uid: int
+    """Of the collection, valid while the file is open."""
     name: str
     file: str
     """Name of the backend's file of the person."""
@@ -29,17 +28,12 @@ class Target:
         check_editable(person)
         return cls(person.session_uid, person.name, person_file_name(person))
 
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> Target:
-        """What dataclasses.asdict gave, after a restart: the person is known by name and file alone now."""
-        return cls(None, str(kept["name"]), str(kept["file"]))
-
     def found(self) -> bpy.types.Collection:
         """The person, if still in a scene and the one it was; else ValueError with a sentence."""
         from ...scene.human import check_editable
 
         people = [person for scene in bpy.data.scenes for person in humans(scene)]
-        person = next((person for person in people if self._is(person)), None)
+        person = next((person for person in people if person.session_uid == self.uid), None)
         if person is None or not any(thing.type == "ARMATURE" for thing in person.objects):
             raise ValueError(
                 f"the person {self.name!r} was removed while the edit was under way; nothing was changed. Undo the "
@@ -59,9 +53,6 @@ class Target:
         Raises as `found` does, and FileNotFoundError.
         """
         return str(person_file(self.found()))
-
-    def _is(self, person: bpy.types.Collection) -> bool:
-        return person.name == self.name if self.uid is None else person.session_uid == self.uid
 
 
 def selected_person(context: bpy.types.Context) -> bpy.types.Collection:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import importlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -54,47 +53,6 @@ class Work(abc.ABC):
         from ...scene.build import home_of_next
 
         return Place(home_of_next(self.new_person))
-
-    @property
-    def not_kept_because(self) -> str:
-        """Why a restart of Blender ends it, for the panel; empty for what is kept, as almost all is."""
-        return ""
-
-    @abc.abstractmethod
-    def to_json(self) -> dict[str, Any]:
-        """What `from_json` needs after a restart of Blender; not asked of what is not kept."""
-
-    @classmethod
-    @abc.abstractmethod
-    def from_json(cls, kept: dict[str, Any]) -> Work:
-        """The work of `to_json`. Raises ValueError, KeyError or TypeError for what is none."""
-
-
-_kinds: dict[str, str] = {}
-"""Kind -> module:class."""
-
-
-def register_kind(kind: str, where: str) -> None:
-    """Make kept works of this kind known. For a room's `register`.
-
-    `where` is the module and the class, "package.room.work:GenerateWork": it is imported when such a work is taken up
-    again, for what works need would slow Blender's start.
-    """
-    if _kinds.setdefault(kind, where) != where:
-        raise ValueError(f"there are two kinds of work {kind!r}: give one another name")
-
-
-def unregister_kind(kind: str) -> None:
-    """Undo `register_kind`."""
-    _kinds.pop(kind, None)
-
-
-def registered_kind(kind: str) -> type[Work] | None:
-    """The class of a kind of work; None for one that this version does not know."""
-    if kind not in _kinds:
-        return None
-    module, _, name = _kinds[kind].partition(":")
-    return getattr(importlib.import_module(module), name)
 
 
 def chosen_checkpoint(name: str) -> str:

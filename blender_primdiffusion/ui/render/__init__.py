@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bpy
 
-from ..jobs.work import register_kind, unregister_kind
 from . import engine_panels, panel, person_operators, scene_operators, settings
 
 CLASSES = (
@@ -16,16 +15,12 @@ CLASSES = (
     *scene_operators.OPERATORS,
     *panel.PANELS,
 )
-WORKS = {"merge": "MergeWork", "merge_frames": "MergeFramesWork", "fit_gain": "FitGainWork"}
-"""Of merge_work, by kind."""
 
 
 def register() -> None:
     """Make the room known to Blender."""
     for cls in CLASSES:
         bpy.utils.register_class(cls)
-    for kind, work in WORKS.items():
-        register_kind(kind, f"{__name__}.merge_work:{work}")
     bpy.types.Scene.primdiffusion_merging = bpy.props.PointerProperty(type=settings.PRIMDIFFUSION_PG_merging)
     bpy.types.Collection.primdiffusion_density_gain = settings.gain_property()
     engine_panels.join_panels()
@@ -36,7 +31,5 @@ def unregister() -> None:
     engine_panels.leave_panels()
     del bpy.types.Collection.primdiffusion_density_gain
     del bpy.types.Scene.primdiffusion_merging
-    for kind in WORKS:
-        unregister_kind(kind)
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -17,7 +17,6 @@ from ...scene.attachment import set_attachment
 from ...scene.human import armature_of
 from ...scene.material import set_density_gain
 from ...scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
-from ..jobs.kept_poses import packed, unpacked
 from ..jobs.target import Target
 from ..jobs.work import Work
 
@@ -81,15 +80,6 @@ class MergeWork(Work):
         size = files[0].stat().st_size / 1e6
         return f"Merged {person.name} at {self.voxel * 1e3:.3g} mm in {result['seconds']:.1f} s, {size:.1f} MB"
 
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> MergeWork:
-        """What `to_json` gave."""
-        return cls(Target.from_json(kept["target"]), Moment(**kept["moment"]), float(kept["voxel"]))
-
 
 @dataclasses.dataclass
 class MergeFramesWork(Work):
@@ -129,23 +119,6 @@ class MergeFramesWork(Work):
         size = sum(path.stat().st_size for path in files) / 1e6
         return f"Merged {len(files)} frames of {person.name} in {result['seconds']:.1f} s, {size:.0f} MB"
 
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return {
-            "target": dataclasses.asdict(self.target),
-            "people": packed(moment.params for moment in self.moments),
-            "digests": [moment.digest for moment in self.moments],
-            "start": self.start,
-            "voxel": self.voxel,
-        }
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> MergeFramesWork:
-        """What `to_json` gave."""
-        both = zip(unpacked(kept["people"]), kept["digests"], strict=True)
-        moments = [Moment(params, digest) for params, digest in both]
-        return cls(Target.from_json(kept["target"]), moments, int(kept["start"]), float(kept["voxel"]))
-
 
 @dataclasses.dataclass(frozen=True)
 class FitGainWork(Work):
@@ -175,15 +148,6 @@ class FitGainWork(Work):
             f"Density gain {gain:g} for {person.name}: opacity is off by {100 * result['error']:.1f} % on average, by "
             f"{100 * result['error_before']:.1f} % with {result['gain_before']:g}"
         )
-
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> FitGainWork:
-        """What `to_json` gave."""
-        return cls(Target.from_json(kept["target"]), Moment(**kept["moment"]))
 
 
 class _Writer(threading.Thread):

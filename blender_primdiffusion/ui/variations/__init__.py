@@ -5,7 +5,6 @@ from __future__ import annotations
 import bpy
 from bpy.app.handlers import persistent
 
-from ..jobs.work import register_kind, unregister_kind
 from . import icons, operators, panel, settings, sheet
 
 CLASSES = (
@@ -32,7 +31,6 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion_variations = bpy.props.PointerProperty(type=settings.PRIMDIFFUSION_PG_variations)
-    register_kind("variations", f"{__name__}.work:VariationsWork")
     bpy.app.handlers.load_pre.append(clear_before_loading)
 
 
@@ -41,7 +39,6 @@ def unregister() -> None:
     if clear_before_loading in bpy.app.handlers.load_pre:  # 5.2 clears them before it disables extensions at exit
         bpy.app.handlers.load_pre.remove(clear_before_loading)
     clear_before_loading()
-    unregister_kind("variations")
     del bpy.types.Scene.primdiffusion_variations
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

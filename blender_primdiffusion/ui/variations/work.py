@@ -18,10 +18,7 @@ PICTURE_PX = 256
 
 @dataclasses.dataclass(frozen=True)
 class VariationsWork(Work):
-    """Show Variations, and More Like This.
-
-    The latter is not kept over a restart: whom it varies lies in the temporary folder, which goes with Blender.
-    """
+    """Show Variations, and More Like This."""
 
     kind = method = "variations"
 
@@ -57,17 +54,3 @@ class VariationsWork(Work):
         sheet.fill(result["people"], self.title, around=bool(self.person))
         icons.free()  # those of the steps
         return f"{len(self.seeds)} people in {result['seconds']:.1f} s"
-
-    @property
-    def not_kept_because(self) -> str:
-        """Of variants of a person."""
-        return "the person to vary is a temporary file" if self.person else ""
-
-    def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_json(cls, kept: dict[str, Any]) -> VariationsWork:
-        """What `to_json` gave."""
-        return cls(**{**kept, "seeds": tuple(kept["seeds"])})

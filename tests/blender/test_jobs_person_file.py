@@ -1,0 +1,59 @@
+"""Jobs about a person find the person's file when their turn comes, wherever it is by then."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import bpy
+import pytest
+import synthetic_shape
+from blender_primdiffusion.scene.exported_model import FrameRange
+
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.human import person_file
+from blender_primdiffusion.ui.assets.work import HumanAssetWork, PoseAssetWork
+from blender_primdiffusion.ui.export.mesh_work import AddProxyWork, ExportMeshWork
+from blender_primdiffusion.ui.export.person_work import ExportGaussiansWork, ExportVdbSequenceWork
+from blender_primdiffusion.ui.export.posing import posed_frames, posed_now
+from blender_primdiffusion.ui.human.edit_work import BlendWork, RedressWork, TransferWork, VaryWork
+from blender_primdiffusion.ui.jobs.target import Target
+from blender_primdiffusion.ui.jobs.work import Work
+from blender_primdiffusion.ui.render.merge_work import FitGainWork, MergeWork, Moment
+
+
+@pytest.fixture
+def person(addon, tmp_path):
+    file = tmp_path / "person.human.safetensors"
+    file.write_bytes(b"a person")
+    return build_human(addon, synthetic_shape.write(tmp_path / "human.npz", 6), "Änne", [file])
+
+
+def jobs_about(person: bpy.types.Collection, folder: Path) -> list[Work]:
+    target, moment, context = Target.of(person), Moment.now(person), bpy.context
+    return [
+        VaryWork.of(person, 3, {"amount": 0.5, "seed": 3}),
+        RedressWork.of(person, 3, {"region": {"painted": [0.0, 1.0]}, "seed": 3}),
+        TransferWork.of(person, 3, {"other": "/a/b"}),
+        BlendWork.of(person, 3, {"other": "/a/b", "fraction": 0.5}),
+        MergeWork(target, moment, 0.006),
+        FitGainWork(target, moment),
+        ExportMeshWork(target, 512, 9000, folder / "ä.glb", "GLB", FrameRange(1, 3)),
+        AddProxyWork(target, 512, 9000),
+        ExportGaussiansWork(target, folder / "ä.ply", posed_now(context, person), 500),
+        ExportVdbSequenceWork(target, folder, "ä", posed_frames(context, person, range(1, 4)), 1, 0.01),
+        HumanAssetWork(target),
+        PoseAssetWork.of(person, "Lehnt"),
+    ]
+
+
+def test_jobs_ask_where_the_file_is_when_their_turn_comes(person, tmp_path):
+    jobs, before = jobs_about(person, tmp_path), person_file(person)
+    now = before.parent.rename(tmp_path / "elsewhere") / before.name
+    for volume in bpy.data.volumes:
+        volume.filepath = str(now.parent / Path(volume.filepath).name)
+    assert person_file(person) == now
+    for job in jobs:
+        asked = json.dumps(job.params(tmp_path))
+        assert json.dumps(str(before)) not in asked, job.label
+        assert json.dumps(str(now)) in asked, job.label
