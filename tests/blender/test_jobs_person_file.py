@@ -8,10 +8,10 @@ from pathlib import Path
 import bpy
 import pytest
 import synthetic_shape
-from blender_primdiffusion.scene.exported_model import FrameRange
 
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import person_file
+from blender_primdiffusion.scene.export_model import FrameRange
+from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.ui.assets.work import HumanAssetWork, PoseAssetWork
 from blender_primdiffusion.ui.export.mesh_work import AddProxyWork, ExportMeshWork
 from blender_primdiffusion.ui.export.person_work import ExportGaussiansWork, ExportVdbSequenceWork
