@@ -106,6 +106,9 @@ def speed(person: Primitives, operations_per_second: float, repeats: int) -> Fig
             f"cpu_roofline_{name}_ms": floor,
             f"cpu_roofline_ratio_{name}": milliseconds / floor,
         }
+    people = crowd()
+    far = look_at(torch.tensor([0.0, 0.0, 8.0]), torch.zeros(3), vertical_fov=0.5, width=256, height=256)
+    figures["cpu_forward_crowd_ms"] = best(lambda: march(people, far), repeats)
     figures["cpu_forward_4mm_wall_ms"] = best(lambda: march(person, camera), repeats, time.perf_counter)
     forward, backward = backward_ms(person, camera, max(repeats // 2, 2))
     figures |= {
@@ -117,6 +120,18 @@ def speed(person: Primitives, operations_per_second: float, repeats: int) -> Fig
     slow = best(lambda: march_reference(person, small), 2)
     figures["reference_over_cpu_128"] = slow / best(lambda: march(person, small), repeats)
     return figures
+
+
+def crowd() -> Primitives:
+    """Sixteen people of 4096 small boxes: 4.3e9 pairs of a box and a pixel, of which almost none meet."""
+    count = 16 * 4096
+    return Primitives(
+        position=torch.rand((count, 3), generator=torch.Generator().manual_seed(27)) * 4 - 2,
+        rotation=torch.eye(3).expand(count, 3, 3),
+        half_extent=torch.full((count, 3), 0.004),
+        rgb=torch.full((count, 3, 2, 2, 2), 0.5),
+        density=torch.full((count, 2, 2, 2), 10.0),
+    )
 
 
 def largest_error(person: Primitives, camera: Camera) -> float:

@@ -23,12 +23,10 @@ def test_a_process_that_dies_is_an_error():
         apart(os._exit, 3, meanwhile=nothing)
 
 
+@pytest.mark.timeout(60)
 def test_what_is_raised_meanwhile_ends_it_at_once():
-    began = time.monotonic()
-
     def cancel():
         raise InterruptedError
 
     with pytest.raises(InterruptedError):
-        apart(time.sleep, 60, meanwhile=cancel)
-    assert time.monotonic() - began < 10
+        apart(time.sleep, 3600, meanwhile=cancel)

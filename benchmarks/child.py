@@ -1,0 +1,126 @@
+"""How soon Blender's side of the pipe hears from its child, cancels and notices a death: ticked as by Blender's timer.
+
+    python benchmarks/child.py --json FILE
+
+Waits are in seconds from the event to the tick that shows it: a cancel while torch is loaded, between steps and while
+the child is stopped in the middle of one; a child that is killed. Beside them the longest tick of all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import record
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "blender_primdiffusion"))
+from worker.backend import Backend  # noqa: E402
+from worker.client import BackendClient  # noqa: E402
+from worker.job import Job  # noqa: E402
+
+TICK_S = 0.1
+"""Of Blender's timer."""
+STEPS = 1000
+"""More than are waited for."""
+BEATS = 10
+PATIENCE_S = 120.0
+
+
+class Timer:
+    """Ticks jobs and remembers the longest tick."""
+
+    def __init__(self) -> None:
+        self.longest_s = 0.0
+
+    def until(self, job: Job, reached: Callable[[], bool]) -> float:
+        """Seconds until `reached`; raises TimeoutError."""
+        began = time.monotonic()
+        while not reached():
+            if time.monotonic() - began > PATIENCE_S:
+                raise TimeoutError(f"waited {PATIENCE_S:.0f} s for a job that is {job.state}: {job.message}")
+            before = time.monotonic()
+            job.tick()
+            self.longest_s = max(self.longest_s, time.monotonic() - before)
+            if not reached():
+                time.sleep(TICK_S)
+        return time.monotonic() - began
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
+    arguments = parser.parse_args()
+    timer = Timer()
+    with tempfile.TemporaryDirectory(prefix="primdiffusion_child_") as name:
+        folder = Path(name)
+        figures: dict[str, float | None] = {
+            "cancel_loading_seconds": cancel_seconds(
+                timer, folder, lambda job: bool(job.info) and not job.info.get("ready")
+            ),
+            "cancel_sampling_seconds": cancel_seconds(timer, folder, lambda job: job.step > 2),
+            "cancel_stopped_seconds": cancel_seconds(timer, folder, lambda job: job.step > 2, signal.SIGSTOP),
+            "death_noticed_seconds": death_seconds(timer, folder),
+            "heartbeat_interval_seconds_max": heartbeat_interval_s(),
+        }
+    figures["tick_seconds_max"] = timer.longest_s
+    record.tell(figures, arguments.json)
+
+
+def cancel_seconds(timer: Timer, folder: Path, when: Callable[[Job], bool], send: int = 0) -> float:
+    """From the cancel of a job for which `when` holds, the signal `send` having reached its child, to its end."""
+    backend = Backend(lambda: BackendClient(Path(sys.executable)))
+    job = generate(backend, folder)
+    timer.until(job, lambda: backend.client is not None and backend.client.pid is not None and when(job))
+    os.kill(backend.client.pid, send)
+    job.cancel()
+    seconds = timer.until(job, lambda: job.finished)
+    backend.shutdown()
+    return seconds
+
+
+def death_seconds(timer: Timer, folder: Path) -> float:
+    """From the death of a child at work to the failure of its job."""
+    backend = Backend(lambda: BackendClient(Path(sys.executable)))
+    job = generate(backend, folder)
+    timer.until(job, lambda: job.step > 2)
+    os.kill(backend.client.pid, signal.SIGKILL)
+    seconds = timer.until(job, lambda: job.finished)
+    backend.shutdown()
+    return seconds
+
+
+def heartbeat_interval_s() -> float:
+    """The longest time between two of BEATS heartbeats of an idle child."""
+    pipe = subprocess.PIPE
+    child = subprocess.Popen([sys.executable, "-m", "primdiffusion.serve"], stdin=pipe, stdout=pipe)
+    times, ready = [], False
+    assert child.stdin is not None
+    assert child.stdout is not None
+    for line in child.stdout:
+        method = json.loads(line).get("method")
+        ready |= method == "ready"
+        if ready and method == "heartbeat":
+            times.append(time.monotonic())
+        if len(times) > BEATS:
+            break
+    child.stdin.close()
+    child.wait()
+    return max(after - before for before, after in pairwise(times))
+
+
+def generate(backend: Backend, folder: Path) -> Job:
+    return Job(backend, "generate", {"seed": 1, "steps": STEPS, "size": 16, "out_dir": str(folder / "out")})
+
+
+if __name__ == "__main__":
+    main()
