@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from primdiffusion.body.model import BodyPose, J
+from primdiffusion.formats.arrays import read_arrays
 
 POSE_KEYS = ("pose", "poses", "theta")
 TRANSLATION_KEYS = ("translation", "trans", "transl")
@@ -35,8 +35,11 @@ def read_pose(path: str | Path, frame: int = 0) -> BodyPose:
     if not path.is_file():
         raise FileNotFoundError(f"there is no pose file {path}: check the path")
     try:
-        content: Any = json.loads(path.read_text("utf-8")) if path.suffix == ".json" else _arrays(path)
-    except (ValueError, OSError, zipfile.BadZipFile) as e:
+        if path.suffix == ".json":
+            content: Any = json.loads(path.read_text("utf-8"))
+        else:
+            content = read_arrays(path, optional=(*POSE_KEYS, *TRANSLATION_KEYS))
+    except (ValueError, OSError) as e:
         raise PoseFileError(
             f"{path} is neither JSON nor an npz of plain arrays ({e}): convert it to one of these"
         ) from e
@@ -62,11 +65,6 @@ def pose_from_numbers(content: Any, name: str, frame: int = 0) -> BodyPose:
     if not (np.isfinite(theta).all() and np.isfinite(move).all()):
         raise PoseFileError(f"{name} holds NaN or infinite numbers: export the pose again")
     return BodyPose.from_axis_angle(torch.from_numpy(theta), torch.from_numpy(move))
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as stored:
-        return {name: stored[name] for name in (*POSE_KEYS, *TRANSLATION_KEYS) if name in stored}
 
 
 def _first(content: dict[str, Any], keys: tuple[str, ...], default: Any) -> Any:

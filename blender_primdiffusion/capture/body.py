@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.arrays import ArrayFileError, read_arrays
 from ..formats.joints import PARENTS
-from ..motion.arrays import ArrayFileError, read_npz
 from ..motion.skeleton import chain, joint_positions
 from ..places import backend_module_path
 
@@ -109,7 +109,7 @@ def read_body(path: Path | None = None) -> Body:
     if not source.is_file():
         raise BodyError(f"there is no body model {source}: check the path")
     try:
-        arrays = read_npz(source, _KEYS)
+        arrays = read_arrays(source, optional=_KEYS)
     except ArrayFileError as e:
         raise BodyError(f"{e}; a body model is an .npz of plain arrays in SMPL's form") from e
     _check(source, arrays)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..motion.arrays import ArrayFileError, array_names, read_npz
+from ..formats.arrays import ArrayFileError, array_names, read_arrays
 from ..motion.files import POSE_KEYS, MotionFileError, motion_from_arrays
 from .scan_files import ScanError, ScanFile
 
@@ -47,9 +47,9 @@ def read_parameters(scan_file: ScanFile) -> Parameters:
             f"with global_orient, body_pose, betas and transl there{hint}"
         )
     try:
-        arrays = read_npz(path, (*POSE_KEYS, *_SHAPE_KEYS, "scale", "body"))
+        arrays = read_arrays(path, optional=(*POSE_KEYS, *_SHAPE_KEYS, "scale", "body"))
         motion = motion_from_arrays({key: arrays[key] for key in POSE_KEYS if key in arrays}, path)
-    except (ArrayFileError, MotionFileError) as e:
+    except (ArrayFileError, MotionFileError, OSError) as e:
         raise ScanError(str(e)) from e
     except StopIteration:
         names = ", ".join(array_names(path)[:8])

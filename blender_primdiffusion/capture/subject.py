@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.arrays import ArrayFileError, read_arrays
 from ..formats.camera_files import write_cameras, write_colmap, write_nerf, write_opencv
 from ..formats.camera_rig import View
 from ..formats.capture_layout import (
@@ -25,7 +26,6 @@ from ..formats.capture_layout import (
     write_smpl,
 )
 from ..formats.picture_files import is_whole_picture
-from ..motion.arrays import ArrayFileError, read_npz
 from ..motion.motion import Motion
 
 
@@ -115,7 +115,7 @@ def _refuse_others(folder: Path, smpl: tuple[NDArray, ...]) -> None:
     wanted = dict(zip(("global_orient", "body_pose", "betas", "transl"), smpl, strict=True))
     path = folder / SMPL_FOLDER / SMPL_PLAIN_FILE
     try:
-        present = read_npz(path, tuple(wanted)) if path.is_file() else {}
+        present = read_arrays(path, optional=tuple(wanted)) if path.is_file() else {}
     except ArrayFileError:
         present = {}  # cut short: it is written anew
     for name, values in wanted.items():

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import ArrayFileError, array_names, read_npy, read_npz
+from ..formats.arrays import ArrayFileError, array_names, read_arrays, read_npy
 from .bvh import BvhError, read_bvh
 from .motion import Detected, Motion
 from .rotation import from_axis_angle, nearest
@@ -78,7 +78,7 @@ def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None 
 def _read_npz(path: Path) -> tuple[Motion, bool]:
     """The motion as it is in the file, and whether its up axis is to be found out."""
     names = array_names(path)
-    arrays = read_npz(path, POSE_KEYS)
+    arrays = read_arrays(path, optional=POSE_KEYS)
     if "smpl" in names and not any(key in arrays for key in (*_POSES, *_REST)):
         raise MotionFileError(f"{path} holds pickled objects, which are never read: use its twin of plain arrays")
     if not any(key in arrays for key in (*_POSES, *_REST)):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.capture.plain_npz import NpzError
 from primdiffusion.capture.poses import MotionFileError, built_in_poses, choose_poses, read_motion
 from primdiffusion.formats import capture_layout
+from primdiffusion.formats.arrays import ArrayFileError
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 
 THETA = np.random.default_rng(0).uniform(-0.5, 0.5, (5, 72))
@@ -92,7 +92,7 @@ def test_translations_that_do_not_fit_are_refused_by_name(tmp_path, moves):
 )  # fmt: skip
 def test_files_that_are_no_poses_are_refused_by_name(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises((MotionFileError, NpzError), match=name):
+    with pytest.raises((MotionFileError, ArrayFileError), match=name):
         read_motion(tmp_path / name)
 
 

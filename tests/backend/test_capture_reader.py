@@ -15,13 +15,13 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.body.smpl_pickle import UnsafePickleError
 from primdiffusion.capture.multisample import shoot
 from primdiffusion.capture.people_files import read_person
-from primdiffusion.capture.plain_npz import NpzError, read_npz
 from primdiffusion.capture.rasterised import render
 from primdiffusion.capture.reader import CaptureFileError, open_captures
 from primdiffusion.capture.sheet import default_joints, draw_sheet, reprojection_error
 from primdiffusion.capture.subject import sit
 from primdiffusion.capture.verify import verify
 from primdiffusion.formats import capture_layout
+from primdiffusion.formats.arrays import ArrayFileError, read_numbers
 
 NAME = "person_000000"
 
@@ -134,7 +134,7 @@ def test_a_pickle_without_parameters_is_refused_by_name(root, content):
     as_released(root)
     path = root / NAME / capture_layout.SMPL_FOLDER / capture_layout.SMPL_FILE
     np.savez(path, smpl=np.array(content, dtype=object))
-    with pytest.raises(NpzError, match=capture_layout.SMPL_FILE):
+    with pytest.raises(ArrayFileError, match=capture_layout.SMPL_FILE):
         open_captures(root).subject(NAME)
 
 
@@ -152,7 +152,7 @@ def test_zip_paths_that_lead_out_are_not_followed(tmp_path):
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("../../evil.npy", b"evil")
         archive.writestr("/evil.npy", b"evil")
-    assert read_npz(path, ("x",))["x"].tolist() == [0, 1, 2]
+    assert read_numbers(path, ("x",))["x"].tolist() == [0, 1, 2]
     assert [p.name for p in tmp_path.rglob("*")] == ["in", "a.npz"]
 
 
@@ -167,16 +167,16 @@ def test_zip_paths_that_lead_out_are_not_followed(tmp_path):
 )
 def test_npz_files_of_other_things_are_refused(tmp_path, arrays, why):
     np.savez(tmp_path / "a.npz", **arrays)
-    with pytest.raises(NpzError, match=why):
-        read_npz(tmp_path / "a.npz", ("x",))
+    with pytest.raises(ArrayFileError, match=why):
+        read_numbers(tmp_path / "a.npz", ("x",))
 
 
 def test_an_npz_that_claims_petabytes_is_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive, archive.open("x.npy", "w") as member:
         about = {"descr": "<f8", "fortran_order": False, "shape": (1 << 50,)}
         np.lib.format.write_array_header_1_0(member, about)
-    with pytest.raises(NpzError, match=r"a\.npz"):
-        read_npz(tmp_path / "a.npz", ("x",))
+    with pytest.raises(ArrayFileError, match=r"a\.npz"):
+        read_numbers(tmp_path / "a.npz", ("x",))
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ def test_an_npz_that_claims_petabytes_is_refused(tmp_path):
         ("cameras.json", b'{"camera0000": {"K": [[1]]}}', "not a list of cameras"),
         ("cameras.json", b"{}", "names no camera"),
         ("cameras.json", b"{", "cannot be read"),
-        (f"{capture_layout.SMPL_FOLDER}/{capture_layout.SMPL_PLAIN_FILE}", 100, "no whole .npz"),
+        (f"{capture_layout.SMPL_FOLDER}/{capture_layout.SMPL_PLAIN_FILE}", 100, "not a whole .npz"),
     ],
 )
 def test_wrong_and_missing_files_are_named(root, file, content, why):

@@ -8,8 +8,8 @@ import zipfile
 
 import numpy as np
 import pytest
+from blender_primdiffusion.formats.arrays import ArrayFileError, read_arrays
 
-from blender_primdiffusion.motion.arrays import ArrayFileError, read_npz
 from blender_primdiffusion.motion.files import DEFAULT_FPS, MotionFileError, read_motion
 from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, to_axis_angle
 from blender_primdiffusion.motion.skeleton import REST_JOINTS
@@ -216,7 +216,7 @@ def test_names_with_paths_in_them_write_nothing(tmp_path):
     with pytest.raises(MotionFileError, match="holds no poses"):
         read_motion(tmp_path / "evil.npz")
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["evil.npz"]
-    assert list(read_npz(tmp_path / "evil.npz", ["../../escaped"])) == ["../../escaped"]
+    assert list(read_arrays(tmp_path / "evil.npz", ["../../escaped"])) == ["../../escaped"]
 
 
 def test_a_damaged_member_is_named(tmp_path):
@@ -225,4 +225,4 @@ def test_a_damaged_member_is_named(tmp_path):
     content[400:440] = bytes(40)
     (tmp_path / "m.npz").write_bytes(content)
     with pytest.raises(ArrayFileError, match="damaged"):
-        read_npz(tmp_path / "m.npz", ["poses"])
+        read_arrays(tmp_path / "m.npz", ["poses"])

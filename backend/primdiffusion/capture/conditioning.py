@@ -58,7 +58,7 @@ def captured_person(path: str | Path, subject: str | None = None, frame: int = 0
     Raises:
         FileNotFoundError: there is no such folder, or a file of the person's is missing.
         ConditioningError: nobody, or several people, can be meant; no such frame; another body model.
-        CaptureFolderError, CaptureFileError, NpzError, BodyFileError: a file is damaged or of another size.
+        CaptureFolderError, CaptureFileError, ArrayFileError, BodyFileError: a file is damaged or of another size.
     """
     captures, name = choose_subject(path, subject)
     person = captures.subject(name)
@@ -118,7 +118,7 @@ def conditioning_views(
         KeyError: there is nobody of this name.
         FileNotFoundError: a picture, or another file of the person's, is missing.
         ConditioningError: there is no such frame or camera, or none of them shows the person.
-        CaptureFileError, NpzError, BodyFileError: a file is damaged, or a mask of another size than its picture.
+        CaptureFileError, ArrayFileError, BodyFileError: a file is damaged, or a mask of another size than its picture.
     """
     person = captures.subject(subject)
     _check_frame(person, frame)
@@ -168,7 +168,7 @@ def default_betas(subject: Subject) -> Float[Tensor, "10"]:
 
     Raises:
         ConditioningError: there are more, impossible ones, or joints were noted that are not the default body's.
-        NpzError: joints.npz is damaged.
+        ArrayFileError: joints.npz is damaged.
     """
     betas, components = torch.from_numpy(subject.smpl.betas), default_body().shape_basis.shape[-1]
     remedy = "render the person again on the default body (primdiffusion captures, or Blender's without a body file)"

@@ -133,7 +133,7 @@ class CaptureDataset(SampleSet[TrainingSample]):
         """The sample at a position.
 
         Raises:
-            FileNotFoundError, CaptureFileError, NpzError, BodyFileError: a file is missing or damaged.
+            FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
         """
         epoch, index = position
         if self._order[0] != epoch:
@@ -207,7 +207,7 @@ def batches(
 
     Raises:
         ValueError: the batch size is not positive.
-        FileNotFoundError, CaptureFileError, NpzError, BodyFileError: a file is missing or damaged.
+        FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
     """
     if size < 1:
         raise ValueError(f"a batch of {size} samples: ask for one or more")

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from primdiffusion.body.model import BodyPose, J, default_body
-from primdiffusion.capture.plain_npz import NpzError, read_npz
+from primdiffusion.formats.arrays import ArrayFileError, read_numbers
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.pose_file import body_theta
 
@@ -44,12 +44,12 @@ def read_motion(path: str | Path) -> BodyPose:
     .npz of AMASS, of "poses" or "pose" [F, 72 or more], or of "global_orient" and "body_pose"; .npy or .json of the
     same. Hands of SMPL-H and SMPL-X are left out (`pose_file.body_theta`). AMASS (its names are "trans" with "poses"
     or "pose_body") is turned so that y is up. The extension has a reader of its own, for it imports nothing of the
-    backend; a test holds both to the same poses. Raises FileNotFoundError, NpzError or MotionFileError.
+    backend; a test holds both to the same poses. Raises FileNotFoundError, ArrayFileError or MotionFileError.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no pose file {path}: check the path")
-    content = read_npz(path, (), KEYS) if path.suffix == ".npz" else _read_plain(path)
+    content = read_numbers(path, (), KEYS) if path.suffix == ".npz" else _read_plain(path)
     turns = _turns(path, content)
     move = np.asarray(_first(content, TRANSLATIONS, np.zeros(3)), np.float64)
     if move.size not in (3, 3 * len(turns)) or not np.isfinite(move).all():
@@ -68,7 +68,7 @@ def read_motions(paths: Sequence[Path]) -> tuple[list[BodyPose], list[str]]:
     for path in paths:
         try:
             motions.append(read_motion(path))
-        except (FileNotFoundError, NpzError, MotionFileError) as e:
+        except (FileNotFoundError, ArrayFileError, MotionFileError) as e:
             failures.append(str(e))
     return motions, failures
 

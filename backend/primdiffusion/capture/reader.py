@@ -105,7 +105,7 @@ class Captures:
 
         Raises:
             KeyError: there is nobody of this name.
-            FileNotFoundError, CaptureFileError, NpzError, BodyFileError: a file is missing or damaged.
+            FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
         """
         if name not in self.subjects:
             raise KeyError(f"{self.root} has no subject {name!r}")
@@ -119,7 +119,7 @@ class Captures:
 
         Raises:
             KeyError, IndexError: there is no such subject, frame or camera.
-            FileNotFoundError, CaptureFileError, NpzError, BodyFileError: a file is missing or damaged.
+            FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
         """
         person = self.subject(subject)
         if not (0 <= frame < person.frames and 0 <= camera < len(person.views)):

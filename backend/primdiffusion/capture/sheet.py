@@ -10,8 +10,8 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw
 
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.capture.plain_npz import NpzError, read_npz
 from primdiffusion.capture.reader import Captures, Subject
+from primdiffusion.formats.arrays import ArrayFileError, read_numbers
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.capture_layout import replacing
 
@@ -25,7 +25,7 @@ def draw_sheet(captures: Captures, out: Path, rows: int, columns: int, size: int
 
     Raises:
         ValueError: there is no row, column or pixel.
-        FileNotFoundError, CaptureFileError, NpzError, BodyFileError: a file is missing or damaged.
+        FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
     """
     if min(rows, columns, size) < 1:
         raise ValueError(f"a sheet of {rows} x {columns} pictures of {size} pixels: ask for one or more of each")
@@ -54,10 +54,10 @@ def joints_of(subject: Subject) -> Float[np.ndarray, "F J 3"]:
     """The joints in the world as they were noted; of the default body's where nothing was (released layout).
 
     Raises:
-        NpzError: joints.npz is damaged.
+        ArrayFileError: joints.npz is damaged.
     """
     try:
-        return read_npz(subject.folder / "joints.npz", ("world",))["world"]
+        return read_numbers(subject.folder / "joints.npz", ("world",))["world"]
     except FileNotFoundError:
         return default_joints(subject)
 
@@ -75,15 +75,15 @@ def reprojection_error(subject: Subject) -> float:
     The cameras are read from cameras.json. 0 where nothing was noted.
 
     Raises:
-        NpzError: joints.npz is damaged or of another number of cameras.
+        ArrayFileError: joints.npz is damaged or of another number of cameras.
     """
     path = subject.folder / "joints.npz"
     try:
-        noted = read_npz(path, ("world", "pixel"))
+        noted = read_numbers(path, ("world", "pixel"))
     except FileNotFoundError:
         return 0.0
     if noted["pixel"].shape != (len(subject.views), *noted["world"].shape[:2], 2):
-        raise NpzError(
+        raise ArrayFileError(
             f"{path} has joints of {noted['pixel'].shape}, not of {len(subject.views)} cameras: render again"
         )
     errors = [

@@ -12,7 +12,7 @@ from jaxtyping import Float32
 
 from primdiffusion.body.model import BodyPose, J
 from primdiffusion.body.smpl_pickle import BodyFileError, array_of_objects, as_array, load_restricted
-from primdiffusion.capture.plain_npz import NpzError, read_member, read_npz
+from primdiffusion.formats.arrays import ArrayFileError, read_member, read_numbers
 from primdiffusion.formats.capture_layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE
 
 KEYS = ("global_orient", "body_pose", "betas", "transl")
@@ -38,12 +38,12 @@ def read_smpl(subject: Path) -> SmplParameters:
 
     Raises:
         FileNotFoundError: neither file is there.
-        NpzError: the file is damaged, or not of this form.
+        ArrayFileError: the file is damaged, or not of this form.
         BodyFileError: its pickle is damaged, or asks for more than arrays.
     """
     plain, pickled = subject / SMPL_FOLDER / SMPL_PLAIN_FILE, subject / SMPL_FOLDER / SMPL_FILE
     if plain.is_file():
-        return _checked(plain, read_npz(plain, KEYS))
+        return _checked(plain, read_numbers(plain, KEYS))
     if pickled.is_file():
         return _checked(pickled, _read_pickled(pickled))
     raise FileNotFoundError(f"there is no {plain.name} nor {pickled.name} in {plain.parent}: render it again")
@@ -51,9 +51,7 @@ def read_smpl(subject: Path) -> SmplParameters:
 
 def _read_pickled(path: Path) -> dict[str, np.ndarray]:
     """The dictionary in an array without dimensions; nothing in it is run."""
-    data = read_member(path, "smpl.npy")
-    assert data is not None
-    stream = io.BytesIO(data)
+    stream = io.BytesIO(read_member(path, "smpl.npy"))
     try:
         version = np.lib.format.read_magic(stream)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -67,9 +65,11 @@ def _read_pickled(path: Path) -> dict[str, np.ndarray]:
     except BodyFileError:
         raise
     except KeyError as e:
-        raise NpzError(f"{path} lacks {e}: render the subject again, or take the file from its publisher") from e
+        raise ArrayFileError(f"{path} lacks {e}: render the subject again, or take the file from its publisher") from e
     except (ValueError, SyntaxError, TypeError) as e:
-        raise NpzError(f"{path} holds no dictionary of SMPL parameters ({e}): take it from its publisher again") from e
+        raise ArrayFileError(
+            f"{path} holds no dictionary of SMPL parameters ({e}): take it from its publisher again"
+        ) from e
 
 
 def _checked(path: Path, arrays: dict[str, np.ndarray]) -> SmplParameters:
@@ -77,10 +77,10 @@ def _checked(path: Path, arrays: dict[str, np.ndarray]) -> SmplParameters:
     shapes = {"global_orient": (frames, 3), "body_pose": (frames, 3 * (J - 1)), "transl": (frames, 3)}
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
-            raise NpzError(f"{path}: {name} has shape {arrays[name].shape}, not {shape}: make it again")
+            raise ArrayFileError(f"{path}: {name} has shape {arrays[name].shape}, not {shape}: make it again")
     betas = arrays["betas"].reshape(-1)
     if not all(np.isfinite(array).all() for array in arrays.values()) or not frames or arrays["betas"].ndim > 2:
-        raise NpzError(f"{path} holds no frame, or NaN or infinite numbers: make it again")
+        raise ArrayFileError(f"{path} holds no frame, or NaN or infinite numbers: make it again")
     return SmplParameters(
         theta=np.concatenate([arrays["global_orient"], arrays["body_pose"]], axis=1).astype(np.float32),
         translation=arrays["transl"].astype(np.float32),

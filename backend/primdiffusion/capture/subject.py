@@ -16,9 +16,9 @@ from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.capture.figure import Figure, figure_of
 from primdiffusion.capture.multisample import Shot, shoot
 from primdiffusion.capture.people_files import SkinnedPerson
-from primdiffusion.capture.plain_npz import NpzError, read_npz
 from primdiffusion.capture.texture_pyramid import BYTE_OF_LINEAR, encode_bytes
 from primdiffusion.formats import camera_files, capture_layout, picture_files
+from primdiffusion.formats.arrays import ArrayFileError, read_numbers
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
 
@@ -147,8 +147,8 @@ def _refuse_others(subject: Path, theta: np.ndarray, betas: np.ndarray, translat
     path = subject / capture_layout.SMPL_FOLDER / capture_layout.SMPL_PLAIN_FILE
     wanted = {"global_orient": theta[:, :3], "body_pose": theta[:, 3:], "betas": betas[None], "transl": translation}
     try:
-        present = read_npz(path, tuple(wanted))
-    except (FileNotFoundError, NpzError):
+        present = read_numbers(path, tuple(wanted))
+    except (FileNotFoundError, ArrayFileError):
         return  # nothing yet, or cut short: it is written anew
     for name, values in wanted.items():
         if present[name].shape != values.shape or not np.allclose(present[name], values, atol=1e-5):

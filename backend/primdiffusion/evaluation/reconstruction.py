@@ -126,8 +126,8 @@ def evaluate(
 
     Raises:
         KeyError: there is no such subject.
-        FileNotFoundError, ConditioningError, CaptureFileError, NpzError, BodyFileError: a file is missing or damaged,
-            there is no such frame or camera, or a subject is of another body model.
+        FileNotFoundError, ConditioningError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or
+            damaged, there is no such frame or camera, or a subject is of another body model.
     """
     settings = settings or EvaluationSettings()
     for name in settings.subjects or captures.subjects:

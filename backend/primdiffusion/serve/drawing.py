@@ -6,7 +6,6 @@ import functools
 import math
 import os
 import time
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.drawing.bands import BAND_SECONDS, FIRST_PIXELS, draw_in_bands
 from primdiffusion.drawing.scene import Look, Picture, Scene
 from primdiffusion.failures import PictureOutOfMemory, out_of_memory
+from primdiffusion.formats.arrays import read_arrays
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.human import Human, place_skinned
 from primdiffusion.human_file import load_human
@@ -195,11 +195,11 @@ def _load_solids(file: Stamp) -> Solids:
     """Raises ValueError, naming the file, where it holds no solids."""
     path = Path(file[0])
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            return Solids(
-                np.ascontiguousarray(stored["corners"], np.float32),
-                np.ascontiguousarray(stored["colour"], np.float32),
-                np.ascontiguousarray(stored["holdout"], np.bool_),
-            )
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as e:
+        arrays = read_arrays(path, ("corners", "colour", "holdout"))
+        return Solids(
+            np.ascontiguousarray(arrays["corners"], np.float32),
+            np.ascontiguousarray(arrays["colour"], np.float32),
+            np.ascontiguousarray(arrays["holdout"], np.bool_),
+        )
+    except ValueError as e:
         raise ValueError(f"{path} holds no solids ({e}): it needs corners [F, 3, 3], colour [F, 3], holdout [F]") from e

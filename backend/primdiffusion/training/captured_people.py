@@ -95,8 +95,8 @@ def looks_of(
     """A person's payloads, on the CPU, and the betas of the body that their boxes sit on.
 
     Raises:
-        FileNotFoundError, ConditioningError, CaptureFileError, NpzError, BodyFileError: captures are missing, damaged
-            or of another body.
+        FileNotFoundError, ConditioningError, CaptureFileError, ArrayFileError, BodyFileError: captures are missing,
+            damaged or of another body.
         ValueError: the pictures lead to numbers that are not finite.
     """
     subject = captures.subject(name)

@@ -47,7 +47,8 @@ def fit(config: FitConfig) -> EncoderModel:
         ValueError: settings that cannot be, or others than those with which the run in this folder began; captures
             without a frame, or of another body; objective or gradient that are not finite (NotFiniteError); too little
             memory (says which batch to try).
-        FileNotFoundError, CaptureFileError, NpzError, BodyFileError, WeightsFileError: files are missing or damaged.
+        FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError, WeightsFileError: files are missing or
+            damaged.
         OSError: there is no room; the last whole state remains.
     """
     if config.threads:

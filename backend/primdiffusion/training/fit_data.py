@@ -75,7 +75,7 @@ def betas_of(captures: Captures) -> Float[Tensor, "people 10"]:
 
     Raises:
         ConditioningError: somebody was captured on another body model.
-        FileNotFoundError, CaptureFileError, NpzError, BodyFileError: a camera has no pictures, a file is damaged.
+        FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a camera has no pictures, a file is damaged.
     """
     return torch.stack([default_betas(captures.subject(name)) for name in captures.subjects])
 
@@ -90,7 +90,7 @@ def fit_batches(dataset: FitDataset, config: FitConfig, start: Position, share: 
     """`batches` of a run; errors of the loader's workers are told as they would be without any.
 
     Raises:
-        FileNotFoundError, CaptureFileError, NpzError, BodyFileError: a file is missing or damaged.
+        FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
         ChildProcessError: a worker was killed.
     """
     try:
