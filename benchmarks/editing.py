@@ -20,13 +20,14 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 from primdiffusion.body.model import BodyPose
-from primdiffusion.diffusion.model import DEFAULT_STEPS, DiffusionModel
+from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.editing.inpaint import harmonise, inpaint
 from primdiffusion.editing.interpolate import interpolate
-from primdiffusion.editing.regions import DISJOINT, PARTS, region_of
+from primdiffusion.editing.regions import DISJOINT, region_of
 from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.formats.requests import PARTS, STEPS
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.machine import best_device
@@ -186,7 +187,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="PNG to write")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    studio = Studio(load_checkpoint(arguments.checkpoint, best_device()), 3 if arguments.quick else DEFAULT_STEPS)
+    studio = Studio(load_checkpoint(arguments.checkpoint, best_device()), 3 if arguments.quick else STEPS)
     rows = []
     for heading, shown in (
         (f"regions: {len(DISJOINT)} parts that share no primitive, {len(PARTS)} names", studio.parts()),

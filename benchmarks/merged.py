@@ -19,10 +19,10 @@ import numpy as np
 import psutil
 import torch
 from primdiffusion.body.model import BodyPose
+from primdiffusion.formats.requests import DENSITY_GAIN
 from primdiffusion.human import body_of, generate, pose_body
 from primdiffusion.human_file import export_for_blender, load_human, save_human
 from primdiffusion.primitives.anchors import attach
-from primdiffusion.render.gain import DEFAULT_GAIN
 from primdiffusion.serve.draw_params import PersonParams
 from primdiffusion.serve.merge_params import FitGainParams, MergeParams
 from primdiffusion.serve.merging import fit_gain_of, merge_people
@@ -160,7 +160,7 @@ def main() -> None:
 
     setup_cycles_preview(bpy.context.scene, size=SIZE, samples=1, yaw=0.5, world=GREY)
     pictures = {}
-    for name, gain in (("usual", DEFAULT_GAIN), ("fitted", fit["gain"])):
+    for name, gain in (("usual", DENSITY_GAIN), ("fitted", fit["gain"])):
         set_density_gain(person, gain)
         set_attachment(person, "MERGED")
         pictures[name], figures["seconds_cycles_merged"] = rendered(folder / f"merged_{name}.png")

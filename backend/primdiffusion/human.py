@@ -24,14 +24,9 @@ from primdiffusion import __version__
 from primdiffusion.body.measures import betas_of_measures
 from primdiffusion.body.model import BodyModel, BodyPose, PosedBody, default_body
 from primdiffusion.diffusion.conditioning import Attributes
-from primdiffusion.diffusion.model import (
-    DEFAULT_GUIDANCE,
-    DEFAULT_SAMPLER,
-    DEFAULT_STEPS,
-    DiffusionModel,
-    sample,
-)
+from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.samplers import Step
+from primdiffusion.formats import requests
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.records import TensorRecord
@@ -80,11 +75,11 @@ class Human(TensorRecord):
 def generate(
     model: DiffusionModel,
     seed: int,
-    steps: int = DEFAULT_STEPS,
-    sampler: str = DEFAULT_SAMPLER,
+    steps: int = requests.STEPS,
+    sampler: str = requests.SAMPLERS[0],
     on_step: Callable[[Step], None] | None = None,
     attributes: Attributes = MappingProxyType({}),
-    guidance: float = DEFAULT_GUIDANCE,
+    guidance: float = requests.GUIDANCE,
 ) -> Human:
     """A new person, on the CPU; the same for the same model, seed, steps, sampler, attributes, guidance and device.
 
@@ -99,11 +94,11 @@ def generate(
 def generate_batch(
     model: DiffusionModel,
     seeds: Sequence[int],
-    steps: int = DEFAULT_STEPS,
-    sampler: str = DEFAULT_SAMPLER,
+    steps: int = requests.STEPS,
+    sampler: str = requests.SAMPLERS[0],
     on_step: Callable[[Step], None] | None = None,
     attributes: Attributes = MappingProxyType({}),
-    guidance: float = DEFAULT_GUIDANCE,
+    guidance: float = requests.GUIDANCE,
 ) -> list[Human]:
     """People of several seeds, who share the work; each as `generate` makes them, but for rounding. Errors likewise."""
     condition = model.condition(attributes)

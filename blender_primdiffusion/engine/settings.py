@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-STEP_M = 0.004
+from ..formats.requests import RAY_STEP
 
 
 def _redraw(settings: bpy.types.PropertyGroup, _context: bpy.types.Context) -> None:
@@ -20,7 +20,7 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
         description="Distance between samples along a ray: smaller is slower and finer",
         subtype="DISTANCE",
         unit="LENGTH",
-        default=STEP_M,
+        default=RAY_STEP,
         min=0.0005,
         max=0.05,
         soft_min=0.001,

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import bpy
 
+from ..formats.requests import DENSITY_GAIN
+
 MATERIAL_NAME = "PrimDiffusion Volume"
-DENSITY_GAIN = 1.6
-"""Cycles absorbs exponentially, the paper's marcher adds and clamps; with this factor on density their alpha is nearest
-for people of the default checkpoint, each of whom can have a fitted one (see `gain`)."""
 GAIN_NODE = "Density Gain"
 
 

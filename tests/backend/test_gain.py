@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from primdiffusion.formats.requests import DENSITY_GAIN
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.gain import DEFAULT_GAIN, FAINT, fit_gain, unclamped_alpha
+from primdiffusion.render.gain import FAINT, fit_gain, unclamped_alpha
 from primdiffusion.render.march import march
 
 
@@ -42,7 +43,7 @@ def test_no_other_gain_is_better():
         return np.abs(1 - np.exp(-gain * met) - np.minimum(met, 1)).mean()
 
     assert fit.error == pytest.approx(error(fit.gain), rel=1e-9)
-    assert fit.error_before == pytest.approx(error(DEFAULT_GAIN), rel=1e-9)
+    assert fit.error_before == pytest.approx(error(DENSITY_GAIN), rel=1e-9)
     assert fit.error <= min(error(gain) for gain in np.linspace(0.1, 20, 2000)) * 1.0005
     assert fit.rays == len(met)
 

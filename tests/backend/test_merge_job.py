@@ -9,9 +9,9 @@ import pytest
 import torch
 from primdiffusion.body.model import BodyPose
 from primdiffusion.export.merged_file import upright_grid
+from primdiffusion.formats.requests import DENSITY_GAIN
 from primdiffusion.human import generate, place, pose_body
 from primdiffusion.human_file import save_human
-from primdiffusion.render.gain import DEFAULT_GAIN
 from primdiffusion.render.merge import merge
 from primdiffusion.reshaping import reshaped
 from primdiffusion.serve.draw_params import PersonParams
@@ -103,7 +103,7 @@ def test_a_cancelled_merge_leaves_no_file(person, tmp_path):
 def test_a_fitted_gain_is_at_least_as_good_as_the_usual_one(person):
     fit = fit_gain_of(FitGainParams([person]), quiet)
     assert fit["error"] <= fit["error_before"] < 0.2
-    assert fit["gain_before"] == DEFAULT_GAIN
+    assert fit["gain_before"] == DENSITY_GAIN
     assert 0.1 <= fit["gain"] <= 20
     assert fit["rays"] > 1000
 

@@ -10,13 +10,13 @@ from unittest.mock import MagicMock
 
 import bpy
 import pytest
+from blender_primdiffusion.formats.requests import PARTS
 
 from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui.generate import attributes
 from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_attributes
 from blender_primdiffusion.ui.human import edit_settings
-from blender_primdiffusion.worker.names import PARTS
 
 VOCABULARY = {
     "categories": {"sex": ["female", "male"], "outfit": ["suit", "fitted tee and jeans"], "age": ["old"]},

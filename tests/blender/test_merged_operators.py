@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
+from blender_primdiffusion.formats.requests import DENSITY_GAIN
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 from blender_primdiffusion import places
@@ -20,7 +21,7 @@ from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.files import folder_of, sequence_files, volume_path
 from blender_primdiffusion.scene.human import MARK, armature_of, humans, remove_human
 from blender_primdiffusion.scene.keyframes import keyframe_poses
-from blender_primdiffusion.scene.material import DENSITY_GAIN, density_gain
+from blender_primdiffusion.scene.material import density_gain
 from blender_primdiffusion.scene.merged import merged_of, merged_state
 from blender_primdiffusion.ui.jobs.queue import queue
 from blender_primdiffusion.ui.jobs.target import Target

@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.formats.requests import DENSITY_GAIN
 
 from blender_primdiffusion.scene.attachment import attachment_before_merge, attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
@@ -14,7 +15,6 @@ from blender_primdiffusion.scene.duplicate import duplicate_human
 from blender_primdiffusion.scene.files import VolumeWriteError, folder_of, sequence_files, volume_path
 from blender_primdiffusion.scene.grid_cache import person_memory
 from blender_primdiffusion.scene.material import (
-    DENSITY_GAIN,
     density_gain,
     person_material,
     set_density_gain,

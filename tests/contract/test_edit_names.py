@@ -5,23 +5,20 @@ from pathlib import Path
 import pytest
 import tiny_model
 from primdiffusion.diffusion.samplers import SAMPLERS as BACKENDS_SAMPLERS
-from primdiffusion.editing.regions import PARTS as BACKENDS_PARTS
-from primdiffusion.editing.regions import region_of
-from primdiffusion.serve.edit_params import TRANSFERS as BACKENDS_TRANSFERS
+from primdiffusion.editing.regions import parts_of, region_of
+from primdiffusion.formats.requests import PARTS, SAMPLERS
 from primdiffusion.training.checkpoint import default_checkpoint, load_checkpoint
-from worker.names import PARTS, SAMPLERS, TRANSFERS
 from worker.vocabulary import read_vocabulary
 
 
-def test_parts_of_the_body_are_the_backends_in_its_order():
-    assert PARTS == BACKENDS_PARTS
+def test_every_part_of_the_body_is_a_region():
+    assert set(PARTS) == set(parts_of(None))
     assert len(PARTS) <= 32, "Blender's menu of several choices holds 32 bits"
     assert all(region_of([part]).any() for part in PARTS)
 
 
-def test_samplers_and_transfers_are_the_backends():
+def test_samplers_are_the_backends():
     assert set(SAMPLERS) == set(BACKENDS_SAMPLERS)
-    assert TRANSFERS == BACKENDS_TRANSFERS
 
 
 def test_the_card_of_a_checkpoint_tells_what_its_model_knows(checkpoint):

@@ -15,13 +15,13 @@ from primdiffusion.diffusion.conditioning import NOTHING, Attributes, Vocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.samplers import SAMPLERS, Step, gaussian_noise
 from primdiffusion.diffusion.schedule import Schedule, trailing_steps
+from primdiffusion.formats import requests
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import GRID, K, Payload, S
 from primdiffusion.primitives.slab import CHANNELS_PER_LAYER, pack, unpack
 from primdiffusion.primitives.stand import Stand
 
 BETAS = 10
-DEFAULT_STEPS, DEFAULT_SAMPLER, DEFAULT_GUIDANCE = 30, "ddim", 1.5
 """What `sample` does where nothing else is said; guidance is of no effect without a condition."""
 
 
@@ -228,10 +228,10 @@ class DiffusionModel:
 def sample(
     model: DiffusionModel,
     seeds: Sequence[int],
-    steps: int = DEFAULT_STEPS,
-    sampler: str = DEFAULT_SAMPLER,
+    steps: int = requests.STEPS,
+    sampler: str = requests.SAMPLERS[0],
     condition: Float[Tensor, "#b a"] | None = None,
-    guidance: float = DEFAULT_GUIDANCE,
+    guidance: float = requests.GUIDANCE,
 ) -> Iterator[Step]:
     """Generate a person of each seed, yielding every step; the last step's x0 is the result (30 DDIM steps by default).
 

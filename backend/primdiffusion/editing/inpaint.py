@@ -8,7 +8,7 @@ from types import MappingProxyType
 from jaxtyping import Bool
 from torch import Tensor
 
-from primdiffusion.diffusion.model import DEFAULT_GUIDANCE, DEFAULT_STEPS, DiffusionModel
+from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.editing.edit import (
     OnStep,
     asked,
@@ -23,6 +23,7 @@ from primdiffusion.editing.edit import (
 )
 from primdiffusion.editing.regions import check_region, name_region
 from primdiffusion.editing.repaint import noised, repaint
+from primdiffusion.formats import requests
 from primdiffusion.human import Human, made_by
 
 
@@ -31,9 +32,9 @@ def inpaint(
     human: Human,
     region: Bool[Tensor, "k"],
     seed: int = 0,
-    steps: int = DEFAULT_STEPS,
+    steps: int = requests.STEPS,
     attributes: Mapping[str, str | float] = MappingProxyType({}),
-    guidance: float = DEFAULT_GUIDANCE,
+    guidance: float = requests.GUIDANCE,
     on_step: OnStep | None = None,
 ) -> Human:
     """The person with the primitives of a region sampled anew so that they fit the others (`repaint`).
@@ -67,7 +68,7 @@ def harmonise(
     region: Bool[Tensor, "k"],
     amount: float = 0.3,
     seed: int = 0,
-    steps: int = DEFAULT_STEPS,
+    steps: int = requests.STEPS,
     on_step: OnStep | None = None,
 ) -> Human:
     """The person with a region, pasted there perhaps, brought into agreement with the rest by a little noise and back.

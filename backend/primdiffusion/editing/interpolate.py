@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.diffusion.model import DEFAULT_STEPS, DiffusionModel
+from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import Denoise, Step, ddim
 from primdiffusion.diffusion.schedule import Schedule
 from primdiffusion.editing.edit import (
@@ -25,6 +25,7 @@ from primdiffusion.editing.edit import (
     with_edit,
 )
 from primdiffusion.editing.shares import check_share
+from primdiffusion.formats import requests
 from primdiffusion.human import Human, made_by
 from primdiffusion.primitives.primitives import Payload
 
@@ -34,7 +35,7 @@ def interpolate(
     a: Human,
     b: Human,
     fraction: float = 0.5,
-    steps: int = DEFAULT_STEPS,
+    steps: int = requests.STEPS,
     on_step: OnStep | None = None,
 ) -> Human:
     """The person at `fraction` of the way from `a` to `b`: a likely person all the way, not a double exposure.

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.formats.requests import PARTS, SIDED_PARTS
 from primdiffusion.geometry.surface import surface_points
 from primdiffusion.primitives.anchors import Anchors, anchor_skin_weights, attach, default_anchors, default_texels
 from primdiffusion.primitives.primitives import GRID, K, S
@@ -60,12 +61,8 @@ _UNIONS = {
     "skin": ("face", "neck", "hands"),
 }
 """What an artist picks: several parts under one name."""
-SIDES = tuple(f"{side}_{_ONE_OF[part]}" for part in _SIDED for side in ("left", "right"))
-"""Halves of the parts that come in pairs, by the person's own left and right."""
-DISJOINT = ("face", "hair", "neck", "torso", "hips", *SIDES)
+DISJOINT = ("face", "hair", "neck", "torso", "hips", *SIDED_PARTS)
 """Parts that share no primitive; together they are the whole person."""
-PARTS = ("face", "hair", "neck", "torso", *_SIDED, "hips", *_UNIONS, *SIDES)
-"""All names that `region_of` knows."""
 
 
 def region_of(names: Sequence[str], stand: Stand | None = None) -> Bool[Tensor, "k"]:

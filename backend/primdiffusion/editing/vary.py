@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import torch
 
-from primdiffusion.diffusion.model import DEFAULT_GUIDANCE, DEFAULT_STEPS, DiffusionModel
+from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import ddim, gaussian_noise
 from primdiffusion.editing.edit import (
     OnStep,
@@ -22,6 +22,7 @@ from primdiffusion.editing.edit import (
     last,
     with_edit,
 )
+from primdiffusion.formats import requests
 from primdiffusion.human import Human, made_by
 
 
@@ -30,10 +31,10 @@ def vary(
     human: Human,
     amount: float = 0.5,
     seed: int = 0,
-    steps: int = DEFAULT_STEPS,
+    steps: int = requests.STEPS,
     on_step: OnStep | None = None,
     attributes: Mapping[str, str | float] = MappingProxyType({}),
-    guidance: float = DEFAULT_GUIDANCE,
+    guidance: float = requests.GUIDANCE,
 ) -> Human:
     """A variant of a person with the same body: noise of a level that grows with `amount`, then DDIM back.
 
@@ -53,10 +54,10 @@ def vary_batch(
     human: Human,
     amount: float,
     seeds: Sequence[int],
-    steps: int = DEFAULT_STEPS,
+    steps: int = requests.STEPS,
     on_step: OnStep | None = None,
     attributes: Mapping[str, str | float] = MappingProxyType({}),
-    guidance: float = DEFAULT_GUIDANCE,
+    guidance: float = requests.GUIDANCE,
 ) -> list[Human]:
     """Variants of several seeds, who share the work; each as `vary` makes them, but for rounding. Errors likewise."""
     generators = [edit_generator(seed) for seed in seeds]

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from primdiffusion.export.field import pack_field
 from primdiffusion.export.surface import depth_below
+from primdiffusion.formats.requests import GAUSSIANS
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.lattice import WINDOW_POWER, WINDOW_SHARPNESS
@@ -19,8 +20,6 @@ WIDTH = 1 / 6**0.5
 GAIN = 1.2
 """How much more optical depth Gaussians get than voxels have opacity: theirs multiplies up as 1 - product(1 - a), the
 marcher's adds up until it is 1 and so hides sooner."""
-DEFAULT_LIMIT = 400_000
-"""Gaussians of a person at most."""
 DEEPEST = 0.025
 """How far below the surface a voxel is still drawn, metres: what lies deeper nobody sees."""
 FAINTEST = 1 / 255
@@ -43,7 +42,7 @@ class Gaussians(TensorRecord):
     """Linear, in [0, 1]."""
 
 
-def gaussians_of(primitives: Primitives, limit: int = DEFAULT_LIMIT) -> Gaussians:
+def gaussians_of(primitives: Primitives, limit: int = GAUSSIANS) -> Gaussians:
     """The voxels of an unbatched set of boxes as Gaussians, at most `limit`: the most opaque of every box are kept.
 
     A voxel's opacity is that of a ray along the box's normal through it; matter deeper than DEEPEST is left out. Raises

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from primdiffusion.formats.requests import VOXEL
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.merge import VOXEL, Merged, merge
+from primdiffusion.render.merge import Merged, merge
 
 Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Blender's axes from the backend's. Grids are turned before they are made: their voxels would not turn afterwards."""

@@ -14,6 +14,7 @@ from primdiffusion.export.apart import apart
 from primdiffusion.export.field import Field, look_along, pack_field, weights_at
 from primdiffusion.export.simplify import simplified, unwrapped
 from primdiffusion.export.surface import Surface, outside_surface
+from primdiffusion.formats import requests
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
@@ -40,11 +41,11 @@ OnStage = Callable[[str, int, int], None]
 class ProxySettings:
     """How fine the mesh is."""
 
-    spacing: float = 0.006
+    spacing: float = requests.VOXEL
     """Of the grid that the surface is found on, metres."""
-    triangles: int = 20_000
+    triangles: int = requests.TRIANGLES
     """At most."""
-    texture_px: int = 2048
+    texture_px: int = requests.TEXTURE_SIZE
     """Pixels a side of the texture."""
 
     def __post_init__(self) -> None:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
+from primdiffusion.formats.requests import DENSITY_GAIN
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings, march
@@ -18,8 +19,6 @@ FAINT = 1e-4
 MET = 1e-3
 """Rays with less opacity than this miss the person."""
 SMALLEST_GAIN, LARGEST_GAIN = 0.1, 20.0
-DEFAULT_GAIN = 1.6
-"""What the extension's material starts with."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +29,7 @@ class GainFit:
     error: float
     """Mean difference of alpha over rays that meet the person, with this gain."""
     error_before: float
-    """The same with DEFAULT_GAIN."""
+    """The same with DENSITY_GAIN."""
     rays: int
     """How many met the person."""
 
@@ -66,4 +65,4 @@ def fit_gain(reached: Float[ndarray, "n"]) -> GainFit:
         best = int(np.argmin([error(gain) for gain in candidates]))
         candidates = np.geomspace(candidates[max(best - 1, 0)], candidates[min(best + 1, len(candidates) - 1)], 100)
     gain = float(candidates[int(np.argmin([error(gain) for gain in candidates]))])
-    return GainFit(gain, error(gain), error(DEFAULT_GAIN), len(met))
+    return GainFit(gain, error(gain), error(DENSITY_GAIN), len(met))

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from primdiffusion.formats.requests import RAY_STEP
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import Primitives
@@ -41,7 +42,7 @@ class MarchSettings:
     the smallest stride for boxes finer than that.
     """
 
-    step: float = 0.004
+    step: float = RAY_STEP
     """Distance between the samples of the largest boxes, metres: the largest stride times the spacing."""
     strides: tuple[int, ...] = (4, 2, 1)
     """Falling; each divides the one before it."""

@@ -10,12 +10,11 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
+from primdiffusion.formats.requests import VOXEL
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.cpu_compiled import on_all_threads
 from primdiffusion.render.cpu_merge import sum_boxes
 
-VOXEL = 0.006
-"""Metres; finer ones show more of the primitives' detail (theirs are 2 to 14 mm) at eight times the memory for half."""
 POINTS = 2
 """Places along a voxel's side at which the primitives are read."""
 MOST_VOXELS = 2**27

@@ -12,10 +12,11 @@ import numpy as np
 import torch
 
 from primdiffusion.export.merged_file import upright_grid, write_grid_npz
+from primdiffusion.formats.requests import DENSITY_GAIN
 from primdiffusion.human import Human, framing, place_skinned
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.gain import DEFAULT_GAIN, fit_gain, unclamped_alpha
+from primdiffusion.render.gain import fit_gain, unclamped_alpha
 from primdiffusion.reshaping import reshaped
 from primdiffusion.serve.draw_params import PersonParams
 from primdiffusion.serve.merge_params import FitGainParams, MergeFramesParams, MergeParams
@@ -73,7 +74,7 @@ def fit_gain_of(params: FitGainParams, report: Report) -> dict[str, Any]:
     return {
         "gain": round(fit.gain, 3),
         "error": round(fit.error, 5),
-        "gain_before": DEFAULT_GAIN,
+        "gain_before": DENSITY_GAIN,
         "error_before": round(fit.error_before, 5),
         "rays": fit.rays,
     }

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from primdiffusion.diffusion.model import DEFAULT_STEPS, DiffusionModel
+from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.formats import requests
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import framing, generate_batch, place
 from primdiffusion.render.march import MarchSettings, march
@@ -24,7 +25,7 @@ STEP = 0.006
 
 
 @torch.no_grad()
-def write_samples(path: Path, model: DiffusionModel, seeds: Sequence[int] = SEEDS, steps: int = DEFAULT_STEPS) -> None:
+def write_samples(path: Path, model: DiffusionModel, seeds: Sequence[int] = SEEDS, steps: int = requests.STEPS) -> None:
     """People of `seeds` from a little to their left, over black. Raises OSError where there is no room."""
     pictures = []
     for human in generate_batch(model, seeds, steps):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from ...worker.names import SAMPLERS
+from ...formats.requests import GUIDANCE, PICTURE_SIZE, SAMPLERS, STEPS
 
 if TYPE_CHECKING:
     import argparse  # takes a fifth of what registering may take; imported where it is used
@@ -31,12 +31,12 @@ def parse_generate(argv: Sequence[str]) -> argparse.Namespace:
     add("--out", type=Path, required=True, help="folder for all of them; one begun before is gone on with")
     add("--count", type=_whole(1), default=1, help="how many (default %(default)s)")
     add("--seed", type=_whole(0), default=0, help="of the first; the next ones follow (default %(default)s)")
-    add("--steps", type=_whole(1), default=30, help="denoising steps (default %(default)s)")
+    add("--steps", type=_whole(1), default=STEPS, help="denoising steps (default %(default)s)")
     add("--sampler", choices=SAMPLERS, default=SAMPLERS[0], help="(default %(default)s)")
     add("--attributes", nargs="+", default=[], metavar="NAME=VALUE", help='like sex=female height=1.7 "hair=long bob"')
-    add("--guidance", type=float, default=1.5, help="how strongly attributes are followed (default %(default)s)")
+    add("--guidance", type=float, default=GUIDANCE, help="how strongly attributes are followed (default %(default)s)")
     add("--checkpoint", type=Path, help="a .safetensors file instead of the preferences' or the default one")
-    add("--pictures", type=_whole(16), default=512, metavar="SIZE", help="pixels a side (default %(default)s)")
+    add("--pictures", type=_whole(16), default=PICTURE_SIZE, metavar="SIZE", help="pixels a side (default %(default)s)")
     blend = made.add_mutually_exclusive_group()
     blend.add_argument(
         "--blend", nargs="?", const="person.blend", metavar="NAME", help="a .blend in each folder too, called so"

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import bpy
 
+from ...formats.requests import CAPTURE_VIEWS
+
 _CAMERAS_FILE = "cameras.json"
 
 
@@ -52,7 +54,7 @@ class PRIMDIFFUSION_PG_reconstruct(bpy.types.PropertyGroup):
     views: bpy.props.IntProperty(
         name="Views",
         description="How many cameras, spread around the person; all where there are fewer",
-        default=8,
+        default=CAPTURE_VIEWS,
         min=1,
         soft_max=36,
     )

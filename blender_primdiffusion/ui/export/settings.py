@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 
+from ...formats import requests
 from ..translations import CONTEXT
 
 FORMATS = (
@@ -34,27 +35,27 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
         name="Texture",
         description="Pixels a side of the mesh proxy's texture",
         items=[(str(px), f"{px} px", "") for px in (512, 1024, 2048, 4096)],
-        default="2048",
+        default=str(requests.TEXTURE_SIZE),
     )
     triangles: bpy.props.IntProperty(
         name="Triangles",
         translation_context=CONTEXT,
         description="Of the mesh proxy, at most",
-        default=20_000,
+        default=requests.TRIANGLES,
         min=500,
         max=1_000_000,
     )
     gaussians: bpy.props.IntProperty(
         name="Gaussians",
         description="At most; a person has some 130 thousand that can be seen",
-        default=400_000,
+        default=requests.GAUSSIANS,
         min=1000,
         max=1_000_000,
     )
     voxel: bpy.props.FloatProperty(
         name="Voxel Size",
         description="Side of the voxels of a VDB sequence: half of it, eight times the memory",
-        default=0.006,
+        default=requests.VOXEL,
         min=0.002,
         max=0.05,
         precision=3,

@@ -6,7 +6,7 @@ import random
 
 import bpy
 
-from ...worker.names import SAMPLERS
+from ...formats import requests
 from .attributes import PRIMDIFFUSION_PG_attributes
 from .quality import ITEMS, apply_quality, name_quality
 
@@ -15,7 +15,7 @@ _SAMPLERS = {
     "dpmpp_2m": ("DPM-Solver++(2M)", "Two steps are looked at together: does well with few"),
     "ddpm": ("DDPM", "New noise at each step: wants many"),
 }
-SAMPLER_ITEMS = [(name, *_SAMPLERS[name]) for name in SAMPLERS]
+SAMPLER_ITEMS = [(name, *_SAMPLERS[name]) for name in requests.SAMPLERS]
 
 
 LARGEST_SEED = 2**31 - 1
@@ -54,7 +54,7 @@ class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
     steps: bpy.props.IntProperty(
         name="Steps",
         description="Denoising steps: more take longer and add detail",
-        default=30,
+        default=requests.STEPS,
         min=1,
         max=1000,
         soft_max=100,
@@ -67,7 +67,7 @@ class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
         name="Guidance",
         description="How strongly the attributes are followed: 1 as people are, more exaggerates; "
         "without attributes it does nothing",
-        default=1.5,
+        default=requests.GUIDANCE,
         min=0.0,
         max=20.0,
         soft_min=1.0,

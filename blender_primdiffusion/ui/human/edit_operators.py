@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
+from ...formats.requests import STEPS
 from ...scene.files import person_file
 from ...scene.human import body_of, humans
 from ..generate.attributes import asked, parsed
@@ -32,7 +33,7 @@ class _Edit:
     bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO (the result has one)
     human: bpy.props.StringProperty(name="Person", description=_HUMAN, options=_SKIP)
     seed: bpy.props.IntProperty(name="Seed", min=0, description=_PANELS, options=_SKIP)
-    steps: bpy.props.IntProperty(name="Steps", min=1, max=1000, default=30, description=_PANELS, options=_SKIP)
+    steps: bpy.props.IntProperty(name="Steps", min=1, max=1000, default=STEPS, description=_PANELS, options=_SKIP)
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import bpy
 
+from ...formats.requests import SIDED_PARTS, WHOLE_PARTS
 from ...scene.human import body_of, humans
-from ...worker.names import SIDED_PARTS, WHOLE_PARTS
 from ..generate.attributes import draw_attributes
 from ..jobs.drawing import draw_job
 from ..jobs.target import selected_person

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import bpy
 
+from ...formats.requests import AMOUNT, FRACTION, PARTS, TRANSFERS
 from ...scene.human import MARK, humans
-from ...worker.names import PARTS, TRANSFERS
 from ..generate.attributes import PRIMDIFFUSION_PG_attributes, title
 from ..translations import CONTEXT
 
@@ -44,7 +44,7 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
     amount: bpy.props.FloatProperty(
         name="Amount",
         description="How far the new person may be from this one: 0 is the same, 1 anybody",
-        default=0.5,
+        default=AMOUNT,
         min=0.0,
         max=1.0,
         subtype="FACTOR",
@@ -78,7 +78,7 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
         name="Fraction",
         translation_context=CONTEXT,
         description="How much of the other person: 0 is this one, 1 the other",
-        default=0.5,
+        default=FRACTION,
         min=0.0,
         max=1.0,
         subtype="FACTOR",

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import bpy
 
+from ...formats.requests import VOXEL
 from ...scene.attachment import attachment_before_merge, attachment_of, set_attachment
 from ...scene.human import armature_of, humans
 from ..jobs.follow import submit
@@ -80,7 +81,7 @@ class _Merging(_OfPerson):
         name="Voxel Size",
         description="Metres. Not given: the panel's",
         min=0.0005,
-        default=0.006,
+        default=VOXEL,
         options={"SKIP_SAVE"},
     )
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import bpy
 
-from ...scene.material import DENSITY_GAIN, density_gain, set_density_gain
+from ...formats.requests import DENSITY_GAIN, VOXEL
+from ...scene.material import density_gain, set_density_gain
 
 
 class PRIMDIFFUSION_PG_merging(bpy.types.PropertyGroup):
@@ -15,7 +16,7 @@ class PRIMDIFFUSION_PG_merging(bpy.types.PropertyGroup):
         description="Side of the merged volume's voxels: half the size shows more and takes eight times the memory",
         subtype="DISTANCE",
         unit="LENGTH",
-        default=0.006,
+        default=VOXEL,
         min=0.001,
         max=0.1,
         soft_min=0.003,

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import bpy
 
+from ...formats.requests import AMOUNT
+
 COUNT_ITEMS = [(str(count), str(count), f"{count} people") for count in (4, 8, 12, 16)]
 
 
@@ -38,7 +40,7 @@ class PRIMDIFFUSION_PG_variations(bpy.types.PropertyGroup):
     amount: bpy.props.FloatProperty(
         name="Difference",
         description="How far More Like This goes from the chosen person: 0 is the person, 1 anybody",
-        default=0.5,
+        default=AMOUNT,
         min=0.05,
         max=1.0,
         subtype="FACTOR",
