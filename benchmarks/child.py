@@ -3,7 +3,8 @@
     python benchmarks/child.py --json FILE
 
 Waits are in seconds from the event to the tick that shows it: a cancel while torch is loaded, between steps and while
-the child is stopped in the middle of one; a child that is killed. Beside them the longest tick of all.
+the child is stopped in the middle of one; a child that is killed. Beside them the longest tick of all, and the longest
+under a flood of messages.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from itertools import pairwise
 from pathlib import Path
 
@@ -25,7 +26,7 @@ import record
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "blender_primdiffusion"))
 from worker.backend import Backend  # noqa: E402
-from worker.client import BackendClient  # noqa: E402
+from worker.client import BackendClient, Died  # noqa: E402
 from worker.job import Job  # noqa: E402
 
 TICK_S = 0.1
@@ -33,6 +34,12 @@ TICK_S = 0.1
 STEPS = 1000
 """More than are waited for."""
 BEATS = 10
+FLOOD = """
+import json, sys
+for i in range(300_000):
+    progress = {"id": 2, "stage": "sample", "step": i, "total": 300_000, "eta_s": 1.0}
+    print(json.dumps({"jsonrpc": "2.0", "method": "progress", "params": progress}))
+"""
 PATIENCE_S = 120.0
 
 
@@ -71,6 +78,7 @@ def main() -> None:
             "cancel_stopped_seconds": cancel_seconds(timer, folder, lambda job: job.step > 2, signal.SIGSTOP),
             "death_noticed_seconds": death_seconds(timer, folder),
             "heartbeat_interval_seconds_max": heartbeat_interval_s(),
+            "flood_tick_seconds_max": flood_tick_s(folder),
         }
     figures["tick_seconds_max"] = timer.longest_s
     record.tell(figures, arguments.json)
@@ -78,7 +86,7 @@ def main() -> None:
 
 def cancel_seconds(timer: Timer, folder: Path, when: Callable[[Job], bool], send: int = 0) -> float:
     """From the cancel of a job for which `when` holds, the signal `send` having reached its child, to its end."""
-    backend = Backend(lambda: BackendClient(Path(sys.executable)))
+    backend = Backend(this_python)
     job = generate(backend, folder)
     timer.until(job, lambda: backend.client is not None and backend.client.pid is not None and when(job))
     os.kill(backend.client.pid, send)
@@ -90,13 +98,36 @@ def cancel_seconds(timer: Timer, folder: Path, when: Callable[[Job], bool], send
 
 def death_seconds(timer: Timer, folder: Path) -> float:
     """From the death of a child at work to the failure of its job."""
-    backend = Backend(lambda: BackendClient(Path(sys.executable)))
+    backend = Backend(this_python)
     job = generate(backend, folder)
     timer.until(job, lambda: job.step > 2)
     os.kill(backend.client.pid, signal.SIGKILL)
     seconds = timer.until(job, lambda: job.finished)
     backend.shutdown()
     return seconds
+
+
+def this_python() -> Generator[None, None, BackendClient]:
+    """The real child on the Python that runs this."""
+    yield
+    return BackendClient(Path(sys.executable))
+
+
+def flood_tick_s(folder: Path) -> float:
+    """The longest tick while a child writes messages as fast as it can."""
+    package = folder / "flood" / "primdiffusion"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    (package / "serve.py").write_text(FLOOD, encoding="utf-8")
+    client, longest = BackendClient(Path(sys.executable), folder / "flood"), 0.0
+    client.start()
+    ended = False
+    while not ended:
+        before = time.monotonic()
+        ended = any(isinstance(event, Died) for event in client.poll())
+        longest = max(longest, time.monotonic() - before)
+        time.sleep(TICK_S / 10)
+    return longest
 
 
 def heartbeat_interval_s() -> float:

@@ -6,7 +6,6 @@ import contextlib
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
 
 DONE, FAILED, UNUSABLE, NO_BACKEND, CANCELLED = 0, 1, 2, 3, 130
@@ -41,23 +40,45 @@ def stdout_of_our_own() -> Iterator[Callable[[str], None]]:
         os.close(ours)
 
 
+class Stop:
+    """Whether a command was asked to stop; read between pieces of work."""
+
+    def __init__(self, ended: Callable[[], bool] = lambda: False) -> None:
+        """`ended` is another reason to stop, looked at each time."""
+        self._asked = False
+        self.ended = ended
+
+    def set(self) -> None:
+        """Ask."""
+        self._asked = True
+
+    def is_set(self) -> bool:
+        """Whether it was asked to."""
+        self._asked = self._asked or self.ended()
+        return self._asked
+
+
 @contextlib.contextmanager
-def stopped_by_signals() -> Iterator[threading.Event]:
+def stopped_by_signals() -> Iterator[Stop]:
     """Set by Ctrl-C or a polite kill, for the time between pieces of work; the second one ends the process at once.
 
     An exception would not do: raised while Cycles calls Python, it is printed and forgotten.
     """
-    stop = threading.Event()
+    stop = Stop()
+    asked = []
 
     def note(*_: object) -> None:
-        if stop.is_set():
+        if asked:
             os._exit(CANCELLED)
+        asked.append(True)
         stop.set()
 
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {}
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before[number] = signal.signal(number, note)
+    except ValueError:  # not in the main thread, which alone gets signals
+        pass
     try:
         yield stop
     finally:

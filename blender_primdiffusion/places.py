@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import bpy
 
 if TYPE_CHECKING:
+    from collections.abc import Generator
+
     from .worker.backend import Backend
     from .worker.client import BackendClient
     from .worker.setup_folder import SetUpFolder
@@ -63,20 +65,17 @@ def preference(name: str) -> str:
 
 
 def new_backend(python: str) -> Backend:
-    """A child that is yet to be started, on the interpreter of this path; empty: found when it starts.
-
-    What Blender knows is read here: the thread that starts the child must not touch bpy.
-    """
+    """A child that is yet to be started, on the interpreter of this path; empty: found when it starts."""
     from .worker import client, environment
     from .worker.backend import Backend
 
     module_path, cache = backend_module_path(), cache_folder()
     own_environment = set_up_folder().environment
 
-    def make_client() -> BackendClient:
-        found = environment.find_backend_python(python or None, own_environment, module_path, cache_dir=cache)
+    def make_client() -> Generator[None, None, BackendClient]:
+        found = yield from environment.search(python or None, own_environment, module_path, cache_dir=cache)
         made = client.BackendClient(found.path, module_path, cache_dir=cache)
-        made.info["torch"] = found.torch  # which the child does not tell
+        made.info["torch"] = found.torch  # the child does not report it
         return made
 
     return Backend(make_client)

@@ -11,14 +11,14 @@ import contextlib
 import dataclasses
 import json
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 
 import bpy
 
-from ..console import CANCELLED, DONE, FAILED, UNUSABLE, duration, stdout_of_our_own, stopped_by_signals
+from ..console import CANCELLED, DONE, FAILED, UNUSABLE, Stop, duration, stdout_of_our_own, stopped_by_signals
 from ..formats.capture_layout import CaptureFolderError
+from ..worker.child_streams import stdin_has_ended
 from .job import CaptureError, Progress, run
 from .options import MARK, UsageError, parse, settings_of
 from .report import Report, report_path
@@ -75,7 +75,7 @@ def scans_in(folders: Sequence, only: Sequence[str] = ()) -> list[ScanFile]:
     return [found[name] for name in sorted(found) if not only or name in only]
 
 
-def _run(options: argparse.Namespace, say: Say, stop: threading.Event) -> int:
+def _run(options: argparse.Namespace, say: Say, stop: Stop) -> int:
     if options.verify or (options.repair and not options.people):
         return _check(options, say)
     if options.repair and options.out.exists():
@@ -88,7 +88,7 @@ def _run(options: argparse.Namespace, say: Say, stop: threading.Event) -> int:
             say(scan.name)
         return DONE
     if options.while_stdin:
-        _set_at_end_of_stdin(stop)
+        stop.ended = stdin_has_ended
     return _render(options, settings, scans, say, stop)
 
 
@@ -100,9 +100,7 @@ def _check(options: argparse.Namespace, say: Say) -> int:
     return FAILED if wrong else DONE
 
 
-def _render(
-    options: argparse.Namespace, settings: CaptureSettings, scans: list[ScanFile], say: Say, stop: threading.Event
-) -> int:
+def _render(options: argparse.Namespace, settings: CaptureSettings, scans: list[ScanFile], say: Say, stop: Stop) -> int:
     try:
         settings.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -142,12 +140,3 @@ def describe(progress: Progress) -> str:
     """A line for people."""
     left = "" if progress.eta_s is None else f", {duration(progress.eta_s)} left"
     return f"{progress.subject}: view {progress.done} of {progress.total}{left}"
-
-
-def _set_at_end_of_stdin(stop: threading.Event) -> None:
-    def wait() -> None:
-        while sys.stdin.buffer.read(4096):
-            pass
-        stop.set()
-
-    threading.Thread(target=wait, name="capture stdin", daemon=True).start()

@@ -6,7 +6,6 @@ import contextlib
 import os
 import shutil
 import tempfile
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ SHARED_MEMORY = Path("/dev/shm")
 CHANNELS = 5
 """Combined (4) and depth."""
 _PREFIX = "primdiffusion_"
+_FOLDER = "folder"
 
 
 class Frame:
@@ -43,37 +43,41 @@ class Frame:
 class Frames:
     """A folder in shared memory for frames and what else the child reads; `close` removes it with all that is in it.
 
-    For any thread: a render and a viewport may both ask.
+    For several threads, each with names of its own: a render and a viewport may both ask.
     """
 
     def __init__(self) -> None:
-        self._lock = threading.RLock()
-        self._folder: Path | None = None
+        self._folders: dict[str, Path] = {}
+        """At most one; two threads that need it at once agree on it by `setdefault`, which is atomic."""
         self._spare: dict[str, Frame] = {}
 
     @property
     def folder(self) -> Path:
         """Made at first use."""
-        with self._lock:
-            if self._folder is None or not self._folder.is_dir():
-                _sweep()
-                place = SHARED_MEMORY if os.access(SHARED_MEMORY, os.W_OK) else None
-                self._folder = Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{os.getpid()}_", dir=place))
-                self._spare.clear()
-            return self._folder
+        folder = self._folders.get(_FOLDER)
+        if folder is not None and not folder.is_dir():
+            self._folders.pop(_FOLDER, None)
+            self._spare.clear()
+            folder = None
+        if folder is None:
+            _sweep()
+            new = _new_folder(SHARED_MEMORY if os.access(SHARED_MEMORY, os.W_OK) else None)
+            folder = self._folders.setdefault(_FOLDER, new)
+            if folder is not new:
+                new.rmdir()
+        return folder
 
     def take(self, name: str, width: int, height: int) -> Frame:
         """The frame of this name; the one of last time if it has this size. OSError where there is no room for it."""
-        with self._lock:
-            frame = self._spare.get(name)
-            if frame is None or (frame.width, frame.height) != (width, height) or not frame.path.exists():
-                self.drop(name)
-                path = self._allocate(name, width * height * CHANNELS * 4)
-                frame = self._spare[name] = Frame(path, width, height)
-            return frame
+        frame = self._spare.get(name)
+        if frame is None or (frame.width, frame.height) != (width, height) or not frame.path.exists():
+            self.drop(name)
+            path = self._allocate(name, width * height * CHANNELS * 4)
+            frame = self._spare[name] = Frame(path, width, height)
+        return frame
 
     def drop(self, name: str) -> None:
-        """Removes the frame of this name; who still maps it keeps it."""
+        """Removes the frame of this name; its last user still maps it."""
         frame = self._spare.pop(name, None)
         if frame is not None:
             frame.path.unlink(missing_ok=True)
@@ -81,9 +85,9 @@ class Frames:
     def close(self) -> None:
         """Removes the folder."""
         self._spare.clear()
-        if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
-            self._folder = None
+        folder = self._folders.pop(_FOLDER, None)
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
 
     def _allocate(self, name: str, size: int) -> Path:
         """A file of `size` bytes that has its room: a full memory file system would otherwise end the process later."""
@@ -93,8 +97,12 @@ class Frames:
             if self.folder.parent != SHARED_MEMORY:
                 raise
         self.close()
-        self._folder = Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{os.getpid()}_"))
-        return _reserve(self._folder / f"{name}_{size}.frame", size)
+        folder = self._folders.setdefault(_FOLDER, _new_folder(None))
+        return _reserve(folder / f"{name}_{size}.frame", size)
+
+
+def _new_folder(within: Path | None) -> Path:
+    return Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{os.getpid()}_", dir=within))
 
 
 def _reserve(path: Path, size: int) -> Path:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import threading
 
 from ..places import new_backend, preference
 from ..worker.drawing import IDLE_S, DrawingChild
@@ -11,33 +10,40 @@ from .frames import Frames
 
 frames = Frames()
 """Of all renders and viewports."""
-_child: DrawingChild | None = None
-_child_python = ""
-_lock = threading.Lock()
+_children: dict[str, DrawingChild] = {}
+"""By the preference for their Python; one at a time."""
 
 
 def drawing_child() -> DrawingChild:
     """The engine's child, which runs beside the one that generates people; another preference makes another one."""
-    global _child, _child_python
     python = preference("backend_python")
-    with _lock:  # renders ask from a thread of their own
-        if _child is None or python != _child_python:
-            if _child is not None:
-                _child.close()
-            _child, _child_python = DrawingChild(new_backend(python), IDLE_S), python
-        return _child
+    child = _children.get(python)
+    if child is None:  # renders ask from a thread of Blender's: one of two that ask at once makes it
+        child = _children.setdefault(python, DrawingChild(new_backend(python), IDLE_S))
+        _close([other for other in list(_children) if other != python])
+    return child
+
+
+def advance() -> None:
+    """Follow what the child draws, and end an idle one. Never waits."""
+    for child in list(_children.values()):
+        child.advance()
 
 
 def child_pid() -> int | None:
     """The process of the engine's child, None while there is none."""
-    return _child.pid if _child is not None else None
+    return next((child.pid for child in list(_children.values()) if child.pid is not None), None)
 
 
 @atexit.register
 def close() -> None:
     """Ends the child and frees the memory; the next picture starts anew."""
-    global _child
-    if _child is not None:
-        _child.close()
-        _child = None
+    _close(list(_children))
     frames.close()
+
+
+def _close(pythons: list[str]) -> None:
+    for python in pythons:
+        child = _children.pop(python, None)
+        if child is not None:
+            child.close()

@@ -60,6 +60,7 @@ class Viewport:
             self.update(context, depsgraph)  # Blender does not tell
         if self._picture is not None:
             self._refinement.want(_wish(self._picture, context, depsgraph))
+            studio.advance()
             self._refinement.advance()
             if not self._refinement.resting:
                 follow()
@@ -179,6 +180,7 @@ def stop() -> None:
 
 
 def _tick() -> float | None:
+    studio.advance()
     if any([viewport.advance() for viewport in _viewports]):  # each of them, not only up to the first with news
         _redraw()
     return TICK_S if any(not viewport.resting for viewport in _viewports) else None

@@ -77,7 +77,7 @@ def index_to_local(grid: MergedGrid, blender_version: tuple[int, ...]) -> NDArra
 
 
 def write_grid(grid: MergedGrid, path: Path) -> str:
-    """Writes `density` and `Cd` as half floats; returns a digest of what they hold. Needs no bpy: any thread may write.
+    """Writes `density` and `Cd` as half floats; returns a digest of what they hold.
 
     `bpy.utils.expose_bundled_modules()` must have been called before. Raises VolumeWriteError.
     """

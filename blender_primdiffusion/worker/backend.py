@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Generator
 from typing import Protocol
 
 from .client import BackendClient, Event
+from .polling import run_to_end
+
+END_S = 2.0
+"""What a child that was asked to end may take for it."""
 
 
 class Job(Protocol):
@@ -19,13 +23,17 @@ class Job(Protocol):
 
 
 class Backend:
-    """The child that jobs share: started at first use, kept warm, started anew after it died."""
+    """The child that jobs share: started at first use, kept warm, started anew after it died.
 
-    def __init__(self, make_client: Callable[[], BackendClient]):
-        """`make_client` finds a Python and returns a client not yet started, in a thread: it must not touch bpy."""
+    Blender may be closed between any two calls, so what takes long is a generator that yields while it waits.
+    """
+
+    def __init__(self, make_client: Callable[[], Generator[None, None, BackendClient]]):
+        """`make_client` finds a Python and returns a client not yet started; yields while it looks for one."""
         self._make_client = make_client
-        self._lock = threading.Lock()
         self._client: BackendClient | None = None
+        self._leaving: list[tuple[BackendClient, float, Callable[[], None]]] = []
+        """Each with the time at which it is killed, and what is to be done after it has gone."""
         self._closed = False
         self._job: Job | None = None
 
@@ -42,19 +50,21 @@ class Backend:
         client = self._client
         return client if client is not None and client.alive else None
 
+    def connecting(self) -> Generator[None, None, BackendClient]:
+        """The running child, started now if there is none, which takes seconds. Raises BackendNotFound or OSError."""
+        running = self.client
+        if running is not None:
+            return running
+        client = yield from self._make_client()
+        if self._closed:
+            raise RuntimeError("the backend was shut down while it was starting")
+        client.start()
+        self._client = client
+        return client
+
     def connect(self) -> BackendClient:
-        """The running child, started now if there is none. Takes seconds. Raises BackendNotFound or OSError."""
-        with self._lock:
-            running = self.client
-            if running is not None:
-                return running
-            client = self._make_client()
-            client.start()
-            self._client = client
-            if self._closed:
-                client.shutdown()
-                raise RuntimeError("the backend was shut down while it was starting")
-            return client
+        """As `connecting`, for callers that wait."""
+        return run_to_end(self.connecting())
 
     @property
     def log(self) -> tuple[str, ...]:
@@ -62,17 +72,38 @@ class Backend:
         return self._client.stderr if self._client is not None else ()
 
     def listen(self) -> list[Event]:
-        """What has happened while nobody is at work: the child's end, or its silence."""
+        """What has happened between jobs: the child's end, or its silence."""
+        self.see_off()
         return self._client.poll() if self._client is not None else []
 
     def release(self) -> None:
         """Ends the child that is kept warm, without waiting for it; the next job starts another."""
         client, self._client = self._client, None
-        if client is not None:  # its farewell takes a moment, in which Blender would stand still
-            threading.Thread(target=client.shutdown, name="primdiffusion end", daemon=True).start()
+        if client is not None:
+            client.end()
+            self.part_with(client)
+
+    def part_with(self, client: BackendClient, afterwards: Callable[[], None] = lambda: None) -> None:
+        """Do `afterwards` when a child that was asked to end has gone; see to it that it goes."""
+        self._leaving.append((client, time.monotonic() + END_S, afterwards))
+
+    def see_off(self) -> None:
+        """Look after children that are about to end. Takes no time."""
+        leaving, self._leaving = self._leaving, []
+        for client, killed_at, afterwards in leaving:
+            if client.gone_within(0.0):
+                afterwards()
+                continue
+            if time.monotonic() > killed_at:
+                client.kill(0.0)
+            self._leaving.append((client, killed_at, afterwards))
 
     def shutdown(self) -> None:
-        """Ends the child for good, also one that is just being started."""
+        """Ends the child for good, also one that is just being started. Waits for its end some seconds at most."""
         self._closed = True
         if self._client is not None:
             self._client.shutdown()
+        for client, _, afterwards in self._leaving:
+            client.shutdown()
+            afterwards()
+        self._leaving.clear()

@@ -1,31 +1,32 @@
 """The child process and the conversation with it: JSON-RPC 2.0, a message a line. Nothing here waits for the child.
 
-Threads read the child's two outputs and write its input; `poll` hands over what has arrived and notices a death or a
-silence. All public methods are for one thread (Blender's main thread).
+`poll` reads what the child has written (see `child_streams`), sends what its input takes, and notices a death or a
+silence. All public methods are for one thread at a time.
 """
 
 from __future__ import annotations
 
 import collections
-import contextlib
 import dataclasses
 import itertools
 import json
 import os
-import queue
 import subprocess
-import threading
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
+
+from .child_streams import LOG_LINES, Input, Output
 
 SILENCE_S = 20.0
 """The child sends a heartbeat every 0.5 s; importing torch from a cold disk can hold it up for seconds."""
-STDERR_LINES = 200
 LONGEST_POLL_GAP_S = 1.0
 """Silence counts only while we poll: a suspended laptop or a blocked Blender is not the child's fault."""
-STUCK_AT_EXIT_S = 1.0
+POLL_S = 0.05
+"""Of parsing in one call of `poll`: a flood of messages is taken in over several."""
+LISTEN_S = 0.01
+"""Between two looks at the child's output in `wait`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,9 +58,9 @@ class Notification:
 
 @dataclasses.dataclass(frozen=True)
 class Died:
-    """The child is gone, and it was not told to go; the last event of a client."""
+    """The child is gone, and it was not asked to end; the last event of a client."""
 
-    exit_code: int | None
+    exit_code: int
     message: str
     stderr: tuple[str, ...]
 
@@ -108,16 +109,15 @@ class BackendClient:
         self._environment = child_environment(module_path, cache_dir, env or {})
         self._silence_s = silence_s
         self._process: subprocess.Popen[bytes] | None = None
-        self._incoming: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
-        self._outgoing: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-        self._stderr: collections.deque[str] = collections.deque(maxlen=STDERR_LINES)
-        self._stderr_thread: threading.Thread | None = None
+        self._input: Input | None = None
+        self._output: Output | None = None
+        self._errors: Output | None = None
+        self._lines: collections.deque[bytes] = collections.deque()
+        self._stray: collections.deque[str] = collections.deque(maxlen=LOG_LINES)
+        self._last_errors: tuple[str, ...] = ()
         self._ids = itertools.count(1)
         self._expected_to_end = False
-        self._output_ended_at: float | None = None
-        self._reported_end = False
-        self._heard = threading.Event()
-        self._arrival = threading.Event()
+        self._ended = False
         self._silence = 0.0
         self._reported_silence = False
         self._polled_at = time.monotonic()
@@ -129,22 +129,25 @@ class BackendClient:
         """Starts the child and asks it who it is; `info` fills as it answers. Raises OSError without such a Python."""
         if self._process is not None:
             raise RuntimeError("this client has been started before: make a new one")
-        process = subprocess.Popen(
-            self._command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            env=self._environment,
-            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
-        )
-        self._process = process
+        output, errors = Output(), Output()
+        try:
+            self._process = subprocess.Popen(
+                self._command,
+                stdin=subprocess.PIPE,
+                stdout=output.target,
+                stderr=errors.target,
+                bufsize=0,
+                env=self._environment,
+                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+            )
+        except OSError:
+            output.close()
+            errors.close()
+            raise
+        output.target.close()
+        errors.target.close()
+        self._input, self._output, self._errors = Input(self._process.stdin), output, errors
         self._polled_at = time.monotonic()
-        threading.Thread(target=self._write, args=(process.stdin,), name="primdiffusion stdin", daemon=True).start()
-        threading.Thread(target=self._read, args=(process.stdout,), name="primdiffusion stdout", daemon=True).start()
-        self._stderr_thread = threading.Thread(
-            target=self._listen, args=(process.stderr,), name="primdiffusion stderr", daemon=True
-        )
-        self._stderr_thread.start()
         self._hello = self.request("hello", {})
 
     @property
@@ -157,12 +160,13 @@ class BackendClient:
         """The child runs and can be asked for something."""
         if self._process is None or self._expected_to_end:  # one that was killed may take a moment to go
             return False
-        return self._process.poll() is None and self._output_ended_at is None
+        return self._process.poll() is None
 
     @property
     def stderr(self) -> tuple[str, ...]:
-        """The last lines the child wrote to stderr (and all stray prints)."""
-        return tuple(self._stderr)
+        """The last lines the child wrote to stderr, and lines on stdout that are no messages."""
+        errors = self._last_errors if self._errors is None else self._errors.log()
+        return (*self._stray, *errors)
 
     def request(self, method: str, params: Mapping[str, Any]) -> int:
         """Sends a request and returns its id; the answer comes through `poll`. A dead child answers with Died there."""
@@ -175,7 +179,7 @@ class BackendClient:
         self.request("cancel", {"id": id})
 
     def abandon(self, id: int) -> None:
-        """Nobody wants the answer to request `id` any more, whose cancel the child has not got round to yet."""
+        """Drop the answer to request `id`, whose cancel the child has not come to yet."""
         self._abandoned.add(id)
 
     @property
@@ -189,39 +193,48 @@ class BackendClient:
         now = time.monotonic()
         self._silence += min(now - self._polled_at, LONGEST_POLL_GAP_S)
         self._polled_at = now
-        if self._heard.is_set():
-            self._heard.clear()
-            self._silence, self._reported_silence = 0.0, False
+        if self._process is None or self._ended:
+            return events
+        if self._input is not None:
+            self._input.flush()
+        exit_code = self._process.poll()  # before reading: then all that it wrote is there
         for message in self._arrived():
+            self._silence, self._reported_silence = 0.0, False
             if message.get("id") in self._abandoned and "method" not in message:
                 self._abandoned.discard(message["id"])
-            else:
+            elif message.get("method") != "heartbeat":
                 events.append(self._event(message))
-        events.extend(self._ending(now))
-        if self.alive and self._silence > self._silence_s and not self._reported_silence:
+        if exit_code is not None and not self._lines and self._output is not None and self._output.at_end:
+            events.extend(self._end(exit_code))
+        elif self.alive and self._silence > self._silence_s and not self._reported_silence:
             self._reported_silence = True
             events.append(Silent(self._silence))
         return events
 
     def wait(self, timeout_s: float) -> None:
-        """Sleeps until the child has said something (heartbeats aside) or ended, at most `timeout_s`; then `poll`."""
-        if self._arrival.wait(timeout_s):
-            self._arrival.clear()
+        """Sleeps until the child has written something or ended, at most `timeout_s`; then `poll`."""
+        end = time.monotonic() + timeout_s
+        while self.alive and not self._lines and not (self._output is not None and self._output.has_more()):
+            left = end - time.monotonic()
+            if left <= 0:
+                return
+            time.sleep(min(left, LISTEN_S))
+
+    def end(self) -> None:
+        """Asks the child to end, without waiting for it: by a request, and by the end of its input."""
+        self._expected_to_end = True
+        if self._input is not None:
+            self.request("shutdown", {})
+            self._input.close()
 
     def shutdown(self, timeout_s: float = 2.0) -> None:
         """Ends the child politely, or by force after `timeout_s`; waits no longer than that. Safe to call twice."""
-        self._expected_to_end = True
-        if self._process is None:
-            return
-        self.request("shutdown", {})
-        self._outgoing.put(None)
-        try:
-            self._process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
+        self.end()
+        if not self.gone_within(timeout_s):
             self.kill()
 
     def kill(self, patience_s: float = 1.0) -> bool:
-        """Ends the child at once. It was told to go, so no Died follows.
+        """Ends the child at once; no Died follows.
 
         Waits no longer than `patience_s` for the system to take it away, gigabytes of memory with it; whether it is
         gone.
@@ -229,29 +242,39 @@ class BackendClient:
         self._expected_to_end = True
         if self._process is not None:
             self._process.kill()
-            self._outgoing.put(None)
+            if self._input is not None:
+                self._input.close()
         return self.gone_within(patience_s)
 
     def gone_within(self, seconds: float) -> bool:
-        """Wait for the end of a child that was told to go; whether it has ended."""
+        """Wait for the end of a child that was asked to end; whether it has ended."""
         if self._process is None:
             return True
         try:
             self._process.wait(seconds)
         except subprocess.TimeoutExpired:  # a busy system, or an uninterruptible wait
             return False
+        self._close_streams()
         return True
 
     # what has arrived
 
     def _arrived(self) -> Iterator[dict[str, Any]]:
-        with contextlib.suppress(queue.Empty):
-            while True:
-                message = self._incoming.get_nowait()
-                if message is None:
-                    self._output_ended_at = time.monotonic()
-                else:
-                    yield message
+        """Messages, for POLL_S at most."""
+        end = time.monotonic() + POLL_S
+        while self._output is not None:
+            if not self._lines:
+                self._lines.extend(self._output.lines())
+                if not self._lines:
+                    return
+            line = self._lines.popleft()
+            message = _parse(line)
+            if message is not None:
+                yield message
+            elif line.strip():
+                self._stray.append(f"[not a message] {line[:300].decode('utf-8', 'replace').rstrip()}")
+            if time.monotonic() > end:
+                return
 
     def _event(self, message: dict[str, Any]) -> Event:
         method, params, id = message.get("method"), message.get("params") or {}, message.get("id")
@@ -270,57 +293,27 @@ class BackendClient:
             self.info = {**result, **{name: value for name, value in self.info.items() if value is not None}}
         return Response(id, result)
 
-    def _ending(self, now: float) -> Iterator[Died]:
+    def _end(self, exit_code: int) -> Iterator[Event]:
         """The end of the child, once, after everything it still said."""
-        if self._process is None or self._reported_end:
-            return
-        exit_code = self._process.poll()
-        if exit_code is None and self._output_ended_at is None:
-            return
-        if exit_code is None and now - (self._output_ended_at or now) < STUCK_AT_EXIT_S:
-            return  # the output has ended and the process is about to
-        if self._output_ended_at is None:  # gone, but the reader may still hold its last words
-            self._output_ended_at = now
-            return
-        self._reported_end = True
-        self._outgoing.put(None)
-        if exit_code is None:
-            self._process.kill()
-        if self._expected_to_end:
-            return
-        if self._stderr_thread is not None:
-            self._stderr_thread.join(0.1)
-        yield Died(exit_code, death_sentence(exit_code), self.stderr)
+        self._ended = True
+        last = _parse(self._output.rest()) if self._output is not None else None
+        if last is not None:
+            yield self._event(last)
+        self._close_streams()
+        if not self._expected_to_end:
+            yield Died(exit_code, death_sentence(exit_code), self.stderr)
 
-    # threads
+    def _close_streams(self) -> None:
+        if self._errors is not None:
+            self._last_errors = tuple(self._errors.log())
+        for stream in (self._input, self._output, self._errors):
+            if stream is not None:
+                stream.close()
+        self._input = self._output = self._errors = None
 
     def _send(self, message: dict[str, Any]) -> None:
-        self._outgoing.put(json.dumps(message).encode("utf-8") + b"\n")
-
-    def _write(self, stdin: IO[bytes]) -> None:
-        with contextlib.suppress(OSError):  # a broken pipe: the child is gone, which `poll` reports
-            while (line := self._outgoing.get()) is not None:
-                stdin.write(line)
-                stdin.flush()
-        with contextlib.suppress(OSError):
-            stdin.close()
-
-    def _read(self, stdout: IO[bytes]) -> None:
-        for line in stdout:
-            message = _parse(line)
-            if message is None:
-                self._stderr.append(f"[not a message] {line[:300].decode('utf-8', 'replace').rstrip()}")
-                continue
-            self._heard.set()
-            if message.get("method") != "heartbeat":  # nobody may poll for hours: let nothing pile up
-                self._incoming.put(message)
-                self._arrival.set()
-        self._incoming.put(None)
-        self._arrival.set()
-
-    def _listen(self, stderr: IO[bytes]) -> None:
-        for line in stderr:
-            self._stderr.append(line.decode("utf-8", "replace").rstrip())
+        if self._input is not None:
+            self._input.send(json.dumps(message).encode("utf-8") + b"\n")
 
 
 def _parse(line: bytes) -> dict[str, Any] | None:
@@ -331,10 +324,8 @@ def _parse(line: bytes) -> dict[str, Any] | None:
     return message if isinstance(message, dict) else None
 
 
-def death_sentence(exit_code: int | None) -> str:
+def death_sentence(exit_code: int) -> str:
     """One sentence on how the child ended."""
-    if exit_code is None:
-        return "the backend closed its output and hung: it was ended"
     if exit_code in (-9, 137):
         return "the backend was killed by the system (often: out of memory)"
     if exit_code < 0:

@@ -1,15 +1,15 @@
 """Pictures from the child: asked for by any thread, drawn one after the other, followed by whoever asked.
 
-A thread of its own speaks with the child, so that neither Blender's render thread nor its window waits for it. The
-child is started by the first picture, kept warm, and ended when nobody has asked for one in a while.
+There is no thread of its own: whoever waits for a picture, Blender's render thread or a timer of its window, also
+speaks with the child, one of them at a time (`DrawingChild.advance`). The child is started by the first picture, kept
+warm, and ended when none has been asked for in a while.
 """
 
 from __future__ import annotations
 
 import collections
-import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Generator, Mapping
 from typing import Any, Literal
 
 from .backend import Backend
@@ -20,15 +20,16 @@ IDLE_S = 600.0
 """A child at rest holds about half a gigabyte; starting one takes seconds."""
 CANCEL_PATIENCE_S = 15.0
 """A cancel takes effect at the end of a band; a child that takes longer than this is ended."""
-LISTEN_S = 0.02
-"""How late a cancel may be noticed."""
+LISTEN_S = 0.01
+"""Between two looks at the child while a picture is waited for."""
 State = Literal["waiting", "starting", "drawing", "done", "failed", "cancelled"]
 
 
 class Drawing:
     """One picture: wanted, under way, and at last done, failed or cancelled. Read and waited for by any thread."""
 
-    def __init__(self, params: Mapping[str, Any]):
+    def __init__(self, params: Mapping[str, Any], advance: Callable[[], None] = lambda: None):
+        """`advance` speaks with the child that draws this picture; it never waits."""
         self.params = dict(params)
         self.state: State = "waiting"
         self.rows = 0
@@ -39,7 +40,7 @@ class Drawing:
         """When done: seconds, and what they were spent on."""
         self.error: JobError | None = None
         self.cancel_asked_at: float | None = None
-        self._news = threading.Condition()
+        self._advance = advance
         self._version = self._seen = 0
 
     @property
@@ -49,24 +50,29 @@ class Drawing:
 
     def wait(self, timeout_s: float) -> bool:
         """Sleeps until there is news since the last call, at most `timeout_s`; whether there is."""
-        with self._news:
-            self._news.wait_for(lambda: self._version != self._seen, timeout_s)
-            news, self._seen = self._version != self._seen, self._version
-        return news
+        end = time.monotonic() + timeout_s
+        while True:
+            self._advance()
+            if self._version != self._seen:
+                self._seen = self._version
+                return True
+            left = end - time.monotonic()
+            if left <= 0:
+                return False
+            time.sleep(min(left, LISTEN_S))
 
     def cancel(self) -> None:
         """Asks for an end, which comes within a band of the picture; before the first, nothing is drawn at all."""
         if self.cancel_asked_at is None:
             self.cancel_asked_at = time.monotonic()
+            self._advance()
 
     def become(self, state: State, **facts: Any) -> None:
-        """Moves on, and wakes those who wait. For the thread that speaks with the child."""
-        with self._news:
-            for name, value in facts.items():
-                setattr(self, name, value)
-            self.state = state
-            self._version += 1
-            self._news.notify_all()
+        """Moves on. For whoever speaks with the child."""
+        for name, value in facts.items():
+            setattr(self, name, value)
+        self.state = state
+        self._version += 1
 
 
 class DrawingChild:
@@ -76,24 +82,27 @@ class DrawingChild:
         self._backend = backend
         self._idle_s = idle_s
         self._wanted: collections.deque[Drawing] = collections.deque()
-        self._wake = threading.Condition()
-        self._thread: threading.Thread | None = None
+        self._current: Drawing | None = None
+        self._connecting: Generator[None, None, BackendClient] | None = None
+        self._client: BackendClient | None = None
+        """The child that `_current` was asked of."""
+        self._request = 0
+        self._told_to_cancel = False
+        self._idle_since = time.monotonic()
         self._closed = False
+        self._turn: collections.deque[None] = collections.deque([None])
+        """Whoever has taken the one element speaks with the child: taking it is atomic and never waits."""
 
     def draw(self, params: Mapping[str, Any]) -> Drawing:
         """Asks for a picture (`params` of the request `draw`, docs/protocol.md) and returns at once.
 
         Raises RuntimeError after `close`.
         """
-        drawing = Drawing(params)
-        with self._wake:
-            if self._closed:
-                raise RuntimeError("this child has been closed: make a new one")
-            self._wanted.append(drawing)
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._work, name="primdiffusion draw", daemon=True)
-                self._thread.start()
-            self._wake.notify()
+        if self._closed:
+            raise RuntimeError("this child has been closed: make a new one")
+        drawing = Drawing(params, self.advance)
+        self._wanted.append(drawing)
+        self.advance()
         return drawing
 
     @property
@@ -110,65 +119,81 @@ class DrawingChild:
 
     def close(self) -> None:
         """Ends the child for good; drawings under way become cancelled."""
-        with self._wake:
-            self._closed = True
-            for drawing in self._wanted:
-                drawing.cancel()
-            self._wake.notify()
+        self._closed = True
+        self.advance()
         self._backend.shutdown()
 
-    # the thread that speaks with the child
+    def advance(self) -> None:
+        """Take in what the child has said, ask for the next picture, end an idle child. Never waits.
 
-    def _work(self) -> None:
-        while (drawing := self._next()) is not None:
-            if drawing.cancel_asked_at is None:
-                self._draw(drawing)
-            else:
-                drawing.become("cancelled")
+        For any thread; does nothing while another is at it.
+        """
+        try:
+            self._turn.popleft()
+        except IndexError:
+            return
+        try:
+            self._backend.see_off()
+            while (drawing := self._next()) is not None:
+                self._follow(drawing)
+                if not drawing.finished:
+                    return
+                self._current, self._idle_since = None, time.monotonic()
+            self._rest()
+        finally:
+            self._turn.append(None)
+
+    # whoever has the turn
 
     def _next(self) -> Drawing | None:
-        """The next one wanted; None after `close`. Ends an idle child."""
-        with self._wake:
-            while not self._wanted:
-                if self._closed:
-                    return None
-                if not self._wake.wait(self._idle_s) and not self._wanted:
-                    client = self._backend.client
-                    if client is not None:
-                        client.shutdown()
-            return self._wanted.popleft()
+        """The one at work, or else the next one wanted."""
+        if self._current is None and self._wanted:
+            self._current, self._client, self._told_to_cancel = self._wanted.popleft(), None, False
+        return self._current
 
-    def _draw(self, drawing: Drawing) -> None:
-        if self._backend.client is None:
-            drawing.become("starting")
+    def _rest(self) -> None:
+        """Between pictures: end a child that has been idle for long."""
+        if self._backend.client is not None and time.monotonic() - self._idle_since > self._idle_s:
+            self._backend.release()
+
+    def _follow(self, drawing: Drawing) -> None:
+        if self._closed or (self._client is None and drawing.cancel_asked_at is not None):
+            drawing.become("cancelled")  # a child that is being started is there for the next one
+        elif self._client is None:
+            self._start(drawing)
+        else:
+            self._listen(self._client, drawing)
+
+    def _start(self, drawing: Drawing) -> None:
+        if self._connecting is None:
+            self._connecting = self._backend.connecting()
+            if self._backend.client is None:
+                drawing.become("starting")
         try:
-            client = self._backend.connect()
+            next(self._connecting)
+        except StopIteration as connected:
+            self._connecting, self._client = None, connected.value
+            self._ask(connected.value, drawing)
         except Exception as e:
+            self._connecting = None
             drawing.become("failed", error=JobError(str(e) or type(e).__name__, "", "environment"))
-            return
-        if drawing.cancel_asked_at is not None:
-            drawing.become("cancelled")
-            return
+
+    def _ask(self, client: BackendClient, drawing: Drawing) -> None:
         client.poll()  # what concerned an earlier picture
         drawing.become("drawing" if client.info.get("ready") else "starting")
-        request, told = client.request("draw", drawing.params), False
-        while not drawing.finished:
-            if drawing.cancel_asked_at is not None or self._closed:
-                drawing.cancel()
-                if not told:
-                    client.cancel(request)
-                    told = True
-                self._lose_patience(client, drawing)
-            client.wait(LISTEN_S)
-            for event in client.poll():
-                _take(event, client, request, drawing)
-            if self._closed and not client.alive and not drawing.finished:
-                drawing.become("cancelled")
+        self._request = client.request("draw", drawing.params)
 
-    def _lose_patience(self, client: BackendClient, drawing: Drawing) -> None:
-        if time.monotonic() - (drawing.cancel_asked_at or 0.0) > CANCEL_PATIENCE_S:
-            client.kill()
-            drawing.become("cancelled")
+    def _listen(self, client: BackendClient, drawing: Drawing) -> None:
+        if drawing.cancel_asked_at is not None:
+            if not self._told_to_cancel:
+                client.cancel(self._request)
+                self._told_to_cancel = True
+            if time.monotonic() - drawing.cancel_asked_at > CANCEL_PATIENCE_S:
+                client.kill(0.0)
+                drawing.become("cancelled")
+                return
+        for event in client.poll():
+            _take(event, client, self._request, drawing)
 
 
 def _take(event: Event, client: BackendClient, request: int, drawing: Drawing) -> None:
@@ -186,6 +211,6 @@ def _take(event: Event, client: BackendClient, request: int, drawing: Drawing) -
         remedy = "render again; if it happens again, a smaller picture needs less memory"
         drawing.become("failed", error=JobError(event.message, remedy, "died", event.stderr))
     elif isinstance(event, Silent):
-        client.kill()
+        client.kill(0.0)
         sentence = f"the backend hung: it said nothing for {event.seconds:.0f} s and was ended"
         drawing.become("failed", error=JobError(sentence, "render again", "hung", client.stderr))

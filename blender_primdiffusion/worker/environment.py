@@ -7,9 +7,11 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Generator, Iterator, Mapping
 from pathlib import Path
 
+from .child_streams import Output
 from .client import child_environment
 from .setup_folder import is_half_installed
 
@@ -67,15 +69,16 @@ def candidates(preference: str | Path | None, own_environment: Path | None) -> I
     yield "Blender's own Python", Path(sys.executable)
 
 
-def find_backend_python(
+def search(
     preference: str | Path | None = None,
     own_environment: Path | None = None,
     module_path: Path | None = None,
     *,
     cache_dir: Path | None = None,
     timeout_s: float = TRIAL_S,
-) -> BackendPython:
-    """The first candidate that imports primdiffusion and torch. Takes seconds: call it from a thread (Backend does).
+) -> Generator[None, None, BackendPython]:
+    """Try each candidate in a process of its own, which takes seconds; yields while it runs, and returns the first that
+    imports primdiffusion and torch.
 
     `module_path` and `cache_dir` as in `child_environment`. Raises BackendNotFound with one reason for each candidate.
     """
@@ -83,36 +86,49 @@ def find_backend_python(
     reasons = []
     for source, path in candidates(preference, own_environment):
         try:
-            return _try(path, source, environment, timeout_s)
+            return (yield from _try(path, source, environment, timeout_s))
         except BackendNotFound as e:
             reasons.append(str(e))
     advice = "press Set Up Backend, or name a Python with PrimDiffusion's packages in the extension's preferences"
     raise BackendNotFound(f"No Python for the backend: {'; '.join(reasons)}. To go on, {advice}.")
 
 
-def _try(path: Path, source: str, environment: Mapping[str, str], timeout_s: float) -> BackendPython:
+def _try(
+    path: Path, source: str, environment: Mapping[str, str], timeout_s: float
+) -> Generator[None, None, BackendPython]:
     named = f"{path} ({source})"
+    answer, errors = Output(), Output()
     try:
-        done = subprocess.run(
+        process = subprocess.Popen(
             [str(path), "-c", TRIAL],
             stdin=subprocess.DEVNULL,
-            capture_output=True,
+            stdout=answer.target,
+            stderr=errors.target,
             env=dict(environment),
-            timeout=timeout_s,
             creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
-            check=False,
         )
+        end = time.monotonic() + timeout_s
+        try:
+            while (exit_code := process.poll()) is None:
+                if time.monotonic() > end:
+                    raise BackendNotFound(f"{named} did not import torch within {timeout_s:.0f} s")
+                yield
+        finally:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+        answered, complaints = answer.log(), errors.log()
     except FileNotFoundError as e:
         raise BackendNotFound(f"{named} does not exist") from e
     except OSError as e:
         raise BackendNotFound(f"{named} cannot be run: {e.strerror}") from e
-    except subprocess.TimeoutExpired as e:
-        raise BackendNotFound(f"{named} did not import torch within {timeout_s:.0f} s") from e
-    if done.returncode != 0:
-        lines = done.stderr.decode("utf-8", "replace").strip().splitlines()
-        raise BackendNotFound(f"{named} cannot run it: {lines[-1] if lines else f'exit code {done.returncode}'}")
+    finally:
+        answer.close()
+        errors.close()
+    if exit_code != 0:
+        raise BackendNotFound(f"{named} cannot run it: {complaints[-1] if complaints else f'exit code {exit_code}'}")
     try:
-        about = json.loads(done.stdout.decode("utf-8", "replace").strip().splitlines()[-1])
+        about = json.loads(answered[-1])
         return BackendPython(path, source, about["version"], about["torch"], about["python"])
     except (ValueError, IndexError, KeyError) as e:
-        raise BackendNotFound(f"{named} is no Python interpreter: it answered {done.stdout[:80]!r}") from e
+        raise BackendNotFound(f"{named} is no Python interpreter: it answered {answered[:1]}") from e

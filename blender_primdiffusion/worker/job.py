@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import shutil
-import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,7 +22,6 @@ CANCEL_PATIENCE_S = 0.35
 """A cancel takes effect at the end of a step; no step is waited for longer than this. Beside it the second in which a
 cancel is done holds ticks of the timer and drawings of the window, which on a busy machine take as long."""
 _KILL_PATIENCE_S = 0.05
-_GONE_AT_LAST_S = 60.0
 STAGES = {
     "read": "Reading the pictures",
     "load": "Loading the model",
@@ -82,12 +80,8 @@ class Job:
         self.result: dict[str, Any] | None = None
         """The child's."""
         self.error: JobError | None = None
-        self._connected: BackendClient | None = None
-        self._connect_error: Exception | None = None
-        self._connecting = threading.Thread(target=self._connect, name="primdiffusion start", daemon=True)
-        if backend.admit(self):
-            self._connecting.start()
-        else:
+        self._connecting = backend.connecting()
+        if not backend.admit(self):
             self._fail(JobError("the backend is at work already", "wait for it, or cancel it first", "busy"))
 
     @property
@@ -109,6 +103,7 @@ class Job:
         """Takes in what has happened; True if something visible changed. Never waits."""
         if self.finished:
             return False
+        self._backend.see_off()
         before = (self.state, self.step, self.total, self.eta_s, self.message, self.picture, dict(self.pictures))
         if self._client is None:
             self._tick_start()
@@ -135,23 +130,19 @@ class Job:
 
     # starting
 
-    def _connect(self) -> None:
-        try:
-            self._connected = self._backend.connect()
-        except Exception as e:
-            self._connect_error = e
-
     def _tick_start(self) -> None:
-        if self._connecting.is_alive():
-            return
-        self._client = self._connected
         if self._cancel_asked_at is not None:
+            self._connecting.close()
             self._end("cancelled", "Cancelled")
-        elif self._client is None:
-            said = str(self._connect_error) or type(self._connect_error).__name__
-            self._fail(JobError(said, "", "environment"))
-        elif not self._client.info.get("ready"):
-            self.message = "Loading PyTorch"
+            return
+        try:
+            next(self._connecting)
+        except StopIteration as connected:
+            self._client = connected.value
+            if not self._client.info.get("ready"):
+                self.message = "Loading PyTorch"
+        except Exception as error:  # whatever it is, the user is to read it
+            self._fail(JobError(str(error) or type(error).__name__, "", "environment"))
 
     def _ask(self, client: BackendClient) -> None:
         """Sends the request, unless the child has still to find out that an earlier one is not wanted any more."""
@@ -222,12 +213,7 @@ class Job:
         if client is None or client.kill(_KILL_PATIENCE_S):
             self._clear_leftovers()
         else:
-
-            def clear() -> None:
-                client.gone_within(_GONE_AT_LAST_S)
-                self._clear_leftovers()
-
-            threading.Thread(target=clear, name="primdiffusion end", daemon=True).start()
+            self._backend.part_with(client, self._clear_leftovers)
 
     def _clear_leftovers(self) -> None:
         """Half-written files of a killed child lie in a folder of its own (the backend's staging.py names it so)."""

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from .client import BackendClient, Died, Event, Failure, Notification, Response
-from .environment import BackendNotFound, find_backend_python
+from .environment import BackendNotFound, search
+from .polling import run_to_end
 from .setup_pip import SetUpFailed
 
 STEPS = 3
@@ -38,7 +39,7 @@ def try_backend(
     """Sentences on what is being tried, last the result. Raises SetUpFailed in a sentence."""
     yield "Starting the backend"
     try:
-        found = find_backend_python(python, module_path=module_path, cache_dir=cache_dir, timeout_s=READY_S)
+        found = run_to_end(search(python, module_path=module_path, cache_dir=cache_dir, timeout_s=READY_S))
     except BackendNotFound as error:
         raise SetUpFailed(f"the self-test failed: {error}") from error
     began = time.monotonic()

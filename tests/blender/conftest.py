@@ -63,6 +63,7 @@ def saved_scene(empty_scene, tmp_path):
 def addon(saved_scene, tmp_path, monkeypatch):
     """The add-on registered from the checkout, on an interpreter that runs the fake child."""
     import synthetic
+    from backend_python import found
 
     import blender_primdiffusion
     from blender_primdiffusion import places
@@ -71,7 +72,7 @@ def addon(saved_scene, tmp_path, monkeypatch):
 
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic.write(tmp_path / "prepared.npz", 8)))
     python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", found(python))
     monkeypatch.setattr(places, "backend_module_path", lambda: Path(__file__).parent / "fake_backend")
     queue.outcomes.clear()
     queue.info = {}

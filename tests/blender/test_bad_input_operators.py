@@ -179,7 +179,7 @@ def backend_missing(_person) -> None:
     def nowhere(*_, **__):
         raise BackendNotFound("the preferences name the Python '/nowhere/python', which does not exist: set it up")
 
-    environment.find_backend_python = nowhere
+    environment.search = nowhere
 
 
 def two_people(_person) -> None:
@@ -204,7 +204,7 @@ SOURCE: dict[str, Path] = {}
 def anna(addon, tmp_path, monkeypatch):
     from blender_primdiffusion.worker import environment
 
-    monkeypatch.setattr(environment, "find_backend_python", environment.find_backend_python)  # after `backend_missing`
+    monkeypatch.setattr(environment, "search", environment.search)  # after `backend_missing`
     npz = synthetic_shape.write(tmp_path / "human.npz", 8)
     monkeypatch.setenv("FAKE_HUMAN", str(npz))
     (tmp_path / "first").mkdir()

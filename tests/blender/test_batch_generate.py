@@ -132,7 +132,7 @@ def test_without_a_backend_everybody_is_spared_the_attempt(out, monkeypatch, cap
     def nowhere(*_, **__):
         raise BackendNotFound("No Python for the backend: /nowhere does not exist")
 
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", nowhere)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", nowhere)
     assert generate(out, "--count", 3) == NO_BACKEND
     assert "/nowhere does not exist" in capfd.readouterr().err
     assert not out.exists()

@@ -9,7 +9,6 @@ import bpy
 import psutil
 
 import blender_primdiffusion
-from blender_primdiffusion.ui.jobs import work
 
 _OWNERS = (
     "Scene", "Object", "Collection", "WindowManager", "Armature", "Volume", "Material", "World", "Action", "PoseBone",
@@ -51,7 +50,6 @@ def traces() -> set[str]:
         found |= {f"property {owner}.{name}" for name in names if "primdiffusion" in name}
     found |= {f"manual {function.__module__}" for function in bpy.utils._manual_map}
     found |= {f"preview {number}" for number in map(id, getattr(bpy.utils.previews, "_previews", {}).values())}
-    found |= {f"work {kind}" for kind in work._kinds}
     found |= {f"thread {thread.name}" for thread in threading.enumerate()}
     found |= {f"child {child.pid}" for child in psutil.Process().children()}
     for handler in bpy.types.FileHandler.__subclasses__():
@@ -76,9 +74,6 @@ def _translated(word: str, language: str) -> bool:
 
 
 def test_register_and_unregister_twice_leave_no_trace(empty_scene):
-    for thread in threading.enumerate():  # of children that tests before this one have ended
-        if thread.name.startswith("primdiffusion"):
-            thread.join(20)
     blender_primdiffusion.register()  # what only the first import brings: modules, and Blender's own caches
     blender_primdiffusion.unregister()
     before = traces()

@@ -131,7 +131,7 @@ def test_without_a_backend_it_says_so_at_once(people, out, monkeypatch, capfd):
     def nowhere(*_, **__):
         raise BackendNotFound("No Python for the backend: /nowhere does not exist")
 
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", nowhere)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", nowhere)
     assert render(people, out, *SMALL) == NO_BACKEND
     assert "/nowhere does not exist" in capfd.readouterr().err
     assert pictures(out) == []

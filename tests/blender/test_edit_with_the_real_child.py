@@ -9,6 +9,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
+from backend_python import found
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 
 import blender_primdiffusion
@@ -29,7 +30,7 @@ def people(saved_scene, tmp_path, monkeypatch):
 
     checkpoint = save_tiny_checkpoint(tmp_path / "tiny.safetensors")
     python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", found(python))
     monkeypatch.setattr(work, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
     # With a cache in Blender's temporary folder the child would compile its marcher anew for each test.
     monkeypatch.setattr(

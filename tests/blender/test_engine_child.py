@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 import pytest
+from backend_python import found
 from engine_stage import pixels
 
 import blender_primdiffusion
@@ -32,7 +33,7 @@ COLOUR = np.round(255 * np.array([0.5372549, 0.7372549, 0.88235295, 1.0]))
 def stage(saved_scene, tmp_path, monkeypatch):
     """The engine on the fake child, with a camera."""
     python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", found(python))
     monkeypatch.setattr(places, "backend_module_path", lambda: FAKE)
     blender_primdiffusion.register()
     scene = saved_scene.scene
@@ -111,17 +112,13 @@ def test_a_cancel_ends_the_picture_within_a_band(stage, monkeypatch):
 
 
 def test_a_cancel_does_not_wait_for_a_child_that_is_still_being_started(stage, monkeypatch):
-    start, started = threading.Event(), []
+    def forever(*_: object, **__: object):
+        while True:
+            yield
 
-    def slowly(*_: object, **__: object) -> BackendPython:
-        start.wait(60)
-        started.append(True)
-        raise OSError("not in this test")
-
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", slowly)
-    final.render_layer(Engine(stop_after_s=0.0), bpy.context.evaluated_depsgraph_get())
-    assert not started
-    start.set()
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", forever)
+    drawing = final.render_layer(Engine(stop_after_s=0.0), bpy.context.evaluated_depsgraph_get())
+    assert drawing.state in ("starting", "cancelled")
 
 
 def test_waiting_leaves_other_threads_their_time(stage, monkeypatch):
@@ -161,7 +158,7 @@ def test_an_error_of_the_child_keeps_its_remedy_and_ends_an_animation(stage, mon
 
 
 def test_without_a_backend_the_error_names_what_was_tried(stage, monkeypatch):
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", find_nothing)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", find_nothing)
     with pytest.raises(RuntimeError, match="extension's preferences"):
         render()
 
@@ -229,6 +226,7 @@ def test_an_idle_child_ends_by_itself_and_the_next_picture_starts_another(stage,
     pid = studio.drawing_child().pid
     end = time.monotonic() + 5
     while studio.drawing_child().pid is not None and time.monotonic() < end:
+        studio.advance()  # a timer does
         time.sleep(0.05)
     assert studio.drawing_child().pid is None
     assert render() == {"FINISHED"}
@@ -254,14 +252,17 @@ import bpy, blender_primdiffusion as b
 from blender_primdiffusion import places
 from blender_primdiffusion.worker import environment
 from blender_primdiffusion.worker.environment import BackendPython
-environment.find_backend_python = lambda *_, **__: BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
+def search(*_, **__):
+    yield
+    return BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
+environment.search = search
 places.backend_module_path = lambda: Path(sys.argv[1])
 b.register()
 from blender_primdiffusion.engine import studio
 frame = studio.frames.take("view", 8, 8)
 drawing = studio.drawing_child().draw({"frame": str(frame.path), "region": None, "width": 8, "height": 8})
 while drawing.rows == 0:
-    time.sleep(0.01)
+    drawing.wait(0.01)
 print(studio.drawing_child().pid, studio.frames.folder, flush=True)
 if sys.argv[2] == "killed":
     os.kill(os.getpid(), 9)

@@ -11,6 +11,7 @@ import exporting
 import numpy as np
 import pytest
 import synthetic
+from backend_python import found
 
 from blender_primdiffusion.scene.human import BETAS, armature_of, humans
 from blender_primdiffusion.scene.human_file import read_tensors
@@ -33,7 +34,7 @@ def store(saved_scene, tmp_path, monkeypatch):
     exporting.write_store(folder)
     monkeypatch.setenv("EXPORT_FOLDER", str(folder))
     python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", found(python))
     monkeypatch.setattr(places, "backend_module_path", lambda: Path(__file__).parent / "export_backend")
     blender_primdiffusion.register()
     yield folder

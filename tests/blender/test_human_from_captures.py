@@ -10,6 +10,7 @@ from unittest.mock import MagicMock
 
 import bpy
 import pytest
+from backend_python import found
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 import blender_primdiffusion
@@ -158,7 +159,7 @@ def test_the_real_child_makes_a_person_of_real_captures(saved_scene, tmp_path, m
     encoder = save_tiny_encoder(tmp_path / "encoder.safetensors")
     folder = captured(tmp_path / "made", people=2, frames=1, passes=("img", "mask"))
     python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.find_backend_python", lambda *_, **__: python)
+    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", found(python))
     monkeypatch.setattr(work, "preference", lambda name: str(encoder) if name == "encoder" else "")
     blender_primdiffusion.register()
     try:

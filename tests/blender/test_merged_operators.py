@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,9 +22,10 @@ from blender_primdiffusion.scene.human import MARK, armature_of, humans, remove_
 from blender_primdiffusion.scene.keyframes import keyframe_poses
 from blender_primdiffusion.scene.material import density_gain
 from blender_primdiffusion.scene.merged import merged_of, merged_state
+from blender_primdiffusion.ui.jobs.follow import follow
 from blender_primdiffusion.ui.jobs.queue import queue
 from blender_primdiffusion.ui.jobs.target import Target
-from blender_primdiffusion.ui.render import panel
+from blender_primdiffusion.ui.render import merge_work, panel
 from blender_primdiffusion.ui.render.merge_work import MergeFramesWork, MergeWork, Moment
 
 ops = bpy.ops.primdiffusion
@@ -138,21 +138,28 @@ def test_a_range_that_is_none_is_refused(person):
     assert merged_of(person) is None
 
 
-def test_a_cancelled_sequence_leaves_nothing_and_its_writer_ends(person, monkeypatch):
+def test_a_cancelled_sequence_leaves_nothing(person, monkeypatch):
     monkeypatch.setenv("FAKE_MERGE", "takes long")
     moment = Moment.now(person)
     before = sorted(folder_of(person).iterdir())
     queue.add(bpy.context, MergeFramesWork(Target.of(person), [moment, moment], 1, 0.02))
     until_running()
-    assert [thread for thread in threading.enumerate() if thread.name == "merged frames"]
     queue.cancel()
     drive()
-    for thread in threading.enumerate():
-        if thread.name == "merged frames":
-            thread.join(5)
-    assert not [thread for thread in threading.enumerate() if thread.name == "merged frames"]
     assert merged_of(person) is None
     assert sorted(folder_of(person).iterdir()) == before
+
+
+def test_the_frames_of_a_sequence_are_written_one_at_a_tick(person, monkeypatch):
+    written, ticks = [], [0]
+    write_grid = merge_work.write_grid
+    monkeypatch.setattr(merge_work, "write_grid", lambda *args: written.append(ticks[0]) or write_grid(*args))
+    moment = Moment.now(person)
+    queue.add(bpy.context, MergeFramesWork(Target.of(person), [moment] * 5, 1, 0.02))
+    while follow() is not None:
+        ticks[0] += 1
+    assert len(written) == len(set(written)) == 5
+    assert len(sequence_files(merged_of(person).data)) == 5
 
 
 @pytest.mark.parametrize(

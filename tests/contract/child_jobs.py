@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Generator
 from pathlib import Path
 
 from worker.backend import Backend
+from worker.client import BackendClient
 from worker.job import Job
 
 _PICTURE_PX = 16
+
+
+def this_pythons_backend(**settings) -> Backend:
+    """The real child on the Python that runs the tests; `settings` of the client."""
+
+    def make_client() -> Generator[None, None, BackendClient]:
+        yield
+        return BackendClient(Path(sys.executable), **settings)
+
+    return Backend(make_client)
 
 
 def _job(backend: Backend, method: str, out_dir: Path, checkpoint: Path | None, **params) -> Job:

@@ -5,12 +5,9 @@ from __future__ import annotations
 
 import sys
 import time
-from pathlib import Path
 
 import pytest
-from child_jobs import generate_job
-from worker.backend import Backend
-from worker.client import BackendClient
+from child_jobs import generate_job, this_pythons_backend
 from worker.job import Job
 
 TICK_S = 0.1
@@ -55,7 +52,7 @@ def tick(job: Job, until, timeout_s: float = 90.0) -> None:
 @pytest.fixture
 def backend(tmp_path):
     (tmp_path / "sitecustomize.py").write_text(LONG_STEPS)
-    backend = Backend(lambda: BackendClient(Path(sys.executable), env={"PYTHONPATH": str(tmp_path)}))
+    backend = this_pythons_backend(env={"PYTHONPATH": str(tmp_path)})
     yield backend
     backend.shutdown()
 

@@ -1,15 +1,12 @@
 """Edits as the panel follows them, with the real child."""
 
-import sys
 import time
 from pathlib import Path
 
 import pytest
-from child_jobs import edit_job, generate_job
+from child_jobs import edit_job, generate_job, this_pythons_backend
 from conversation import BUSY_STEPS
 from primdiffusion.human_file import load_human
-from worker.backend import Backend
-from worker.client import BackendClient
 from worker.job import Job
 
 PART = {"region": ["hair"], "seed": 2}
@@ -33,7 +30,7 @@ def follow(job: Job, until=lambda job: job.finished, timeout_s: float = 120) -> 
 
 @pytest.fixture(scope="module")
 def backend():
-    backend = Backend(lambda: BackendClient(Path(sys.executable)))
+    backend = this_pythons_backend()
     yield backend
     backend.shutdown()
 

@@ -12,9 +12,10 @@ from worker.environment import (
     VARIABLE,
     BackendNotFound,
     candidates,
-    find_backend_python,
     python_of_environment,
+    search,
 )
+from worker.polling import run_to_end
 
 PYTHON = Path(sys.executable)
 
@@ -32,7 +33,7 @@ def no_variable(monkeypatch):
 
 
 def test_the_running_python_will_do_where_it_has_torch():
-    found = find_backend_python()
+    found = run_to_end(search())
     assert found.path == PYTHON
     assert found.source == "Blender's own Python"
     assert found.torch[0].isdigit()
@@ -51,7 +52,7 @@ def test_the_preference_goes_before_the_variable_and_that_before_the_extensions_
 
 def test_a_wish_that_fails_is_an_error_and_not_replaced_by_another_python(tmp_path):
     with pytest.raises(BackendNotFound, match=r"no-python \(the extension's preferences\) does not exist"):
-        find_backend_python(tmp_path / "no-python")
+        run_to_end(search(tmp_path / "no-python"))
 
 
 @pytest.mark.skipif(os.name == "nt", reason="shell scripts")
@@ -66,7 +67,7 @@ def test_a_wish_that_fails_is_an_error_and_not_replaced_by_another_python(tmp_pa
 def test_a_python_that_will_not_do_is_named_with_its_reason_and_what_to_do(tmp_path, text, reason):
     python = script(tmp_path / "python", text)
     with pytest.raises(BackendNotFound) as error:
-        find_backend_python(python, timeout_s=1.0)
+        run_to_end(search(python, timeout_s=1.0))
     assert reason in str(error.value)
     assert str(python) in str(error.value)
     assert "preferences" in str(error.value)
@@ -75,7 +76,7 @@ def test_a_python_that_will_not_do_is_named_with_its_reason_and_what_to_do(tmp_p
 @pytest.mark.skipif(os.name == "nt", reason="shell scripts")
 def test_a_broken_environment_of_the_extension_is_passed_over(tmp_path):
     script(python_of_environment(tmp_path), "exit 1")
-    assert find_backend_python(own_environment=tmp_path).path == PYTHON
+    assert run_to_end(search(own_environment=tmp_path)).path == PYTHON
 
 
 def test_an_old_python_is_told_so():
@@ -87,11 +88,11 @@ def test_an_old_python_is_told_so():
 
 def test_a_folder_is_no_python(tmp_path):
     with pytest.raises(BackendNotFound, match="cannot be run"):
-        find_backend_python(tmp_path)
+        run_to_end(search(tmp_path))
 
 
 def test_the_bundled_package_is_the_one_that_is_tried(tmp_path):
     package = tmp_path / "primdiffusion"
     package.mkdir()
     (package / "__init__.py").write_text("__version__ = 'bundled'")
-    assert find_backend_python(PYTHON, module_path=tmp_path).version == "bundled"
+    assert run_to_end(search(PYTHON, module_path=tmp_path)).version == "bundled"

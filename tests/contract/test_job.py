@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
-from child_jobs import generate_job
+from child_jobs import generate_job, this_pythons_backend
 from conversation import BUSY_STEPS
 from worker.backend import Backend
 from worker.client import BackendClient
@@ -32,7 +32,7 @@ def follow(job: Job, until=lambda job: job.finished, timeout_s: float = 60) -> l
 
 @pytest.fixture(scope="module")
 def backend():
-    backend = Backend(lambda: BackendClient(PYTHON))
+    backend = this_pythons_backend()
     yield backend
     backend.shutdown()
 
@@ -65,13 +65,15 @@ def test_a_job_runs_from_a_cold_start_to_its_files(start):
 def test_a_child_that_was_being_started_when_all_was_shut_down_is_ended_too(checkpoint, tmp_path):
     clients = []
 
-    def slowly() -> BackendClient:
-        time.sleep(0.3)
+    def slowly():
+        for _ in range(3):
+            yield
         clients.append(BackendClient(PYTHON))
         return clients[0]
 
     backend = Backend(slowly)
     job = generate_job(backend, seed=1, steps=1, out_dir=tmp_path / "out", checkpoint=checkpoint)
+    job.tick()
     backend.shutdown()
     assert follow(job)[-1] == "failed"
     assert not clients[0].alive
@@ -95,7 +97,7 @@ def test_a_cancelled_job_leaves_nothing(start, tmp_path):
 
 
 def test_a_job_cancelled_before_the_child_is_up_is_cancelled(checkpoint, tmp_path):
-    backend = Backend(lambda: BackendClient(PYTHON))
+    backend = this_pythons_backend()
     job = generate_job(backend, seed=1, steps=1, out_dir=tmp_path / "out", checkpoint=checkpoint)
     job.cancel()
     assert follow(job) == ["cancelling", "cancelled"]
@@ -150,7 +152,7 @@ def test_a_missing_python_is_the_jobs_error(tmp_path):
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="needs SIGSTOP to hang a process")
 def test_a_child_that_hangs_is_ended_and_fails_the_job(checkpoint, tmp_path):
-    backend = Backend(lambda: BackendClient(PYTHON, silence_s=5.0))
+    backend = this_pythons_backend(silence_s=5.0)
     job = generate_job(backend, seed=1, steps=BUSY_STEPS, out_dir=tmp_path / "out", checkpoint=checkpoint)
     follow(job, lambda job: job.step > 2)
     os.kill(job._client.pid, signal.SIGSTOP)
@@ -161,7 +163,7 @@ def test_a_child_that_hangs_is_ended_and_fails_the_job(checkpoint, tmp_path):
 
 
 def test_a_cancel_while_torch_is_loaded_keeps_the_child(checkpoint, tmp_path):
-    backend = Backend(lambda: BackendClient(PYTHON))
+    backend = this_pythons_backend()
     job = generate_job(backend, seed=1, steps=1, out_dir=tmp_path / "out", checkpoint=checkpoint)
     follow(job, lambda job: job._request is not None)
     assert not job.info.get("ready")

@@ -2,18 +2,15 @@
 
 import os
 import signal
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from capture_scenes import captured
-from child_jobs import reconstruct_job
+from child_jobs import reconstruct_job, this_pythons_backend
 from conversation import Conversation
 from tiny_encoder import save_tiny_encoder
-from worker.backend import Backend
-from worker.client import BackendClient
 from worker.job import Job
 
 CANCELLED, DOMAIN_ERROR, INVALID_PARAMS = -32001, -32002, -32602
@@ -103,7 +100,7 @@ def follow(job: Job, timeout_s: float = 60) -> list[str]:
 
 @pytest.fixture(scope="module")
 def backend():
-    backend = Backend(lambda: BackendClient(Path(sys.executable)))
+    backend = this_pythons_backend()
     yield backend
     backend.shutdown()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -12,6 +11,7 @@ from typing import Any
 
 import bpy
 
+from ...console import Stop
 from ...places import EXTENSION, new_backend, preference
 from ...worker.backend import Backend
 from ...worker.environment import VARIABLE
@@ -77,7 +77,7 @@ def ask(
     backend: Backend,
     method: str,
     params: Mapping[str, Any],
-    stop: threading.Event,
+    stop: Stop,
     tell: Callable[[Job], None] = lambda _job: None,
 ) -> dict[str, Any]:
     """The child's answer; `tell` hears of the job's progress.

@@ -8,13 +8,12 @@ OUT/person_000007/person.blend, person_humans/      where asked for
 from __future__ import annotations
 
 import argparse
-import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from ...capture.report import Report
-from ...console import duration
+from ...console import Stop, duration
 from ...places import preference
 from ...worker.backend import Backend
 from ...worker.job import Job
@@ -35,7 +34,7 @@ def main(argv: Sequence[str]) -> int:
     return run("generate", argv, parse_generate, _generate)
 
 
-def _generate(options: argparse.Namespace, say: Say, stop: threading.Event) -> Report:
+def _generate(options: argparse.Namespace, say: Say, stop: Stop) -> Report:
     attributes, movement = parsed(", ".join(options.attributes)), movement_of(options)
     params = _params(options, attributes)
     report, clock = Report(), Clock(options.count)
@@ -78,7 +77,7 @@ def _is_there(folder: Path, blend: str | None) -> bool:
 class _Person:
     """One of the batch."""
 
-    def __init__(self, options, params, movement: Movement | None, which: str, say: Say, stop: threading.Event):
+    def __init__(self, options, params, movement: Movement | None, which: str, say: Say, stop: Stop):
         self.name = person_name(params["seed"])
         self.say, self.which = say, which
         self._folder: Path = options.out / self.name

@@ -12,13 +12,13 @@ import contextlib
 import dataclasses
 import shutil
 import tempfile
-import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import bpy
 
 from ...capture.report import Report
+from ...console import Stop
 from ...engine import studio
 from ...engine.engine import ENGINE
 from ...formats.capture_layout import replacing
@@ -63,7 +63,7 @@ class _Shot:
     """Degrees; None: as the camera stands."""
 
 
-def _render(options: argparse.Namespace, say: Say, stop: threading.Event) -> Report:
+def _render(options: argparse.Namespace, say: Say, stop: Stop) -> Report:
     movement, everybody = movement_of(options), sources(options.source)
     names = ("engine", "size", "frames", "yaw", "turntable", "transparent", "samples")
     drawn = {name: getattr(options, name) for name in names}
@@ -108,7 +108,7 @@ class _Drawing:
         options: argparse.Namespace,
         movement: Movement | None,
         backend: Backend,
-        stop: threading.Event,
+        stop: Stop,
         say: Say,
     ):
         self.say = say

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,7 +11,17 @@ from pathlib import Path
 from typing import Any
 
 from ...capture.report import Report, report_path
-from ...console import CANCELLED, DONE, FAILED, NO_BACKEND, UNUSABLE, duration, stdout_of_our_own, stopped_by_signals
+from ...console import (
+    CANCELLED,
+    DONE,
+    FAILED,
+    NO_BACKEND,
+    UNUSABLE,
+    Stop,
+    duration,
+    stdout_of_our_own,
+    stopped_by_signals,
+)
 from .asking import NoBackend, Stopped
 from .staging import claim
 from .words import UsageError
@@ -27,7 +36,7 @@ def run(
     name: str,
     argv: Sequence[str],
     parse: Callable[[Sequence[str]], argparse.Namespace],
-    work: Callable[[argparse.Namespace, Say, threading.Event], Report],
+    work: Callable[[argparse.Namespace, Say, Stop], Report],
 ) -> int:
     """Run a command; returns its exit code. Blender's own messages on stdout are dropped.
 

@@ -6,18 +6,17 @@ import collections
 import contextlib
 import json
 import os
-import queue
 import shutil
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO
 
 import bpy
+
+from ...worker.child_streams import Output
 
 PATIENCE_S = 0.7
 """After this a child that was asked to stop is ended: its views are written whole or not at all."""
@@ -43,10 +42,9 @@ class CaptureSession:
         """What the child told, newest last."""
         self.exit_code: int | None = None
         """Of the last run."""
-        self._process: subprocess.Popen[str] | None = None
-        self._heard: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._complaints: collections.deque[str] = collections.deque(maxlen=_KEPT_LINES)
-        self._readers: list[threading.Thread] = []
+        self._process: subprocess.Popen[bytes] | None = None
+        self._output: Output | None = None
+        self._errors: Output | None = None
         self._folder: Path | None = None
         self._asked_to_stop_at: float | None = None
 
@@ -69,38 +67,33 @@ class CaptureSession:
         self.error = self.notice = ""
         self.message, self.fraction, self.eta_s, self.exit_code = "Starting Blender", 0.0, None, None
         self.lines.clear()
-        self._complaints.clear()
-        self._heard, self._asked_to_stop_at = queue.SimpleQueue(), None
-        self._process = subprocess.Popen(
-            [*child_command(), *words, "--progress", "json", "--while-stdin"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            encoding="utf-8",
-            errors="replace",
-            env={**os.environ, "TMPDIR": folder, "TEMP": folder, "TMP": folder},
-            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
-        )
-        self._readers = [
-            threading.Thread(target=_read, args=(self._process.stdout, self._heard.put), daemon=True),
-            threading.Thread(target=_read, args=(self._process.stderr, self._complaints.append), daemon=True),
-        ]
-        for reader in self._readers:
-            reader.start()
+        self._asked_to_stop_at = None
+        self._output, self._errors = Output(), Output()
+        try:
+            self._process = subprocess.Popen(
+                [*child_command(), *words, "--progress", "json", "--while-stdin"],
+                stdin=subprocess.PIPE,
+                stdout=self._output.target,
+                stderr=self._errors.target,
+                env={**os.environ, "TMPDIR": folder, "TEMP": folder, "TMP": folder},
+                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+            )
+        except OSError:
+            self._close_streams()
+            raise
 
     def tick(self) -> bool:
         """Take in what the child has said; True when something visible changed. Never waits."""
         if self._process is None:
             return False
         before = (self.message, self.fraction, len(self.lines), self.busy)
+        exit_code = self._process.poll()  # before reading: then all that it wrote is there
         self._listen()
         asked = self._asked_to_stop_at
         if asked is not None and time.monotonic() - asked > PATIENCE_S:
             self._process.kill()
-        if self._process.poll() is not None and not any(reader.is_alive() for reader in self._readers):
-            self._listen()
-            self._finish(self._process.returncode)
+        if exit_code is not None and self._output.at_end:
+            self._finish(exit_code)
         return before != (self.message, self.fraction, len(self.lines), self.busy)
 
     def cancel(self) -> None:
@@ -118,12 +111,12 @@ class CaptureSession:
             self._process.kill()
             self._process.wait()
             self._process = None
+            self._close_streams()
         self._clear_folder()
 
     def _listen(self) -> None:
-        with contextlib.suppress(queue.Empty):
-            while True:
-                self._take(self._heard.get_nowait())
+        for line in self._output.lines():
+            self._take(line.decode("utf-8", "replace"))
 
     def _take(self, line: str) -> None:
         from ...capture.options import MARK
@@ -143,10 +136,11 @@ class CaptureSession:
         from ...console import CANCELLED, DONE
 
         self.exit_code, stopped = code, self._asked_to_stop_at is not None
-        for stream in (self._process.stdout, self._process.stderr, self._process.stdin):
-            with contextlib.suppress(OSError):
-                stream.close()
+        complaints = self._errors.log()
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
         self._process = None
+        self._close_streams()
         self._clear_folder()
         last = self.lines[-1] if self.lines else ""
         if stopped or code == CANCELLED:
@@ -154,8 +148,13 @@ class CaptureSession:
         elif code == DONE:
             self.notice, self.fraction = last, 1.0
         else:
-            said = [line for line in self._complaints if line.startswith("capture: ")]
+            said = [line for line in complaints if line.startswith("capture: ")]
             self.error = said[-1].removeprefix("capture: ") if said else last or f"Blender ended with code {code}"
+
+    def _close_streams(self) -> None:
+        self._output.close()
+        self._errors.close()
+        self._output = self._errors = None
 
     def _clear_folder(self) -> None:
         if self._folder is not None:
@@ -171,11 +170,6 @@ def child_command() -> list[str]:
     if bpy.app.binary_path:
         return [bpy.app.binary_path, "-b", "--factory-startup", "--python", script, "--"]
     return [sys.executable, script, "--"]
-
-
-def _read(stream: IO[str], take) -> None:
-    for line in stream:
-        take(line.rstrip("\n"))
 
 
 captures = CaptureSession()

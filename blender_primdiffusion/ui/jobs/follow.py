@@ -42,7 +42,7 @@ def keep_following() -> None:
 def follow() -> float | None:
     """The timer: one tick of the line; an answer enters the scene as soon as nothing is in the way."""
     changed = queue.tick()
-    if queue.ready:
+    if queue.ready and not queue.advancing:
         changed |= _nearer()
     if not queue.ready:
         building.close()

@@ -72,6 +72,8 @@ class Queue:
         """At work, None between works."""
         self.job: Job | None = None
         """The request of `current`."""
+        self.advancing = False
+        """`current` has more to do before its answer may enter the scene."""
         self.outcomes: dict[str, Outcome] = {}
         """The last of each kind of work, for the panels."""
         self.last: Outcome | None = None
@@ -124,6 +126,8 @@ class Queue:
             self._end(Outcome(self.current, notice=CANCELLED))
         elif self.job.state == "failed":
             self._end(Outcome(self.current, error=self.job.error))
+        else:
+            self.advancing = self.current.work.advance(self._folder)
         return changed
 
     def finish(self, context: bpy.types.Context) -> Outcome:

@@ -44,8 +44,13 @@ class Work(abc.ABC):
         OSError and RuntimeError become the panel's error, and must leave the scene as it was.
         """
 
+    def advance(self, folder: Path) -> bool:
+        """Do a little with the files that the child has written so far, in the time of a timer's tick; whether there is
+        more to do at once. Called while the child is at work, and then until there is no more, before `finish`."""
+        return False
+
     def place(self) -> Place | None:
-        """Where the volumes of the answer's "human" go, which a thread writes before `finish`; None for works that show
+        """Where the volumes of the answer's "human" go, which are written before `finish`; None for works that show
         nobody. Asked for when the answer is there. ValueError and OSError are left to `finish` to tell."""
         if not self.new_person:
             return None

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import threading
-import time
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,8 +17,6 @@ from ...scene.material import set_density_gain
 from ...scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
 from ..jobs.target import Target
 from ..jobs.work import Work
-
-_POLL_S = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +90,9 @@ class MergeFramesWork(Work):
     """The first frame's number."""
     voxel: float
     """Metres."""
-    _writer: _Writer | None = dataclasses.field(default=None, init=False, repr=False)
+    _digests: list[str] = dataclasses.field(default_factory=list, init=False, repr=False)
+    """Of the VDB files that are written."""
+    _error: OSError | ValueError | None = dataclasses.field(default=None, init=False, repr=False)
 
     @property
     def label(self) -> str:
@@ -102,18 +100,34 @@ class MergeFramesWork(Work):
         return f"Merge {self.target.name}, {len(self.moments)} frames"
 
     def params(self, folder: Path) -> dict[str, Any]:
-        """Of the child's method; its grids are taken in beside it as they appear."""
+        """Of the child's method; its grids become VDB files as they appear (see `advance`)."""
         bpy.utils.expose_bundled_modules()
         file = self.target.file_now()
-        self._writer = _Writer(folder, len(self.moments))
-        self._writer.start()
+        self._digests, self._error = [], None
         people = [{**moment.params, "human": file} for moment in self.moments]
         return {"people": people, "voxel": self.voxel, "out_dir": str(folder)}
 
-    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+    def advance(self, folder: Path) -> bool:
+        """Turn the child's next grid into a VDB file, where there is one."""
+        grid = _grid(folder, len(self._digests))
+        if self._error is not None or len(self._digests) == len(self.moments) or not grid.is_file():
+            return False
+        try:
+            self._digests.append(write_grid(read_grid(grid), grid.with_suffix(".vdb")))
+            grid.unlink()
+        except (OSError, ValueError) as error:  # `finish` reports it
+            self._error = error
+        return _grid(folder, len(self._digests)).is_file()
+
+    def finish(self, _context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
         """Show the sequence in the place of the volumes."""
         person = self.target.found()
-        files = publish(*self._writer.written(), merged_folder(person))
+        while self.advance(folder):
+            pass
+        if self._error is not None:
+            raise self._error
+        written = [_grid(folder, index).with_suffix(".vdb") for index in range(len(self.moments))]
+        files = publish(written, self._digests, merged_folder(person))
         show_merged(person, files, MergedState(tuple(m.digest for m in self.moments), self.voxel, self.start))
         set_attachment(person, "MERGED")
         size = sum(path.stat().st_size for path in files) / 1e6
@@ -150,35 +164,5 @@ class FitGainWork(Work):
         )
 
 
-class _Writer(threading.Thread):
-    """Turns the child's grids into VDB files as they appear, beside Blender; ends when its folder goes."""
-
-    def __init__(self, folder: Path, count: int):
-        super().__init__(name="merged frames", daemon=True)
-        self._folder, self._count = folder, count
-        self._digests: list[str] = []
-        self._error: OSError | ValueError | None = None
-
-    def run(self) -> None:
-        """Frame after frame."""
-        try:
-            for index in range(self._count):
-                grid = self._folder / f"{index:04d}.npz"
-                while not grid.is_file():
-                    if not self._folder.is_dir():
-                        return
-                    time.sleep(_POLL_S)
-                self._digests.append(write_grid(read_grid(grid), self._vdb(index)))
-                grid.unlink()
-        except (OSError, ValueError) as error:
-            self._error = error
-
-    def written(self) -> tuple[list[Path], list[str]]:
-        """The files and their digests, once the child has made all grids. Raises what a frame has failed with."""
-        self.join()
-        if self._error is not None:
-            raise self._error
-        return [self._vdb(index) for index in range(self._count)], self._digests
-
-    def _vdb(self, index: int) -> Path:
-        return self._folder / f"{index:04d}.vdb"
+def _grid(folder: Path, index: int) -> Path:
+    return folder / f"{index:04d}.npz"
