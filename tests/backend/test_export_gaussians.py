@@ -1,5 +1,7 @@
 """3D Gaussian files, drawn by a small splatter and compared with the marcher."""
 
+import functools
+
 import numpy as np
 import pytest
 import splatter
@@ -11,6 +13,17 @@ from primdiffusion.export.gaussians import gaussians_of
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import framing, place
 from primdiffusion.render.march import march
+
+
+@functools.cache
+def sparse():
+    """Every eighth box: quick where only numbers matter."""
+    return place(person()).map(lambda tensor: tensor[::8])
+
+
+@functools.cache
+def everything():
+    return gaussians_of(place(person()), 10**6)
 
 
 def drawn(ply, camera):
@@ -40,7 +53,7 @@ def test_splatted_they_look_like_the_marched_person(tmp_path, bent):
 
 
 def test_the_file_has_the_usual_layout(tmp_path):
-    write_gaussians(tmp_path / "p.ply", gaussians_of(place(person()), 500))
+    write_gaussians(tmp_path / "p.ply", gaussians_of(sparse(), 500))
     ply = splatter.read_ply(tmp_path / "p.ply")
     assert tuple(ply) == PROPERTIES
     assert len(ply["x"]) == 500
@@ -50,7 +63,7 @@ def test_the_file_has_the_usual_layout(tmp_path):
 
 
 def test_colours_are_stored_as_viewers_show_them(tmp_path):
-    gaussians = gaussians_of(place(person()), 200)
+    gaussians = gaussians_of(sparse(), 200)
     write_gaussians(tmp_path / "p.ply", gaussians)
     ply = splatter.read_ply(tmp_path / "p.ply")
     shown = 0.5 + splatter.C0 * np.stack([ply[f"f_dc_{i}"] for i in range(3)], -1)
@@ -58,7 +71,7 @@ def test_colours_are_stored_as_viewers_show_them(tmp_path):
 
 
 def test_rotations_turn_local_axes_into_the_boxes_axes():
-    primitives = place(person())
+    primitives = sparse()
     found = gaussians_of(primitives).rotation.double()
     w, x, y, z = found[0]
     axis = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
@@ -67,7 +80,7 @@ def test_rotations_turn_local_axes_into_the_boxes_axes():
 
 
 def test_a_limit_keeps_the_most_opaque_and_thins_hands_and_torso_alike():
-    many, few = (gaussians_of(place(person()), limit) for limit in (10**6, 3000))
+    many, few = everything(), gaussians_of(place(person()), 3000)
     assert len(few.opacity) == 3000
     assert float(few.opacity.mean()) > float(many.opacity.mean())
     assert float(few.position[:, 0].max()) > float(many.position[:, 0].max()) - 0.1
@@ -75,11 +88,11 @@ def test_a_limit_keeps_the_most_opaque_and_thins_hands_and_torso_alike():
 
 def test_matter_that_nobody_sees_is_left_out():
     primitives = place(person())
-    assert len(gaussians_of(primitives, 10**6).opacity) < 0.8 * float((primitives.density > 0).sum())
+    assert len(everything().opacity) < 0.8 * float((primitives.density > 0).sum())
 
 
 def test_a_limit_of_none_and_a_person_of_nothing_are_refused():
-    primitives = place(person())
+    primitives = sparse()
     with pytest.raises(ValueError, match="1 or more"):
         gaussians_of(primitives, 0)
     empty = type(primitives)(**{**vars(primitives), "density": torch.zeros_like(primitives.density)})

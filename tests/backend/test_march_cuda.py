@@ -22,23 +22,24 @@ POINTER = {"f": "*fp32", "i": "*i32", "l": "*i64", "d": "*fp64"}
 with_triton = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="triton is not installed")
 
 
-def run_cases(**environment: str) -> None:
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", str(CASES)]
+def run_cases(chosen: str, **environment: str) -> None:
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-k", chosen, str(CASES)]
     done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
     assert " passed" in done.stdout
 
 
 @with_triton
-def test_the_kernels_do_what_the_reference_does_in_the_interpreter():
-    run_cases(TRITON_INTERPRET="1")
+@pytest.mark.parametrize("chosen", ["gradient", "not gradient"])
+def test_the_kernels_do_what_the_reference_does_in_the_interpreter(chosen):
+    run_cases(chosen, TRITON_INTERPRET="1")
 
 
 @with_triton
 @pytest.mark.gpu
 def test_the_kernels_do_what_the_reference_does_on_a_device():
     assert cuda.available("cuda")
-    run_cases(TRITON_INTERPRET="0")
+    run_cases("", TRITON_INTERPRET="0")
 
 
 def test_loads_without_triton_and_says_what_is_missing():
