@@ -2,7 +2,7 @@
 
 `python benchmarks/entering.py --json entering.json`. Milliseconds of wall time, each what the main thread does without
 a pause. At once, as scripts and background mode have it: at_once_build_ms, then at_once_evaluate_ms until Blender can
-draw. In a window a thread writes the volumes meanwhile (write_ms), their grids are read some at a time (read_ms, each
+draw. In a window a timer writes the volumes in slices (write_ms), their grids are read some at a time (read_ms, each
 time longest_read_ms at most), and only then enter_build_ms and enter_undo_ms, which evaluates the scene, are in the
 way. second_* is the same for somebody who joins a first person, and edit_* for one who takes the place of the second,
 with all volumes changed (at_once_edit_ms where that is done at once, then evaluated). Drawing is not in it;
@@ -25,11 +25,12 @@ from primdiffusion.human_file import export_for_blender
 from record import tell
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from blender_primdiffusion.scene.beforehand import Place, Written, write
-from blender_primdiffusion.scene.build import build_human, build_written, home_of_next
-from blender_primdiffusion.scene.edit import place_of, replace_by_written, replace_person
+
+from blender_primdiffusion.scene.build import build_human, build_written, next_folder
+from blender_primdiffusion.scene.edit import edit_destination, replace_person
 from blender_primdiffusion.scene.grid_cache import free_unused_grids, read_grids
 from blender_primdiffusion.scene.human import humans
+from blender_primdiffusion.scene.writing import Destination, WrittenHuman, write_now
 from blender_primdiffusion.ui.jobs.building import READ_S
 
 
@@ -45,10 +46,10 @@ def new_file(folder: Path, name: str) -> None:
     bpy.ops.ed.undo_push(message="before")
 
 
-def prepare(human: Path, place: Place) -> tuple[Written, dict[str, float]]:
+def prepare(human: Path, place: Destination) -> tuple[WrittenHuman, dict[str, float]]:
     """What a window does before the operator's turn."""
     began = time.perf_counter()
-    written = write(human, place, lambda _fraction: None)
+    written = write_now(human, place)
     figures = {"write_ms": 1000 * (time.perf_counter() - began)}
     parts, read = [], 0
     while read < len(written.files):
@@ -60,7 +61,7 @@ def prepare(human: Path, place: Place) -> tuple[Written, dict[str, float]]:
 
 def enter(human: Path) -> dict[str, float]:
     """As in a window, a part after the other."""
-    written, figures = prepare(human, Place(home_of_next("Human")))
+    written, figures = prepare(human, Destination(next_folder("Human")))
     figures["enter_build_ms"] = milliseconds(lambda: build_written(bpy.context, written))
     figures["enter_undo_ms"] = milliseconds(lambda: bpy.ops.ed.undo_push(message="Generate Human"))
     return figures
@@ -69,9 +70,9 @@ def enter(human: Path) -> dict[str, float]:
 def edit(person: bpy.types.Collection, human: Path, file: Path) -> dict[str, float]:
     """Likewise, of somebody who becomes the one of `human`; grids of before are freed first, as in a window."""
     freed = milliseconds(free_unused_grids)
-    written, figures = prepare(human, place_of(person))
+    written, figures = prepare(human, edit_destination(person))
     figures["free_ms"] = freed
-    figures["enter_swap_ms"] = milliseconds(lambda: replace_by_written(person, written, file))
+    figures["enter_swap_ms"] = milliseconds(lambda: replace_person(person, written, file))
     figures["enter_evaluate_ms"] = milliseconds(bpy.context.view_layer.update)
     figures["enter_undo_ms"] = milliseconds(lambda: bpy.ops.ed.undo_push(message="Vary Human"))
     return figures
@@ -99,8 +100,10 @@ def measured(folder: Path) -> dict[str, float]:
     figures |= {f"second_{name}": value for name, value in enter(people[2]).items()}
     first, second = humans(bpy.context.scene)
     file = folder / "person.human.safetensors"
-    file.write_bytes(b"somebody")
-    figures["at_once_edit_ms"] = milliseconds(lambda: replace_person(first, people[3], file))
+    file.write_bytes(b"a person")
+    figures["at_once_edit_ms"] = milliseconds(
+        lambda: replace_person(first, write_now(people[3], edit_destination(first)), file)
+    )
     figures["at_once_edit_evaluate_ms"] = milliseconds(bpy.context.view_layer.update)
     free_unused_grids()
     figures |= {f"edit_{name}": value for name, value in edit(second, people[4], file).items()}

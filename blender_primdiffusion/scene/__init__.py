@@ -1,1 +1,1 @@
-"""A person in Blender: armature, proxy mesh, volumes and their material, built from one human.npz."""
+"""Humans in Blender: armature, body mesh, volumes and material, built from a human.npz; their files; mesh proxies."""

@@ -1,4 +1,7 @@
-"""The action an armature has: its curves, its end, its repetition, and its way into a strip."""
+"""An armature's action: its curves, its end, looping, and pushing it down to an NLA strip.
+
+Panels import this file when Blender starts, so it needs no numpy.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import bpy
 
 
 def push_to_strip(armature: bpy.types.Object) -> bpy.types.NlaStrip:
-    """The armature's action becomes a strip on a new track above those there are (the NLA's Push Down)."""
+    """Move the armature's action to a strip on a new track above the others (the NLA's Push Down)."""
     animation = armature.animation_data
     action, slot = animation.action, animation.action_slot
     track = animation.nla_tracks.new()
@@ -18,7 +21,7 @@ def push_to_strip(armature: bpy.types.Object) -> bpy.types.NlaStrip:
 
 
 def action_curves(armature: bpy.types.Object) -> bpy.types.bpy_prop_collection | None:
-    """The curves that the armature's own slot of its action has; None without."""
+    """The curves in the armature's slot of its action, if any."""
     animation = armature.animation_data
     if animation is None or animation.action is None or animation.action_slot is None:
         return None
@@ -31,18 +34,18 @@ def action_curves(armature: bpy.types.Object) -> bpy.types.bpy_prop_collection |
 
 
 def last_key(armature: bpy.types.Object) -> float:
-    """Frame of the last key of the armature's action; minus infinity where it has none."""
+    """The frame of the last key of the armature's action; minus infinity without keys."""
     ends = [curve.keyframe_points[-1].co[0] for curve in action_curves(armature) or () if len(curve.keyframe_points)]
     return max(ends, default=float("-inf"))
 
 
 def loops(armature: bpy.types.Object) -> bool:
-    """Whether `repeat` is on."""
+    """Whether the action loops (see `repeat`)."""
     return any(modifier.type == "CYCLES" for curve in action_curves(armature) or () for modifier in curve.modifiers)
 
 
 def repeat(armature: bpy.types.Object) -> None:
-    """Let the action go on for ever, before and after: turns begin again, places go on from where they are."""
+    """Loop the action before and after its range: rotations start again, locations continue from where they were."""
     for curve in action_curves(armature) or ():
         if not any(modifier.type == "CYCLES" for modifier in curve.modifiers):
             cycles = curve.modifiers.new("CYCLES")

@@ -13,20 +13,20 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES, PARENTS
 from .convention import matrix_to_quaternion, points_to_blender, rotations_to_blender
 
-_TOWARDS = {"pelvis": "spine1", "spine3": "neck"}
-"""Which child a bone points at, where a joint has several."""
+_POINTS_TO = {"pelvis": "spine1", "spine3": "neck"}
+"""The child that a bone points to, where a joint has several."""
 _LEAF_LENGTH = {"head": 0.15, "left_foot": 0.06, "right_foot": 0.06, "left_hand": 0.08, "right_hand": 0.08}
 _LEAF_DIRECTION = {"head": (0.0, 0.0, 1.0), "left_foot": (0.0, -1.0, 0.0), "right_foot": (0.0, -1.0, 0.0)}
 _SHORTEST = 0.01
 
 
 def bone_tails(joints: NDArray) -> NDArray[np.float64]:
-    """Tails [24, 3] of bones with heads at `joints` [24, 3], both z up: towards the child, leaves straight on."""
+    """Tails [24, 3] of bones with heads at `joints` [24, 3], z up: at the child, or straight on for leaves."""
     tails = np.array(joints, np.float64)
     for index, name in enumerate(JOINT_NAMES):
         children = [child for child, parent in enumerate(PARENTS) if parent == index]
         if children:
-            target = JOINT_NAMES.index(_TOWARDS[name]) if name in _TOWARDS else children[0]
+            target = JOINT_NAMES.index(_POINTS_TO[name]) if name in _POINTS_TO else children[0]
             offset = joints[target] - joints[index]
         else:
             direction = np.asarray(_LEAF_DIRECTION.get(name, joints[index] - joints[PARENTS[index]]), np.float64)
@@ -61,11 +61,11 @@ def build_armature(name: str, joints: NDArray) -> bpy.types.Object:
 
 
 def move_rest_joints(data: bpy.types.Armature, joints: NDArray) -> None:
-    """Give an armature that exists other rest joints [24, 3] (z up, metres); poses and further bones stay.
+    """Move an armature's bones to other rest joints [24, 3] (z up, metres); poses and additional bones stay.
 
-    Each bone is moved as it is, not turned towards the new joints: its axes stay, so a pose or an animation means the
-    same joint rotations afterwards. Modes, selection and the active object stay too. Raises ValueError when a joint's
-    bone is missing, or the armature is in edit mode.
+    Bones are moved but not turned towards the new joints: with the same axes, a pose or an animation means the same
+    joint rotations as before. Modes, selection and the active object stay too. Raises ValueError when a joint's bone is
+    missing, or the armature is in edit mode.
     """
     missing = [name for name in JOINT_NAMES if name not in data.bones]
     if missing:
@@ -87,10 +87,10 @@ def move_rest_joints(data: bpy.types.Armature, joints: NDArray) -> None:
 
 @contextmanager
 def _in_edit_mode(armature: bpy.types.Object) -> Iterator[None]:
-    """An armature object of no scene in edit mode, in a scene of its own for as long as the block lasts.
+    """Put an armature object that is in no scene into edit mode, in a temporary scene.
 
-    Edit mode evaluates the scene it is in twice: with a person's thousand volumes that takes half a second, alone some
-    milliseconds. A person who is there may be hidden, or in a mode.
+    Edit mode evaluates its scene twice, which takes half a second with a human's thousand volumes and milliseconds
+    without. The user's scene may also be in another mode, or hide the human.
     """
     scene = bpy.data.scenes.new("PrimDiffusion Bones")
     try:
@@ -108,7 +108,7 @@ def _in_edit_mode(armature: bpy.types.Object) -> Iterator[None]:
 
 
 def rest_rotations(armature: bpy.types.Object) -> NDArray[np.float64]:
-    """Bone axes at rest [24, 3, 3] in the armature's space, in SMPL's joint order.
+    """Rest axes of the bones [24, 3, 3] in the armature's space, in SMPL's joint order.
 
     Raises ValueError when the armature lacks one of SMPL's joints.
     """
@@ -123,7 +123,7 @@ def bone_bases(rest: NDArray, rotations: NDArray, translation: NDArray) -> tuple
     """Pose-bone quaternions [*b, 24, 4] (w first) and the pelvis bone's location [*b, 3] for SMPL joint rotations.
 
     `rotations` [*b, 24, 3, 3] turn each joint about itself along the world's rest axes, y up, and `translation` [*b, 3]
-    moves the whole person. A bone's own axes O at rest differ, so its basis is O^T R O: then Blender's bone matrix is
+    moves the whole human. A bone's own axes O at rest differ, so its basis is O^T R O: then Blender's bone matrix is
     G_j B_j with SMPL's skinning transform G_j and the bone's rest matrix B_j, whatever O is.
     """
     inverse = np.swapaxes(rest, -1, -2)

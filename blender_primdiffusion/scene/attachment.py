@@ -1,30 +1,32 @@
-"""How a person's volumes follow the body: by the armature, on the posed surface, or merged into one grid."""
+"""How a human's volumes follow the body: by the armature, on the posed surface, or merged into one grid."""
 
 from __future__ import annotations
 
 import bpy
 
+from .human import check_editable
+
 ATTACHMENT = "primdiffusion_attachment"
-"""Custom property of a person's collection: one of MODES; ARMATURE where it is missing."""
+"""Custom property of a human's collection: one of MODES; ARMATURE where it is missing."""
 MODES = ("ARMATURE", "SURFACE", "MERGED")
 _BEFORE = "primdiffusion_attachment_before_merge"
 
 
 def attachment_of(collection: bpy.types.Collection) -> str:
-    """The person's mode."""
+    """The human's mode."""
     mode = str(collection.get(ATTACHMENT, MODES[0]))
     return mode if mode in MODES else MODES[0]
 
 
 def set_attachment(collection: bpy.types.Collection, mode: str) -> None:
-    """Show the person in another mode. Files stay as they are; undo and redo go back and forth.
+    """Show the human in another mode; its files stay, so undo and redo can switch.
 
     ARMATURE: each volume is an object whose frame is blended by linear blend skinning. SURFACE: instances of these
-    volumes on the posed surface's tangent planes, as the paper and the engine place them. MERGED: one volume, made by
-    `merged.show_merged` in one pose. Raises ValueError or FileNotFoundError, with what to do, before anything changes;
-    makes no undo step, its caller does.
+    volumes on the posed surface's tangent planes, where the paper and the engine place them. MERGED: one volume, made
+    by `merged.show_merged` in one pose. Raises ValueError or FileNotFoundError before anything changes. Makes no undo
+    step.
     """
-    from .human import check_editable
+    # numpy, which Blender starts without: panels import this file to show the mode
     from .merged import merged_of
     from .surface import build_surface, carrier_of, primitives_of
 
@@ -44,6 +46,6 @@ def set_attachment(collection: bpy.types.Collection, mode: str) -> None:
 
 
 def attachment_before_merge(collection: bpy.types.Collection) -> str:
-    """The mode to go back to when a merge is undone."""
+    """The mode to return to when the merged volume is removed."""
     mode = str(collection.get(_BEFORE, MODES[0]))
     return mode if mode in MODES[:2] else MODES[0]

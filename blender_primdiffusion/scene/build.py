@@ -13,64 +13,63 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from . import volumes
 from .armature import build_armature
-from .beforehand import Baked, Written, bake
 from .convention import frames_to_blender, matrix_to_quaternion, points_to_blender
-from .files import HOME, PERSON, folder_of, free_name, humans_folder, stored_path, volume_path
+from .files import HOME, PERSON, available_name, folder_of, humans_folder, stored_path
 from .grid_cache import read_headers
 from .human import BETAS, BODY_MARK, MARK, armature_of, humans
 from .material import volume_material
 from .shape import saved_body
+from .writing import Destination, WrittenHuman, write_now
 
+GAP_M = 0.2
+"""Between the hands of two humans in the T pose."""
+_FLESH_M = 0.1
+"""Around bones."""
 _NAME_LENGTH = 40
 _ABOUT_BETAS = "Shape of the body. The sliders in the sidebar set it; keys and drivers move the engine's picture alone"
 _KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials")
-GAP_M = 0.2
-"""Between the hands of two people in the T pose."""
-_FLESH_M = 0.1
-"""Around bones."""
 
 
 def build_human(
     context: bpy.types.Context, human_npz: str | Path, name: str = "Human", keep: Sequence[Path] = ()
 ) -> bpy.types.Collection:
-    """Build the person of a human.npz in the scene: armature, hidden body mesh and a volume for every primitive.
+    """Write the volumes of a human.npz and build it in the scene at once, which takes seconds; see `build_written`.
 
-    The person faces -y with the soles on z = 0 at the world's origin: the armature object is lifted, its space is the
-    backend's turned z up. Volumes are written to `folder_of(collection)`, the files in `keep` are copied beside them,
-    and the body's file is put beside that folder. Raises HumanFileError or VolumeWriteError, and then leaves neither
-    data nor files. Takes several seconds; makes no undo step, its caller does.
+    Raises HumanFileError or VolumeWriteError, and then leaves neither data nor files.
     """
-    person = _build(context, bake(human_npz), None, name, keep)
-    read_headers(volume_path(thing.data) for thing in person.all_objects if thing.type == "VOLUME")
-    return person
+    written = write_now(human_npz, Destination(next_folder(name)))
+    read_headers(written.files)
+    return build_written(context, written, name, keep)
 
 
 def build_written(
-    context: bpy.types.Context, written: Written, name: str = "Human", keep: Sequence[Path] = ()
+    context: bpy.types.Context, written: WrittenHuman, name: str = "Human", keep: Sequence[Path] = ()
 ) -> bpy.types.Collection:
-    """As `build_human`, quickly, of a person whose volumes are written: where they are, or, if somebody else has taken
-    that place meanwhile, as copies elsewhere."""
-    with written.entering(lambda: folder_of(person)):
-        person = _build(context, written.baked, written, name, keep)
-    return person
+    """Build a human whose volumes are written: armature, hidden body mesh and a volume for every primitive.
+
+    The human faces -y with the soles on z = 0 at the world's origin: the armature object is lifted; in its space, the
+    backend's axes are turned z up. The files in `keep` are copied to `folder_of(collection)`, and the volumes too where
+    they were written elsewhere because the name was taken since. Raises VolumeWriteError, and then leaves neither data
+    nor files. Makes no undo step.
+    """
+    with written.entering(lambda: folder_of(collection)):
+        collection = _build(context, written, name, keep)
+    return collection
 
 
-def home_of_next(name: str) -> Path:
-    """`folder_of` the person who is built under this name next, as far as can be told: Blender numbers names."""
+def next_folder(name: str) -> Path:
+    """`folder_of` the next human that is built under this name, as far as can be foreseen: Blender numbers names."""
     name = name[:_NAME_LENGTH]
     taken = {collection.name for collection in bpy.data.collections if collection.library is None}
     numbered = (f"{name}.{number:03d}" for number in itertools.count(1))
-    free = name if name not in taken else next(one for one in numbered if one not in taken)
+    free = name if name not in taken else next(candidate for candidate in numbered if candidate not in taken)
     return humans_folder() / bpy.path.clean_name(free)
 
 
-def _build(
-    context: bpy.types.Context, baked: Baked, written: Written | None, name: str, keep: Sequence[Path]
-) -> bpy.types.Collection:
-    human = baked.human
-    with _nothing_left_on_failure():
+def _build(context: bpy.types.Context, written: WrittenHuman, name: str, keep: Sequence[Path]) -> bpy.types.Collection:
+    human = written.human
+    with _no_data_left_on_failure():
         collection = bpy.data.collections.new(name[:_NAME_LENGTH])
         label = collection.name
         armature = build_armature(label, points_to_blender(human.joints))
@@ -83,52 +82,39 @@ def _build(
         collection.objects.link(body)
         primitives = bpy.data.collections.new(f"{label}_primitives")
         collection.children.link(primitives)
-        home = folder_of(collection)
-        kept = {free_name(path, home, path.name): path for path in keep}
+        folder = folder_of(collection)
+        copies = {available_name(path, folder, path.name): path for path in keep}
         with (
-            _volumes(baked, written, home, kept) as files,
-            saved_body(collection, human.shape_model, home.parent),
+            written.files_in(folder, range(len(human.density)), copies) as files,
+            saved_body(collection, human.shape_model, folder.parent),
         ):
             attach_volumes(
                 label,
                 armature,
                 primitives,
-                files,
+                list(files.values()),
                 points_to_blender(human.position),
                 frames_to_blender(human.rotation),
                 human.primitive_weights,
                 volume_material(),
             )
-            collection[MARK] = baked.provenance
-            collection[HOME] = str(home)
-            for name, path in kept.items():
-                if name != path.name:  # the usual name is taken by somebody who was deleted
-                    collection[PERSON] = name
+            collection[MARK] = written.provenance
+            collection[HOME] = str(folder)
+            for new_name, path in copies.items():
+                if new_name != path.name:  # the usual name belongs to a human that was deleted
+                    collection[PERSON] = new_name
             context.scene.collection.children.link(collection)
     return collection
 
 
 @contextmanager
-def _volumes(baked: Baked, written: Written | None, home: Path, kept: dict[str, Path]) -> Iterator[Sequence[Path]]:
-    """The files of the volumes in `home`, with `kept` beside them where the block ends well."""
-    if written is None:
-        with volumes.written(baked.grids, home, kept) as files:
-            yield files
-        return
-    here = written.home == home
-    copies = {} if here else {path.name: path for path in written.files}
-    with volumes.written(baked.grids, home, {**kept, **copies}, which=[]):
-        yield written.files if here else [home / name for name in copies]
-
-
-@contextmanager
-def _nothing_left_on_failure() -> Iterator[None]:
+def _no_data_left_on_failure() -> Iterator[None]:
     """When the block fails, remove every datablock made in it."""
     before = {kind: set(getattr(bpy.data, kind)) for kind in _KINDS}
     try:
         yield
     except BaseException:
-        new = [thing for kind in _KINDS for thing in getattr(bpy.data, kind) if thing not in before[kind]]
+        new = [block for kind in _KINDS for block in getattr(bpy.data, kind) if block not in before[kind]]
         bpy.data.batch_remove(new)
         raise
 
@@ -144,10 +130,8 @@ def build_body_mesh(
     """A mesh object, linked to no collection: vertices [V, 3] z up in the armature's space, faces [F, 3], uv [F, 3, 2].
 
     Vertex groups carry skin_weights [V, 24]; the Armature modifier blends matrices linearly (preserve volume off), as
-    SMPL does. It is hidden in renders and in the viewport: the volumes are what one looks at.
+    SMPL does. It is hidden in renders and in the viewport, where the volumes show instead.
     """
-    import numpy as np  # not for those who ask for `body_of` alone: Blender starts without it
-
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(vertices))
     mesh.vertices.foreach_set("co", np.asarray(vertices, np.float32).ravel())
@@ -187,12 +171,12 @@ def attach_volumes(
     weights: NDArray,
     material: bpy.types.Material,
 ) -> list[bpy.types.Object]:
-    """A Volume object for each file, in `collection`, at rest where position [K, 3] and rotation [K, 3, 3] (z up) say.
+    """A Volume object for each file, in `collection`, with rest position [K, 3] and rotation [K, 3, 3] (z up).
 
     Parented to the armature, with an Armature constraint of one target per non-zero weight [K, 24] and preserve volume
     off: the evaluated matrix is A (sum_j w_j G_j) [rotation | position], with the armature object's matrix A and SMPL's
     skinning transforms G_j. It shears where joints bend, as linear blending does. Turns off the viewports' relationship
-    lines, of which there would be some thousand.
+    lines, of which there would be thousands.
     """
     hide_relationship_lines()
     quaternions = matrix_to_quaternion(rotation)
@@ -222,7 +206,8 @@ def attach_volumes(
 
 
 def hide_relationship_lines() -> None:
-    """Turn the overlay off in the 3D viewports of all workspaces; Overlays > Relationship Lines shows them again."""
+    """Turn Blender's dashed lines from children to parents off in the 3D viewports of all workspaces: a human's
+    volumes would have two thousand. Overlays > Relationship Lines shows them again."""
     for screen in bpy.data.screens:
         for area in screen.areas:
             for space in area.spaces:
@@ -231,41 +216,40 @@ def hide_relationship_lines() -> None:
 
 
 def stand_beside_others(context: bpy.types.Context, collection: bpy.types.Collection) -> None:
-    """Move a person who has just been built along the world's x axis, as little as is needed to stand free.
+    """Move a new human along the world's x axis, as little as needed to stand clear of the scene's other humans.
 
-    Looks at where the bones of the scene's people are as posed; nobody else moves. Evaluates the scene where somebody
-    else is in it. Raises ValueError as `armature_of` does.
+    Compares the bones as posed, so it evaluates the scene if there are others. Raises ValueError as `armature_of`.
     """
     armature = armature_of(collection)
     others = [
-        thing
-        for person in humans(context.scene)
-        if person != collection
-        for thing in person.objects
-        if thing.type == "ARMATURE" and thing.data.bones
+        obj
+        for human in humans(context.scene)
+        if human != collection
+        for obj in human.objects
+        if obj.type == "ARMATURE" and obj.data.bones
     ]
     if others:
         context.view_layer.update()
-        armature.location.x += _shift(_ground(armature), [_ground(other) for other in others])
+        armature.location.x += _shift(_footprint(armature), [_footprint(other) for other in others])
 
 
 def _shift(own: NDArray[np.float64], others: list[NDArray[np.float64]]) -> float:
-    """The smallest move in x, metres, after which the rectangle `own` is GAP_M or more from all others; right first."""
-    places = [0.0]
+    """The smallest move in x, metres, after which the rectangle `own` is GAP_M or more from all others; prefers +x."""
+    candidates = [0.0]
     for other in others:
-        places += [other[1, 0] + GAP_M - own[0, 0], other[0, 0] - GAP_M - own[1, 0]]
-    free = [x for x in places if not any(_meet(own + np.array([x, 0.0]), other) for other in others)]
+        candidates += [other[1, 0] + GAP_M - own[0, 0], other[0, 0] - GAP_M - own[1, 0]]
+    free = [x for x in candidates if not any(_too_close(own + np.array([x, 0.0]), other) for other in others)]
     return min(free, key=lambda x: (round(abs(x), 6), x < 0))  # beyond the outermost there is always room
 
 
-def _meet(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+def _too_close(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
     """Whether two rectangles are nearer than GAP_M in x while they overlap in y."""
     gap = np.array([GAP_M - 1e-6, 0.0])
-    return bool(((one[0] < other[1] + gap) & (other[0] < one[1] + gap)).all())
+    return bool(((first[0] < second[1] + gap) & (second[0] < first[1] + gap)).all())
 
 
-def _ground(armature: bpy.types.Object) -> NDArray[np.float64]:
-    """Lowest and highest x and y in the world [2, 2] of the bones as posed, with flesh around them."""
+def _footprint(armature: bpy.types.Object) -> NDArray[np.float64]:
+    """Lowest and highest x and y in the world [2, 2] of the bones as posed, with a margin for flesh."""
     to_world = np.array(armature.matrix_world)
     bones = [(bone.head, bone.tail) for bone in armature.pose.bones]
     ends = np.array(bones, np.float64).reshape(-1, 3) @ to_world[:3, :3].T + to_world[:3, 3]

@@ -1,7 +1,7 @@
-"""Files of people brought beside the .blend: by itself from the temporary folder of one never saved, else when asked.
+"""Copy files of humans beside the .blend, and find those that are no longer used.
 
-People generated before the first save have their files in a temporary folder; saving brings them along. Those that were
-appended, or saved under another name elsewhere, keep theirs where they were until Collect Files.
+Humans generated before the first save have their files in a temporary folder, which saving copies. Files of humans that
+were appended, or whose .blend was saved elsewhere under another name, stay where they were until Collect Files.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from .files import (
     PRIMITIVE_VDB,
     TEMPORARY,
     VolumeWriteError,
+    available_name,
+    copy_file,
     folders_of,
-    free_name,
     humans_folder,
     person_file_name,
-    put_copy,
     sequence_files,
     stored_path,
     volume_path,
@@ -33,36 +33,36 @@ from .files import (
 from .human import MARK
 from .shape import BODY_FILE, BODY_NPZ, body_files
 
-_PERSON = re.compile(r"person(_[0-9a-f]{12})?\.human\.safetensors")
+_PERSON_FILES = re.compile(r"person(_[0-9a-f]{12})?\.human\.safetensors")
 
 
 @dataclasses.dataclass(frozen=True)
 class Collected:
-    """What was brought."""
+    """What was copied."""
 
     volumes: int
-    """That show another file now."""
+    """Volumes that show another file now."""
     files: int
-    """That were not there before."""
+    """Files that did not exist before."""
     size: int
-    """Of these, bytes."""
+    """Bytes of these files."""
 
 
 def collect_temporary_volumes(blend_path: str) -> Collected:
-    """Copy files of people from temporary folders to the folder of `blend_path`, and point to the copies.
+    """Copy files of humans from temporary folders to the folder of `blend_path`, and point to the copies.
 
-    Temporary folders of an earlier Blender, after a crash, count too. What the .blend does not use stays behind, for
-    undo. In a .blend never saved paths become absolute: Blender makes them relative when it first writes it. Raises
+    Includes temporary folders of an earlier Blender that has crashed. Files that the .blend does not use stay, for
+    undo. In a .blend never saved, paths become absolute: Blender makes them relative when it first writes it. Raises
     VolumeWriteError when the folder beside the .blend cannot be written.
     """
     return _collect(blend_path, [volume for volume in _local() if _temporary(volume_path(volume))])
 
 
 def collect_files() -> Collected:
-    """Copy all files of this .blend's people beside it, and point to the copies; those linked stay where they are.
+    """Copy all files of this .blend's humans beside it, and point to the copies; files of linked humans stay.
 
     Raises ValueError for a .blend that was never saved, FileNotFoundError where files are missing, and VolumeWriteError
-    where they cannot be written; then nothing is changed.
+    where they cannot be written; then nothing has changed.
     """
     if not bpy.data.filepath:
         raise ValueError("this file was never saved: save it first, which collects the files of its people too")
@@ -77,8 +77,8 @@ def collect_files() -> Collected:
     return _collect(bpy.data.filepath, away)
 
 
-def note_folders() -> None:
-    """Keep on each person where their files are now, for the day when the .blend is moved without them."""
+def store_folders() -> None:
+    """Store with each human where its files are, in case the .blend is moved without them."""
     for person in bpy.data.collections:
         if MARK in person and person.library is None:
             home = folders_of(person)[0]
@@ -88,7 +88,7 @@ def note_folders() -> None:
 
 @persistent
 def collect_before_saving(blend_path: str, *_: object) -> None:
-    """Handler of save_pre. After a failure, printed, the .blend is saved pointing to the temporary files."""
+    """Handler of save_pre. After a failure, which is printed, the .blend is saved pointing to the temporary files."""
     if not blend_path:  # the start-up file
         return
     try:
@@ -97,39 +97,39 @@ def collect_before_saving(blend_path: str, *_: object) -> None:
         print(
             f"PrimDiffusion: volumes stay in {humans_folder('')}: they could not be copied beside the .blend ({error})"
         )
-    note_folders()
+    store_folders()
 
 
 def unused(folder: Path) -> list[Path]:
-    """Files of people in `folder` that nothing in the .blend, as it is now, points to: of earlier states of people.
+    """Files in `folder`, of earlier states of humans, that nothing in the current .blend points to.
 
-    Undo may still want them, and so may other .blend files that share the folder.
+    Undo may still need them, and so may other .blend files that share the folder.
     """
     if not folder.is_dir():
         return []
     used = {path.resolve() for volume in bpy.data.volumes if volume.filepath for path in sequence_files(volume)}
-    kept = people_files() | body_files()
+    in_use = _person_files() | body_files()
     found = []
     for path in sorted(folder.rglob("*")):
-        of_people = any(pattern.fullmatch(path.name) for pattern in (PRIMITIVE_VDB, _PERSON, BODY_NPZ, MERGED_VDB))
-        if of_people and path.name not in kept and path.resolve() not in used:
+        named_so = any(pattern.fullmatch(path.name) for pattern in (PRIMITIVE_VDB, _PERSON_FILES, BODY_NPZ, MERGED_VDB))
+        if named_so and path.name not in in_use and path.resolve() not in used:
             found.append(path)
     return found
 
 
-def people_files() -> set[str]:
-    """Names of the backend's files that people of this .blend use, those linked included."""
+def _person_files() -> set[str]:
+    """Names of the backend's files that humans of this .blend use, linked ones included."""
     return {person_file_name(collection) for collection in bpy.data.collections if MARK in collection}
 
 
 def _local() -> list[bpy.types.Volume]:
-    """Volumes of people that live in this .blend."""
+    """Volumes of humans in this .blend that are not linked."""
     shown = {
-        thing.data: None
+        obj.data: None
         for person in bpy.data.collections
         if MARK in person
-        for thing in person.all_objects
-        if thing.type == "VOLUME" and thing.data.filepath
+        for obj in person.all_objects
+        if obj.type == "VOLUME" and obj.data.filepath
     }
     return [volume for volume in shown if volume.library is None]
 
@@ -150,7 +150,7 @@ def _collect(blend_path: str, away: Iterable[bpy.types.Volume]) -> Collected:
     try:
         for source, destination in copies.items():
             there = destination.is_file() and destination.stat().st_size == source.stat().st_size
-            if not there and put_copy(source, destination):  # of volumes and bodies, the name tells the content
+            if not there and copy_file(source, destination):  # names of volumes and bodies identify the content
                 made.append(destination)
     except OSError as error:
         for path in made:
@@ -172,28 +172,28 @@ def _of_person(
     target: Path,
     names: dict[bpy.types.Collection, str],
 ) -> dict[Path, Path]:
-    """Copies of the backend's file and the body's, where the person's volumes go; other names needed go to `names`."""
+    """Copies of the backend's and the body's file to where the human's volumes go; new names are added to `names`."""
     near = folders_of(person)
-    volume = next((thing.data for thing in person.all_objects if thing.type == "VOLUME"), None)
+    volume = next((obj.data for obj in person.all_objects if obj.type == "VOLUME"), None)
     if volume not in moved:
         return {}
     home, copies = moved[volume].parent, {}
     file = next((path for path in (folder / person_file_name(person) for folder in near) if path.is_file()), None)
     if file is not None and file.parent != home:
-        name = free_name(file, home, file.name)
+        name = available_name(file, home, file.name)
         copies[file] = home / name
         if name != person_file_name(person):
             names[person] = name
     body = str(person.get(BODY_FILE, ""))
-    places = [place / body for folder in near for place in (folder.parent, folder)] if body else []
-    found = next((path for path in places if path.is_file()), None)
+    paths = [parent / body for folder in near for parent in (folder.parent, folder)] if body else []
+    found = next((path for path in paths if path.is_file()), None)
     if found is not None:
         copies[found] = target / body
     return copies
 
 
 def _temporary(path: Path) -> bool:
-    """Among the temporary files of this Blender, or of one that has crashed."""
+    """Whether a file is among the temporary files of this Blender, or of one that has crashed."""
     return any(folder.name == TEMPORARY and folder.parent.name.startswith("blender_") for folder in path.parents) or (
         _inside(path, humans_folder(""))
     )

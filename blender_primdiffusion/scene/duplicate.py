@@ -11,122 +11,122 @@ import bpy
 from .human import armature_of, volumes_of
 from .surface import build_surface, carrier_of, node_inputs, set_node_input
 
-LONGEST = 40
-"""Characters; parts of people add to it, and Blender's names end at 63."""
+LONGEST_NAME = 40
+"""Characters of a human's name; names of its parts are longer, and Blender allows 63."""
 
 
 def duplicate_human(collection: bpy.types.Collection) -> bpy.types.Collection:
-    """A copy of a person in the same place, linked beside them; posing, reshaping and editing one leaves the other.
+    """Copy a human, in the same place and scene; posing, reshaping and editing one leaves the other unchanged.
 
-    Everything in the person's collections comes along, and what points to a part of the person points to the copy's.
-    Files are shared, and so are the volumes' data, which edits copy before they change them (see `shape.own_data`).
-    Raises ValueError for a collection that holds no person.
+    Everything in the human's collections is copied, and pointers to parts of the human become pointers to the copies.
+    Files are shared, and so is the volumes' data, which edits copy before they change it (see `human.own_data`). Raises
+    ValueError for a collection that is no human.
     """
     armature_of(collection)
-    shared = {thing for objects in volumes_of(collection).values() for thing in objects}
-    twin = collection.copy()
-    twins: dict[Any, Any] = {collection: twin}
-    _copy_children(twin, twins)
-    objects = [thing for thing in collection.all_objects if thing not in twins]
-    for thing in objects:
-        twins[thing] = thing.copy()
-    for copy in [twins[key] for key in list(twins) if isinstance(key, bpy.types.Collection)]:
-        for thing in list(copy.objects):
-            copy.objects.unlink(thing)
-            copy.objects.link(twins[thing])
-    for thing in objects:
-        if thing.data is not None and thing not in shared:
-            twins[thing].data = thing.data.copy()
-        _own(thing, twins[thing], twins)
+    shared = {obj for objects in volumes_of(collection).values() for obj in objects}
+    duplicate = collection.copy()
+    copies: dict[Any, Any] = {collection: duplicate}
+    _copy_children(duplicate, copies)
+    objects = [obj for obj in collection.all_objects if obj not in copies]
+    for obj in objects:
+        copies[obj] = obj.copy()
+    for copy in [copies[key] for key in list(copies) if isinstance(key, bpy.types.Collection)]:
+        for obj in list(copy.objects):
+            copy.objects.unlink(obj)
+            copy.objects.link(copies[obj])
+    for obj in objects:
+        if obj.data is not None and obj not in shared:
+            copies[obj].data = obj.data.copy()
+        _separate(obj, copies[obj], copies)
     for holder in _holders(collection):
-        holder.children.link(twin)
-    _name_parts(collection, twin, twins)
-    keep_surface(twin)
-    return twin
+        holder.children.link(duplicate)
+    _name_parts(collection, duplicate, copies)
+    rebuild_surface(duplicate)
+    return duplicate
 
 
 def rename_human(collection: bpy.types.Collection, name: str) -> None:
-    """Call a person `name`, and their armature, body mesh and volumes after it; files on disk keep their names.
+    """Rename a human, and the armature, body mesh and volumes that are named after it; files keep their names.
 
-    Parts that somebody has renamed keep their names. Blender adds a number where the name is taken. Raises ValueError
-    for an empty name and for a person who is linked.
+    Parts that the user has renamed keep their names. Blender adds a number where the name is taken. Raises ValueError
+    for an empty name and for a linked human.
     """
     armature = armature_of(collection)
-    name = name.strip()[:LONGEST]
+    name = name.strip()[:LONGEST_NAME]
     if not name:
         raise ValueError(f"the person {collection.name!r} needs a name: type one")
-    linked = next((thing.library for thing in (collection, armature) if thing.library is not None), None)
+    linked = next((obj.library for obj in (collection, armature) if obj.library is not None), None)
     if linked is not None:
-        raise ValueError(f"the person {collection.name!r} is linked from {linked.filepath!r}: rename them there")
+        raise ValueError(f"the person {collection.name!r} is linked from {linked.filepath!r}: rename it there")
     before = collection.name
     collection.name = name
     parts = [*collection.children_recursive, *collection.all_objects]
-    shared = {thing.data for thing in collection.all_objects if thing.data is not None}
+    shared = {obj.data for obj in collection.all_objects if obj.data is not None}
     for part in [*parts, *shared]:
         new = part_name(part.name, before, collection.name)
         if part.library is None and new != part.name:
             part.name = new
-    keep_surface(collection)
+    rebuild_surface(collection)
 
 
 def part_name(name: str, before: str, after: str) -> str:
-    """What a part is called once the person who was `before` is `after`."""
+    """The name of a part of a human that is renamed from `before` to `after`."""
     if name == before or name.startswith(f"{before}_"):
         return after + name[len(before) :]
     return name
 
 
-def keep_surface(collection: bpy.types.Collection) -> None:
-    """Have a person attached to their surface show the same volumes after names have changed: its nodes sort by name.
+def rebuild_surface(collection: bpy.types.Collection) -> None:
+    """Update the surface attachment after names have changed, since its nodes sort volumes by name.
 
-    Where the body mesh or the body's file is gone nothing can be kept, and nothing is shown there either.
+    Where the body mesh or the body's file is missing, the attachment shows nothing anyway.
     """
     if carrier_of(collection) is not None:
         with contextlib.suppress(ValueError, FileNotFoundError):
             build_surface(collection)
 
 
-def _copy_children(copy: bpy.types.Collection, twins: dict[Any, Any]) -> None:
+def _copy_children(copy: bpy.types.Collection, copies: dict[Any, Any]) -> None:
     for child in list(copy.children):
         copy.children.unlink(child)
-        twins[child] = child.copy()
-        copy.children.link(twins[child])
-        _copy_children(twins[child], twins)
+        copies[child] = child.copy()
+        copy.children.link(copies[child])
+        _copy_children(copies[child], copies)
 
 
-def _own(thing: bpy.types.Object, copy: bpy.types.Object, twins: dict[Any, Any]) -> None:
-    """Give the copy an action of its own, and turn what it points to into the copies."""
-    if thing.animation_data is not None and thing.animation_data.action is not None:
-        slot = thing.animation_data.action_slot
-        copy.animation_data.action = thing.animation_data.action.copy()
+def _separate(obj: bpy.types.Object, copy: bpy.types.Object, copies: dict[Any, Any]) -> None:
+    """Give the copy an action of its own, and redirect its pointers to the copies."""
+    if obj.animation_data is not None and obj.animation_data.action is not None:
+        slot = obj.animation_data.action_slot
+        copy.animation_data.action = obj.animation_data.action.copy()
         if slot is not None:
             copy.animation_data.action_slot = copy.animation_data.action.slots[slot.identifier]
-    if copy.parent in twins:
+    if copy.parent in copies:
         inverse = copy.matrix_parent_inverse.copy()
-        copy.parent = twins[copy.parent]
+        copy.parent = copies[copy.parent]
         copy.matrix_parent_inverse = inverse
     bones = copy.pose.bones if copy.pose is not None else ()
     for pointing in (*copy.modifiers, *copy.constraints, *(one for bone in bones for one in bone.constraints)):
-        _point_to(pointing, twins)
+        _point_to(pointing, copies)
         for target in getattr(pointing, "targets", ()):
-            _point_to(target, twins)
-        _point_sockets_to(pointing, twins)
+            _point_to(target, copies)
+        _point_sockets_to(pointing, copies)
 
 
-def _point_to(pointing: Any, twins: dict[Any, Any]) -> None:
+def _point_to(pointing: Any, copies: dict[Any, Any]) -> None:
     for prop in pointing.bl_rna.properties:
         if prop.type == "POINTER" and not prop.is_readonly:
             value = getattr(pointing, prop.identifier)
-            if isinstance(value, bpy.types.ID) and value in twins:
-                setattr(pointing, prop.identifier, twins[value])
+            if isinstance(value, bpy.types.ID) and value in copies:
+                setattr(pointing, prop.identifier, copies[value])
 
 
-def _point_sockets_to(modifier: Any, twins: dict[Any, Any]) -> None:
-    """The inputs of a Geometry Nodes modifier are no properties of its type."""
+def _point_sockets_to(modifier: Any, copies: dict[Any, Any]) -> None:
+    """Redirect the inputs of a Geometry Nodes modifier, which are not properties of its type."""
     if getattr(modifier, "type", "") == "NODES":
         for socket, value in node_inputs(modifier).items():
-            if isinstance(value, bpy.types.ID) and value in twins:
-                set_node_input(modifier, socket, twins[value])
+            if isinstance(value, bpy.types.ID) and value in copies:
+                set_node_input(modifier, socket, copies[value])
 
 
 def _holders(collection: bpy.types.Collection) -> list[bpy.types.Collection]:
@@ -134,10 +134,10 @@ def _holders(collection: bpy.types.Collection) -> list[bpy.types.Collection]:
     return [holder for holder in every if collection in list(holder.children)]
 
 
-def _name_parts(collection: bpy.types.Collection, twin: bpy.types.Collection, twins: dict[Any, Any]) -> None:
-    """Call the parts of the copy as those of the person are called."""
-    for part, copy in twins.items():
-        copy.name = part_name(part.name, collection.name, twin.name)
+def _name_parts(collection: bpy.types.Collection, duplicate: bpy.types.Collection, copies: dict[Any, Any]) -> None:
+    """Name the parts of the copy as those of the original are named."""
+    for part, copy in copies.items():
+        copy.name = part_name(part.name, collection.name, duplicate.name)
         data = getattr(copy, "data", None)
         if data is not None and data != part.data:
-            data.name = part_name(part.data.name, collection.name, twin.name)
+            data.name = part_name(part.data.name, collection.name, duplicate.name)

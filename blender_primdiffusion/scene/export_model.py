@@ -1,12 +1,11 @@
-"""Armature and mesh proxy as a file of another program, by Blender's own exporters, in a scene of their own.
+"""Export armature and mesh proxy to other programs by Blender's own exporters, in a temporary scene.
 
-That scene holds nothing else and is gone afterwards: selection, modes and visibility of the user's are never touched.
+That scene holds nothing else, so the user's selection, modes and visibility stay as they are.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -16,23 +15,24 @@ from pathlib import Path
 import bpy
 
 from ..formats.joints import JOINT_NAMES
+from .files import copy_file
 
 
 @dataclasses.dataclass(frozen=True)
 class FrameRange:
-    """What of the scene's time is written."""
+    """The frames that are exported."""
 
     first: int
     last: int
 
     @property
     def animated(self) -> bool:
-        """More than a pose."""
+        """Whether this is more than one pose."""
         return self.last > self.first
 
 
 def check_ready(armature: bpy.types.Object) -> None:
-    """ValueError, with what to do, for an armature that cannot be exported now."""
+    """Raises ValueError for an armature that cannot be exported now."""
     if armature.data.is_editmode:
         raise ValueError(f"{armature.name!r} is in Edit Mode: leave it (Tab) to export")
     missing = [name for name in JOINT_NAMES if name not in armature.data.bones]
@@ -50,15 +50,15 @@ def write_model(
     kind: str,
     frames: FrameRange,
 ) -> None:
-    """Writes `kind` (GLB, FBX or USD) with everything it needs; a reader never sees half a file.
+    """Write a file of `kind` (GLB, FBX or USD), which appears whole or not at all.
 
     USD's textures go into a folder beside the file, except in .usdz. Raises ValueError or RuntimeError where an
-    exporter is missing or fails, OSError.
+    exporter is missing or fails, and OSError.
     """
     check_ready(armature)
     folder = Path(tempfile.mkdtemp(prefix="export_", dir=bpy.app.tempdir or None))
     try:
-        with _stage(context, armature, mesh, frames) as around, context.temp_override(**around):
+        with _selected_in_scene(context, armature, mesh, frames) as overrides, context.temp_override(**overrides):
             _EXPORTERS[kind](folder / path.name, frames)
         if not (folder / path.name).is_file():
             raise RuntimeError(f"Blender's exporter wrote no {kind} file: see the console")
@@ -68,10 +68,10 @@ def write_model(
 
 
 @contextmanager
-def alone(context: bpy.types.Context, armature: bpy.types.Object) -> Iterator[bpy.types.Scene]:
-    """A scene with nothing but the armature, at the current frame: one with a person's volumes takes far longer.
+def scene_with_only(context: bpy.types.Context, armature: bpy.types.Object) -> Iterator[bpy.types.Scene]:
+    """A temporary scene with only the armature, at the current frame: with volumes, evaluation takes far longer.
 
-    An armature that is hidden or shown at rest is posed meanwhile.
+    An armature that is hidden or shown in rest position is posed meanwhile.
     """
     source = context.scene
     scene = bpy.data.scenes.new(armature.name)
@@ -90,18 +90,18 @@ def alone(context: bpy.types.Context, armature: bpy.types.Object) -> Iterator[bp
 
 
 @contextmanager
-def _stage(
+def _selected_in_scene(
     context: bpy.types.Context, armature: bpy.types.Object, mesh: bpy.types.Object, frames: FrameRange
 ) -> Iterator[dict[str, object]]:
-    """What to override for a scene with these two, selected."""
-    with alone(context, armature) as scene:
+    """Context overrides for a temporary scene in which the armature and the mesh are selected."""
+    with scene_with_only(context, armature) as scene:
         scene.frame_start, scene.frame_end = frames.first, frames.last
         scene.collection.objects.link(mesh)
         layer = scene.view_layers[0]
         if frames.animated:
             scene.frame_set(frames.first)
-        for thing in (armature, mesh):
-            thing.select_set(True, view_layer=layer)
+        for obj in (armature, mesh):
+            obj.select_set(True, view_layer=layer)
         layer.objects.active = armature
         yield {
             "scene": scene, "view_layer": layer, "active_object": armature, "object": armature,
@@ -166,8 +166,8 @@ _EXPORTERS: dict[str, Callable[[Path, FrameRange], None]] = {"GLB": _write_glb, 
 
 @contextmanager
 def _enabled(module: str, label: str) -> Iterator[None]:
-    """Blender's own add-on `module`, enabled for the moment where the user has disabled it."""
-    import addon_utils
+    """Enable Blender's own add-on `module` for the block where the user has disabled it."""
+    import addon_utils  # of Blender's scripts, which the bpy module adds to the path when it starts
 
     _, loaded = addon_utils.check(module)
     if not loaded and addon_utils.enable(module, default_set=False) is None:
@@ -180,21 +180,14 @@ def _enabled(module: str, label: str) -> Iterator[None]:
 
 
 def _run(exporter: Callable[..., set[str]], **settings: object) -> None:
-    """Raises RuntimeError with Blender's own sentence where it fails."""
+    """Run an operator; raises RuntimeError, with Blender's own message, where it fails."""
     if exporter(**settings) != {"FINISHED"}:
         raise RuntimeError("Blender's exporter was cancelled: see the console")
 
 
 def _publish(folder: Path, path: Path) -> None:
-    """Copies what was written to where it belongs, the file itself last. Raises OSError."""
+    """Copy the written files to their destination, the main file last. Raises OSError."""
     for source in sorted(folder.rglob("*"), key=lambda source: source == folder / path.name):
         if source.is_dir():
             continue
-        target = path.parent / source.relative_to(folder)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = target.with_name(f".{target.name}.part")
-        try:
-            shutil.copyfile(source, unfinished)
-            os.replace(unfinished, target)
-        finally:
-            unfinished.unlink(missing_ok=True)
+        copy_file(source, path.parent / source.relative_to(folder))

@@ -12,34 +12,34 @@ from pathlib import Path
 import bpy
 
 TEMPORARY = "primdiffusion_humans"
-"""Folder of the people of a .blend that was never saved, among Blender's temporary files."""
+"""Folder, among Blender's temporary files, for the humans of a .blend that was never saved."""
 PERSON_FILE = "person.human.safetensors"
-"""The person as the backend keeps it, beside the volumes."""
+"""The human as the backend saves it, beside the volumes."""
 PERSON = "primdiffusion_person_file"
-"""Custom property of a person's collection: the name of the backend's file since the person was edited. It goes back
-and forth with undo, as the paths of the volumes do."""
+"""Custom property of a human's collection: the name of the backend's file since the last edit. Undo switches it back,
+as it does the paths of the volumes."""
 HOME = "primdiffusion_folder"
-"""Custom property of a person's collection: the absolute folder of their files when the .blend was last saved. Paths
-of volumes are relative to the .blend, which may be moved alone, or opened as a copy in a temporary folder."""
+"""Custom property of a human's collection: the absolute folder of its files when the .blend was last saved. Paths of
+volumes are relative to the .blend, which may be moved alone, or opened as a copy in a temporary folder."""
 PRIMITIVE_VDB = re.compile(r"prim_(\d{4,})_[0-9a-f]{12}\.vdb")
-"""Names of the files of volumes."""
+"""File names of the volumes of primitives; the hash is of the content."""
 MERGED_VDB = re.compile(r"merged_[0-9a-f]{12}(_\d{4,})?\.vdb")
-"""Names of merged files; those of a sequence end in the frame, counted from 1."""
+"""File names of merged volumes; those of a sequence end in the frame, counted from 1."""
 
 
 class VolumeWriteError(OSError):
-    """VDB files could not be written; nothing was left behind."""
+    """Files of a human could not be written; nothing was left behind."""
 
 
 class MissingPersonFile(FileNotFoundError):
-    """The backend's file of a person is not where it should be."""
+    """The backend's file of a human is not where it should be."""
 
     kind = "missing_volumes"
     """By which panels find the remedy."""
 
 
 def humans_folder(blend_path: str | None = None) -> Path:
-    """Where the people of a .blend live: `<blendname>_humans` beside it, a temporary folder while it is unsaved."""
+    """The folder of a .blend's humans: `<blendname>_humans` beside it, a temporary folder while it is unsaved."""
     blend = Path(blend_path if blend_path is not None else bpy.data.filepath)
     if blend.name:
         return blend.resolve().parent / f"{blend.stem}_humans"
@@ -47,7 +47,7 @@ def humans_folder(blend_path: str | None = None) -> Path:
 
 
 def stored_path(path: Path) -> str:
-    """A path as a .blend should hold it: relative (`//`) when the .blend is saved, else absolute."""
+    """A path as a .blend should store it: relative (`//`) when the .blend is saved, else absolute."""
     if not bpy.data.filepath:
         return str(path)
     try:
@@ -56,23 +56,40 @@ def stored_path(path: Path) -> str:
         return str(path)
 
 
+def volume_path(volume: bpy.types.Volume) -> Path:
+    """The absolute path of a volume's file."""
+    return Path(bpy.path.abspath(volume.filepath, library=volume.library))
+
+
+def sequence_files(volume: bpy.types.Volume) -> list[Path]:
+    """All files of a volume: those of a merged sequence, else the only one."""
+    path = volume_path(volume)
+    match = MERGED_VDB.fullmatch(path.name)
+    if match is None or match[1] is None:
+        return [path]
+    return sorted(path.parent.glob(path.name.replace(match[1], "_*")))
+
+
 def folder_of(collection: bpy.types.Collection) -> Path:
-    """Where a person's files live: `<blendname>_humans/<collection name>` (see `humans_folder`)."""
+    """The folder for a human's files: `<blendname>_humans/<collection name>` (see `humans_folder`)."""
     return humans_folder() / bpy.path.clean_name(collection.name)
 
 
 def folders_of(collection: bpy.types.Collection) -> list[Path]:
-    """Where a person's files may be: beside the volumes as they are now, else `folder_of`."""
-    volume = next((thing.data for thing in collection.all_objects if thing.type == "VOLUME"), None)
-    beside = [volume_path(volume).parent] if volume is not None and volume.filepath else []
-    return [*beside, folder_of(collection)]
+    """Where a human's files may be: beside the volumes wherever these are, else `folder_of`.
+
+    Volumes keep their paths when a collection is renamed and when a .blend is saved elsewhere.
+    """
+    volume = next((obj.data for obj in collection.all_objects if obj.type == "VOLUME"), None)
+    current = [volume_path(volume).parent] if volume is not None and volume.filepath else []
+    return [*current, folder_of(collection)]
 
 
 def home_of(collection: bpy.types.Collection) -> Path:
-    """The folder of the person's files, if it belongs to this .blend.
+    """The folder for new files of a human: the one of its files, if that belongs to this .blend.
 
-    Else (saved under another name, appended from another .blend) a folder of its own, into which all of the person
-    goes, so that nobody is ever in two places.
+    Otherwise (the .blend was saved under another name, the human appended from another .blend) `folder_of`, which then
+    gets all files, so that they are never in two places.
     """
     folders = folders_of(collection)
     home = next((folder for folder in folders if (folder / person_file_name(collection)).is_file()), folders[0])
@@ -82,12 +99,13 @@ def home_of(collection: bpy.types.Collection) -> Path:
     return folder_of(collection)
 
 
-def person_file(collection: bpy.types.Collection) -> Path:
-    """The backend's own file of a person: beside their volumes, wherever these are now, else in `folder_of`.
+def person_file_name(collection: bpy.types.Collection) -> str:
+    """The name of `person_file`, which each edit changes."""
+    return str(collection.get(PERSON, PERSON_FILE))
 
-    Volumes keep their paths when a collection is renamed and when a .blend is saved elsewhere. Raises FileNotFoundError
-    with a sentence that names the person and the file.
-    """
+
+def person_file(collection: bpy.types.Collection) -> Path:
+    """The backend's file of a human. Raises MissingPersonFile."""
     name, folders = person_file_name(collection), folders_of(collection)
     for folder in folders:
         if (folder / name).is_file():
@@ -98,28 +116,23 @@ def person_file(collection: bpy.types.Collection) -> Path:
     )
 
 
-def person_file_name(collection: bpy.types.Collection) -> str:
-    """The name of `person_file`, which is another one after each edit."""
-    return str(collection.get(PERSON, PERSON_FILE))
+def content_name(person: Path) -> str:
+    """A name for the backend's file of a human that no other content has."""
+    return f"person_{hashlib.sha256(person.read_bytes()).hexdigest()[:12]}.human.safetensors"
 
 
-def volume_path(volume: bpy.types.Volume) -> Path:
-    """The absolute path of a volume's file."""
-    return Path(bpy.path.abspath(volume.filepath, library=volume.library))
+def available_name(person: Path, folder: Path, name: str) -> str:
+    """The name for a copy of the backend's file in `folder`: `name`, unless another human's file has it, which undo
+    may need."""
+    taken = folder / name
+    if not taken.is_file() or filecmp.cmp(person, taken, shallow=False):
+        return name
+    return content_name(person)
 
 
-def sequence_files(volume: bpy.types.Volume) -> list[Path]:
-    """All files of a volume: those of a merged sequence, else its one."""
-    path = volume_path(volume)
-    match = MERGED_VDB.fullmatch(path.name)
-    if match is None or match[1] is None:
-        return [path]
-    return sorted(path.parent.glob(path.name.replace(match[1], "_*")))
-
-
-def put_copy(source: Path, destination: Path) -> bool:
-    """Copy a file, which appears whole or not at all; whether it was not there before. Raises OSError."""
-    before = destination.exists()
+def copy_file(source: Path, destination: Path) -> bool:
+    """Copy a file, which appears whole or not at all; returns whether it is new. Raises OSError."""
+    new = not destination.exists()
     destination.parent.mkdir(parents=True, exist_ok=True)
     unfinished = destination.with_name(f".{source.name}.part")
     try:
@@ -127,18 +140,4 @@ def put_copy(source: Path, destination: Path) -> bool:
         os.replace(unfinished, destination)
     finally:
         unfinished.unlink(missing_ok=True)
-    return not before
-
-
-def named_by_content(person: Path) -> str:
-    """A name for the backend's file of a person that no other content has."""
-    return f"person_{hashlib.sha256(person.read_bytes()).hexdigest()[:12]}.human.safetensors"
-
-
-def free_name(person: Path, folder: Path, name: str) -> str:
-    """The name under which the backend's file of a person may be put into `folder`: `name`, unless that is taken by
-    somebody else, whom undo may bring back."""
-    taken = folder / name
-    if not taken.is_file() or filecmp.cmp(person, taken, shallow=False):
-        return name
-    return named_by_content(person)
+    return new

@@ -1,13 +1,13 @@
-"""What Blender keeps of VDB files that it has read, given back.
+"""Blender's cache of VDB grids: how much memory grids take, reading them ahead of time, and freeing them.
 
-Blender holds every grid it has read in one cache, up to Preferences > System > Memory Cache Limit (4 GB by default):
-deleting volumes, another file or undo free nothing. A float grid of 8^3 voxels takes 0.3 MB there and a colour grid
-0.6 MB, most of it the upper nodes of the tree, tables of 32^3 entries of 8 and 16 bytes: OpenVDB's standard tree, the
-one Blender reads. Volumes that are shown go on without the cache, by bounds and copies of their own; Blender reads the
-files again where it evaluates them anew, as after undo, or renders.
+Blender holds every grid it has read in one cache, up to Preferences > System > Memory Cache Limit (4 GB by default).
+Deleting volumes, opening another file or undo free nothing. A float grid of 8^3 voxels takes 0.3 MB there and a colour
+grid 0.6 MB, mostly for the upper nodes of the tree, tables of 32^3 entries of 8 and 16 bytes: OpenVDB's standard tree,
+the only one Blender reads. Volumes that are shown do not need the cache, since they have bounds and copies of their
+own; Blender reads the files again where it evaluates them anew, as after undo, or renders.
 
-Of each path it has read Blender also remembers the headers, until it ends: some 7 kB for two grids, and no call frees
-them (benchmarks/extension_bare.py).
+Blender also remembers the headers of each path it has read, some 7 kB for two grids, until it quits; no call frees them
+(benchmarks/extension_bare.py).
 """
 
 from __future__ import annotations
@@ -23,15 +23,16 @@ from pathlib import Path
 import bpy
 
 from .files import volume_path
+from .volumes import openvdb
 
-_LEAST_MB = 1
+_LOWEST_LIMIT_MB = 1
 
 
 def free_unused_grids() -> None:
-    """Empty the cache by lowering its limit for a moment, and hand the memory to the system where that can be asked."""
+    """Empty the cache by lowering its limit for a moment, and return the memory to the system where possible."""
     preferences = bpy.context.preferences
     was_dirty, limit = preferences.is_dirty, preferences.system.memory_cache_limit
-    preferences.system.memory_cache_limit = _LEAST_MB
+    preferences.system.memory_cache_limit = _LOWEST_LIMIT_MB
     preferences.system.memory_cache_limit = limit
     preferences.is_dirty = was_dirty
     if sys.platform == "linux":
@@ -41,28 +42,29 @@ def free_unused_grids() -> None:
 
 
 def read_headers(files: Iterable[Path]) -> None:
-    """Have Blender read the headers of VDB files before it reads their voxels: .1 s for 1024 of them.
+    """Make Blender read the headers of VDB files before it reads their voxels: .1 s for 1024 of them.
 
-    It keeps the headers for good. Allocated among the voxels they would leave holes when those are freed, of as much
-    memory again. Only for files that exist: of one that does not, Blender keeps the error. The .blend is not touched.
+    Blender never frees headers. Allocated among voxels, they would fragment the memory of these when it is freed, so
+    that as much again is lost. Only for files that exist: Blender remembers the error of a missing one. The .blend is
+    not touched.
     """
-    with bpy.data.temp_data() as beside:
-        volume = beside.volumes.new("PrimDiffusion")
+    with bpy.data.temp_data() as temporary:
+        volume = temporary.volumes.new("PrimDiffusion")
         for path in files:
             volume.filepath = str(path)
             volume.grids.load()
 
 
-def read_grids(files: Sequence[Path], most_s: float) -> int:
-    """Have Blender read the grids of as many files as it can in `most_s` seconds; how many these were, one at least.
+def read_grids(files: Sequence[Path], budget_s: float) -> int:
+    """Make Blender read the grids of as many files as it can in `budget_s` seconds, at least one; returns how many.
 
-    They are kept in its cache (see `grid_cache`); the .blend is not touched.
+    They stay in its cache; the .blend is not touched. Otherwise Blender reads all grids of a new human at once.
     """
-    end = time.monotonic() + most_s
-    with bpy.data.temp_data() as beside:  # removing a volume from bpy.data has Blender evaluate the scene anew
-        volume = beside.volumes.new("PrimDiffusion")
+    end = time.monotonic() + budget_s
+    with bpy.data.temp_data() as temporary:  # removing a volume from bpy.data makes Blender evaluate the scene again
+        volume = temporary.volumes.new("PrimDiffusion")
         for count, path in enumerate(files, 1):
-            if path.is_file():  # of one that is missing Blender would keep the error
+            if path.is_file():  # Blender remembers the error of a missing file
                 volume.filepath = str(path)
                 for grid in volume.grids if volume.grids.load() else ():
                     grid.load()
@@ -71,9 +73,8 @@ def read_grids(files: Sequence[Path], most_s: float) -> int:
     return len(files)
 
 
-def read_again(volume: bpy.types.Volume) -> None:
-    """Have Blender show a volume whose file was missing when it looked: it looks no more, and keeps the error until
-    grids are unloaded that were read."""
+def reload_volume(volume: bpy.types.Volume) -> None:
+    """Make Blender show a volume whose file was missing before: it remembers the error until grids are unloaded."""
     volume.grids.load()
     volume.grids.unload()
     volume.update_tag()
@@ -81,36 +82,34 @@ def read_again(volume: bpy.types.Volume) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Memory:
-    """Bytes of a person's volumes."""
+    """Bytes of a human's volumes."""
 
     files: int
     """On disk."""
     grids: int
-    """In memory once drawn: of the trees of voxels, as the files' own headers tell them. Most of it is the tree's upper
-    nodes, which have one size whatever they hold. Cycles makes copies of its own while it renders."""
+    """In memory once drawn: the trees of voxels, as in the files' headers. Cycles makes copies of its own when it
+    renders."""
 
 
 def person_memory(collection: bpy.types.Collection) -> Memory:
-    """Of all volumes that the person shows or hides; files that are missing count nothing.
+    """Memory of all of a human's volumes, shown or hidden, without missing files.
 
-    Reads the files' headers once, about .2 s for 1024 of them, and remembers them by their names.
+    Reads the files' headers once, about .2 s for 1024 of them, and caches the result by their names.
     """
-    paths = {volume_path(thing.data) for thing in collection.all_objects if thing.type == "VOLUME"}
+    paths = {volume_path(obj.data) for obj in collection.all_objects if obj.type == "VOLUME"}
     return _memory_of(tuple(sorted(paths)))
 
 
 @functools.lru_cache(maxsize=64)
 def _memory_of(paths: Sequence[Path]) -> Memory:
-    bpy.utils.expose_bundled_modules()
-    import openvdb  # Blender's own, importable only after the line above
-
+    vdb = openvdb()
     files = grids = 0
     for path in paths:
         if not path.is_file():
             continue
         files += path.stat().st_size
         try:
-            grids += sum(grid.metadata.get("file_mem_bytes", 0) for grid in openvdb.readAllGridMetadata(str(path)))
+            grids += sum(grid.metadata.get("file_mem_bytes", 0) for grid in vdb.readAllGridMetadata(str(path)))
         except (OSError, RuntimeError):
             continue  # a damaged file takes no memory
     return Memory(files, grids)

@@ -1,7 +1,7 @@
-""".human files: a person as the backend keeps them (safetensors), with the shape they have now and how they move.
+""".human files: a human as the backend saves it (safetensors), with its current shape and its motion.
 
-The file is the backend's own, which reads it as any other: what is added has names of its own (`motion.*`). Reading and
-writing needs numpy alone: eight bytes of length, a JSON header, then plain arrays.
+The backend reads them as it reads its own files; the motion is stored under additional names (`motion.*`). Safetensors
+files are eight bytes of length, a JSON header, then plain arrays, so numpy is enough to read and write them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-"""What is read: the same format under either name."""
 _LARGEST_HEADER = 1 << 20
 _METADATA = "__metadata__"
 _DTYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U8": "|u1", "BF16": "<u2"}
@@ -24,12 +23,12 @@ _REMEDY = "choose a .human file, or export the person again"
 
 @dataclasses.dataclass(frozen=True)
 class HumanMotion:
-    """How the person moves; one frame is a pose."""
+    """How the human moves; one frame is a pose."""
 
     frames: NDArray[np.float32]
     """Frame numbers [F], increasing."""
     rotations: NDArray[np.float32]
-    """Of the joints [F, 24, 3, 3]; y up."""
+    """Joint rotations [F, 24, 3, 3], y up."""
     translations: NDArray[np.float32]
     """[F, 3], metres, y up."""
     fps: float
@@ -37,15 +36,15 @@ class HumanMotion:
 
 @dataclasses.dataclass(frozen=True)
 class HumanTensors:
-    """A .human file taken apart."""
+    """The content of a .human file."""
 
     metadata: dict[str, str]
     arrays: dict[str, tuple[str, tuple[int, ...], bytes]]
-    """By name: safetensors' dtype, shape, bytes."""
+    """Safetensors' dtype, shape and bytes by name."""
 
 
 def read_tensors(path: Path) -> HumanTensors:
-    """Raises ValueError for a file of another kind or a damaged one, OSError."""
+    """Read a .human file. Raises ValueError for a file of another kind or a damaged one, OSError."""
     data = path.read_bytes()
     length = int.from_bytes(data[:8], "little")
     try:
@@ -68,22 +67,22 @@ def read_tensors(path: Path) -> HumanTensors:
 
 
 def reshaped(human: HumanTensors, betas: NDArray, growth: NDArray | None) -> HumanTensors:
-    """The person with another shape [10], on which their boxes are `growth` [K, 3] times as large (None: as they are).
+    """The human with another shape [10] and its boxes scaled by `growth` [K, 3], if given.
 
-    Raises ValueError for a file that holds another number of boxes.
+    Raises ValueError where the file holds another number of boxes.
     """
     arrays = {**human.arrays, "betas": _stored(np.asarray(betas, np.float32))}
     if growth is not None:
         dtype, shape, raw = human.arrays.get("delta_scale", ("", (), b""))
         if dtype != "F32" or shape != growth.shape:
-            given, wanted = f"{dtype}{list(shape)}", f"F32{list(growth.shape)}"
-            raise ValueError(f"the person's file holds sizes of boxes as {given}, not {wanted}; {_REMEDY}")
+            given, expected = f"{dtype}{list(shape)}", f"F32{list(growth.shape)}"
+            raise ValueError(f"the person's file holds sizes of boxes as {given}, not {expected}; {_REMEDY}")
         arrays["delta_scale"] = _stored((_loaded(dtype, shape, raw) * growth).astype(np.float32))
     return HumanTensors(human.metadata, arrays)
 
 
 def with_motion(human: HumanTensors, motion: HumanMotion | None) -> HumanTensors:
-    """The person with a motion; None takes it away."""
+    """The human with another motion, or without for None."""
     metadata = {name: text for name, text in human.metadata.items() if name != "motion"}
     arrays = {name: array for name, array in human.arrays.items() if name not in _MOTION}
     if motion is not None:
@@ -94,7 +93,7 @@ def with_motion(human: HumanTensors, motion: HumanMotion | None) -> HumanTensors
 
 
 def motion_in(human: HumanTensors) -> HumanMotion | None:
-    """The motion that a file holds. Raises ValueError for one that is damaged."""
+    """The motion in a file, if any. Raises ValueError where it is damaged."""
     if "motion" not in human.metadata:
         return None
     try:
@@ -107,16 +106,16 @@ def motion_in(human: HumanTensors) -> HumanMotion | None:
         if array.shape != tuple(frames if s == "F" else s for s in shape) or not np.isfinite(array).all():
             raise ValueError(f"the motion in the .human file is damaged; {_REMEDY}")
     if frames == 0 or not 0 < fps < 1e4 or np.any(np.diff(arrays[0]) <= 0):
-        raise ValueError(f"the motion in the .human file has no order of frames; {_REMEDY}")
+        raise ValueError(f"the motion in the .human file has frames out of order; {_REMEDY}")
     return HumanMotion(*arrays, fps)
 
 
 def write_tensors(path: Path, human: HumanTensors) -> None:
-    """Writes the file whole or not at all. Raises OSError."""
+    """Write a .human file, which appears whole or not at all. Raises OSError."""
     header: dict[str, object] = {_METADATA: human.metadata}
     offset = 0
     sizes = {name: np.dtype(_DTYPES.get(dtype, "u1")).itemsize for name, (dtype, _, _) in human.arrays.items()}
-    ordered = sorted(human.arrays, key=lambda name: (-sizes[name], name))  # the widest first: so all are aligned
+    ordered = sorted(human.arrays, key=lambda name: (-sizes[name], name))  # widest first, so that all are aligned
     for name in ordered:
         dtype, shape, raw = human.arrays[name]
         header[name] = {"dtype": dtype, "shape": list(shape), "data_offsets": [offset, offset + len(raw)]}

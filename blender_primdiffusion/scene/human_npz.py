@@ -1,21 +1,21 @@
-"""human.npz, the backend's result: read without pickle and checked before anything in the scene is touched."""
+"""Read human.npz, the backend's result: without pickle, and checked before the scene is touched."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.arrays import ArrayFileError, array_names, check_shapes, read_arrays
 from ..formats.joints import JOINT_NAMES, PARENTS
 from .shape_model import FIELDS, INTEGERS, ShapeModel, faulty_field
 
 FORMAT_VERSION = 2
-"""The newest that is read; 1 knows the person in one shape only."""
+"""The newest that is read; version 1 has no shape model."""
 VOXELS = 8
 """Voxels along a side of a primitive."""
 
@@ -26,7 +26,7 @@ class HumanFileError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class HumanFile:
-    """A generated person at rest, in the backend's axes (y up, metres); see `convention` for Blender's."""
+    """A generated human at rest, in the backend's axes (y up, metres); `convention` turns them into Blender's."""
 
     meta: dict[str, object]
     """Provenance: seed, steps, checkpoint, full_density, version."""
@@ -55,7 +55,7 @@ class HumanFile:
     density: NDArray[np.float32]
     """Opacity per metre [K, D, H, W], before the marcher's window."""
     shape_model: ShapeModel | None = None
-    """How all of this follows other betas; None in files of format version 1."""
+    """How the human changes with the betas; None in files of format version 1."""
 
 
 _SHAPES: dict[str, tuple[int | str, ...]] = {
@@ -65,7 +65,7 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
 }  # fmt: skip
 _DTYPES: dict[str, type] = {"faces": np.int64, "rgb": np.float32, "density": np.float32}
 _SAME_SURFACE = 1e-4
-"""Metres the person's own surface may be from what the shape model gives for their betas."""
+"""Metres the surface may be off what the shape model gives for the betas."""
 _REMEDY = "generate the person again"
 
 
@@ -75,38 +75,35 @@ def read_human(path: str | Path) -> HumanFile:
     Raises HumanFileError when the file is missing, truncated, of another version, or holds arrays of the wrong shape,
     NaN, weights that do not sum to one, or frames that are not rotations.
     """
-    import zipfile  # slow to import, and not needed to register
-
     path = Path(path)
     if not path.is_file():
         raise HumanFileError(f"there is no human file at {str(path)!r}; {_REMEDY}")
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        arrays = read_arrays(path, array_names(path))
+    except (ArrayFileError, OSError) as error:
         raise HumanFileError(f"{path.name!r} is damaged or no human file ({error}); {_REMEDY}") from error
-    version = int(_plain(arrays, "format_version", path))
+    version = int(_scalar(arrays, "format_version", path))
     if not 1 <= version <= FORMAT_VERSION:
         raise HumanFileError(
             f"{path.name!r} has format version {version}, this add-on reads 1 to {FORMAT_VERSION}; "
             "use an add-on and a backend of the same release"
         )
     try:
-        meta = json.loads(str(_plain(arrays, "meta", path)))
+        meta = json.loads(str(_scalar(arrays, "meta", path)))
     except json.JSONDecodeError as error:
         raise HumanFileError(f"the field 'meta' of {path.name!r} is not JSON ({error}); {_REMEDY}") from error
     _check_skeleton(arrays, path)
     sizes: dict[str, int] = {}
-    human = _checked_values(HumanFile(meta=meta, **_shaped_fields(arrays, path, _SHAPES, sizes)), path)
+    human = _checked_values(HumanFile(meta=meta, **_fields(arrays, path, _SHAPES, sizes)), path)
     if version == 1:
         return human
-    fields = _shaped_fields(arrays, path, FIELDS, sizes)
+    fields = _fields(arrays, path, FIELDS, sizes)
     dtypes = {name: np.int32 if name in INTEGERS else np.float32 for name in FIELDS}
     model = ShapeModel(**{name: value.astype(dtypes[name]) for name, value in fields.items()})
     return dataclasses.replace(human, shape_model=_checked_shape(model, human, path))
 
 
-def _plain(arrays: dict[str, NDArray], name: str, path: Path) -> Any:
+def _scalar(arrays: dict[str, NDArray], name: str, path: Path) -> Any:
     value = _field(arrays, name, path)
     if value.size != 1:
         raise HumanFileError(f"the field {name!r} of {path.name!r} holds {value.size} values instead of one; {_REMEDY}")
@@ -126,24 +123,16 @@ def _check_skeleton(arrays: dict[str, NDArray], path: Path) -> None:
         raise HumanFileError(f"the skeleton of {path.name!r} is not SMPL's 24 joints; choose a body in SMPL format")
 
 
-def _shaped_fields(
+def _fields(
     arrays: dict[str, NDArray], path: Path, shapes: dict[str, tuple[int | str, ...]], sizes: dict[str, int]
 ) -> dict[str, NDArray]:
-    """Every array of `shapes` with its dtype; those named by letters are equal among the fields, `sizes` keeps them."""
-    fields: dict[str, NDArray] = {}
-    for name, shape in shapes.items():
-        value = _field(arrays, name, path)
-        fits = value.ndim == len(shape) and value.dtype.kind in "fiu"
-        for wanted, given in zip(shape, value.shape, strict=False):
-            fits = fits and given == (sizes.setdefault(wanted, given) if isinstance(wanted, str) else wanted)
-        if not fits or value.size == 0:
-            want = tuple(sizes.get(s, s) if isinstance(s, str) else s for s in shape)
-            raise HumanFileError(
-                f"the field {name!r} of {path.name!r} is {value.dtype} {value.shape} instead of numbers of shape "
-                f"{want}; {_REMEDY}"
-            )
-        fields[name] = value.astype(_DTYPES.get(name, np.float64))
-    return fields
+    """The arrays of `shapes`, checked, each with its dtype."""
+    fields = {name: _field(arrays, name, path) for name in shapes}
+    try:
+        check_shapes(path, fields, shapes, sizes)
+    except ArrayFileError as error:
+        raise HumanFileError(f"{error}; {_REMEDY}") from error
+    return {name: values.astype(_DTYPES.get(name, np.float64)) for name, values in fields.items()}
 
 
 def _checked_values(human: HumanFile, path: Path) -> HumanFile:

@@ -13,8 +13,8 @@ GAIN_NODE = "Density Gain"
 def volume_material(gain: float = DENSITY_GAIN) -> bpy.types.Material:
     """The shared material, made on first use.
 
-    With s = gain * density: Emission of strength s and colour Cd, Absorption of density s in black; so a ray gathers
-    the integral of Cd s exp(-integral of s): premultiplied colour.
+    With s = gain * density: emission of strength s and colour Cd, absorption of density s in black, so that a ray
+    integrates Cd s exp(-integral of s): premultiplied colour.
     """
     existing = bpy.data.materials.get(MATERIAL_NAME)
     if existing is not None and existing.node_tree is not None and GAIN_NODE in existing.node_tree.nodes:
@@ -60,7 +60,7 @@ _SAME = 1e-4
 
 
 def person_material(collection: bpy.types.Collection) -> bpy.types.Material:
-    """What the person's volumes show, as their first one has it."""
+    """The material of the human's volumes, as the first one has it."""
     for data in _volumes(collection):
         if data.materials and data.materials[0] is not None:
             return data.materials[0]
@@ -68,15 +68,15 @@ def person_material(collection: bpy.types.Collection) -> bpy.types.Material:
 
 
 def density_gain(collection: bpy.types.Collection) -> float | None:
-    """The factor on density in the person's material; None where somebody has given them one without it."""
+    """The factor on density in the human's material; None where the user has assigned one without it."""
     node = _gain_node(person_material(collection))
     return None if node is None else node.outputs[0].default_value
 
 
 def set_density_gain(collection: bpy.types.Collection, gain: float) -> None:
-    """Give a person this factor: the shared material where it is the usual one, else a material of their own.
+    """Give a human this factor: by the shared material where it is the default, else by a material of its own.
 
-    Raises ValueError for a person with a material that has no such factor, or a linked one.
+    Raises ValueError for a human whose material has no such factor or is linked.
     """
     material = person_material(collection)
     if _gain_node(material) is None:
@@ -85,14 +85,14 @@ def set_density_gain(collection: bpy.types.Collection, gain: float) -> None:
             f"volumes the material {volume_material().name!r} again"
         )
     if material.library is not None or any(data.library is not None for data in _volumes(collection)):
-        raise ValueError(f"the person {collection.name!r} is linked: make them local to change the density gain")
+        raise ValueError(f"the person {collection.name!r} is linked: make it local to change the density gain")
     current = _gain_node(material).outputs[0]
     if abs(current.default_value - gain) <= _SAME:
         return
-    shown_to_others = _keep_own_data(collection)
+    shown_to_others = _make_data_own(collection)
     volumes = _volumes(collection)
-    usual = _gain_node(volume_material()).outputs[0].default_value
-    if abs(gain - usual) <= _SAME:
+    default = _gain_node(volume_material()).outputs[0].default_value
+    if abs(gain - default) <= _SAME:
         _assign(volumes, volume_material())
         return
     shown_by = bpy.data.user_map(subset=[material])[material]
@@ -104,19 +104,19 @@ def set_density_gain(collection: bpy.types.Collection, gain: float) -> None:
     current.default_value = gain
 
 
-def _keep_own_data(collection: bpy.types.Collection) -> bool:
-    """Copy the data of volumes that objects of other people show too, as duplicates do; whether there were such."""
-    own = [thing for thing in collection.all_objects if thing.type == "VOLUME"]
+def _make_data_own(collection: bpy.types.Collection) -> bool:
+    """Copy the data of volumes that other humans (duplicates) use too; returns whether there were any."""
+    own = [obj for obj in collection.all_objects if obj.type == "VOLUME"]
     mine = set(own)
-    others = {thing.data for thing in bpy.data.objects if thing.type == "VOLUME" and thing not in mine}
-    shared = [thing for thing in own if thing.data in others]
-    for thing in shared:
-        thing.data = thing.data.copy()
+    others = {obj.data for obj in bpy.data.objects if obj.type == "VOLUME" and obj not in mine}
+    shared = [obj for obj in own if obj.data in others]
+    for obj in shared:
+        obj.data = obj.data.copy()
     return bool(shared)
 
 
 def _volumes(collection: bpy.types.Collection) -> list[bpy.types.Volume]:
-    return [thing.data for thing in collection.all_objects if thing.type == "VOLUME"]
+    return [obj.data for obj in collection.all_objects if obj.type == "VOLUME"]
 
 
 def _gain_node(material: bpy.types.Material) -> bpy.types.Node | None:

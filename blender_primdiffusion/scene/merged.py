@@ -1,13 +1,10 @@
-"""A person as one volume: the child's grid as a VDB file, or a sequence of them, and the object that shows it."""
+"""A human as one volume: the grid from the child as a VDB file or sequence, and the object that shows it."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import json
-import os
-import shutil
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,14 +12,17 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .files import VolumeWriteError, folders_of, person_file_name, stored_path
+from ..formats.arrays import ArrayFileError, check_shapes, read_arrays
+from .files import VolumeWriteError, copy_file, folders_of, person_file_name, stored_path
 from .human import armature_of
 from .material import person_material
+from .volumes import write_vdb
 
 MARK = "primdiffusion_merged"
 """Custom property of a merged object: its `MergedState` as JSON."""
+_SHAPES = {"density": ("X", "Y", "Z"), "colour": ("X", "Y", "Z", 3), "origin": (3,), "voxel": ()}
 _DECIMALS = 4
-"""Of matrices, in digests: a tenth of a millimetre."""
+"""Of matrices in digests: a tenth of a millimetre."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,29 +44,25 @@ class MergedState:
     """What a merged volume shows."""
 
     poses: tuple[str, ...]
-    """`pose_digest` of each frame; a single one: the same in every frame."""
+    """`pose_digest` of each frame; a single one holds for every frame."""
     voxel: float
     start: int = 0
     """The scene's frame of the first pose, where there are several."""
 
     def shows(self, digest: str, frame: int) -> bool:
-        """Whether this is the person in this pose at this frame of the scene."""
+        """Whether this is the human in this pose at this frame of the scene."""
         index = min(max(frame - self.start, 0), len(self.poses) - 1) if len(self.poses) > 1 else 0
         return self.poses[index] == digest
 
 
 def read_grid(path: Path) -> MergedGrid:
-    """Reads the child's file. Raises ValueError for a damaged one, OSError."""
-    import zipfile  # slow to import, and not needed to register
-
+    """Read the child's file. Raises ValueError for a damaged one, OSError."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            grid = MergedGrid(stored["density"], stored["colour"], stored["origin"], float(stored["voxel"]))
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        stored = read_arrays(path, tuple(_SHAPES))
+        check_shapes(path, stored, _SHAPES, {})
+    except ArrayFileError as error:
         raise ValueError(f"the merged grid {path.name!r} is damaged ({error}); merge again") from error
-    if grid.density.ndim != 3 or grid.colour.shape != (*grid.density.shape, 3) or grid.origin.shape != (3,):
-        raise ValueError(f"the merged grid {path.name!r} holds {grid.colour.shape} colours; merge again")
-    return grid
+    return MergedGrid(stored["density"], stored["colour"], stored["origin"], float(stored["voxel"]))
 
 
 def index_to_local(grid: MergedGrid, blender_version: tuple[int, ...]) -> NDArray[np.float64]:
@@ -77,58 +73,41 @@ def index_to_local(grid: MergedGrid, blender_version: tuple[int, ...]) -> NDArra
 
 
 def write_grid(grid: MergedGrid, path: Path) -> str:
-    """Writes `density` and `Cd` as half floats; returns a digest of what they hold.
-
-    `bpy.utils.expose_bundled_modules()` must have been called before. Raises VolumeWriteError.
-    """
-    import openvdb  # Blender's own
-
-    transform = openvdb.createLinearTransform(index_to_local(grid, bpy.app.version).tolist())
-    density, colour = openvdb.FloatGrid(), openvdb.Vec3SGrid()
-    density.name, density.gridClass = "density", openvdb.GridClass.FOG_VOLUME
-    colour.name = "Cd"
-    for written, values in ((density, grid.density), (colour, grid.colour)):
-        written.copyFromArray(np.ascontiguousarray(values, np.float32))
-        written.transform = transform
-        written.saveFloatAsHalf = True
+    """Write a grid as a VDB file; returns a digest of its content. Raises VolumeWriteError."""
+    transform = index_to_local(grid, bpy.app.version)
     try:
-        openvdb.write(str(path), grids=[density, colour])
+        write_vdb(path, grid.density, grid.colour, transform)
     except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
         raise _write_error(path.parent, error) from error
-    digest = hashlib.sha256(index_to_local(grid, bpy.app.version).tobytes())
+    digest = hashlib.sha256(transform.tobytes())
     for values in (grid.density, grid.colour):
         digest.update(np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()
 
 
 def publish(files: Sequence[Path], digests: Sequence[str], folder: Path) -> list[Path]:
-    """Copies written grids into `folder` under names of their content; several as a sequence. All files or none.
+    """Copy written grids into `folder` under names made from their content; several become a sequence.
 
-    Raises VolumeWriteError.
+    Raises VolumeWriteError, and then copies none.
     """
-    whole = hashlib.sha256("".join(digests).encode()).hexdigest()[:12]
+    digest = hashlib.sha256("".join(digests).encode()).hexdigest()[:12]
     ends = [f"_{number:04d}" for number in range(1, len(files) + 1)] if len(files) > 1 else [""]
-    targets = [folder / f"merged_{whole}{end}.vdb" for end in ends]
-    made: list[Path] = []
+    targets = [folder / f"merged_{digest}{end}.vdb" for end in ends]
+    new = [target for target in targets if not target.is_file()]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         for source, target in zip(files, targets, strict=True):
-            if target.is_file():
-                continue
-            made.append(target)
-            unfinished = target.with_name(f".{target.name}.part")
-            made.append(unfinished)
-            shutil.copyfile(source, unfinished)
-            os.replace(unfinished, target)
+            if target in new:
+                copy_file(source, target)
     except OSError as error:
-        for path in made:
-            path.unlink(missing_ok=True)
+        for path in new:
+            if path.is_file():
+                path.unlink()
         raise _write_error(folder, error) from error
     return targets
 
 
 def show_merged(collection: bpy.types.Collection, files: Sequence[Path], state: MergedState) -> bpy.types.Object:
-    """The object that shows these files, made or pointed to them; it moves with the armature object. Hides nothing."""
+    """Show these files in the human's merged object, made if there is none; it moves with the armature object."""
     merged = merged_of(collection)
     if merged is None:
         label = f"{collection.name}_merged"
@@ -148,30 +127,30 @@ def show_merged(collection: bpy.types.Collection, files: Sequence[Path], state: 
 
 
 def merged_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
-    """The person's merged object; None where there is none."""
-    return next((thing for thing in collection.all_objects if thing.type == "VOLUME" and MARK in thing), None)
+    """The human's merged object, if any."""
+    return next((obj for obj in collection.all_objects if obj.type == "VOLUME" and MARK in obj), None)
 
 
 def merged_state(merged: bpy.types.Object) -> MergedState:
-    """What it shows."""
-    kept = json.loads(merged[MARK])
-    return MergedState(**{**kept, "poses": tuple(kept["poses"])})
+    """What a merged object shows."""
+    saved = json.loads(merged[MARK])
+    return MergedState(**{**saved, "poses": tuple(saved["poses"])})
 
 
 def remove_merged(collection: bpy.types.Collection) -> None:
-    """Take the merged object out of the .blend; its files stay, for undo."""
+    """Remove the merged object from the .blend; its files stay for undo."""
     merged = merged_of(collection)
     if merged is not None:
-        bpy.data.volumes.remove(merged.data)  # takes the object along
+        bpy.data.volumes.remove(merged.data)  # removes the object too
 
 
 def merged_folder(collection: bpy.types.Collection) -> Path:
-    """Where merged files go: beside the person's volumes."""
+    """Where merged files go: beside the human's volumes."""
     return folders_of(collection)[0]
 
 
 def pose_digest(collection: bpy.types.Collection, joints: NDArray, betas: Sequence[float] | None) -> str:
-    """What tells a person in a pose from others: their file, shape and joints [24, 3, 4]."""
+    """Identifies a human in a pose: hash of the file name, the shape and the joints [24, 3, 4]."""
     rounded = np.round(np.asarray(joints, np.float64), _DECIMALS) + 0.0  # no negative zeros
     shape = [] if betas is None else [round(float(value), _DECIMALS) for value in betas]
     digest = hashlib.sha256(f"{person_file_name(collection)} {shape}".encode())

@@ -1,7 +1,7 @@
-"""Files of people that are not where the .blend says: which, where they are instead, and paths put right.
+"""Find missing files of humans and repair the paths to them.
 
-Names of volumes and bodies tell their content, so a file of the right name is the right file wherever it lies. The
-backend's file of a person who was never edited has a plain name: it is known by the volumes beside it, or its betas.
+Names of volumes and bodies contain a hash, so a file of the right name is the right file wherever it is. The backend's
+file of a human that was never edited has a plain name: it is identified by the volumes beside it, or by its betas.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from .files import (
     MERGED_VDB,
     PERSON_FILE,
     PRIMITIVE_VDB,
+    copy_file,
     folder_of,
     folders_of,
     humans_folder,
     person_file_name,
-    put_copy,
     stored_path,
     volume_path,
 )
@@ -38,13 +38,13 @@ _SAME_BETAS = 1e-4
 
 
 class Listing:
-    """Names of files by folder, as they were when the folder was first asked for."""
+    """File names by folder. Each folder is read once: a thousand single checks take a second on a network drive."""
 
     def __init__(self) -> None:
         self._names: dict[Path, frozenset[str]] = {}
 
     def names(self, folder: Path) -> frozenset[str]:
-        """Everything in a folder; nothing for one that is not there or may not be read."""
+        """Names in a folder; none where it does not exist or cannot be read."""
         if folder not in self._names:
             try:
                 self._names[folder] = frozenset(os.listdir(folder))
@@ -56,39 +56,39 @@ class Listing:
         return path.name in self.names(path.parent)
 
     def found(self, wanted: Iterable[str], folders: Iterable[Path]) -> dict[str, Path]:
-        """Where the wanted names are; of several folders, the first that has it. Stops when all are found."""
-        left, places = set(wanted), {}
+        """Paths of the wanted names, each in the first of the folders that has it."""
+        left, paths = set(wanted), {}
         for folder in folders:
             if not left:
                 break
             for name in left & self.names(folder):
-                places[name] = folder / name
-            left -= places.keys()
-        return places
+                paths[name] = folder / name
+            left -= paths.keys()
+        return paths
 
 
 @dataclasses.dataclass(frozen=True)
-class Lost:
-    """What one person misses. Holds Blender's objects: for use at once."""
+class MissingFiles:
+    """The missing files of one human. Holds references to Blender's data, so it must not be stored."""
 
     person: bpy.types.Collection
     volumes: tuple[bpy.types.Volume, ...]
-    """Of the primitives, without their files."""
+    """Volumes of primitives without their file."""
     merged: tuple[bpy.types.Volume, ...]
-    """Merged ones without all of their files."""
+    """Merged volumes without all of their files."""
     person_file: str
-    """The backend's file; empty when it is there."""
+    """Name of the backend's file; empty when it exists."""
     body_file: str
-    """The body's; empty when it is there."""
+    """Name of the body's file; empty when it exists."""
 
     @property
     def linked(self) -> str:
-        """The .blend that the person lives in; empty for this one."""
+        """Path of the .blend that the human is linked from; empty for this one."""
         holder = next((v for v in (*self.volumes, *self.merged, self.person) if v.library is not None), None)
         return holder.library.filepath if holder is not None else ""
 
-    def told(self) -> str:
-        """Like: 12 volumes of 'Human'."""
+    def summary(self) -> str:
+        """For messages, for instance: 12 volumes of 'Human'."""
         parts = []
         if self.volumes:
             parts.append(f"{len(self.volumes)} {'volume' if len(self.volumes) == 1 else 'volumes'}")
@@ -97,8 +97,8 @@ class Lost:
         return f"{', '.join(parts)} of {self.person.name!r}"
 
 
-def missing_files() -> list[Lost]:
-    """Of everybody in the .blend, those linked included; empty when everybody is whole. Reads each folder once."""
+def missing_files() -> list[MissingFiles]:
+    """Missing files of all humans in the .blend, linked ones included. Reads each folder once."""
     listing, lost = Listing(), []
     for person in bpy.data.collections:
         if MARK not in person:
@@ -107,18 +107,18 @@ def missing_files() -> list[Lost]:
         near = folders_of(person)
         name, body = person_file_name(person), str(person.get(BODY_FILE, ""))
         has_person = any(folder / name in listing for folder in near)
-        has_body = not body or any(place / body in listing for folder in near for place in (folder.parent, folder))
+        has_body = not body or any(path / body in listing for folder in near for path in (folder.parent, folder))
         if single or several or not (has_person and has_body):
             wanted = "" if has_person else name
-            lost.append(Lost(person, tuple(single), tuple(several), wanted, "" if has_body else body))
+            lost.append(MissingFiles(person, tuple(single), tuple(several), wanted, "" if has_body else body))
     return lost
 
 
-def find_files(lost: Sequence[Lost], directory: Path | None = None) -> dict[str, Path]:
-    """Where the files of volumes and bodies, and of edited people, are: by their names.
+def find_files(lost: Sequence[MissingFiles], directory: Path | None = None) -> dict[str, Path]:
+    """Paths, by name, of files of volumes, bodies and edited humans.
 
-    Looks beside the .blend, where people were when it was last saved, in the folders of other people, and then in
-    `directory` and its folders. Raises NotADirectoryError where that is none.
+    Looks beside the .blend, in the folders of its humans when it was last saved, in the folders of other humans, and
+    then in `directory` and below. Raises NotADirectoryError where that is no folder.
     """
     if directory is not None and not directory.is_dir():
         raise NotADirectoryError(f"there is no folder {str(directory)!r}: choose the one that the volumes are in")
@@ -128,17 +128,17 @@ def find_files(lost: Sequence[Lost], directory: Path | None = None) -> dict[str,
         *(one.body_file for one in lost),
         *(one.person_file for one in lost if one.person_file != PERSON_FILE),
     } - {""}
-    return Listing().found(wanted, _places(directory))
+    return Listing().found(wanted, _search_folders(directory))
 
 
-def find_person(lost: Lost, directory: Path | None = None) -> Path | None:
-    """The backend's file of a person, where it is now; None where it is not found. Raises nothing."""
+def find_person(lost: MissingFiles, directory: Path | None = None) -> Path | None:
+    """Where the backend's file of a human is now; None where it is not found. Does not raise."""
     if not lost.person_file:
         near = [folder / person_file_name(lost.person) for folder in folders_of(lost.person)]
         return next((path for path in near if path.is_file()), None)
     listing = Listing()
-    own = {volume_path(thing.data).name for thing in lost.person.all_objects if thing.type == "VOLUME"}
-    for folder in _places(directory):
+    own = {volume_path(obj.data).name for obj in lost.person.all_objects if obj.type == "VOLUME"}
+    for folder in _search_folders(directory):
         if lost.person_file not in listing.names(folder):
             continue
         path = folder / lost.person_file
@@ -147,8 +147,8 @@ def find_person(lost: Lost, directory: Path | None = None) -> Path | None:
     return None
 
 
-def repair(lost: Sequence[Lost], found: dict[str, Path]) -> int:
-    """Point volumes to the files that were found; how many now show again. Linked ones stay as they are."""
+def repair(lost: Sequence[MissingFiles], found: dict[str, Path]) -> int:
+    """Point volumes to the files that were found; returns how many. Linked volumes stay as they are."""
     repaired = 0
     for one in lost:
         for volume in one.volumes:
@@ -158,37 +158,37 @@ def repair(lost: Sequence[Lost], found: dict[str, Path]) -> int:
                 repaired += 1
         for volume in one.merged:
             path = found.get(volume_path(volume).name)
-            whole = path is not None and all((path.parent / name).is_file() for name in _sequence_names(volume))
-            if whole and volume.library is None:
+            complete = path is not None and all((path.parent / name).is_file() for name in _sequence_names(volume))
+            if complete and volume.library is None:
                 volume.filepath = stored_path(path)
                 repaired += 1
     return repaired
 
 
-def bring_back(lost: Sequence[Lost], found: dict[str, Path], directory: Path | None = None) -> int:
-    """Copy the backend's and the body's files that were found to where the person's volumes are now; how many.
+def copy_back(lost: Sequence[MissingFiles], found: dict[str, Path], directory: Path | None = None) -> int:
+    """Copy the backend's and the body's files that were found to where the human's volumes are now; returns how many.
 
-    For after `repair`. Raises OSError where they cannot be written.
+    Call `repair` first. Raises OSError.
     """
-    brought = 0
+    copied = 0
     for one in lost:
         home = folders_of(one.person)[0]
         if one.linked or not home.is_dir():
             continue
         if one.person_file and not (home / one.person_file).is_file():
             source = find_person(one, directory)
-            brought += source is not None and put_copy(source, home / one.person_file)
-        places = [home.parent / one.body_file, home / one.body_file]
-        if one.body_file in found and not any(place.is_file() for place in places):
-            brought += put_copy(found[one.body_file], places[0])
-    return brought
+            copied += source is not None and copy_file(source, home / one.person_file)
+        paths = [home.parent / one.body_file, home / one.body_file]
+        if one.body_file in found and not any(path.is_file() for path in paths):
+            copied += copy_file(found[one.body_file], paths[0])
+    return copied
 
 
 def _without_files(
     person: bpy.types.Collection, listing: Listing
 ) -> tuple[list[bpy.types.Volume], list[bpy.types.Volume]]:
     single, several = [], []
-    for volume in {thing.data: None for thing in person.all_objects if thing.type == "VOLUME"}:
+    for volume in {obj.data: None for obj in person.all_objects if obj.type == "VOLUME"}:
         path = volume_path(volume)
         if PRIMITIVE_VDB.fullmatch(path.name) and path not in listing:
             single.append(volume)
@@ -198,7 +198,7 @@ def _without_files(
 
 
 def _sequence_names(volume: bpy.types.Volume) -> list[str]:
-    """Names of all files of a merged volume, there or not."""
+    """Names of all files of a merged volume, missing or not."""
     name = volume_path(volume).name
     match = MERGED_VDB.fullmatch(name)
     if match is None or match[1] is None or not volume.is_sequence:
@@ -207,21 +207,21 @@ def _sequence_names(volume: bpy.types.Volume) -> list[str]:
     return [name.replace(match[1], f"_{number:0{width}d}") for number in range(1, volume.frame_duration + 1)]
 
 
-def _places(directory: Path | None) -> Iterator[Path]:
-    """Folders in which people's files may be, the likeliest first."""
+def _search_folders(directory: Path | None) -> Iterator[Path]:
+    """Folders in which files of humans may be, the likeliest first."""
     seen: set[Path] = set()
-    for folder in _likely():
+    for folder in _likely_folders():
         if folder not in seen:
             seen.add(folder)
             yield folder
     if directory is not None:
-        yield from _below(directory)
+        yield from _folders_below(directory)
 
 
-def _likely() -> Iterator[Path]:
-    of_people = [person for person in bpy.data.collections if MARK in person]
-    yield from (folder_of(person) for person in of_people)
-    homes = [Path(str(person[HOME])) for person in of_people if person.get(HOME)]
+def _likely_folders() -> Iterator[Path]:
+    humans = [person for person in bpy.data.collections if MARK in person]
+    yield from (folder_of(person) for person in humans)
+    homes = [Path(str(person[HOME])) for person in humans if person.get(HOME)]
     yield from homes
     shown = {volume_path(volume).parent for volume in bpy.data.volumes if volume.filepath}
     yield from sorted(shown)
@@ -242,8 +242,8 @@ def _folders_in(folder: Path, ending: str = "") -> list[Path]:
         return []
 
 
-def _below(directory: Path) -> Iterator[Path]:
-    """A folder and those in it, not for ever: somebody may have chosen a whole disk."""
+def _folders_below(directory: Path) -> Iterator[Path]:
+    """A folder and those below it, up to a limit: the user may have chosen a whole disk."""
     for folder, inside, _ in itertools.islice(os.walk(directory), _MOST_FOLDERS):
         yield Path(folder)
         if len(Path(folder).parts) - len(directory.parts) >= _DEEPEST:
@@ -251,7 +251,7 @@ def _below(directory: Path) -> Iterator[Path]:
 
 
 def _has_betas(path: Path, person: bpy.types.Collection) -> bool:
-    """The file holds the body that the person was generated with."""
+    """Whether a file holds the betas that the human was generated with."""
     try:
         dtype, _, raw = read_tensors(path).arrays["betas"]
         betas = np.frombuffer(raw, "<f4") if dtype == "F32" else np.empty(0)

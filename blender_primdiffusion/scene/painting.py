@@ -1,4 +1,4 @@
-"""A region painted on the body mesh as a vertex group."""
+"""Regions that the user paints on the body mesh as vertex groups."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def painted_weights(body: bpy.types.Object, group: str) -> NDArray[np.float32]:
 
 
 def start_painting(context: bpy.types.Context, body: bpy.types.Object, group: str) -> None:
-    """Show the body mesh, make the vertex group if there is none, and go to Weight Paint mode with it.
+    """Show the body mesh, make the vertex group if there is none, and enter Weight Paint mode with it.
 
     Raises ValueError for a mesh that cannot be painted in this view layer.
     """
@@ -46,22 +46,22 @@ def start_painting(context: bpy.types.Context, body: bpy.types.Object, group: st
     body.show_in_front = True
     made = body.vertex_groups.get(group) or body.vertex_groups.new(name=group)
     body.vertex_groups.active = made
-    for thing in context.selected_objects:
-        thing.select_set(False)
+    for obj in context.selected_objects:
+        obj.select_set(False)
     body.select_set(True)
     context.view_layer.objects.active = body
     bpy.ops.object.mode_set(mode="WEIGHT_PAINT")
 
 
 def end_painting(context: bpy.types.Context, body: bpy.types.Object) -> None:
-    """Back to Object mode; the body mesh is hidden again."""
+    """Return to Object mode and hide the body mesh."""
     leave_mode(context)
     body.show_in_front = False
     body.hide_viewport = True
 
 
 def leave_mode(context: bpy.types.Context) -> None:
-    """Back to Object mode from any other."""
+    """Return to Object mode from any other."""
     active = context.view_layer.objects.active
     if active is not None and active.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")

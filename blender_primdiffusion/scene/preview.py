@@ -1,4 +1,4 @@
-"""A Cycles picture of a person in minutes on a CPU: camera, world, and settings fit for a thousand volumes."""
+"""Preview renders in Cycles: camera, world, and settings by which a thousand volumes take minutes on a CPU."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def setup_cycles_preview(
     focal_mm: float = 70.0,
     world: float | None = None,
 ) -> bpy.types.Object:
-    """Make `scene` ready to render its people as they are posed now, and return the camera, which frames them.
+    """Make `scene` ready to render its humans as they are posed now, and return the camera, which frames them.
 
-    size: pixels a side. samples: per pixel; more only smooth edges, since no light scatters. yaw: radians the camera
-    stands to the person's left of the front. world: grey level of the background, None for a transparent film. The view
-    transform is Standard, so that a colour in the volumes is that colour in the picture. A picture of 384 x 384 at one
-    sample took a minute on two idle cores (docs/results/demo.json). Raises ValueError when nobody is in the scene.
+    size: pixels a side. samples: per pixel; more samples only smooth edges, since no light scatters. yaw: angle of the
+    camera from the front towards the human's left, radians. world: grey level of the background, None for a transparent
+    film. The view transform is Standard, so that the picture has the colours of the volumes. A picture of 384 x 384 at
+    one sample took a minute on two idle cores (docs/results/demo.json). Raises ValueError for a scene without humans.
     """
-    extent = people_extent(scene)
+    extent = humans_extent(scene)
     scene.render.engine = "CYCLES"
     fit_cycles_to_volumes(scene, samples)
     scene.render.resolution_x = scene.render.resolution_y = size
@@ -49,7 +49,7 @@ def setup_cycles_preview(
 
 
 def fit_cycles_to_volumes(scene: bpy.types.Scene, samples: int) -> None:
-    """Settings of Cycles by which a person takes minutes and not hours; nothing of other objects' light is kept."""
+    """Set Cycles up so that a human takes minutes, not hours: other objects lose indirect light."""
     cycles = scene.cycles
     cycles.samples = samples
     cycles.use_adaptive_sampling = False
@@ -62,16 +62,16 @@ def fit_cycles_to_volumes(scene: bpy.types.Scene, samples: int) -> None:
         cycles.volume_biased = True  # unbiased tracking takes seconds per volume object, an hour a frame
 
 
-def people_extent(scene: bpy.types.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lowest and highest corner [3] of everybody in a scene, as posed. Raises ValueError when nobody is there."""
+def humans_extent(scene: bpy.types.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lowest and highest corner [3] of all humans in a scene, as posed. Raises ValueError when there are none."""
     extents = [posed_extent(collection) for collection in humans(scene)]
     if not extents:
-        raise ValueError(f"nobody is in the scene {scene.name!r}; generate a person first")
+        raise ValueError(f"there is no person in the scene {scene.name!r}; generate one first")
     return np.min([low for low, _ in extents], 0), np.max([high for _, high in extents], 0)
 
 
 def posed_extent(collection: bpy.types.Collection) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lowest and highest corner [3] in the world of a person's bones as posed, with flesh around them."""
+    """Lowest and highest corner [3] in the world of a human's bones as posed, with a margin for flesh."""
     armature = armature_of(collection)
     bpy.context.view_layer.update()
     ends = [armature.matrix_world @ end for bone in armature.pose.bones for end in (bone.head, bone.tail)]
@@ -104,31 +104,30 @@ def frame_box(
     size: tuple[int, int] = (1, 1),
     distance: float | None = None,
 ) -> None:
-    """Look at the middle of the box from `yaw` radians, level, as near as a picture of `size` shows its corners.
-
-    With a `distance` in metres, from so far: turntables want the same all round.
+    """Point the camera at the middle of a box, level, from `yaw` radians, as near as a picture of `size` shows all
+    corners; or from `distance` metres, which turntables keep constant.
     """
     low, high = extent
     if distance is None:
         distance = framing_distance(camera, extent, yaw, size)
-    towards = _towards(yaw)
-    camera.location = (low + high) / 2 + towards * distance
-    camera.rotation_euler = Vector(-towards).to_track_quat("-Z", "Y").to_euler()
+    direction = _camera_direction(yaw)
+    camera.location = (low + high) / 2 + direction * distance
+    camera.rotation_euler = Vector(-direction).to_track_quat("-Z", "Y").to_euler()
     camera.data.clip_end = max(100.0, 2 * distance)
 
 
 def framing_distance(
     camera: bpy.types.Object, extent: tuple[NDArray, NDArray], yaw: float, size: tuple[int, int] = (1, 1)
 ) -> float:
-    """Metres from the middle of a box at which a picture of `size` just shows its eight corners."""
+    """Distance in metres from the middle of a box at which a picture of `size` just shows its eight corners."""
     low, high = extent
     right = np.array([math.cos(yaw), math.sin(yaw), 0.0])
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * (high - low) / 2
     half = np.array(size) / max(size) * (_SENSOR_MM / 2 / camera.data.lens)  # tangents of the half angles of view
     aside = np.maximum(np.abs(corners @ right) / half[0], np.abs(corners[:, 2]) / half[1]) * _MARGIN
-    return float((aside + corners @ _towards(yaw)).max())
+    return float((aside + corners @ _camera_direction(yaw)).max())
 
 
-def _towards(yaw: float) -> NDArray[np.float64]:
-    """The level direction in which a camera at `yaw` stands."""
+def _camera_direction(yaw: float) -> NDArray[np.float64]:
+    """The horizontal direction from the subject to a camera at `yaw`."""
     return np.array([math.sin(yaw), -math.cos(yaw), 0.0])

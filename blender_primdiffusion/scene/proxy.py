@@ -12,7 +12,6 @@ import hashlib
 import json
 import shutil
 import tempfile
-import zlib
 from pathlib import Path
 
 import bpy
@@ -20,6 +19,7 @@ import numpy as np
 from mathutils.kdtree import KDTree
 from numpy.typing import NDArray
 
+from ..formats.arrays import ArrayFileError, check_shapes, read_arrays
 from ..formats.joints import JOINT_NAMES
 from .build import build_body_mesh
 from .convention import points_to_blender
@@ -29,14 +29,15 @@ from .shape import shape_model_of
 from .shape_model import SAME_BETAS, ShapeModel
 
 PROXY_MARK = "primdiffusion_proxy"
-"""Custom property of a proxy object: the person's file that it was made of and the shape that it shows, as JSON."""
+"""Custom property of a proxy: the human's file that it was made from and the shape that it shows, as JSON."""
 _FORMAT_VERSION = 1
 _SHAPES = {"vertices": ("V", 3), "faces": ("F", 3), "uv_corner": ("F", 3, 2), "skin_weights": ("V", 24)}
 NEIGHBOURS = 12
 """Vertices of the body that one of the proxy follows."""
 REACH = 0.02
-"""Metres farther than the nearest at which another one's say has fallen to a third: seams of folds are not followed."""
-_KEPT = 4
+"""Metres beyond the nearest at which another vertex's weight has fallen to a third, so that seams of folds are not
+followed."""
+_CACHED = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,36 +55,28 @@ class ProxyMesh:
 
 
 def read_proxy(path: Path) -> ProxyMesh:
-    """Reads the child's proxy.npz. Raises ValueError for a damaged one, OSError."""
-    import zipfile  # slow to import, and not needed to register
-
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            version = int(stored["format_version"])
-            names = tuple(str(name) for name in stored["joint_names"])
-            arrays = {name: np.asarray(stored[name]) for name in _SHAPES}
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"the mesh {path.name!r} is damaged ({error}); export again") from error
-    if version != _FORMAT_VERSION or names != JOINT_NAMES:
-        raise ValueError(f"the mesh {path.name!r} is of another version: use an add-on and a backend of one release")
+    """Read the child's proxy.npz. Raises ValueError for a damaged one, OSError."""
     sizes: dict[str, int] = {}
-    for name, shape in _SHAPES.items():
-        given = arrays[name].shape
-        wanted = tuple(sizes.setdefault(s, n) if isinstance(s, str) else s for s, n in zip(shape, given, strict=False))
-        if given != wanted or len(given) != len(shape) or not np.isfinite(arrays[name]).all():
-            raise ValueError(
-                f"the field {name!r} of {path.name!r} is {given}, not {shape} finite numbers; export again"
-            )
-    if arrays["faces"].min(initial=0) < 0 or arrays["faces"].max(initial=-1) >= len(arrays["vertices"]):
+    try:
+        arrays = read_arrays(path, ("format_version", "joint_names", *_SHAPES))
+        check_shapes(path, arrays, _SHAPES, sizes)
+    except ArrayFileError as error:
+        raise ValueError(f"the mesh {path.name!r} is damaged ({error}); export again") from error
+    names = tuple(str(name) for name in arrays["joint_names"])
+    if int(arrays["format_version"]) != _FORMAT_VERSION or names != JOINT_NAMES:
+        raise ValueError(f"the mesh {path.name!r} is of another version: use an add-on and a backend of one release")
+    for name in _SHAPES:
+        if not np.isfinite(arrays[name]).all():
+            raise ValueError(f"the field {name!r} of {path.name!r} holds NaN or infinite values; export again")
+    if arrays["faces"].min() < 0 or arrays["faces"].max() >= sizes["V"]:
         raise ValueError(f"the faces of {path.name!r} have corners that do not exist; export again")
-    kinds = {name: np.int64 if name == "faces" else np.float64 for name in _SHAPES}
-    return ProxyMesh(**{name: value.astype(kinds[name]) for name, value in arrays.items()})
+    return ProxyMesh(**{name: arrays[name].astype(np.int64 if name == "faces" else np.float64) for name in _SHAPES})
 
 
 def build_proxy(
     collection: bpy.types.Collection, proxy: ProxyMesh, texture: Path, betas: NDArray | None
 ) -> bpy.types.Object:
-    """The proxy as an object that follows the person's armature, shown and rendered, linked to no collection.
+    """The proxy as an object that follows the human's armature, shown and rendered, linked to no collection.
 
     The texture is packed into the .blend. `betas` [10]: the shape it was made in.
     """
@@ -98,12 +91,12 @@ def build_proxy(
 
 
 def proxy_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
-    """The person's proxy that was added to the scene; None where there is none."""
-    return next((thing for thing in collection.all_objects if thing.type == "MESH" and PROXY_MARK in thing), None)
+    """The human's proxy in the scene, if any."""
+    return next((obj for obj in collection.all_objects if obj.type == "MESH" and PROXY_MARK in obj), None)
 
 
 def is_outdated(collection: bpy.types.Collection, proxy: bpy.types.Object, betas: NDArray | None) -> bool:
-    """The person was edited since, or has a shape that the proxy could not follow."""
+    """Whether the human was edited since, or has a shape that the proxy could not follow."""
     made_of, now = json.loads(proxy[PROXY_MARK]), _origin(collection, betas)
     same_shape = (made_of["betas"] is None) == (now["betas"] is None) and (
         now["betas"] is None or np.allclose(made_of["betas"], now["betas"], atol=1e-4)
@@ -112,36 +105,36 @@ def is_outdated(collection: bpy.types.Collection, proxy: bpy.types.Object, betas
 
 
 def shown_betas(proxy: bpy.types.Object) -> NDArray[np.float64] | None:
-    """The shape [10] that a proxy shows; None where that is not known."""
+    """The shape [10] that a proxy shows; None where it is unknown."""
     betas = json.loads(proxy[PROXY_MARK])["betas"]
     return None if betas is None else np.array(betas, np.float64)
 
 
 def show_betas(proxy: bpy.types.Object, betas: NDArray) -> None:
-    """Note that a proxy shows another shape [10]."""
+    """Store with a proxy that it shows another shape [10]."""
     proxy[PROXY_MARK] = json.dumps({**json.loads(proxy[PROXY_MARK]), "betas": _rounded(betas)})
 
 
 def remove_proxy(proxy: bpy.types.Object) -> None:
-    """Take a proxy out of the .blend with its mesh, material and texture."""
+    """Remove a proxy from the .blend with its mesh, material and texture."""
     mesh = proxy.data
     materials = [material for material in mesh.materials if material is not None]
     nodes = [node for material in materials if material.node_tree for node in material.node_tree.nodes]
     images = [node.image for node in nodes if node.type == "TEX_IMAGE" and node.image is not None]
     bpy.data.objects.remove(proxy)
-    for thing in (mesh, *materials, *images):
-        if thing.users == 0:
-            bpy.data.batch_remove([thing])
+    for block in (mesh, *materials, *images):  # in this order: removing a user frees what it uses
+        if block.users == 0:
+            bpy.data.batch_remove([block])
 
 
 def follow_shape(collection: bpy.types.Collection, proxy: bpy.types.Object | None, betas: NDArray) -> None:
-    """Move a person's proxy, if there is one, to the body of these betas [10]; at rest, no pose is touched.
+    """Move a human's proxy, if there is one, to the body of these betas [10], at rest.
 
-    Some tenths of a second for a mesh that was not met before, a few milliseconds afterwards. One that has shape keys,
-    is in Edit Mode or linked from another file stays as it is, and is said to be outdated. Raises as `shape_model_of`.
+    Takes some tenths of a second for a new mesh, a few milliseconds afterwards. A proxy that has shape keys, is in Edit
+    Mode or linked from another file stays as it is, and then counts as outdated. Raises as `shape_model_of`.
     """
     shown = None if proxy is None else shown_betas(proxy)
-    if proxy is None or shown is None or not _is_free(proxy):
+    if proxy is None or shown is None or not _can_follow(proxy):
         return
     change = np.asarray(betas, np.float64) - shown
     if np.abs(change).max() <= SAME_BETAS:
@@ -184,7 +177,7 @@ def _material(name: str, texture: Path) -> bpy.types.Material:
 
 
 class _Bound:
-    """A mesh as it was met first, known by its faces: which vertices of the body it follows is not found twice."""
+    """A mesh as first seen, identified by its faces, so that its nearest body vertices are searched once."""
 
     def __init__(self, mesh: bpy.types.Mesh, shown: NDArray) -> None:
         corners = np.empty(len(mesh.loops), np.int32)
@@ -199,14 +192,14 @@ class _Bound:
         return hash(self.digest)
 
 
-def _is_free(proxy: bpy.types.Object) -> bool:
+def _can_follow(proxy: bpy.types.Object) -> bool:
     mesh = proxy.data
     return mesh.shape_keys is None and mesh.library is None and proxy.library is None and not mesh.is_editmode
 
 
-@functools.lru_cache(maxsize=_KEPT)
+@functools.lru_cache(maxsize=_CACHED)
 def _basis(bound: _Bound, model: ShapeModel) -> NDArray[np.float64]:
-    """What a unit of each shape coefficient adds to the mesh's vertices [V, 3, 10], z up."""
+    """Displacements of the mesh's vertices by a unit of each beta [V, 3, 10], z up."""
     body = points_to_blender(model.surface(bound.shown))
     tree = KDTree(len(body))
     for index, point in enumerate(body):

@@ -13,7 +13,6 @@ import json
 import os
 import re
 import tempfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,19 +21,20 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.arrays import read_arrays
 from .files import VolumeWriteError, folders_of
 from .human import BETA_COUNT, BETAS, MARK, armature_of
 from .shape_model import FIELDS, INTEGERS, SAME_BETAS, ShapeModel, faulty_field
 
 BODY_FILE = "primdiffusion_body_file"
-"""Custom property of a person's collection: the name of their body's file."""
+"""Custom property of a human's collection: the name of its body's file."""
 BODY_NPZ = re.compile(r"body_[0-9a-f]{12}\.npz")
 _SMALL, _SMALL_LIMIT = np.uint16, 2**16
-"""Of whole numbers in files: vertices and faces of bodies are fewer."""
+"""Integers in files, where they fit: bodies have fewer vertices and faces."""
 
 
 def betas_of(collection: bpy.types.Collection) -> NDArray[np.float64]:
-    """The person's shape [10] as the engine draws it now. Raises ValueError where it is no list of ten numbers."""
+    """The human's shape [10] as the engine draws it now. Raises ValueError where it is no list of ten numbers."""
     armature = armature_of(collection)
     given = armature[BETAS] if BETAS in armature else generated_betas(collection)
     try:
@@ -50,22 +50,24 @@ def betas_of(collection: bpy.types.Collection) -> NDArray[np.float64]:
 
 
 def generated_betas(collection: bpy.types.Collection) -> NDArray[np.float64]:
-    """The shape [10] that the person was generated with, or got from their last edit. Raises ValueError where the
-    collection's note of that is damaged."""
+    """The shape [10] that the human was generated with, or got from its last edit.
+
+    Raises ValueError where the collection's provenance is damaged.
+    """
     try:
         betas = np.array(json.loads(collection[MARK])["betas"], np.float64)
     except (ValueError, KeyError, TypeError):
         betas = np.empty(0)
     if betas.shape != (BETA_COUNT,):
         raise ValueError(
-            f"the custom property {MARK!r} of {collection.name!r} was changed by hand and tells no shape: undo that, "
+            f"the custom property {MARK!r} of {collection.name!r} was changed by hand and holds no shape: undo that, "
             "or generate the person again"
         )
     return betas
 
 
-def keeps_own_shape(collection: bpy.types.Collection) -> bool:
-    """The shape is not the one of the person's file: somebody has chosen it."""
+def has_custom_shape(collection: bpy.types.Collection) -> bool:
+    """Whether the shape differs from the one in the human's file: the user has set it."""
     try:
         return not np.allclose(betas_of(collection), generated_betas(collection), atol=SAME_BETAS)
     except ValueError:
@@ -73,19 +75,19 @@ def keeps_own_shape(collection: bpy.types.Collection) -> bool:
 
 
 def shape_model_of(collection: bpy.types.Collection) -> ShapeModel:
-    """How the person's body follows its shape. Raises ValueError or FileNotFoundError with what to do."""
+    """The model by which the human's body follows its shape. Raises ValueError or FileNotFoundError."""
     if BODY_FILE not in collection:
         raise ValueError(
-            f"the person {collection.name!r} was made by an earlier version and keeps their shape: generate the person "
-            "again, or vary them, to reshape"
+            f"the person {collection.name!r} was made by an earlier version and cannot be reshaped: generate the "
+            "person again, or vary it"
         )
     name = str(collection[BODY_FILE])
-    places = [place / name for near in folders_of(collection) for place in (near.parent, near)]
-    return read_body_file(next((place for place in places if place.is_file()), places[0]))
+    paths = [folder / name for near in folders_of(collection) for folder in (near.parent, near)]
+    return read_body_file(next((path for path in paths if path.is_file()), paths[0]))
 
 
 def body_file_name(model: ShapeModel) -> str:
-    """The name that a shape model's file has."""
+    """The name of a shape model's file."""
     digest = hashlib.sha256()
     for name in FIELDS:
         digest.update(np.ascontiguousarray(getattr(model, name)).tobytes())
@@ -94,10 +96,9 @@ def body_file_name(model: ShapeModel) -> str:
 
 @contextmanager
 def saved_body_file(model: ShapeModel, folder: Path) -> Iterator[str]:
-    """The name of the model's file in `folder`, which is written if it is not there, and goes again where the block
-    fails.
+    """Write the model's file in `folder` if it is not there, yield its name, and remove it again if the block fails.
 
-    Raises VolumeWriteError when it cannot be written.
+    Raises VolumeWriteError.
     """
     path = folder / body_file_name(model)
     made = not path.exists()
@@ -113,9 +114,9 @@ def saved_body_file(model: ShapeModel, folder: Path) -> Iterator[str]:
 
 @contextmanager
 def saved_body(collection: bpy.types.Collection, model: ShapeModel | None, folder: Path) -> Iterator[None]:
-    """As `kept`; the collection names the file where the block ends well.
+    """As `saved_body_file`; the collection refers to the file when the block ends well.
 
-    Without a model (human.npz of format version 1) nothing is written: such people stay in one shape.
+    Without a model (human.npz of format version 1) nothing is written, and the human cannot be reshaped.
     """
     if model is None:
         yield
@@ -126,30 +127,27 @@ def saved_body(collection: bpy.types.Collection, model: ShapeModel | None, folde
 
 
 def body_files() -> set[str]:
-    """Names of the files of bodies that people of this .blend stand on, those linked included."""
+    """Names of the body files that humans of this .blend use, linked ones included."""
     return {str(collection[BODY_FILE]) for collection in bpy.data.collections if BODY_FILE in collection}
 
 
 @functools.lru_cache(maxsize=4)
 def read_body_file(path: Path) -> ShapeModel:
-    """The shape model in a file; kept in memory, since a file of this name never has another content.
+    """The shape model in a file; cached, since a file of this name never changes.
 
-    Raises FileNotFoundError, or ValueError for a damaged file, with what to do.
+    Raises FileNotFoundError, or ValueError for a damaged file.
     """
-    import zipfile  # slow to import, and not needed to register
-
     if not path.is_file():
         raise FileNotFoundError(
             f"the body's file is missing: {str(path)!r}; put it back beside the people's folders, or generate the "
             "person again"
         )
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in FIELDS}
+        arrays = read_arrays(path, tuple(FIELDS))
         dtypes = {name: np.int32 if name in INTEGERS else np.float32 for name in FIELDS}
         model = ShapeModel(**{name: arrays[name].astype(dtypes[name]) for name in FIELDS})
         fault = faulty_field(model)
-    except (OSError, ValueError, EOFError, KeyError, IndexError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, IndexError) as error:
         raise ValueError(f"the body's file {str(path)!r} is damaged ({error}); generate the person again") from error
     if fault is not None:
         raise ValueError(f"the field {fault!r} of {str(path)!r} holds impossible values; generate the person again")

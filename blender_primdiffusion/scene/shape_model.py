@@ -14,25 +14,25 @@ from numpy.typing import NDArray
 from .human import BETA_COUNT, LARGEST_BETA
 
 _TINY = 1e-12
-"""What the backend divides by at least when it normalises."""
+"""Smallest divisor when normalising, as in the backend."""
 SHARE = 0.5
-"""Exponent of the surface's stretch by which boxes grow; the backend's `reshaping.SHARE`."""
+"""Boxes grow by the surface's stretch to this power; the backend's `reshaping.SHARE`."""
 SAME_BETAS = 1e-5
-"""Betas that differ by less are the same body."""
+"""Betas that differ by less are the same shape."""
 DENSITY = 985.0
-"""kg/m^3 of a living person with air in the lungs."""
+"""Of a living body with air in the lungs, kg/m^3."""
 MOST_CORRECTIONS = 20
 _TOLERANCE = np.array([1e-4, 1e-2])
 """Metres, kilograms."""
 DEFAULT_BODY_VERTICES = 12196
-"""Only the body that comes with the extension has as many."""
+"""By this number of vertices the body that comes with the extension is recognised."""
 _CLEAR = {0: "Stature", 1: "Shoulders", 3: "Waist", 5: "Girth"}
-"""What single betas of the default body do; the others change several things a little."""
+"""Sliders of betas of the default body with one clear effect; the other betas change several measures a little."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rest:
-    """A person at rest; metres, y up, facing +z."""
+    """A human at rest; metres, y up, facing +z."""
 
     vertices: NDArray[np.float64]
     """[V, 3]."""
@@ -41,12 +41,12 @@ class Rest:
     position: NDArray[np.float64]
     """Centres of the primitives [K, 3]."""
     rotation: NDArray[np.float64]
-    """Their axes T, B, N as columns [K, 3, 3]."""
+    """Axes T, B, N of the primitives as columns [K, 3, 3]."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ShapeModel:
-    """A body before it has a shape, and where the primitives sit on it; metres, y up, facing +z."""
+    """A body as a function of its shape, and the primitives on it; metres, y up, facing +z."""
 
     template: NDArray[np.float32]
     """The mean body at rest [V, 3]."""
@@ -59,9 +59,9 @@ class ShapeModel:
     faces: NDArray[np.int32]
     """Triangles [F, 3], counter-clockwise seen from outside."""
     face: NDArray[np.int32]
-    """The triangle that each primitive sits on [K]."""
+    """The triangle of each primitive [K]."""
     barycentric: NDArray[np.float32]
-    """Where on it [K, 3]; rows sum to one."""
+    """The primitive's place on it [K, 3]; rows sum to one."""
     stencil_vertex: NDArray[np.int32]
     """Vertices that span a primitive's tangent plane [K, m], padded with weight 0."""
     stencil_du: NDArray[np.float32]
@@ -70,19 +70,19 @@ class ShapeModel:
     """Likewise dP/dv; du x dv points out of the body."""
 
     def rest(self, betas: NDArray) -> Rest:
-        """The person of these betas [10] at rest (SMPL eqs. 8 and 10; paper sec. 3.1)."""
+        """The human of these betas [10] at rest (SMPL eqs. 8 and 10; paper sec. 3.1)."""
         vertices = self.surface(betas)
         joints = self.joint_template + self.joint_basis @ np.asarray(betas, np.float64)
         return Rest(vertices, joints, *self.frames(vertices))
 
     def surface(self, betas: NDArray) -> NDArray[np.float64]:
-        """Vertices [V, 3] of the person of these betas [10] at rest."""
+        """Rest vertices [V, 3] at these betas [10]."""
         return self.template + self.shape_basis @ np.asarray(betas, np.float64)
 
     def frames(self, vertices: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centres [K, 3] and axes [K, 3, 3] of the primitives on the body as its vertices [V, 3] lie, posed or not.
+        """Centres [K, 3] and axes [K, 3, 3] of the primitives on a body with vertices [V, 3], posed or not.
 
-        T = normalize(dP/du), N = normalize(T x dP/dv), B = N x T (SPEC 1.8, 2), in whatever axes the vertices are.
+        T = normalize(dP/du), N = normalize(T x dP/dv), B = N x T (SPEC 1.8, 2), in the axes of the vertices.
         """
         du, dv = self._planes(vertices)
         tangent = _unit(du)
@@ -91,15 +91,17 @@ class ShapeModel:
         return np.einsum("kc,kcx->kx", self.barycentric, vertices[self.faces[self.face]]), rotation
 
     def growth(self, before: NDArray, after: NDArray) -> NDArray[np.float64]:
-        """Factors [K, 3] on boxes along T, B, N when the person of these betas [10] gets others: see the backend's
-        `reshaping.box_growth`. Ones where the betas are the same."""
+        """Scale factors [K, 3] of boxes along T, B, N when the betas [10] change from `before` to `after`.
+
+        Twin of the backend's `reshaping.box_growth`; ones where the betas are the same.
+        """
         if np.allclose(before, after, rtol=0, atol=SAME_BETAS):
             return np.ones((len(self.face), 3))
         stretch = self._sides(after) / np.maximum(self._sides(before), _TINY)
         return np.concatenate([stretch**SHARE, np.ones_like(stretch[:, :1])], -1)
 
     def _sides(self, betas: NDArray) -> NDArray[np.float64]:
-        """How long cells are along T, and how wide along B, at rest [K, 2], metres."""
+        """Lengths of cells along T and widths along B at rest [K, 2], metres."""
         du, dv = self._planes(self.surface(betas))
         length = np.linalg.norm(du, axis=-1)
         area = np.linalg.norm(np.cross(du, dv), axis=-1)
@@ -117,12 +119,12 @@ FIELDS: dict[str, tuple[int | str, ...]] = {
     "faces": ("F", 3), "face": ("K",), "barycentric": ("K", 3),
     "stencil_vertex": ("K", "m"), "stencil_du": ("K", "m"), "stencil_dv": ("K", "m"),
 }  # fmt: skip
-"""Shapes of the arrays of a ShapeModel, as files hold them under the same names."""
+"""Shapes of a ShapeModel's arrays, which files store under the same names."""
 INTEGERS = ("faces", "face", "stencil_vertex")
 
 
 def faulty_field(model: ShapeModel) -> str | None:
-    """The first field that holds impossible values, None when all is well."""
+    """The first field that holds impossible values, if any."""
     for name in FIELDS:
         if not np.isfinite(getattr(model, name)).all():
             return name
@@ -141,7 +143,7 @@ class Measures(NamedTuple):
     height: float
     """Metres."""
     weight: float
-    """Kilograms: the volume within the skin, as heavy as a person."""
+    """Kilograms: the volume within the skin times DENSITY."""
 
 
 def measure(model: ShapeModel, betas: NDArray) -> Measures:
@@ -152,7 +154,7 @@ def measure(model: ShapeModel, betas: NDArray) -> Measures:
 def betas_of_measures(
     model: ShapeModel, betas: NDArray, height: float | None = None, weight: float | None = None
 ) -> NDArray[np.float64]:
-    """The betas [10], moved as little as possible until the body has the given height (m) and weight (kg).
+    """The betas [10] nearest to `betas` at which the body has the given height (m) and weight (kg).
 
     Newton steps of least length, exact to 0.1 mm and 10 g. Raises ValueError where no body within LARGEST_BETA has
     these measures.
@@ -172,13 +174,13 @@ def betas_of_measures(
         moved = moved if not rows else moved * np.inf
     if rows and not np.abs(moved).max() <= LARGEST_BETA:
         names = (("a height of {:.2f} m", height), ("a weight of {:.0f} kg", weight))
-        asked = " with ".join(text.format(value) for text, value in names if value is not None)
-        raise ValueError(f"no body of this model has {asked}: ask for something more usual")
+        measures = " with ".join(text.format(value) for text, value in names if value is not None)
+        raise ValueError(f"no body of this model has {measures}: ask for something more usual")
     return moved
 
 
 def slider_names(model: ShapeModel) -> list[str]:
-    """A name for each beta [10]: by what it does where that is clear, else by its number, from 1."""
+    """A name for each beta [10]: its effect where that is clear, else its number, from 1."""
     clear = _CLEAR if len(model.template) == DEFAULT_BODY_VERTICES else {}
     return [clear.get(index, f"Shape {index + 1}") for index in range(BETA_COUNT)]
 

@@ -22,7 +22,7 @@ from .shape_model import ShapeModel
 
 MARK = "primdiffusion_surface"
 """Custom property of a carrier."""
-_NOBODY = -1
+_DELETED = -1
 GROUP_NAME = "PrimDiffusion Boxes on Surface"
 VERTEX, PRIMITIVE, FIRST, PICK, GROWTH = "vertex", "primitive", "first", "pick", "growth"
 WEIGHTS = ("centre_weight", "du_weight", "dv_weight")
@@ -32,27 +32,27 @@ BODY, VOLUMES = "Body", "Volumes"
 
 
 def carrier_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
-    """The person's carrier; None before they were first attached to their surface."""
-    return next((thing for thing in collection.all_objects if MARK in thing), None)
+    """The human's carrier; None before it was first attached to the surface."""
+    return next((obj for obj in collection.all_objects if MARK in obj), None)
 
 
 def primitives_of(collection: bpy.types.Collection) -> bpy.types.Collection:
-    """The collection of the person's volumes. Raises ValueError where they lie in none of their own."""
-    volumes = {thing for objects in volumes_of(collection).values() for thing in objects}
+    """The collection of the human's volumes. Raises ValueError where they have none to themselves."""
+    volumes = {obj for objects in volumes_of(collection).values() for obj in objects}
     children = collection.children_recursive
-    held = [sum(thing in volumes for thing in child.objects) for child in children]
-    if not any(held):
+    counts = [sum(obj in volumes for obj in child.objects) for child in children]
+    if not any(counts):
         raise ValueError(
-            f"the volumes of {collection.name!r} lie in no collection of their own: move them into a new one inside "
+            f"the volumes of {collection.name!r} are in no collection of their own: move them into a new one inside "
             f"{collection.name!r}"
         )
-    return children[int(np.argmax(held))]
+    return children[int(np.argmax(counts))]
 
 
 def build_surface(collection: bpy.types.Collection) -> bpy.types.Object:
-    """The person's carrier, made or brought up to date; hides nothing (see `attachment`).
+    """Make or update the human's carrier; shows and hides nothing (see `attachment`).
 
-    Raises ValueError for a person of an earlier version, or whose body mesh was deleted or changed, and
+    Raises ValueError for a human of an earlier version, or whose body mesh was deleted or changed, and
     FileNotFoundError where the body's file is missing.
     """
     model, body, primitives = shape_model_of(collection), body_of(collection), primitives_of(collection)
@@ -74,7 +74,7 @@ def build_surface(collection: bpy.types.Collection) -> bpy.types.Object:
         former, carrier.data = carrier.data, mesh
         if former.users == 0:
             bpy.data.meshes.remove(former)
-    grow(collection, growth)
+    scale_surface(collection, growth)
     modifier = carrier.modifiers.get("Surface") or carrier.modifiers.new("Surface", "NODES")
     modifier.node_group = surface_group()
     sockets = {
@@ -85,8 +85,8 @@ def build_surface(collection: bpy.types.Collection) -> bpy.types.Object:
     return carrier
 
 
-def grow(collection: bpy.types.Collection, growth: NDArray) -> None:
-    """Have the person's carrier, if there is one, show volumes `growth` [K, 3] times as large as in their files."""
+def scale_surface(collection: bpy.types.Collection, growth: NDArray) -> None:
+    """Scale the volumes on the human's carrier, if there is one, by `growth` [K, 3]."""
     carrier = carrier_of(collection)
     if carrier is None:
         return
@@ -99,34 +99,34 @@ def grow(collection: bpy.types.Collection, growth: NDArray) -> None:
 
 
 def picks(collection: bpy.types.Collection, primitives: bpy.types.Collection, count: int) -> NDArray[np.int32]:
-    """Which of the collection's children, in the node's order, shows each primitive [count]; -1 where it was deleted.
+    """The index of each primitive's volume among the collection's children [count]; -1 where it was deleted.
 
-    The node sorts objects and collections together, by name, as `_natural` does.
+    The node sorts objects and collections together, by name, as `_natural_order` does.
     """
-    children = sorted([*primitives.objects, *primitives.children], key=lambda child: _natural(child.name))
+    children = sorted([*primitives.objects, *primitives.children], key=lambda child: _natural_order(child.name))
     rank = {child: number for number, child in enumerate(children)}
-    found = np.full(count, _NOBODY, np.int32)
+    found = np.full(count, _DELETED, np.int32)
     for k, objects in volumes_of(collection).items():
-        here = [rank[thing] for thing in objects if thing in rank]
+        here = [rank[obj] for obj in objects if obj in rank]
         if here and k < count:
             found[k] = min(here)
     return found
 
 
 def carrier_mesh(name: str, model: ShapeModel, pick: NDArray) -> bpy.types.Mesh:
-    """A vertex for each vertex of the body that a primitive's centre or tangent plane is a sum of, with its weights."""
+    """A vertex, with its weights, for each body vertex in the sums of each primitive's centre and tangent plane."""
     count, width = model.stencil_vertex.shape
     vertex = np.concatenate([model.faces[model.face], model.stencil_vertex], 1)
-    none, nowhere = np.zeros((count, 3)), np.zeros((count, width))
+    no_corners, no_stencil = np.zeros((count, 3)), np.zeros((count, width))
     weights = (
-        np.concatenate([model.barycentric, nowhere], 1),
-        np.concatenate([none, model.stencil_du], 1),
-        np.concatenate([none, model.stencil_dv], 1),
+        np.concatenate([model.barycentric, no_stencil], 1),
+        np.concatenate([no_corners, model.stencil_du], 1),
+        np.concatenate([no_corners, model.stencil_dv], 1),
     )
     used = np.any([weight != 0 for weight in weights], 0)
     used[:, 0] = True  # the point that becomes the instance
     primitive = np.broadcast_to(np.arange(count)[:, None], used.shape)[used]
-    first = np.concatenate([[True], primitive[1:] != primitive[:-1]]) & (pick[primitive] != _NOBODY)
+    first = np.concatenate([[True], primitive[1:] != primitive[:-1]]) & (pick[primitive] != _DELETED)
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(primitive))
     for attribute, kind, values in (
@@ -144,7 +144,7 @@ def carrier_mesh(name: str, model: ShapeModel, pick: NDArray) -> bpy.types.Mesh:
 
 
 def surface_group() -> bpy.types.NodeTree:
-    """The shared group, made on first use; its inputs are the body's object and the collection of volumes."""
+    """The shared node group, made on first use; its inputs are the body's object and the collection of volumes."""
     existing = bpy.data.node_groups.get(GROUP_NAME)
     if existing is not None and existing.library is None and existing.bl_idname == "GeometryNodeTree":
         return existing
@@ -161,7 +161,10 @@ def surface_group() -> bpy.types.NodeTree:
 
 
 def node_inputs(modifier: bpy.types.NodesModifier) -> dict[str, Any]:
-    """Values by identifiers of sockets; sockets without a value (geometry) are left out."""
+    """Inputs of a modifier by socket identifier, without sockets that have no value (geometry).
+
+    They are custom properties of the modifier up to Blender 5.1, of its `properties` from 5.2.
+    """
     group = modifier.node_group
     if group is None:
         return {}
@@ -174,7 +177,7 @@ def node_inputs(modifier: bpy.types.NodesModifier) -> dict[str, Any]:
 
 
 def set_node_input(modifier: bpy.types.NodesModifier, socket: str, value: Any) -> None:
-    """Set the input with this identifier."""
+    """Set the input of a modifier with this socket identifier."""
     if bpy.app.version < (5, 2):
         modifier[socket] = value
     else:
@@ -185,23 +188,23 @@ def _build(tree: bpy.types.NodeTree) -> None:
     made: list[bpy.types.Node] = []
 
     def node(kind: str, inputs: dict[str | int, object] | None = None, **values: object) -> bpy.types.Node:
-        one = tree.nodes.new(kind)
-        one.location = (180 * (len(made) % 8), -220 * (len(made) // 8))
-        made.append(one)
+        new = tree.nodes.new(kind)
+        new.location = (180 * (len(made) % 8), -220 * (len(made) // 8))
+        made.append(new)
         for key, value in values.items():
-            setattr(one, key, value)
+            setattr(new, key, value)
         for key, value in (inputs or {}).items():
             if isinstance(value, bpy.types.NodeSocket):
-                tree.links.new(value, one.inputs[key])
+                tree.links.new(value, new.inputs[key])
             else:
-                one.inputs[key].default_value = value
-        return one
+                new.inputs[key].default_value = value
+        return new
 
     def attribute(name: str, kind: str) -> bpy.types.NodeSocket:
         return node("GeometryNodeInputNamedAttribute", {"Name": name}, data_type=kind).outputs["Attribute"]
 
-    given = node("NodeGroupInput").outputs
-    body = node("GeometryNodeObjectInfo", {"Object": given[BODY]}, transform_space="RELATIVE").outputs["Geometry"]
+    group_input = node("NodeGroupInput").outputs
+    body = node("GeometryNodeObjectInfo", {"Object": group_input[BODY]}, transform_space="RELATIVE").outputs["Geometry"]
     vertex = node(
         "GeometryNodeSampleIndex",
         {"Geometry": body, "Value": node("GeometryNodeInputPosition").outputs[0], "Index": attribute(VERTEX, "INT")},
@@ -228,14 +231,15 @@ def _build(tree: bpy.types.NodeTree) -> None:
         primary_axis="Z",
         secondary_axis="X",
     ).outputs["Rotation"]
-    placed = node("GeometryNodeSetPosition", {"Geometry": given["Geometry"], "Position": centre}).outputs["Geometry"]
+    points = node("GeometryNodeSetPosition", {"Geometry": group_input["Geometry"], "Position": centre})
     volumes = node(
-        "GeometryNodeCollectionInfo", {"Collection": given[VOLUMES], "Separate Children": True, "Reset Children": True}
+        "GeometryNodeCollectionInfo",
+        {"Collection": group_input[VOLUMES], "Separate Children": True, "Reset Children": True},
     ).outputs["Instances"]
     instances = node(
         "GeometryNodeInstanceOnPoints",
         {
-            "Points": placed,
+            "Points": points.outputs["Geometry"],
             "Selection": attribute(FIRST, "BOOLEAN"),
             "Instance": volumes,
             "Pick Instance": True,
@@ -248,7 +252,7 @@ def _build(tree: bpy.types.NodeTree) -> None:
     tree.links.new(instances.outputs["Instances"], output.inputs["Geometry"])
 
 
-def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Names as Blender sorts them: numbers in them by value, letters whatever their case."""
+def _natural_order(name: str) -> list[tuple[int, int, str]]:
+    """Sort key of names as Blender sorts them: digits by value, letters regardless of case."""
     parts = re.findall(r"\d+|\D", name.lower())
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]

@@ -1,8 +1,9 @@
-"""Primitives as VDB files: the marcher's window baked into density, a small file each, named by its content."""
+"""Primitives as VDB files: the marcher's window baked into the density, one small file each, named by its content."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import os
 import shutil
@@ -10,6 +11,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 
 import bpy
 import numpy as np
@@ -23,18 +25,16 @@ FAINTEST = 0.05
 """Opacity per metre below which a voxel counts as empty; half a percent of alpha over a whole box. The window leaves
 less than this on the outermost voxels."""
 PAD = 1
-"""Empty voxels kept all round those that are not: Cycles draws a grid only half a voxel beyond its last one."""
-
-
-_NEXT_TO_NOTHING = 1e-4
+"""Empty voxels around those that are not: Cycles draws a grid only half a voxel beyond its last one."""
+_ALMOST_EMPTY = 1e-4
 """Opacity per metre of the one voxel of an empty primitive: Cycles complains of grids without any value."""
 _ALL_ACTIVE = -1.0
-"""A tolerance no difference from the background is below: zeros become active voxels too."""
+"""A tolerance below every difference from the background, so that zeros become active voxels too."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Grids:
-    """Voxels of all primitives in the index order of VDB: x along T, y along B, z along N; padded by PAD all round."""
+    """Voxels of all primitives in VDB's index order: x along T, y along B, z along N; padded by PAD on all sides."""
 
     density: NDArray[np.float16]
     """Opacity per metre with the window [K, X, Y, Z]; zero where empty and in the padding."""
@@ -48,7 +48,7 @@ class Grids:
     """Last index that is written, inclusive [K, 3]."""
 
     def drawn_box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centre and half sides [K, 3] of what Cycles takes for the volume, in the primitive's axes, metres."""
+        """Centre and half sides [K, 3] of the box that Cycles draws, in the primitive's axes, metres."""
         step = 2.0 * self.half_extent / (VOXELS - 1)
         low = -self.half_extent + (self.first - PAD - 0.5) * step
         high = -self.half_extent + (self.last - PAD + 0.5) * step
@@ -64,7 +64,7 @@ def window() -> NDArray[np.float64]:
 def bake(density: NDArray, rgb: NDArray, half_extent: NDArray) -> Grids:
     """Voxels as the files hold them, from density [K, D, H, W] and rgb [K, D, H, W, 3] (D, H, W along N, B, T).
 
-    A box is mostly empty outside the skin: only the part that is not gets written, and a ray meets fewer volumes.
+    A box is mostly empty outside the skin: only the part that is not gets written, so that a ray meets fewer volumes.
     """
     pad = [(0, 0)] + [(PAD, PAD)] * 3
     windowed = np.pad(np.asarray(density, np.float64) * window(), pad).transpose(0, 3, 2, 1)
@@ -78,7 +78,7 @@ def bake(density: NDArray, rgb: NDArray, half_extent: NDArray) -> Grids:
     empty = ~(windowed > 0).any((1, 2, 3))
     middle = VOXELS // 2
     first[empty] = last[empty] = middle
-    windowed[empty, middle, middle, middle] = _NEXT_TO_NOTHING
+    windowed[empty, middle, middle, middle] = _ALMOST_EMPTY
     return Grids(
         windowed.astype(np.float16), colour.astype(np.float16), np.asarray(half_extent, np.float64), first, last
     )
@@ -107,7 +107,7 @@ def file_name(grids: Grids, k: int, blender_version: tuple[int, ...]) -> str:
 
 
 class Staging:
-    """A hidden part of a person's folder, whose files move into it together; made by `staged`."""
+    """A hidden folder inside a human's folder, whose files move into the latter together; made by `staged`."""
 
     def __init__(self, hidden: Path, folder: Path):
         self._hidden, self._folder = hidden, folder
@@ -120,11 +120,10 @@ class Staging:
         return [self._folder / name for name in self.names]
 
     def write(self, grids: Grids, which: Sequence[int]) -> Iterator[float]:
-        """Write a VDB for each of `which` primitives; yields before each what fraction is written.
+        """Write a VDB for each primitive in `which`; yields the fraction written before each.
 
         Raises VolumeWriteError.
         """
-        bpy.utils.expose_bundled_modules()
         for number, k in enumerate(which):
             yield number / len(which)
             try:
@@ -144,7 +143,7 @@ class Staging:
 
 @contextmanager
 def staged(folder: Path) -> Iterator[Staging]:
-    """A place for new files of `folder`, which move into it when the block ends well.
+    """Stage new files of `folder`, which move into it when the block ends well.
 
     When the block or a move fails, neither the files nor folders made for them remain. Raises VolumeWriteError when
     the folder cannot be written or the disk is full.
@@ -176,42 +175,51 @@ def staged(folder: Path) -> Iterator[Staging]:
         remove_empty(folder, existing)
 
 
-@contextmanager
-def written(
-    grids: Grids, folder: Path, keep: Mapping[str, Path] | None = None, which: Sequence[int] | None = None
-) -> Iterator[list[Path]]:
-    """Write the VDBs of `which` primitives, None for all, and copy the files in `keep` beside them, as `staged` does.
-
-    Yields the final paths of the VDBs, which exist only after the block.
-    """
-    with staged(folder) as staging:
-        for _ in staging.write(grids, range(len(grids.density)) if which is None else which):
-            pass
-        paths = staging.paths
-        staging.copy(keep or {})
-        yield paths
-
-
 def _write_file(grids: Grids, k: int, folder: Path) -> str:
-    import openvdb  # Blender's own, importable only after bpy.utils.expose_bundled_modules()
+    part = tuple(slice(first, last + 1) for first, last in zip(grids.first[k], grids.last[k], strict=True))
+    name = file_name(grids, k, bpy.app.version)
+    write_vdb(
+        folder / name,
+        grids.density[k][part],
+        grids.colour[k][part],
+        index_to_local(grids.half_extent[k], bpy.app.version),
+        tuple((grids.first[k] - PAD).tolist()),
+        _ALL_ACTIVE,
+    )
+    return name
 
-    transform = openvdb.createLinearTransform(index_to_local(grids.half_extent[k], bpy.app.version).tolist())
-    written_part = tuple(slice(a, b + 1) for a, b in zip(grids.first[k], grids.last[k], strict=True))
-    start = tuple((grids.first[k] - PAD).tolist())
-    density, colour = openvdb.FloatGrid(), openvdb.Vec3SGrid()
-    density.name, density.gridClass = "density", openvdb.GridClass.FOG_VOLUME
-    colour.name = "Cd"
-    for grid, values, tolerance in (
-        (density, grids.density[k], _ALL_ACTIVE),
-        (colour, grids.colour[k], (_ALL_ACTIVE,) * 3),
-    ):
-        part = np.ascontiguousarray(values[written_part], dtype=np.float32)
-        grid.copyFromArray(part, ijk=start, tolerance=tolerance)
+
+def write_vdb(
+    path: Path,
+    density: NDArray,
+    colour: NDArray,
+    index_to_object: NDArray,
+    start: tuple[int, int, int] = (0, 0, 0),
+    tolerance: float = 0.0,
+) -> None:
+    """Write `density` [X, Y, Z] and `Cd` [X, Y, Z, 3] as half floats, the first voxel at index `start`.
+
+    Voxels no further than `tolerance` from zero are left out. Raises OSError, and RuntimeError when the disk is full.
+    """
+    vdb = openvdb()
+    transform = vdb.createLinearTransform(index_to_object.tolist())
+    fog, cd = vdb.FloatGrid(), vdb.Vec3SGrid()
+    fog.name, fog.gridClass = "density", vdb.GridClass.FOG_VOLUME
+    cd.name = "Cd"
+    for grid, values, near_zero in ((fog, density, tolerance), (cd, colour, (tolerance,) * 3)):
+        grid.copyFromArray(np.ascontiguousarray(values, np.float32), ijk=start, tolerance=near_zero)
         grid.transform = transform
         grid.saveFloatAsHalf = True
-    name = file_name(grids, k, bpy.app.version)
-    openvdb.write(str(folder / name), grids=[density, colour])
-    return name
+    vdb.write(str(path), grids=[fog, cd])
+
+
+@functools.cache
+def openvdb() -> ModuleType:
+    """Blender's own module."""
+    bpy.utils.expose_bundled_modules()
+    import openvdb  # importable only after the line above
+
+    return openvdb
 
 
 def _write_error(folder: Path, error: BaseException) -> VolumeWriteError:

@@ -289,7 +289,7 @@ def test_a_damaged_answer_is_told_and_leaves_scene_and_disk_as_they_were(person,
 
 def test_a_failure_in_the_scene_leaves_no_files(varied, tmp_path, monkeypatch):
     before = {path.name for path in shown(varied).values()}
-    monkeypatch.setattr("blender_primdiffusion.scene.edit.named_by_content", lambda _: 1 / 0)
+    monkeypatch.setattr("blender_primdiffusion.scene.edit.content_name", lambda _: 1 / 0)
     drive()
     assert error_of("vary")
     assert {path.name for path in (tmp_path / "shot_humans").rglob("*.vdb")} == before

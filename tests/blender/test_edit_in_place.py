@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import synthetic
 from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices
+from scene_stage import replace
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving, unused
-from blender_primdiffusion.scene.edit import replace_person
 from blender_primdiffusion.scene.files import VolumeWriteError, folder_of, person_file
 from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of, check_editable, human_of, humans
 from blender_primdiffusion.scene.human_npz import HumanFileError
@@ -73,7 +73,7 @@ def person(saved_scene, tmp_path):
 def test_only_volumes_of_changed_primitives_get_new_files(person, saved_scene, tmp_path):
     before, places = paths(person), transforms(person)
     files = {path: path.stat().st_mtime_ns for path in folder_of(person).iterdir()}
-    done = replace_person(person, *redyed(tmp_path, 3, 7))
+    done = replace(person, *redyed(tmp_path, 3, 7))
     assert changed(before, paths(person)) == {3, 7}
     assert (done.volumes, done.of, done.reshaped, done.warning) == (2, COUNT, False, "")
     assert transforms(person) == places
@@ -87,7 +87,7 @@ def test_only_volumes_of_changed_primitives_get_new_files(person, saved_scene, t
 def test_undo_and_redo_bring_back_volumes_and_the_persons_file(person, saved_scene, tmp_path):
     bpy.ops.ed.undo_push(message="before")
     before = paths(person)
-    replace_person(person, *redyed(tmp_path, 3))
+    replace(person, *redyed(tmp_path, 3))
     after = paths(person)
     bpy.ops.ed.undo_push(message="edit")
     bpy.ops.ed.undo()
@@ -103,9 +103,9 @@ def test_undo_and_redo_bring_back_volumes_and_the_persons_file(person, saved_sce
 
 def test_an_edit_and_its_reverse_meet_in_the_same_files(person, saved_scene, tmp_path):
     before = paths(person)
-    replace_person(person, *redyed(tmp_path, 3))
+    replace(person, *redyed(tmp_path, 3))
     files = len(list(folder_of(person).iterdir()))
-    replace_person(person, tmp_path / "human.npz", tmp_path / "first" / "person.human.safetensors")
+    replace(person, tmp_path / "human.npz", tmp_path / "first" / "person.human.safetensors")
     assert paths(person) == before
     assert len(list(folder_of(person).iterdir())) == files + 1  # the first person under an edit's name
     assert person_file(person).read_bytes() == b"first"
@@ -116,7 +116,7 @@ def test_other_betas_move_bones_mesh_and_volumes_and_keep_the_pose(person, saved
     before = [list(bone.rotation_quaternion) for bone in armature_of(person).pose.bones]
     objects = {o.name for o in bpy.data.objects}
     saved_scene.view_layer.objects.active = body_of(person)
-    done = replace_person(person, *reshaped(tmp_path, 3))
+    done = replace(person, *reshaped(tmp_path, 3))
     assert done.reshaped
     assert {o.name for o in bpy.data.objects} == objects
     assert saved_scene.view_layer.objects.active == body_of(person)
@@ -138,7 +138,7 @@ def test_other_betas_move_bones_mesh_and_volumes_and_keep_the_pose(person, saved
 def test_undo_takes_another_shape_back(person, saved_scene, tmp_path):
     bpy.ops.ed.undo_push(message="before")
     places = transforms(person)
-    replace_person(person, *reshaped(tmp_path))
+    replace(person, *reshaped(tmp_path))
     assert transforms(person) != places
     bpy.ops.ed.undo_push(message="edit")
     bpy.ops.ed.undo()
@@ -147,13 +147,13 @@ def test_undo_takes_another_shape_back(person, saved_scene, tmp_path):
 
 def test_a_shape_the_user_chose_stays_while_the_betas_do(person, saved_scene, tmp_path):
     armature_of(person)[BETAS] = [2.0] * 10
-    replace_person(person, *redyed(tmp_path, 3))
+    replace(person, *redyed(tmp_path, 3))
     assert list(armature_of(person)[BETAS]) == [2.0] * 10
 
 
 def test_a_mesh_changed_by_hand_keeps_its_shape_and_is_named(person, saved_scene, tmp_path):
     body_of(person).shape_key_add(name="Basis")
-    assert "changed by hand" in replace_person(person, *reshaped(tmp_path)).warning
+    assert "changed by hand" in replace(person, *reshaped(tmp_path)).warning
 
 
 def test_what_was_renamed_moved_or_deleted_by_hand_stays_so(person, saved_scene, tmp_path):
@@ -162,7 +162,7 @@ def test_what_was_renamed_moved_or_deleted_by_hand_stays_so(person, saved_scene,
     objects[4].location.z += 1
     height = objects[4].location.z
     bpy.data.objects.remove(objects[5])
-    done = replace_person(person, *redyed(tmp_path, 3, 4, 5))
+    done = replace(person, *redyed(tmp_path, 3, 4, 5))
     assert (done.volumes, done.of) == (2, COUNT - 1)
     assert bpy.data.objects["Human_prim_0004"].location.z == height
     assert "Human_prim_0005" not in bpy.data.objects
@@ -176,7 +176,7 @@ def test_a_duplicate_that_shares_volumes_is_not_edited_with_the_original(person,
         twin.objects.link(thing.copy())
     before = {o.name: o.data.filepath for o in twin.objects if o.type == "VOLUME"}
     bones = [list(bone.head_local) for bone in armature_of(twin).data.bones]
-    replace_person(person, *reshaped(tmp_path, 3))
+    replace(person, *reshaped(tmp_path, 3))
     assert {o.name: o.data.filepath for o in twin.objects if o.type == "VOLUME"} == before
     assert [list(bone.head_local) for bone in armature_of(twin).data.bones] == bones
     assert person_file(twin).read_bytes() == b"first"
@@ -186,7 +186,7 @@ def test_a_damaged_result_leaves_scene_and_disk_as_they_were(person, saved_scene
     before, files = paths(person), sorted(tmp_path.rglob("*.*"))
     (tmp_path / "bad.npz").write_bytes(b"PK no more")
     with pytest.raises(HumanFileError):
-        replace_person(person, tmp_path / "bad.npz", tmp_path / "first" / "person.human.safetensors")
+        replace(person, tmp_path / "bad.npz", tmp_path / "first" / "person.human.safetensors")
     (tmp_path / "bad.npz").unlink()
     assert paths(person) == before
     assert sorted(tmp_path.rglob("*.*")) == files
@@ -202,7 +202,7 @@ def test_a_full_disk_leaves_scene_and_disk_as_they_were(person, saved_scene, tmp
     edited = redyed(tmp_path, 3)
     monkeypatch.setattr(volumes, "_write_file", full)
     with pytest.raises(VolumeWriteError, match="no space left"):
-        replace_person(person, *edited)
+        replace(person, *edited)
     assert paths(person) == before
     assert sorted(folder_of(person).iterdir()) == files
 
@@ -211,7 +211,7 @@ def test_after_saving_under_another_name_an_edit_brings_all_of_the_person_along(
     first = folder_of(person)
     files = sorted(first.iterdir())
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "second.blend"))
-    replace_person(person, *redyed(tmp_path, 3))
+    replace(person, *redyed(tmp_path, 3))
     assert sorted(first.iterdir()) == files
     assert all(path.startswith("//second_humans/Human/") for path in paths(person).values())
     assert person_file(person).parent == tmp_path / "second_humans" / "Human"
@@ -221,7 +221,7 @@ def test_after_saving_under_another_name_an_edit_brings_all_of_the_person_along(
 def test_an_edit_before_the_first_save_is_collected_without_the_states_before_it(empty_scene, tmp_path):
     npz = synthetic.write(tmp_path / "human.npz", COUNT)
     person = build_human(empty_scene, npz, keep=[person_bytes(tmp_path / "first", b"first")])
-    replace_person(person, *redyed(tmp_path, 3))
+    replace(person, *redyed(tmp_path, 3))
     bpy.app.handlers.save_pre.append(collect_before_saving)
     try:
         bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
@@ -249,7 +249,7 @@ def test_files_of_earlier_states_are_unused_and_those_shown_are_not(person, save
     first = paths(person)["Human_prim_0003"]
     assert unused(humans_folder) == []
     (folder_of(person) / "notes.txt").write_text("mine")
-    replace_person(person, *redyed(tmp_path, 3))
+    replace(person, *redyed(tmp_path, 3))
     names = [path.name for path in unused(humans_folder)]
     assert names == ["person.human.safetensors", Path(first).name]
     assert unused(tmp_path / "nowhere") == []

@@ -67,7 +67,7 @@ def whole(person, where=None) -> bool:
     """Files, grids and the engine's idea of a person; and their volumes' places, where these are given."""
     volumes = {thing.data for thing in person.all_objects if thing.type == "VOLUME"}
     assert len([thing for thing in person.all_objects if thing.type == "VOLUME"]) == COUNT
-    assert not [one.told() for one in missing_files()]
+    assert not [one.summary() for one in missing_files()]
     assert all(volume.grids.load() for volume in volumes)
     assert person_file(person).is_file()
     files = [one.file.resolve() for one in posed_people(bpy.context.evaluated_depsgraph_get())]

@@ -260,7 +260,7 @@ def test_a_camera_is_added_that_sees_the_whole_person(person):
 
 
 def test_nobody_to_look_at_is_refused(addon):
-    with pytest.raises(RuntimeError, match="nobody is in the scene"):
+    with pytest.raises(RuntimeError, match="no person in the scene"):
         ops.add_camera()
     assert not ops.merge.poll()
     assert not bpy.data.cameras

@@ -13,7 +13,7 @@ from blender_primdiffusion.scene import overlap
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import MARK
 from blender_primdiffusion.scene.human_npz import read_human
-from blender_primdiffusion.scene.overlap import most_overlapping, overlap_warning, overlapping_now
+from blender_primdiffusion.scene.overlap import current_overlap, max_overlap, overlap_warning
 from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import generated_betas
 from blender_primdiffusion.scene.volumes import bake
@@ -43,7 +43,7 @@ def counted(source, betas) -> int:
     human = read_human(source)
     rest, growth = human.shape_model.rest(betas), human.shape_model.growth(human.betas, betas)
     offset, half = bake(human.density, human.rgb, human.half_extent).drawn_box()
-    return most_overlapping(
+    return max_overlap(
         rest.position + np.einsum("kij,kj->ki", rest.rotation, growth * offset), rest.rotation, growth * half
     )
 
@@ -51,20 +51,20 @@ def counted(source, betas) -> int:
 def test_the_count_is_that_of_the_shape_of_now(person, source):
     bpy.context.view_layer.update()
     noted = json.loads(person[MARK])["most_overlapping"]
-    assert overlapping_now(person) == noted == counted(source, generated_betas(person))
+    assert current_overlap(person) == noted == counted(source, generated_betas(person))
     reshape(person, small(person))
     bpy.context.view_layer.update()
     expected = counted(source, small(person))
     assert expected > noted
-    assert abs(overlapping_now(person) - expected) <= (0 if bpy.app.version >= (5, 0) else 1)
-    assert ("Volumes", f"{COUNT}, up to {overlapping_now(person)} overlap") in details(person)
+    assert abs(current_overlap(person) - expected) <= (0 if bpy.app.version >= (5, 0) else 1)
+    assert ("Volumes", f"{COUNT}, up to {current_overlap(person)} overlap") in details(person)
     reshape(person, generated_betas(person))
-    assert overlapping_now(person) == noted
+    assert current_overlap(person) == noted
 
 
 def test_volumes_are_counted_once_for_each_shape(person, monkeypatch):
     asked = []
-    monkeypatch.setattr(overlap, "most_overlapping", lambda *boxes: asked.append(boxes) or 50)
+    monkeypatch.setattr(overlap, "max_overlap", lambda *boxes: asked.append(boxes) or 50)
     reshape(person, small(person))
     bpy.context.view_layer.update()
     assert "up to 50 volumes" in overlap_warning(person)
@@ -72,7 +72,7 @@ def test_volumes_are_counted_once_for_each_shape(person, monkeypatch):
     assert len(asked) == 1
     reshape(person, small(person) + 0.5)
     bpy.context.view_layer.update()
-    assert overlapping_now(person) == 50
+    assert current_overlap(person) == 50
     assert len(asked) == 2
 
 
@@ -80,8 +80,8 @@ def test_volumes_that_blender_has_not_read_are_not_read_to_be_counted(person, mo
     reshape(person, small(person))
     next(thing for thing in person.all_objects if thing.type == "VOLUME").hide_viewport = True
     bpy.context.view_layer.update()
-    monkeypatch.setattr(overlap, "most_overlapping", lambda *_: 1 / 0)
-    assert overlapping_now(person) == json.loads(person[MARK])["most_overlapping"]
+    monkeypatch.setattr(overlap, "max_overlap", lambda *_: 1 / 0)
+    assert current_overlap(person) == json.loads(person[MARK])["most_overlapping"]
 
 
 def test_volumes_whose_files_are_missing_are_not_counted(person):
@@ -90,7 +90,7 @@ def test_volumes_whose_files_are_missing_are_not_counted(person):
     volume = next(thing.data for thing in person.all_objects if thing.type == "VOLUME")
     volume.filepath = "//nowhere/prim_0000_0123456789ab.vdb"
     bpy.context.view_layer.update()
-    assert overlapping_now(person) == noted
+    assert current_overlap(person) == noted
 
 
 def test_a_note_changed_by_hand_is_no_warning(person):

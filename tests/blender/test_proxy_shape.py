@@ -7,10 +7,10 @@ import exporting
 import numpy as np
 import pytest
 import synthetic_shape
+from scene_stage import replace
 
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.edit import replace_person
 from blender_primdiffusion.scene.human import body_of
 from blender_primdiffusion.scene.proxy import build_proxy, is_outdated, proxy_of, read_proxy, shown_betas
 from blender_primdiffusion.scene.reshape import reshape
@@ -58,7 +58,7 @@ def test_an_edit_that_changes_the_body_takes_the_proxy_along(person, tmp_path):
     after = betas_of(person) + TALLER
     edited = {**synthetic_shape.at(synthetic_shape.arrays(), after), "meta": np.array('{"seed": 9}')}
     np.savez(tmp_path / "edited.npz", **edited)
-    assert replace_person(person, tmp_path / "edited.npz", tmp_path / "person.human.safetensors").reshaped
+    assert replace(person, tmp_path / "edited.npz", tmp_path / "person.human.safetensors").reshaped
     proxy = proxy_of(person)
     assert np.linalg.norm(places(proxy) - surface(after), axis=-1).mean() < 0.02
     assert np.allclose(shown_betas(proxy), after)

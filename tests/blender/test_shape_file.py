@@ -76,7 +76,7 @@ def test_people_on_one_body_share_its_file_and_nothing_else_is_left_beside_them(
 
 def test_a_person_of_an_earlier_version_is_told_to_be_generated_again(saved_scene, tmp_path):
     person = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 8))
-    with pytest.raises(ValueError, match=r"'Human' was made by an earlier version.*to reshape"):
+    with pytest.raises(ValueError, match=r"'Human' was made by an earlier version"):
         shape_model_of(person)
     assert not list(folder_of(person).parent.glob("body_*"))
 

@@ -10,17 +10,17 @@ import pytest
 import synthetic
 import synthetic_shape
 from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices
+from scene_stage import replace
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.duplicate import rename_human
-from blender_primdiffusion.scene.edit import replace_person
 from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of, humans
 from blender_primdiffusion.scene.keyframes import keyframe_poses
 from blender_primdiffusion.scene.reshape import reshape
-from blender_primdiffusion.scene.shape import betas_of, generated_betas, keeps_own_shape
+from blender_primdiffusion.scene.shape import betas_of, generated_betas, has_custom_shape
 from blender_primdiffusion.scene.surface import build_surface
 
 COUNT = 12
@@ -92,7 +92,7 @@ def test_changing_the_shape_and_back_is_no_change(person, saved_scene):
     reshape(person, SHAPE)
     reshape(person, before[1])
     np.testing.assert_allclose(heads(person), before[0], atol=1e-6)
-    assert not keeps_own_shape(person)
+    assert not has_custom_shape(person)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.3])
@@ -226,21 +226,21 @@ def edited_file(tmp_path, betas):
 
 def test_a_shape_of_ones_own_outlives_an_edit_that_changes_the_shape(person, tmp_path):
     reshape(person, SHAPE)
-    done = replace_person(person, *edited_file(tmp_path, np.ones(10)))
+    done = replace(person, *edited_file(tmp_path, np.ones(10)))
     assert not done.reshaped
     np.testing.assert_allclose(betas_of(person), SHAPE)
     np.testing.assert_allclose(heads(person), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
     assert json.loads(person[MARK])["seed"] == 9
     np.testing.assert_allclose(generated_betas(person), 1)
     reshape(person, generated_betas(person))
-    assert not keeps_own_shape(person)
+    assert not has_custom_shape(person)
 
 
 def test_a_shape_nobody_has_chosen_follows_the_edit(person, tmp_path):
-    assert replace_person(person, *edited_file(tmp_path, SHAPE)).reshaped
+    assert replace(person, *edited_file(tmp_path, SHAPE)).reshaped
     np.testing.assert_allclose(betas_of(person), SHAPE)
     np.testing.assert_allclose(heads(person), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
-    assert not keeps_own_shape(person)
+    assert not has_custom_shape(person)
 
 
 def test_an_edit_gives_people_of_an_earlier_version_a_shape_to_change(saved_scene, tmp_path):
@@ -250,7 +250,7 @@ def test_an_edit_gives_people_of_an_earlier_version_a_shape_to_change(saved_scen
     old = build_human(saved_scene, synthetic_shape.write(tmp_path / "old.npz", format_version=np.array(1)), keep=[keep])
     with pytest.raises(ValueError, match="earlier version"):
         reshape(old, SHAPE)
-    replace_person(old, *edited_file(tmp_path, generated_betas(old)))
+    replace(old, *edited_file(tmp_path, generated_betas(old)))
     reshape(old, SHAPE)
     np.testing.assert_allclose(heads(old), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
 
@@ -316,7 +316,7 @@ def test_volumes_grow_with_half_of_the_surface_s_stretch_in_either_attachment(pe
 
 def test_volumes_of_an_edited_person_grow_from_the_edited_one_s_body(person, saved_scene, tmp_path):
     reshape(person, SHAPE)
-    replace_person(person, *edited_file(tmp_path, np.ones(10)))
+    replace(person, *edited_file(tmp_path, np.ones(10)))
     saved_scene.view_layer.update()
     edited = at(np.ones(10))
     wanted = at(SHAPE)["growth"] / edited["growth"]

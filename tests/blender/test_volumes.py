@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+
 import bpy
 import numpy as np
 import pytest
@@ -9,11 +11,18 @@ import synthetic
 
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.files import VolumeWriteError
-from blender_primdiffusion.scene.overlap import most_overlapping
-from blender_primdiffusion.scene.volumes import FAINTEST, bake, file_name, index_to_local, window, written
+from blender_primdiffusion.scene.overlap import max_overlap
+from blender_primdiffusion.scene.volumes import FAINTEST, bake, file_name, index_to_local, staged, window
 
 bpy.utils.expose_bundled_modules()
 import openvdb  # noqa: E402
+
+
+@contextmanager
+def written(grids, folder):
+    with staged(folder) as staging:
+        list(staging.write(grids, range(len(grids.density))))
+        yield staging.paths
 
 
 @pytest.fixture
@@ -143,8 +152,8 @@ def test_a_full_disk_half_way_keeps_earlier_files_and_drops_the_new(human, grids
 
 def test_overlaps_are_counted():
     turned = synthetic.random_rotations(np.random.default_rng(0), 40)
-    assert most_overlapping(np.zeros((40, 3)), turned, np.full((40, 3), 0.03)) == 40
+    assert max_overlap(np.zeros((40, 3)), turned, np.full((40, 3), 0.03)) == 40
     far = np.arange(40)[:, None] * np.array([1.0, 0, 0])
-    assert most_overlapping(far, turned, np.full((40, 3), 0.03)) == 1
+    assert max_overlap(far, turned, np.full((40, 3), 0.03)) == 1
     pairs = np.repeat(far[:20], 2, 0) + np.tile([[0.0, 0, 0], [0, 0.04, 0]], (20, 1))
-    assert most_overlapping(pairs, np.tile(np.eye(3), (40, 1, 1)), np.full((40, 3), 0.03)) == 2
+    assert max_overlap(pairs, np.tile(np.eye(3), (40, 1, 1)), np.full((40, 3), 0.03)) == 2

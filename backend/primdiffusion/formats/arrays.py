@@ -6,7 +6,7 @@ import contextlib
 import math
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -57,6 +57,26 @@ def read_numbers(path: str | Path, required: Sequence[str] = (), optional: Seque
         if not np.isfinite(values).all():
             raise ArrayFileError(f"{path}: {name!r} holds NaN or infinite numbers: make it again")
     return arrays
+
+
+def check_shapes(
+    path: str | Path, arrays: Mapping[str, NDArray], shapes: Mapping[str, Sequence[int | str]], sizes: dict[str, int]
+) -> None:
+    """Check that `arrays` of a file hold numbers of these shapes. A letter stands for one size, the same in all arrays,
+    which is added to `sizes`.
+
+    Raises ArrayFileError, or KeyError where one is missing.
+    """
+    for name, shape in shapes.items():
+        values = arrays[name]
+        fits = values.ndim == len(shape) and values.dtype.kind in "fiu" and values.size > 0
+        for expected, size in zip(shape, values.shape, strict=False):
+            fits = fits and size == (sizes.setdefault(expected, size) if isinstance(expected, str) else expected)
+        if not fits:
+            expected_shape = tuple(sizes.get(s, s) if isinstance(s, str) else s for s in shape)
+            raise ArrayFileError(
+                f"{path}: {name!r} holds {values.dtype} {values.shape} instead of numbers of shape {expected_shape}"
+            )
 
 
 def read_npy(path: str | Path) -> NDArray:

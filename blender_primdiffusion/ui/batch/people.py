@@ -18,7 +18,7 @@ from ...scene.build import build_human
 from ...scene.files import PERSON_FILE as PERSON_FILE
 from ...scene.human import armature_of, humans
 from ...scene.keyframes import keyframe_poses
-from ...scene.preview import frame_box, framing_distance, people_extent, setup_cycles_preview
+from ...scene.preview import frame_box, framing_distance, humans_extent, setup_cycles_preview
 
 NPZ_FILE = "human.npz"
 """The person for Blender, beside `PERSON_FILE`."""
@@ -92,11 +92,11 @@ def build_person(
 def moving_extent(scene: bpy.types.Scene) -> tuple[np.ndarray, np.ndarray]:
     """The corners of the box that everybody stays in from the scene's first frame to its last, as far as looked at."""
     if not any(armature_of(person).animation_data for person in humans(scene)):
-        return people_extent(scene)
+        return humans_extent(scene)
     before, lows, highs = scene.frame_current, [], []
     for frame in np.unique(np.linspace(scene.frame_start, scene.frame_end, _LOOKED_AT).round().astype(int)):
         scene.frame_set(int(frame))
-        low, high = people_extent(scene)
+        low, high = humans_extent(scene)
         lows.append(low)
         highs.append(high)
     scene.frame_set(before)

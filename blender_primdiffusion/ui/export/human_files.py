@@ -11,7 +11,7 @@ from ...motion.skeleton import unchain
 from ...scene.export_model import FrameRange
 from ...scene.files import person_file
 from ...scene.human_file import HumanMotion, read_tensors, reshaped, with_motion, write_tensors
-from ...scene.shape import BODY_FILE, betas_of, generated_betas, keeps_own_shape, shape_model_of
+from ...scene.shape import BODY_FILE, betas_of, generated_betas, has_custom_shape, shape_model_of
 from .posing import posed_frames
 
 
@@ -24,7 +24,7 @@ def write_human(
     is left out.
     """
     human = read_tensors(person_file(person))
-    if keeps_own_shape(person):
+    if has_custom_shape(person):
         betas, growth = betas_of(person), None
         if BODY_FILE in person:  # people of earlier versions have none, and boxes that keep their size
             growth = shape_model_of(person).growth(generated_betas(person), betas)

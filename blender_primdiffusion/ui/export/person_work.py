@@ -82,7 +82,6 @@ class ExportVdbSequenceWork(Work):
 
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
         """Write all files aside, then put them in their places."""
-        bpy.utils.expose_bundled_modules()
         written = []
         for index, grid in enumerate(result["files"]):
             name = f"{self.stem}_{self.first + index:04d}.vdb"

@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 
 from ...engine.people import posed
-from ...scene.export_model import alone, check_ready
+from ...scene.export_model import check_ready, scene_with_only
 from ...scene.human import armature_of
 
 
@@ -28,7 +28,7 @@ def posed_frames(
     armature = armature_of(person)
     check_ready(armature)
     found = []
-    with alone(context, armature) as scene:
+    with scene_with_only(context, armature) as scene:
         for frame in frames:
             if frame != scene.frame_current:
                 scene.frame_set(frame)

@@ -26,14 +26,14 @@ class _Find:
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Put paths right; have the child write again what is nowhere."""
-        from ...scene.missing import bring_back, find_files, missing_files, repair
+        from ...scene.missing import copy_back, find_files, missing_files, repair
 
         directory = Path(bpy.path.abspath(self.directory)) if self.directory else None
         try:
             lost = missing_files()
             found = find_files(lost, directory)
             repaired = repair(lost, found)
-            brought = bring_back(lost, found, directory)
+            brought = copy_back(lost, found, directory)
             if repaired:
                 bpy.ops.ed.undo_push(message="Find Missing Volumes")
             restored, left = self._restore(context, directory)
@@ -59,14 +59,16 @@ class _Find:
         for one in missing_files():
             source = find_person(one, directory)
             if one.linked:
-                left.append(f"{one.told()}, linked from {one.linked!r}, cannot be found: open that file and look there")
+                left.append(
+                    f"{one.summary()}, linked from {one.linked!r}, cannot be found: open that file and look there"
+                )
             elif source is None:
                 left.append(
-                    f"{one.told()} cannot be found: put them back, choose the folder that they are in, or press "
+                    f"{one.summary()} cannot be found: put them back, choose the folder that they are in, or press "
                     "Generate Again where a seed made them"
                 )
             elif one.merged and not (one.volumes or one.person_file or one.body_file):
-                left.append(f"{one.told()} cannot be found: press Merge again")
+                left.append(f"{one.summary()} cannot be found: press Merge again")
             else:
                 try:
                     works.append(RestoreWork(Target.of(one.person), str(source)))

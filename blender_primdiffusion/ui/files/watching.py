@@ -7,7 +7,7 @@ import dataclasses
 import bpy
 from bpy.app.handlers import persistent
 
-from ...scene.human import anybody
+from ...scene.human import any_humans
 from ..jobs.follow import redraw
 
 SOON_S = 0.5
@@ -30,7 +30,7 @@ state = State()
 def look() -> None:
     """Find out now."""
     before = state.told
-    state.told, state.without_person_file = _found() if anybody() else ("", ())
+    state.told, state.without_person_file = _found() if any_humans() else ("", ())
     if state.told != before:
         redraw()
 
@@ -40,7 +40,7 @@ def _found() -> tuple[str, tuple[str, ...]]:
 
     lost = missing_files()
     alone = [one.person.name for one in lost if one.person_file and not one.linked and find_person(one) is None]
-    return "; ".join(one.told() for one in lost), tuple(alone)
+    return "; ".join(one.summary() for one in lost), tuple(alone)
 
 
 @persistent

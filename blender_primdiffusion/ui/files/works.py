@@ -9,10 +9,10 @@ from typing import Any
 
 import bpy
 
-from ...scene.beforehand import Place
-from ...scene.edit import place_of, place_of_lost, restore_volumes, restore_written
+from ...scene.edit import edit_destination, restore_destination, restore_volumes
 from ...scene.human import MARK
 from ...scene.human_npz import read_human
+from ...scene.writing import Destination, write_now
 from ..jobs.building import building
 from ..jobs.person import show_in_place
 from ..jobs.target import Target
@@ -43,15 +43,15 @@ class RestoreWork(Work):
         """Of the child's method."""
         return {"person": self.file, "out_dir": str(folder), "size": _PICTURE_PX}
 
-    def place(self) -> Place:
+    def place(self) -> Destination:
         """Where the lost ones were."""
-        return place_of_lost(self.target.found())
+        return restore_destination(self.target.found())
 
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Put the volumes back."""
         person, human, file = self.target.found(), Path(result["human"]), Path(self.file)
-        written = building.take(human)
-        count = restore_written(person, written, file) if written is not None else restore_volumes(person, human, file)
+        written = building.take(human) or write_now(human, restore_destination(person))
+        count = restore_volumes(person, written, file)
         _look()
         return f"{count} volumes of {person.name} restored from their file in {result['seconds']:.1f} s"
 
@@ -80,9 +80,9 @@ class RegenerateWork(Work):
         checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
         return {"seed": self.made["seed"], **asked, **checkpoint, "size": _PICTURE_PX, "out_dir": str(folder)}
 
-    def place(self) -> Place:
+    def place(self) -> Destination:
         """Where the lost ones were."""
-        return place_of(self.target.found())
+        return edit_destination(self.target.found())
 
     def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Show them where the lost ones were. Raises ValueError where another checkpoint has made somebody else."""

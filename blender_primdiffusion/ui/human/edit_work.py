@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 import bpy
 import numpy as np
 
-from ...scene.beforehand import Place
-from ...scene.edit import place_of
+from ...scene.edit import edit_destination
 from ...scene.files import person_file
 from ...scene.overlap import overlap_warning_in
+from ...scene.writing import Destination
 from ...worker.sentence import sentence
 from ..jobs.person import show_in_place
 from ..jobs.target import Target
@@ -60,9 +60,9 @@ class EditWork(Work):
         params["picture_px"] = _STEP_PICTURE_PX
         return {**params, **checkpoint, "out_dir": str(folder)}
 
-    def place(self) -> Place:
+    def place(self) -> Destination:
         """In the place of the person's own."""
-        return place_of(self.target.found())
+        return edit_destination(self.target.found())
 
     def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Show the edited person in the place of the one that was; in which scene does not matter."""

@@ -42,7 +42,7 @@ class PRIMDIFFUSION_PT_shape(_InHuman, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Reads the scene; changes nothing."""
         from ...scene.reshape import check_shapeable
-        from ...scene.shape import keeps_own_shape, shape_model_of
+        from ...scene.shape import has_custom_shape, shape_model_of
         from ...scene.shape_model import slider_names
 
         layout = self.layout
@@ -67,7 +67,7 @@ class PRIMDIFFUSION_PT_shape(_InHuman, bpy.types.Panel):
         row = layout.row(align=True)
         row.operator("primdiffusion.random_shape", text="Random", icon="FILE_REFRESH")
         reset = row.row(align=True)
-        reset.enabled = keeps_own_shape(person)
+        reset.enabled = has_custom_shape(person)
         reset.operator("primdiffusion.reset_shape", text="Reset", icon="LOOP_BACK")
         row = layout.row(align=True)
         row.prop(context.scene.primdiffusion_edit, "other", text="Copy From")
@@ -96,7 +96,7 @@ class PRIMDIFFUSION_PT_details(_InHuman, bpy.types.Panel):
 def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
     """What Details says: names and values."""
     from ...scene.grid_cache import person_memory
-    from ...scene.overlap import overlapping_now
+    from ...scene.overlap import current_overlap
 
     provenance = json.loads(person[MARK])
     lines = [(name.capitalize(), f"{provenance[name]}") for name in _SHOWN if provenance.get(name) not in (None, "")]
@@ -109,7 +109,7 @@ def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
     volumes = [thing for thing in person.all_objects if thing.type == "VOLUME"]
     memory = person_memory(person)
     try:
-        most = str(overlapping_now(person))
+        most = str(current_overlap(person))
     except (ValueError, KeyError, TypeError):  # changed by hand
         most = "?"
     lines.append(("Volumes", f"{len(volumes)}, up to {most} overlap"))

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ...scene.beforehand import Place, Writing, Written
+    from ...scene.writing import Destination, VolumeWriter, WrittenHuman
     from .queue import Entry
     from .work import Work
 
@@ -24,7 +24,7 @@ class Building:
     def __init__(self) -> None:
         self._entry: Entry | None = None
         self._human: Path | None = None
-        self._writing: Writing | None = None
+        self._writing: VolumeWriter | None = None
         self._read = 0
         self._shown = 0
 
@@ -61,10 +61,10 @@ class Building:
         self._entry = entry
         place = _place(entry.work) if "human" in result else None
         if place is not None:
-            from ...scene.beforehand import Writing
+            from ...scene.writing import VolumeWriter
 
             self._human = Path(result["human"])
-            self._writing = Writing(self._human, place)
+            self._writing = VolumeWriter(self._human, place)
 
     def goes_on(self, *, may_work: bool) -> bool:
         """Whether there is more to do before the operator runs; does some of it where that is allowed now."""
@@ -87,7 +87,7 @@ class Building:
             self._read += read_grids(written.files[self._read :], SLICE_S)
         return self._read < len(written.files)
 
-    def take(self, human: Path) -> Written | None:
+    def take(self, human: Path) -> WrittenHuman | None:
         """The person of this human.npz, whose files are the caller's from now on; None where they are not written."""
         return self._writing.take() if self._writing is not None and human == self._human else None
 
@@ -99,7 +99,7 @@ class Building:
         self._read = self._shown = 0
 
 
-def _place(work: Work) -> Place | None:
+def _place(work: Work) -> Destination | None:
     try:
         return work.place()
     except (ValueError, OSError):  # the operator tells what has become of the person

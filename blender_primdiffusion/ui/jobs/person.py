@@ -8,10 +8,11 @@ from typing import Any
 
 import bpy
 
-from ...scene.build import build_human, build_written, stand_beside_others
-from ...scene.edit import Replaced, replace_by_written, replace_person
+from ...scene.build import build_written, next_folder, stand_beside_others
+from ...scene.edit import Replaced, edit_destination, replace_person
 from ...scene.grid_cache import free_unused_grids
 from ...scene.overlap import overlap_warning_in
+from ...scene.writing import Destination, write_now
 from ...worker.sentence import sentence
 from .building import building
 
@@ -25,17 +26,13 @@ def build_person(
     """
     keep = [Path(result["person"])] if "person" in result else []  # for the exact marcher, later
     human = Path(result["human"])
-    written, began = building.take(human), time.monotonic()
-    if written is not None:
-        began = written.began
-        collection = build_written(context, written, name, keep)
-    else:
-        collection = build_human(context, human, name, keep)
+    written = building.take(human) or write_now(human, Destination(next_folder(name)))
+    collection = build_written(context, written, name, keep)
     stand_beside_others(context, collection)
     warnings = list(result.get("warnings", ()))
     if overlap := overlap_warning_in(context.scene, collection):
         warnings.append(overlap)
-    notice = f"{made} in {result['seconds']:.1f} s, built in {time.monotonic() - began:.1f} s"
+    notice = f"{made} in {result['seconds']:.1f} s, built in {time.monotonic() - written.began:.1f} s"
     return collection, " ".join([sentence(notice), *map(sentence, warnings)])
 
 
@@ -43,9 +40,8 @@ def show_in_place(context: bpy.types.Context, person: bpy.types.Collection, resu
     """Show the person of the child's `result` where `person` is. Raises as `replace_person` does."""
     human, file = Path(result["human"]), Path(result["person"])
     written = building.take(human)
-    if written is not None:
-        return replace_by_written(person, written, file)
-    done = replace_person(person, human, file)
-    context.view_layer.update()  # what is evaluated holds the grids of before
-    free_unused_grids()
+    done = replace_person(person, written or write_now(human, edit_destination(person)), file)
+    if written is None:  # otherwise `building` has freed them before it read the new ones
+        context.view_layer.update()  # evaluated data holds the old grids
+        free_unused_grids()
     return done

@@ -64,7 +64,7 @@ def selected_person(context: bpy.types.Context) -> bpy.types.Collection:
     if len(people) == 1:
         return people[0]
     if not people:
-        raise ValueError("nobody is in the scene: generate a person first")
+        raise ValueError("there is no person in the scene: generate one first")
     raise ValueError(f"{len(people)} people are in the scene: select a part of the one to edit")
 
 

@@ -11,7 +11,7 @@ import bpy
 from ...places import preference
 
 if TYPE_CHECKING:
-    from ...scene.beforehand import Place
+    from ...scene.writing import Destination
 
 
 class Work(abc.ABC):
@@ -49,15 +49,15 @@ class Work(abc.ABC):
         more to do at once. Called while the child is at work, and then until there is no more, before `finish`."""
         return False
 
-    def place(self) -> Place | None:
+    def place(self) -> Destination | None:
         """Where the volumes of the answer's "human" go, which are written before `finish`; None for works that show
         nobody. Asked for when the answer is there. ValueError and OSError are left to `finish` to tell."""
         if not self.new_person:
             return None
-        from ...scene.beforehand import Place
-        from ...scene.build import home_of_next
+        from ...scene.build import next_folder
+        from ...scene.writing import Destination
 
-        return Place(home_of_next(self.new_person))
+        return Destination(next_folder(self.new_person))
 
 
 def chosen_checkpoint(name: str) -> str:

@@ -62,7 +62,6 @@ class MergeWork(Work):
 
     def params(self, folder: Path) -> dict[str, Any]:
         """Of the child's method."""
-        bpy.utils.expose_bundled_modules()
         people = [{**self.moment.params, "human": self.target.file_now()}]
         return {"people": people, "voxel": self.voxel, "out": str(folder / "grid.npz")}
 
@@ -101,7 +100,6 @@ class MergeFramesWork(Work):
 
     def params(self, folder: Path) -> dict[str, Any]:
         """Of the child's method; its grids become VDB files as they appear (see `advance`)."""
-        bpy.utils.expose_bundled_modules()
         file = self.target.file_now()
         self._digests, self._error = [], None
         people = [{**moment.params, "human": file} for moment in self.moments]

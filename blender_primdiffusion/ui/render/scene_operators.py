@@ -60,12 +60,12 @@ class PRIMDIFFUSION_OT_add_camera(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """The camera becomes the scene's."""
-        from ...scene.preview import frame_box, new_camera, people_extent, posed_extent
+        from ...scene.preview import frame_box, humans_extent, new_camera, posed_extent
 
         scene = context.scene
         person = human_of(context.view_layer.objects.active, scene)
         try:
-            extent = people_extent(scene) if person is None else posed_extent(person)
+            extent = humans_extent(scene) if person is None else posed_extent(person)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

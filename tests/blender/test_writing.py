@@ -9,19 +9,13 @@ import pytest
 import synthetic
 import synthetic_shape
 
-from blender_primdiffusion.scene import beforehand, build
-from blender_primdiffusion.scene.beforehand import Place
-from blender_primdiffusion.scene.build import build_human, build_written, home_of_next
+from blender_primdiffusion.scene import build
+from blender_primdiffusion.scene.build import build_human, build_written, next_folder
 from blender_primdiffusion.scene.files import VolumeWriteError, folder_of, volume_path
 from blender_primdiffusion.scene.grid_cache import read_grids
 from blender_primdiffusion.scene.human_npz import HumanFileError
 from blender_primdiffusion.scene.shape import shape_model_of
-
-
-def written_at_once(human_npz: Path, place: Place) -> beforehand.Written:
-    written = beforehand.Writing(human_npz, place).take()
-    assert written is not None
-    return written
+from blender_primdiffusion.scene.writing import Destination, VolumeWriter, write_now
 
 
 @pytest.fixture
@@ -52,12 +46,12 @@ def state(person):
 
 
 def test_a_person_written_before_is_the_one_that_is_built_at_once(saved_scene, source, keep, tmp_path):
-    written = written_at_once(source, Place(home_of_next("Anna")))
+    written = write_now(source, Destination(next_folder("Anna")))
     early = build_written(saved_scene, written, "Anna", [keep])
     late = build_human(saved_scene, source, "Berta", [keep])
     saved_scene.view_layer.update()
     assert state(early) == state(late)
-    assert folder_of(early) == written.home
+    assert folder_of(early) == written.folder
     assert {path.name for path in folder_of(early).iterdir()} == {path.name for path in folder_of(late).iterdir()}
     assert shape_model_of(early) is shape_model_of(late)
 
@@ -65,17 +59,17 @@ def test_a_person_written_before_is_the_one_that_is_built_at_once(saved_scene, s
 def test_the_next_home_is_the_one_the_next_person_gets(saved_scene, source):
     build_human(saved_scene, source, "Anna")
     collections = set(bpy.data.collections)
-    home = home_of_next("Anna")
+    home = next_folder("Anna")
     assert set(bpy.data.collections) == collections
     assert folder_of(build_human(saved_scene, source, "Anna")) == home
 
 
 def test_a_place_taken_meanwhile_is_left_to_who_has_it(saved_scene, source, keep, tmp_path):
-    written = written_at_once(source, Place(home_of_next("Anna")))
+    written = write_now(source, Destination(next_folder("Anna")))
     bpy.data.collections.new("Anna")
     person = build_written(saved_scene, written, "Anna", [keep])
     assert person.name == "Anna.001"
-    assert not written.home.exists()
+    assert not written.folder.exists()
     assert all(volume_path(t.data).is_file() for t in person.all_objects if t.type == "VOLUME")
     assert (folder_of(person) / keep.name).is_file()
     assert shape_model_of(person).template.shape[1] == 3
@@ -83,12 +77,12 @@ def test_a_place_taken_meanwhile_is_left_to_who_has_it(saved_scene, source, keep
 
 def test_a_file_saved_meanwhile_has_the_person_beside_it(empty_scene, tmp_path):
     source = synthetic_shape.write(tmp_path / "human.npz")
-    written = written_at_once(source, Place(home_of_next("Anna")))
+    written = write_now(source, Destination(next_folder("Anna")))
     (tmp_path / "film").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film" / "shot.blend"))
     person = build_written(empty_scene, written, "Anna")
     assert folder_of(person) == tmp_path / "film" / "shot_humans" / "Anna"
-    assert not written.home.exists()
+    assert not written.folder.exists()
     assert all(not path.exists() for path in written.made)
     assert all(volume_path(t.data).is_file() for t in person.all_objects if t.type == "VOLUME")
     assert shape_model_of(person).template.shape[1] == 3
@@ -97,14 +91,14 @@ def test_a_file_saved_meanwhile_has_the_person_beside_it(empty_scene, tmp_path):
 def test_discarding_leaves_what_others_had(saved_scene, source, tmp_path):
     person = build_human(saved_scene, source, "Anna")
     before = on_disk(tmp_path)
-    again = written_at_once(source, Place(folder_of(person)))  # as after the person was deleted and made again
+    again = write_now(source, Destination(folder_of(person)))  # as after the person was deleted and made again
     again.discard()
-    written_at_once(source, Place(home_of_next("Anna"))).discard()
+    write_now(source, Destination(next_folder("Anna"))).discard()
     assert on_disk(tmp_path) == before
 
 
 def test_a_file_that_the_system_keeps_is_no_reason_to_leave_the_others(saved_scene, source, monkeypatch):
-    written, unlink = written_at_once(source, Place(home_of_next("Anna"))), Path.unlink
+    written, unlink = write_now(source, Destination(next_folder("Anna"))), Path.unlink
 
     def as_on_windows(path: Path, missing_ok: bool = False) -> None:
         if path == written.files[2]:
@@ -118,7 +112,7 @@ def test_a_file_that_the_system_keeps_is_no_reason_to_leave_the_others(saved_sce
 
 def test_a_failure_while_building_removes_what_was_written(saved_scene, source, tmp_path, monkeypatch):
     before = on_disk(tmp_path)
-    written = written_at_once(source, Place(home_of_next("Anna")))
+    written = write_now(source, Destination(next_folder("Anna")))
 
     def failing(*_):
         raise MemoryError("no memory for the volumes")
@@ -132,47 +126,47 @@ def test_a_failure_while_building_removes_what_was_written(saved_scene, source, 
 
 
 def test_slices_write_a_file_at_a_time(saved_scene, source):
-    writing = beforehand.Writing(source, Place(home_of_next("Anna")))
+    writer = VolumeWriter(source, Destination(next_folder("Anna")))
     fractions = []
-    while not writing.over:
-        writing.work(0.0)
-        fractions.append(writing.fraction)
-    assert writing.error is None
-    assert writing.result is not None
-    assert writing.result.whole()
+    while not writer.over:
+        writer.work(0.0)
+        fractions.append(writer.fraction)
+    assert writer.error is None
+    assert writer.result is not None
+    assert writer.result.complete()
     assert fractions == sorted(fractions)
-    assert len(set(fractions)) >= len(writing.result.files)
-    writing.result.files[3].unlink()
-    assert not writing.result.whole()
+    assert len(set(fractions)) >= len(writer.result.files)
+    writer.result.files[3].unlink()
+    assert not writer.result.complete()
 
 
 @pytest.mark.parametrize("steps", [0, 1, 5, 40, 1000])
 def test_stopped_writing_leaves_no_files_however_far_it_was(saved_scene, tmp_path, steps):
     source = synthetic.write(tmp_path / "human.npz", 64)
     before = on_disk(tmp_path)
-    writing = beforehand.Writing(source, Place(home_of_next("Anna")))
+    writer = VolumeWriter(source, Destination(next_folder("Anna")))
     for _ in range(steps):
-        writing.work(0.0)
+        writer.work(0.0)
     assert (on_disk(tmp_path) != before) == (steps >= 5)
-    writing.stop()
-    assert writing.over
-    assert writing.result is None
+    writer.stop()
+    assert writer.over
+    assert writer.result is None
     assert on_disk(tmp_path) == before
 
 
 def test_writing_keeps_its_failure_for_its_caller(saved_scene, tmp_path):
     (tmp_path / "bad.npz").write_bytes(b"nothing")
-    bad = beforehand.Writing(tmp_path / "bad.npz", Place(home_of_next("Anna")))
+    bad = VolumeWriter(tmp_path / "bad.npz", Destination(next_folder("Anna")))
     (tmp_path / "shot_humans").write_text("in the way")
-    full = beforehand.Writing(synthetic.write(tmp_path / "human.npz", 2), Place(home_of_next("Anna")))
-    for writing in (bad, full):
-        assert writing.take() is None
+    full = VolumeWriter(synthetic.write(tmp_path / "human.npz", 2), Destination(next_folder("Anna")))
+    for writer in (bad, full):
+        assert writer.take() is None
     assert isinstance(bad.error, HumanFileError)
     assert isinstance(full.error, VolumeWriteError)
 
 
 def test_grids_read_before_are_there_when_volumes_show_them_and_nothing_else_is(saved_scene, source):
-    written = written_at_once(source, Place(home_of_next("Anna")))
+    written = write_now(source, Destination(next_folder("Anna")))
     read = 0
     while read < len(written.files):
         count = read_grids(written.files[read:], 0.0)
@@ -188,6 +182,6 @@ def test_grids_read_before_are_there_when_volumes_show_them_and_nothing_else_is(
 
 
 def test_a_missing_file_is_no_reason_not_to_read_the_others(saved_scene, source):
-    written = written_at_once(source, Place(home_of_next("Anna")))
+    written = write_now(source, Destination(next_folder("Anna")))
     written.files[0].unlink()
     assert read_grids(written.files, 60.0) == len(written.files)
