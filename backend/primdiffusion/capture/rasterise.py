@@ -7,13 +7,14 @@ looks up its colour. `rasterise` does both and averages sub-pixels.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numba
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from primdiffusion.capture.soup import ALPHA_TEST, Soup, flatten
+from primdiffusion.capture.soup import ALPHA_TEST, Soup, flatten, gather_textures
 from primdiffusion.capture.views import OrthographicView
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb
@@ -62,10 +63,30 @@ def rasterise(mesh: TexturedMesh, view: Camera | OrthographicView, supersample: 
         UnusableMesh: see `flatten`.
         ValueError: `supersample` is less than 1.
     """
+    return rasterise_colourings([mesh], view, supersample)[0]
+
+
+def rasterise_colourings(
+    meshes: Sequence[TexturedMesh], view: Camera | OrthographicView, supersample: int = 1
+) -> list[Picture]:
+    """As `rasterise`, of meshes that differ only in the colours of their textures: triangles are drawn once.
+
+    Raises:
+        UnusableMesh: see `flatten`.
+        ValueError: `supersample` is less than 1.
+    """
     if supersample < 1:
         raise ValueError(f"supersample is {supersample}; it must be 1 or more.")
-    soup = flatten(mesh)
+    soup = flatten(meshes[0])
     fragments = draw(soup, _finer(view, supersample))
+    pictures = []
+    for mesh in meshes:
+        own = soup if mesh is meshes[0] else dataclasses.replace(soup, texels=gather_textures(mesh))
+        pictures.append(_picture(own, fragments, view, supersample))
+    return pictures
+
+
+def _picture(soup: Soup, fragments: Fragments, view: Camera | OrthographicView, supersample: int) -> Picture:
     rgb = shade(soup, fragments)
     distance = fragments.depth * _ray_lengths(view, supersample)
     part = np.where(fragments.face >= 0, soup.part[fragments.face], -1).astype(np.int32)

@@ -14,7 +14,7 @@ from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.primitives.primitives import Frames, Payload, S
 from primdiffusion.primitives.surface_points import carve, look_around, nearest, visible_points
 
-FULL_DENSITY = 100.0
+FULL_DENSITY = 200.0
 """Opacity per metre of solid matter; one over this is the depth at which solid matter hides what is behind it."""
 RAMP = 0.020
 """Depth below the surface at which density is full, metres. A ramp centred on the surface would fatten silhouettes."""

@@ -76,6 +76,18 @@ def count_samples(
     return SampleCount(inside_boxes=int(counts[0][:, 1].sum()), evaluated=int(counts[1][:, 0].sum()))
 
 
+def draw_with_ends(
+    primitives: Primitives, camera: Camera, settings: MarchSettings
+) -> tuple[Rendering, _View, Scene, Ends]:
+    """The picture without gradients, and what a derivative of it needs: boxes with empty cells, ends of the rays."""
+    view = _view(primitives.map(lambda tensor: tensor.detach()), camera, settings, None)
+    inputs = (primitives.rgb.float(), primitives.density.float(), view.to_local, view.offset, view.pixel_to_world)
+    ends = _ends(camera.width * camera.height)
+    fields = _draw(view, _scene(view, inputs, empty_cells=False), ends)
+    rendering = Rendering(*(field.unflatten(0, (camera.height, camera.width)) for field in fields))
+    return rendering, view, _scene(view, inputs, empty_cells=True), ends
+
+
 class _View(NamedTuple):
     """A scene without its payload, in float64; the tensors carry gradients to the records they came from."""
 

@@ -1,0 +1,349 @@
+"""The derivative of a picture by the voxels of its boxes, as a sparse matrix (SPEC 4); numba, float32, CPU.
+
+With the places where rays saturate held fixed, a picture is linear in colour and in density: a ray is the sum of its
+samples, and each sample is a trilinear mean of eight voxels. `linearise` stores those sums, merged over the samples
+that a ray takes in a box, so that products with the matrix and its transpose cost a fraction of a march.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Int16, Int32, Int64
+from numpy import ndarray
+
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render.compositing import Rendering
+from primdiffusion.render.cpu import draw_with_ends
+from primdiffusion.render.cpu_adjoint import steps_that_count
+from primdiffusion.render.cpu_compiled import index, kernel, part
+from primdiffusion.render.cpu_forward import NEVER
+from primdiffusion.render.cpu_hits import HIT_ROWS, LANES, TABLE_ROWS, hit_rays, lowest
+from primdiffusion.render.cpu_sampling import PIXELS, SAMPLES, place_samples, reference_point, tabulate, tile_rays
+from primdiffusion.render.lattice import MarchSettings
+from primdiffusion.render.tiles import TILE
+
+COLOUR, DENSITY, OPACITY = 0, 1, 4
+"""Columns of `PictureJacobian.weight`: of a voxel's colour, of its density for red, green and blue, and for alpha."""
+WEIGHTS = 5
+SHORTEST = 4e-5
+"""Metres of ray: voxels that a ray sees less of are left out. 0.8 % of opacity at a density of 200 per metre."""
+FIRST_ROOM = 2_000_000
+"""Entries that there is room for at first; a picture of 176 x 176 pixels of a person has about 1.5 million."""
+
+
+class PictureJacobian(NamedTuple):
+    """d(rgb, alpha) / d(colour, density) of one picture, row by row of segments: what a ray sees of a box."""
+
+    box_start: Int64[ndarray, "k+1"]
+    """First segment of each box."""
+    ray: Int32[ndarray, "segments"]
+    """The segment's pixel, row-major."""
+    start: Int64[ndarray, "segments+1"]
+    """First entry of each segment."""
+    voxel: Int16[ndarray, "entries"]
+    """Number of the voxel in its box, D, H, W."""
+    weight: Float32[ndarray, "entries 5"]
+    """See COLOUR, DENSITY and OPACITY."""
+    rays: int
+    """Pixels of the picture."""
+
+    @property
+    def voxels(self) -> int:
+        """Voxels of a box times boxes."""
+        return (len(self.box_start) - 1) * VOXELS
+
+
+VOXELS = 512
+"""Of a box; voxel numbers are 16 bits wide."""
+
+
+def linearise(
+    primitives: Primitives,
+    camera: Camera,
+    background: float,
+    settings: MarchSettings = MarchSettings(),  # noqa: B008
+) -> tuple[Rendering, PictureJacobian]:
+    """The picture that `march_cpu` draws over black, and its derivative when composited over a grey `background`.
+
+    `background` is linear. Boxes have 8^3 voxels. Raises ValueError as `march_reference` does, and for other boxes.
+    """
+    boxes, size = primitives.density.shape[0], primitives.density.shape[-1]
+    if size**3 != VOXELS:
+        raise ValueError(f"boxes of {size}^3 voxels cannot be linearised: give boxes of 8^3")
+    rendering, view, scene, ends = draw_with_ends(primitives, camera, settings)
+    saturates = ends.index != NEVER
+    share = np.where(saturates, ends.share, np.float32(1))
+    behind = np.where(saturates[:, None], ends.rgb, np.float32(background)).astype(np.float32)
+    density = primitives.density.detach().float().contiguous().numpy().reshape(boxes, VOXELS)
+    rgb = primitives.rgb.detach().float().contiguous().numpy().reshape(boxes, 3, VOXELS)
+    room = FIRST_ROOM
+    while True:
+        box_start = np.zeros(boxes + 1, np.int64)
+        ray, start = np.empty(room // 8, np.int32), np.empty(room // 8 + 1, np.int64)
+        voxel, weight = np.empty(room, np.int16), np.empty((room, WEIGHTS), np.float32)
+        segments, entries = _linearise(
+            box_start, ray, start, voxel, weight, density, rgb, ends.index, share, ends.box, behind, scene.boxes,
+            scene.size, scene.rectangle, view.limits, scene.pixel_to_world, view.width, view.height, view.spacing,
+        )  # fmt: skip
+        if segments >= 0:
+            break
+        room *= 2
+    start[segments] = entries
+    kept = (ray[:segments], start[: segments + 1], voxel[:entries], weight[:entries])
+    return rendering, PictureJacobian(box_start, *(array.copy() for array in kept), len(behind))
+
+
+def apply(
+    jacobian: PictureJacobian, change: Float32[ndarray, "v 4"], alpha_free: Float32[ndarray, "r"]
+) -> Float32[ndarray, "r 4"]:
+    """J x: how rgb and alpha of every pixel change with the voxels' colours and densities (1/m).
+
+    `alpha_free` is 1 where alpha follows density and 0 where the ray is opaque.
+    """
+    out = np.zeros((jacobian.rays, 4), np.float32)
+    _apply(jacobian.box_start, jacobian.ray, jacobian.start, jacobian.voxel, jacobian.weight, change, out)
+    out[:, 3] *= alpha_free
+    return out
+
+
+def add_transposed(
+    jacobian: PictureJacobian,
+    pixels: Float32[ndarray, "r 4"],
+    alpha_free: Float32[ndarray, "r"],
+    out: Float32[ndarray, "v 4"],
+) -> None:
+    """out += J^T y."""
+    freed = pixels.copy()
+    freed[:, 3] *= alpha_free
+    _add_transposed(jacobian.box_start, jacobian.ray, jacobian.start, jacobian.voxel, jacobian.weight, freed, out)
+
+
+def add_diagonal(
+    jacobian: PictureJacobian,
+    weight: Float32[ndarray, "r 4"],
+    alpha_free: Float32[ndarray, "r"],
+    out: Float32[ndarray, "v 4"],
+) -> None:
+    """out += diag(J^T W J), merged entries squared, for a diagonal W of the pixels' weights."""
+    freed = weight.copy()
+    freed[:, 3] *= alpha_free
+    _add_diagonal(jacobian.box_start, jacobian.ray, jacobian.start, jacobian.voxel, jacobian.weight, freed, out)
+
+
+class ColourMatrix(NamedTuple):
+    """The part of a `PictureJacobian` that colours need: exact, as opacity does not depend on colour."""
+
+    box_start: Int64[ndarray, "k+1"]
+    ray: Int32[ndarray, "segments"]
+    start: Int64[ndarray, "segments+1"]
+    voxel: Int16[ndarray, "entries"]
+    weight: Float32[ndarray, "entries"]
+    rays: int
+
+    @classmethod
+    def of(cls, jacobian: PictureJacobian) -> ColourMatrix:
+        """Shares all but the weights with the Jacobian."""
+        weight = np.ascontiguousarray(jacobian.weight[:, COLOUR])
+        return cls(jacobian.box_start, jacobian.ray, jacobian.start, jacobian.voxel, weight, jacobian.rays)
+
+    def apply(self, colours: Float32[ndarray, "v c"]) -> Float32[ndarray, "r c"]:
+        """A x of any number of columns, such as the red, green and blue of several colourings."""
+        out = np.zeros((self.rays, colours.shape[1]), np.float32)
+        _apply_colours(self.box_start, self.ray, self.start, self.voxel, self.weight, colours, out)
+        return out
+
+    def add_transposed(self, pixels: Float32[ndarray, "r c"], out: Float32[ndarray, "v c"]) -> None:
+        """out += A^T y."""
+        _add_colours_transposed(self.box_start, self.ray, self.start, self.voxel, self.weight, pixels, out)
+
+    def add_diagonal(self, weight: Float32[ndarray, "r c"], out: Float32[ndarray, "v c"]) -> None:
+        """out += diag(A^T W A)."""
+        squared = self.weight * self.weight
+        _add_colours_transposed(self.box_start, self.ray, self.start, self.voxel, squared, weight, out)
+
+
+@kernel
+def _linearise(
+    box_start, ray_of, start, voxel, weight, density, rgb, ends, shares, last_box, behind, boxes, size, rectangle,
+    limits, pixel_to_world, width, height, spacing,
+):  # fmt: skip
+    """Fills the matrix; numbers of segments and entries, or -1 where there is no room for them."""
+    rays = np.empty(3 * PIXELS, np.float32)
+    table = np.empty(LANES * TABLE_ROWS, np.float32)
+    hits = np.empty(HIT_ROWS * LANES, np.float32)
+    block = np.empty(8 * SAMPLES, np.float32)
+    sums = np.zeros((VOXELS, WEIGHTS), np.float32)
+    touched = np.empty(VOXELS, np.int64)
+    seen = np.zeros(VOXELS, np.bool_)
+    segments, entries = 0, 0
+    for k in range(len(rectangle)):
+        box_start[k] = segments
+        if rectangle[k, 0] > rectangle[k, 1]:
+            continue
+        stride = boxes.stride[k]
+        step = stride * spacing
+        length = np.float32(step)
+        for tile_row in range(rectangle[k, 2], rectangle[k, 3] + 1):
+            for tile_column in range(rectangle[k, 0], rectangle[k, 1] + 1):
+                row0, column0 = tile_row * TILE, tile_column * TILE
+                middle = tile_rays(rays, pixel_to_world, row0, column0)
+                reference = reference_point(boxes, k, middle, spacing)
+                tabulate(table, 0, boxes, k, middle, reference, spacing)
+                for begin in range(0, PIXELS, LANES):
+                    hit = hit_rays(hits, table, rays, begin, PIXELS)
+                    while hit != 0:
+                        j = index(lowest(hit))
+                        hit &= hit - 1
+                        row, column = row0 + (begin + j) // TILE, column0 + (begin + j) % TILE
+                        if row >= height or column >= width:
+                            continue
+                        ray = row * width + column
+                        enter, leave = steps_that_count(
+                            hits, j, reference, stride, limits, index(ray), ends[ray], k, last_box[ray]
+                        )
+                        if enter > leave:
+                            continue
+                        share = shares[ray] if reference + leave * stride == ends[ray] else np.float32(1)
+                        count = _merge_segment(
+                            sums, touched, seen, density[k], rgb[k], behind[ray], block, hits, j, enter, leave, size,
+                            length, share,
+                        )  # fmt: skip
+                        if entries + count > len(voxel) or segments + 1 >= len(ray_of):
+                            return -1, -1
+                        first = entries
+                        for i in range(count):
+                            v = touched[i]
+                            seen[v] = False
+                            if sums[v, OPACITY] > SHORTEST:
+                                voxel[entries] = v
+                                for column_of_weight in range(WEIGHTS):
+                                    weight[entries, column_of_weight] = sums[v, column_of_weight]
+                                entries += 1
+                            for column_of_weight in range(WEIGHTS):
+                                sums[v, column_of_weight] = 0
+                        if entries > first:
+                            ray_of[segments], start[segments] = ray, first
+                            segments += 1
+    box_start[len(rectangle)] = segments
+    return segments, entries
+
+
+@part()
+def _merge_segment(sums, touched, seen, density, rgb, behind, block, hits, lane, enter, leave, size, length, share):
+    """Adds the samples of a ray in a box to `sums`; how many voxels they touch, which `touched` lists."""
+    count, slab = 0, size * size
+    for begin in range(enter, leave + 1, SAMPLES):
+        place_samples(block, hits, lane, np.float32(begin), size, length)
+        samples = min(SAMPLES, leave + 1 - begin)
+        if begin + samples > leave:
+            block[6 * SAMPLES + samples - 1] *= share
+        for s in range(samples):
+            opacity = block[6 * SAMPLES + s]  # at a density of 1 per metre
+            if opacity < np.float32(2e-5):
+                continue
+            corner = np.int64(block[7 * SAMPLES + s])
+            near, far = block[4 * SAMPLES + s], block[5 * SAMPLES + s]
+            d, r, g, b = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+            for edge in range(4):
+                v = corner + (edge & 1) * size + (edge >> 1) * slab
+                w0, w1 = block[edge * SAMPLES + s] * near, block[edge * SAMPLES + s] * far
+                d += w0 * density[v] + w1 * density[v + 1]
+                r += w0 * rgb[0, v] + w1 * rgb[0, v + 1]
+                g += w0 * rgb[1, v] + w1 * rgb[1, v + 1]
+                b += w0 * rgb[2, v] + w1 * rgb[2, v + 1]
+            r, g, b = r - behind[0], g - behind[1], b - behind[2]
+            for edge in range(4):
+                first = corner + (edge & 1) * size + (edge >> 1) * slab
+                for end in range(2):
+                    v = first + end
+                    w = block[edge * SAMPLES + s] * (far if end else near) * opacity
+                    if not seen[v]:
+                        seen[v] = True
+                        touched[count] = v
+                        count += 1
+                    sums[v, 0] += w * d
+                    sums[v, 1] += w * r
+                    sums[v, 2] += w * g
+                    sums[v, 3] += w * b
+                    sums[v, 4] += w
+    return count
+
+
+@kernel
+def _apply(box_start, ray, start, voxel, weight, x, out):
+    for k in range(len(box_start) - 1):
+        base = k * VOXELS
+        for segment in range(box_start[k], box_start[k + 1]):
+            r, g, b, a = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+            for entry in range(start[segment], start[segment + 1]):
+                v = base + np.int64(voxel[entry])
+                w, d = weight[entry, 0], x[v, 3]
+                r += w * x[v, 0] + weight[entry, 1] * d
+                g += w * x[v, 1] + weight[entry, 2] * d
+                b += w * x[v, 2] + weight[entry, 3] * d
+                a += weight[entry, 4] * d
+            i = ray[segment]
+            out[i, 0] += r
+            out[i, 1] += g
+            out[i, 2] += b
+            out[i, 3] += a
+
+
+@kernel
+def _add_transposed(box_start, ray, start, voxel, weight, y, out):
+    for k in range(len(box_start) - 1):
+        base = k * VOXELS
+        for segment in range(box_start[k], box_start[k + 1]):
+            i = ray[segment]
+            r, g, b, a = y[i, 0], y[i, 1], y[i, 2], y[i, 3]
+            for entry in range(start[segment], start[segment + 1]):
+                v = base + np.int64(voxel[entry])
+                w = weight[entry, 0]
+                out[v, 0] += w * r
+                out[v, 1] += w * g
+                out[v, 2] += w * b
+                out[v, 3] += weight[entry, 1] * r + weight[entry, 2] * g + weight[entry, 3] * b + weight[entry, 4] * a
+
+
+@kernel
+def _add_diagonal(box_start, ray, start, voxel, weight, y, out):
+    for k in range(len(box_start) - 1):
+        base = k * VOXELS
+        for segment in range(box_start[k], box_start[k + 1]):
+            i = ray[segment]
+            for entry in range(start[segment], start[segment + 1]):
+                v = base + np.int64(voxel[entry])
+                w = weight[entry, 0] * weight[entry, 0]
+                for channel in range(3):
+                    out[v, channel] += w * y[i, channel]
+                    out[v, 3] += weight[entry, 1 + channel] * weight[entry, 1 + channel] * y[i, channel]
+                out[v, 3] += weight[entry, 4] * weight[entry, 4] * y[i, 3]
+
+
+@kernel
+def _apply_colours(box_start, ray, start, voxel, weight, x, out):
+    columns = x.shape[1]
+    for k in range(len(box_start) - 1):
+        base = k * VOXELS
+        for segment in range(box_start[k], box_start[k + 1]):
+            row = out[ray[segment]]
+            for entry in range(start[segment], start[segment + 1]):
+                w, colours = weight[entry], x[base + np.int64(voxel[entry])]
+                for column in range(columns):
+                    row[column] += w * colours[column]
+
+
+@kernel
+def _add_colours_transposed(box_start, ray, start, voxel, weight, y, out):
+    columns = y.shape[1]
+    for k in range(len(box_start) - 1):
+        base = k * VOXELS
+        for segment in range(box_start[k], box_start[k + 1]):
+            pixel = y[ray[segment]]
+            for entry in range(start[segment], start[segment + 1]):
+                w, colours = weight[entry], out[base + np.int64(voxel[entry])]
+                for column in range(columns):
+                    colours[column] += w * pixel[column]
