@@ -12,15 +12,23 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+import torch
+from primdiffusion.capture.rasterise import rasterise
+from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.people import assets as assets_module
+from primdiffusion.people import fitted as fitted_module
 from primdiffusion.people import load_base_mesh, make_person, open_assets, recolour
 from primdiffusion.people import person as person_module
 from primdiffusion.people.assets import ENVIRONMENT_VARIABLE, AssetsMissingError
+from primdiffusion.people.fitted import fitted_payloads, orbit_camera
 from primdiffusion.people.fitting import shown_faces, under_hat, under_hem
 from primdiffusion.people.mhclo import parse_mhclo
-from primdiffusion.people.payloads import is_complete, make_payloads
+from primdiffusion.people.payloads import is_complete, make_payloads, rest_frames
 from primdiffusion.people.skin import SkinColours, skin_texture
 from primdiffusion.people.wardrobe import HAIR, HATS, OUTFITS, choose, draw_body, required_meshes
+from primdiffusion.primitives.from_mesh import FULL_DENSITY, from_mesh
+from primdiffusion.primitives.primitives import Payload, Primitives
+from primdiffusion.render.march import march
 
 NEARBY = Path(__file__).resolve().parents[3] / "shared" / "data" / "makehuman"
 SEEDS = range(6)
@@ -218,25 +226,56 @@ def test_skins_darken_steadily_with_tone_for_both_sexes(assets):
 
 def test_payloads_are_stored_whole_and_mended(assets, tmp_path):
     reports = []
-    (path,) = make_payloads(assets, tmp_path, 1, 2, 3, 1, lambda done, total: reports.append((done, total)))
+    (path,) = make_payloads(
+        assets, tmp_path, 1, 2, 3, 1, "from_mesh", lambda done, total: reports.append((done, total))
+    )
     assert reports == [(0, 1), (1, 1)]
     with np.load(path, allow_pickle=False) as file:
         voxels, attributes = file["voxels"], json.loads(str(file["attributes"]))
-        assert float(file["full_density"]) == 100
+        assert float(file["full_density"]) == FULL_DENSITY
     assert voxels.shape == (2, 1024, 8, 8, 8, 4)
     assert np.array_equal(voxels[0, ..., 3], voxels[1, ..., 3])
     assert not np.array_equal(voxels[0], voxels[1])
     assert 0.1 < (voxels[0, ..., 3] > 0).mean() < 0.9
     assert len(attributes["variants"]) == 2
-    assert is_complete(path, 2, 3)
-    assert not is_complete(path, 3, 3)
+    assert is_complete(path, 2, 3, "from_mesh")
+    assert not is_complete(path, 3, 3, "from_mesh")
+    assert not is_complete(path, 2, 3, "fitted")
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    assert not is_complete(path, 2, 3)
-    make_payloads(assets, tmp_path, 1, 2, 3, 1)
+    assert not is_complete(path, 2, 3, "from_mesh")
+    make_payloads(assets, tmp_path, 1, 2, 3, 1, "from_mesh")
     with np.load(path, allow_pickle=False) as file:
         assert np.array_equal(file["voxels"], voxels)
     assert [entry.name for entry in tmp_path.iterdir()] == ["person_000003.npz"]
+
+
+def test_fitted_payloads_look_more_like_the_mesh_in_each_colouring_from_sides_that_were_not_shown(
+    assets, people, monkeypatch
+):
+    monkeypatch.setattr(fitted_module, "BODY_VIEWS", 8)
+    monkeypatch.setattr(fitted_module, "HEAD_VIEWS", 6)
+    colourings = [people[0].mesh, recolour(people[0], 77).mesh]
+    frames = rest_frames(people[0].betas)
+    low, high = people[0].mesh.bounds
+    views = {
+        "body": orbit_camera((low + high) / 2, 1.1 * float((high - low).max()), 33, 3, 0.5, 256),
+        "head": orbit_camera(fitted_module.head_centre(people[0].betas), 0.42, 21, 5, 0.2, 128),
+    }
+
+    def psnr(payload: Payload, mesh, view: str) -> float:
+        drawn, true = march(Primitives.place(frames, payload), views[view]), rasterise(mesh, views[view], 3)
+        over_grey = [
+            encode_srgb(np.clip(rgb + (1 - alpha[..., None]) * 0.2, 0, 1))
+            for rgb, alpha in ((drawn.rgb.numpy(), drawn.alpha.numpy()), (true.rgb, true.alpha))
+        ]
+        return float(-10 * np.log10(np.square(over_grey[0] - over_grey[1]).mean()))
+
+    payloads = fitted_payloads(colourings, frames, people[0].betas)
+    assert torch.equal(payloads[0].density, payloads[1].density)
+    for payload, mesh in zip(payloads, colourings, strict=True):
+        for view, gain in (("body", 1.5), ("head", 1.0)):
+            assert psnr(payload, mesh, view) > psnr(from_mesh(mesh, frames), mesh, view) + gain, view
 
 
 def test_counts_that_make_nothing_are_refused(tmp_path):
@@ -252,9 +291,11 @@ def test_person_is_frozen(people):
 @pytest.mark.slow
 def test_processes_make_the_same_files_as_one(assets, tmp_path):
     environment = dict(os.environ)
-    alone = make_payloads(assets, tmp_path / "one", 3, 1, 11, 1)
+    alone = make_payloads(assets, tmp_path / "one", 3, 1, 11, 1, "from_mesh")
     reports = []
-    together = make_payloads(assets, tmp_path / "two", 3, 1, 11, 2, lambda done, total: reports.append(done))
+    together = make_payloads(
+        assets, tmp_path / "two", 3, 1, 11, 2, "from_mesh", lambda done, total: reports.append(done)
+    )
     assert [path.name for path in together] == [path.name for path in alone]
     assert reports[0] == 0
     assert reports[-1] == 3
@@ -267,7 +308,7 @@ def test_processes_make_the_same_files_as_one(assets, tmp_path):
 @pytest.mark.slow
 def test_workers_end_when_the_command_is_killed(assets, tmp_path):
     command = [sys.executable, "-m", "primdiffusion.cli", "payloads", "--assets", str(assets.root)]
-    options = ["--out", str(tmp_path), "--count", "50", "--workers", "2"]
+    options = ["--out", str(tmp_path), "--count", "50", "--workers", "2", "--making", "from_mesh"]
     process = subprocess.Popen([*command, *options], stdout=subprocess.DEVNULL)
     try:
         assert _within(60, lambda: any(tmp_path.glob("*.npz")))

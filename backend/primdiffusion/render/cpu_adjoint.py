@@ -152,9 +152,7 @@ def _adjoin_box(
                     if row >= height or column >= width:
                         continue
                     ray = index(row * width + column)
-                    enter, leave = steps_that_count(
-                        hits, j, reference, stride, limits, ray, ends[ray], k, last_box[ray]
-                    )
+                    enter, leave = counted_steps(hits, j, reference, stride, limits, ray, ends[ray], k, last_box[ray])
                     if enter > leave:
                         continue
                     share = np.float32(1)
@@ -181,7 +179,7 @@ def _adjoin_box(
 
 
 @part(inline=True)
-def steps_that_count(hits, lane, reference, stride, limits, ray, end, k, last_box):
+def counted_steps(hits, lane, reference, stride, limits, ray, end, k, last_box):
     """First and last step, from the reference point, of a ray in box k that count."""
     enter, leave = np.int64(hits[ENTER * LANES + lane]), np.int64(hits[LEAVE * LANES + lane])
     last = end if k <= last_box else end - 1

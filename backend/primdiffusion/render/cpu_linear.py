@@ -17,7 +17,7 @@ from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu import draw_with_ends
-from primdiffusion.render.cpu_adjoint import steps_that_count
+from primdiffusion.render.cpu_adjoint import counted_steps
 from primdiffusion.render.cpu_compiled import index, kernel, part
 from primdiffusion.render.cpu_forward import NEVER
 from primdiffusion.render.cpu_hits import HIT_ROWS, LANES, TABLE_ROWS, hit_rays, lowest
@@ -201,7 +201,7 @@ def _linearise(
                         if row >= height or column >= width:
                             continue
                         ray = row * width + column
-                        enter, leave = steps_that_count(
+                        enter, leave = counted_steps(
                             hits, j, reference, stride, limits, index(ray), ends[ray], k, last_box[ray]
                         )
                         if enter > leave:

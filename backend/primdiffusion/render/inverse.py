@@ -2,13 +2,13 @@
 
 Minimises over the voxels z = (sRGB-encoded colour, density / full density), with boxes held where they are,
 
-    sum over pictures and pixels of  w |J (z - z_0) - r|^2  +  pull |z - z_start|^2  +  smoothness |grad (z - z_start)|^2
+    sum over pixels of w |J (z - z_0) - r|^2  +  pull |z - z_start|^2  +  smoothness |grad (z - z_start)|^2
 
 where r is what the picture of z_0 lacks and J its derivative (`cpu_linear`), both in encoded colours: dark and bright
-people are alike. The slope of the encoding is held at the target's pixels and at the start's voxels. A step marches all pictures, stores J and
-solves by a few iterations of conjugate gradients; stopping early and the two penalties keep out what the pictures do
-not show, so that other pictures of the same person give nearly the same voxels. The same input gives the same bits on
-the same machine.
+people are alike. The slope of the encoding is held at the target's pixels and at the start's voxels. A step marches all
+pictures, stores J and solves by a few iterations of conjugate gradients; stopping early and the two penalties keep out
+what the pictures do not show, so that other pictures of the same person give nearly the same voxels. The same input
+gives the same bits on the same machine.
 """
 
 from __future__ import annotations
@@ -238,7 +238,7 @@ def conjugate_gradients(curvature, penalty: _Penalty, gradient: ndarray, iterati
     """A few iterations of Jacobi-preconditioned conjugate gradients for (curvature + penalty) x = gradient."""
     settings, unit = penalty.settings, penalty.unit
     own = settings.pull + 6 * settings.smoothness
-    inverse = np.where(penalty.held, 0, 1 / (penalty.diagonal + unit * own))
+    inverse = np.where(penalty.held, 0, 1 / np.maximum(penalty.diagonal + unit * own, 1e-30))
     inverse = inverse.astype(np.float32)
     residual = np.where(penalty.held, 0, gradient).astype(np.float32)
     x = np.zeros_like(residual)

@@ -1,0 +1,132 @@
+"""Fitting voxels to pictures: it recovers what pictures show, leaves the rest alone and repeats."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.people.fitted import orbit_camera
+from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.render.cpu import march_cpu
+from primdiffusion.render.inverse import InverseSettings, Target, fit_colours, fit_payload
+
+FULL = 200.0
+SIDE = 3
+"""Boxes along a side of the sheet that is fitted."""
+
+
+def sheet_frames() -> Frames:
+    """Boxes side by side that overlap, all facing +z."""
+    line = (torch.arange(SIDE) - (SIDE - 1) / 2) * 0.05
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    position = torch.stack([x.flatten(), y.flatten(), torch.zeros(SIDE**2)], dim=-1)
+    return Frames(position, torch.eye(3).expand(SIDE**2, 3, 3).clone(), torch.full((SIDE**2, 3), 0.045))
+
+
+def random_payload(seed: int, smooth: bool = False) -> Payload:
+    generator = torch.Generator().manual_seed(seed)
+    rgb = torch.rand(SIDE**2, 3, 8, 8, 8, generator=generator)
+    density = FULL * torch.rand(SIDE**2, 8, 8, 8, generator=generator)
+    if smooth:
+        rgb, density = torch.full_like(rgb, 0.5), torch.full_like(density, FULL / 2)
+    return Payload(rgb, density, torch.ones(SIDE**2, 3))
+
+
+def cameras(count: int, turn: float = 0.0, size: int = 32) -> list[Camera]:
+    return [
+        orbit_camera(np.zeros(3), 0.3, 360 * (i + turn) / count, 25 * math.sin(3 * i), math.radians(20), size)
+        for i in range(count)
+    ]
+
+
+def pictures(payload: Payload, views: list[Camera]) -> list[Target]:
+    targets = []
+    for camera in views:
+        drawn = march_cpu(Primitives.place(sheet_frames(), payload), camera)
+        targets.append(Target(sheet_frames(), camera, torch.cat([drawn.rgb, drawn.alpha[..., None]], -1).numpy()))
+    return targets
+
+
+def error(payload: Payload, targets: list[Target]) -> float:
+    """Mean square error of colours over black and alpha."""
+    squares = []
+    for target in targets:
+        drawn = march_cpu(Primitives.place(target.frames, payload), target.camera)
+        squares.append(np.square(torch.cat([drawn.rgb, drawn.alpha[..., None]], -1).numpy() - target.rgba).mean())
+    return float(np.mean(squares))
+
+
+def test_pictures_that_were_not_shown_come_nearer():
+    true, start = random_payload(1), random_payload(1, smooth=True)
+    fitted = fit_payload(start, pictures(true, cameras(16)), FULL)
+    unseen = pictures(true, cameras(5, turn=0.37))
+    assert error(fitted, unseen) < 0.1 * error(start, unseen)
+
+
+def test_fitted_values_are_bounded():
+    fitted = fit_payload(random_payload(2, smooth=True), pictures(random_payload(3), cameras(6)), FULL)
+    assert fitted.rgb.min() >= 0
+    assert fitted.rgb.max() <= 1
+    assert fitted.density.min() >= 0
+    assert fitted.density.max() <= FULL
+    assert torch.equal(fitted.delta_scale, torch.ones(SIDE**2, 3))
+
+
+def test_boxes_that_no_picture_shows_stay_as_they_were():
+    start = random_payload(4)
+    away = dataclasses.replace(sheet_frames(), position=sheet_frames().position + torch.tensor([0.0, 0.0, 50.0]))
+    hidden = [dataclasses.replace(target, frames=away) for target in pictures(random_payload(5), cameras(3))]
+    fitted = fit_payload(start, hidden, FULL)
+    torch.testing.assert_close(fitted.rgb, start.rgb)
+    torch.testing.assert_close(fitted.density, start.density)
+
+
+def test_the_same_pictures_give_the_same_bits():
+    start, targets = random_payload(6, smooth=True), pictures(random_payload(7), cameras(6))
+    first, second = fit_payload(start, targets, FULL), fit_payload(start, targets, FULL)
+    assert torch.equal(first.rgb, second.rgb)
+    assert torch.equal(first.density, second.density)
+
+
+def test_pull_and_smoothness_hold_the_voxels_back():
+    start, targets = random_payload(8, smooth=True), pictures(random_payload(9), cameras(8))
+
+    def moved(**settings: float) -> float:
+        return float((fit_payload(start, targets, FULL, InverseSettings(**settings)).rgb - start.rgb).norm())
+
+    free = moved(pull=0.0, smoothness=0.0)
+    assert moved(pull=10.0, smoothness=0.0) < 0.5 * free
+    assert moved(pull=0.0, smoothness=10.0) < 0.8 * free
+
+
+def test_colours_of_several_are_those_of_each_alone_and_keep_the_density():
+    density = random_payload(10)
+    truths = [dataclasses.replace(density, rgb=random_payload(seed).rgb) for seed in (11, 12)]
+    start = dataclasses.replace(density, rgb=torch.full_like(density.rgb, 0.5))
+    targets = [pictures(true, cameras(12)) for true in truths]
+    together = fit_colours([start, start], density, targets)
+    for fitted, true in zip(together, truths, strict=True):
+        assert torch.equal(fitted.density, density.density)
+        unseen = pictures(true, cameras(4, turn=0.37))
+        assert error(fitted, unseen) < 0.2 * error(start, unseen)
+    alone = fit_colours([start], density, targets[1:])[0]
+    unseen = pictures(truths[1], cameras(4, turn=0.37))
+    assert error(together[1], unseen) == pytest.approx(error(alone, unseen), rel=0.25)
+
+
+def test_input_that_cannot_be_fitted_is_named():
+    start, targets = random_payload(1), pictures(random_payload(1), cameras(1))
+    with pytest.raises(ValueError, match="at least one target"):
+        fit_payload(start, [], FULL)
+    with pytest.raises(ValueError, match="not finite"):
+        dataclasses.replace(targets[0], rgba=targets[0].rgba * np.nan)
+    with pytest.raises(ValueError, match="does not fit its camera"):
+        dataclasses.replace(targets[0], rgba=targets[0].rgba[1:])
+    with pytest.raises(ValueError, match="one person"):
+        fit_payload(start.map(lambda field: field[None]), targets, FULL)
+    with pytest.raises(ValueError, match="same cameras"):
+        fit_colours([start, start], start, [targets, targets * 2])
+    with pytest.raises(ValueError, match="steps is 0"):
+        InverseSettings(steps=0)
