@@ -1,11 +1,13 @@
+import dataclasses
 import hashlib
 import json
 
 import pytest
 import torch
 from diffusion_people import VOCABULARY, small_model
+from primdiffusion.diffusion.codec import DEAD_ZONE, VALUES
 from primdiffusion.diffusion.model import DiffusionModel, WholeSlab, sample
-from primdiffusion.diffusion.schedule import linear
+from primdiffusion.diffusion.schedule import dense_steps, linear, trailing_steps
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.training.checkpoint import (
     CheckpointError,
@@ -45,6 +47,25 @@ def test_a_saved_model_generates_the_same_people(path):
     again = path.with_name("again.safetensors")
     save_checkpoint(again, loaded, "linear")
     assert torch.equal(load_checkpoint(again).denoise(x, t), loaded.denoise(x, t))
+
+
+def test_the_steps_that_a_model_is_sampled_in_are_part_of_it(path):
+    assert load_checkpoint(path).chain is trailing_steps
+    save_checkpoint(path, dataclasses.replace(small_model(), chain=dense_steps), "linear")
+    assert load_checkpoint(path).chain is dense_steps
+    rewrite(path, change_metadata=lambda m: {**m, "architecture": without(m["architecture"], "chain")})
+    assert load_checkpoint(path).chain is trailing_steps
+
+
+def test_a_codec_of_before_weights_is_read_as_it_was(path):
+    rewrite(path, lambda t: {k: v for k, v in t.items() if k not in ("codec.weight", "codec.dead_zone")})
+    codec = load_checkpoint(path).codec.codec
+    assert torch.equal(codec.weight, torch.ones(VALUES))
+    assert codec.dead_zone.tolist() == pytest.approx(DEAD_ZONE)
+
+
+def without(tree: str, key: str) -> str:
+    return json.dumps({k: v for k, v in json.loads(tree).items() if k != key})
 
 
 def test_no_temporary_file_is_left(path):

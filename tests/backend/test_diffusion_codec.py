@@ -61,7 +61,10 @@ def test_latents_are_in_the_units_of_the_slab(codec, cells):
     again = torch.stack([cells_from_payload(payload, 100.0) for payload in payloads])
     latents = codec.encode(again)
     moved = (slabs[0] - slabs[1]).square().sum().sqrt()
-    assert (latents[0] - latents[1]).square().sum().sqrt().item() == pytest.approx(moved.item(), rel=0.01)
+    difference = SLAB_UNIT * (again[0] - again[1])
+    assert difference.norm().item() == pytest.approx(moved.item(), rel=0.01)
+    weighted = (codec.weight * difference).norm().item()
+    assert (latents[0] - latents[1]).norm().item() == pytest.approx(weighted, rel=0.01)
     assert pytest.approx(0.364) == SLAB_UNIT
 
 

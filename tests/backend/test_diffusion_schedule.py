@@ -7,6 +7,8 @@ from diffusers import DDPMScheduler
 from diffusers.schedulers.scheduling_ddim import rescale_zero_terminal_snr
 from primdiffusion.diffusion.schedule import (
     CLEAN,
+    dense_steps,
+    fine_linear,
     leading_steps,
     linear,
     sqrt_linear,
@@ -76,10 +78,33 @@ def test_trailing_steps_begin_at_the_end_and_leading_steps_are_the_released_ones
     assert np.all(np.diff(trailing_steps(1000, 30)) < 0)
 
 
+@pytest.mark.parametrize("steps", [1, 2, 7, 30, 100, 997, 1000])
+def test_dense_steps_fall_from_the_end_and_lie_closer_the_lower(steps):
+    chain = dense_steps(1000, steps)
+    assert len(chain) == steps
+    assert chain[0] == 999
+    gaps = -np.diff(chain)
+    assert (gaps > 0).all()
+    assert chain[-1] >= 0
+    if steps == 30:
+        assert chain[-1] == 0
+        assert sum(t < 20 for t in chain) >= 6 > sum(t < 20 for t in trailing_steps(1000, 30))
+        assert gaps[0] > 10 * gaps[-1]
+
+
+def test_the_fine_schedule_ends_as_the_paper_s_and_begins_with_less_noise():
+    fine, paper = fine_linear(), linear()
+    assert fine.noise(0) < 0.2 * paper.noise(0)
+    assert fine.signal(999) == pytest.approx(paper.signal(999), rel=0.1)
+    assert bool((fine.alpha_bar.diff() < 0).all())
+
+
 @pytest.mark.parametrize("steps", [0, 1001, -3])
 def test_impossible_numbers_of_steps_are_refused(steps):
     with pytest.raises(ValueError, match=str(steps)):
         trailing_steps(1000, steps)
+    with pytest.raises(ValueError, match=str(steps)):
+        dense_steps(1000, steps)
 
 
 def test_steps_forward_and_noise_of_a_clean_sample_are_refused():

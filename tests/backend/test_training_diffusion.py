@@ -10,7 +10,8 @@ from diffuse_runs import settings
 from diffusion_people import write_people
 from primdiffusion.diffusion.codec import mirror_cells
 from primdiffusion.diffusion.conditioning import Vocabulary
-from primdiffusion.diffusion.schedule import linear, sqrt_linear
+from primdiffusion.diffusion.schedule import fine_linear, linear, sqrt_linear
+from primdiffusion.primitives.primitives import GRID
 from primdiffusion.training.cells import CellTrainee, prepare
 from primdiffusion.training.config import PhaseConfig, PriorConfig, check_resumable, to_json
 from primdiffusion.training.interrupt import Interrupt
@@ -21,9 +22,11 @@ from primdiffusion.training.losses import (
     closed_form,
     level_weight,
     objective,
+    random_steps,
     weighted_error,
     x0_errors,
 )
+from primdiffusion.training.prior import fit_prior
 from primdiffusion.training.shards import open_people
 from primdiffusion.training.state import TrainingState, learning_rate_factor
 from primdiffusion.training.stored_people import find_people, read_person
@@ -178,6 +181,30 @@ def test_a_network_that_knows_more_has_less_error(prepared_once):
     for level in (300, 900):
         assert errors["gaussian"][level] < errors["nothing"][level]
     assert errors["gaussian"][300] < errors["gaussian"][900]
+
+
+def test_log_uniform_levels_are_even_in_the_logarithm_of_noise_over_signal():
+    schedule = fine_linear()
+    t = random_steps(schedule, 20_000, torch.Generator().manual_seed(0), "log_uniform")
+    ratio = (schedule.half_log_snr(0) - torch.tensor([schedule.half_log_snr(int(one)) for one in t])) / (
+        schedule.half_log_snr(0) - schedule.half_log_snr(999)
+    )
+    assert torch.histc(ratio.float(), 8, 0, 1).min() > 0.1 * len(t)
+    even = random_steps(schedule, 20_000, torch.Generator().manual_seed(0))
+    assert (t < 50).float().mean() > 6 * (even < 50).float().mean()
+
+
+def test_person_components_live_in_the_leading_channels_alone(prepared_once):
+    config, prepared = prepared_once
+    z = prepared.train.latents[:8].float()
+    prior = fit_prior(
+        prepared.train, prepared.codec, prepared.vocabulary, dataclasses.replace(config.prior, channels=2)
+    )
+    assert prior.basis.shape[1] == 2 * GRID * GRID
+    coefficients, rest = prior.split(z)
+    assert torch.equal(rest[:, 2:], z[:, 2:] - prior.mean[2:])
+    assert torch.allclose(prior.join(coefficients, rest), z, atol=1e-4)
+    assert (prior.split(prior.join(coefficients, torch.zeros_like(rest)))[0] - coefficients).abs().max() < 1e-3
 
 
 def test_blends_stay_within_a_geometry_and_keep_the_variance():

@@ -9,6 +9,7 @@ these two layers fixed. The slab repeats a delta scale over 8^3 voxels; here it 
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import torch
 from jaxtyping import Float, UInt8
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
-from primdiffusion.primitives.primitives import GRID, K, Payload, S
+from primdiffusion.primitives.primitives import GRID, WINDOW_POWER, WINDOW_SHARPNESS, K, Payload, S
 from primdiffusion.primitives.slab import DELTA_SCALE_UNIT, NETWORK_SCALE
 
 VOXEL_VALUES = 4 * S**3
@@ -27,12 +28,17 @@ SCALE_VALUE = S**1.5 * DELTA_SCALE_UNIT / 255
 SLAB_UNIT = 2 * NETWORK_SCALE
 """Network units per value: noise on latents is the noise that the paper puts on the slab."""
 DEAD_ZONE = (0.08, 0.84)
-"""Decoded relative density a becomes clip((a - 0.08) / 0.84): what truncation leaves around a person is not haze."""
+"""Decoded relative density a becomes clip((a - start) / width): what truncation leaves around a person is not haze.
+These are of codecs that state no other: of payloads from meshes, at 96 numbers a primitive."""
+FITTED_DEAD_ZONE = (0.03, 0.94)
+"""Of codecs of fitted payloads, whose densities are exact enough for silhouettes."""
+LEAST_WEIGHT = 0.1
+"""Of a voxel in a corner of its box, which the window all but hides."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LinearCodec(TensorRecord):
-    """Cells [*b, 1024, 2051] to latents [*b, C, 32, 32] and back: z = 0.364 basis (v - mean), in the slab's units."""
+    """Cells [*b, 1024, 2051] to latents [*b, C, 32, 32] and back: z = 0.364 basis weight (v - mean), in slab units."""
 
     mean: Float[Tensor, "k v"]
     """Mean values of every primitive; equal to its own mirror image."""
@@ -40,19 +46,26 @@ class LinearCodec(TensorRecord):
     """Orthonormal rows, each even or odd under the mirror of a cell."""
     parity: Float[Tensor, "c"]
     """1 for even rows, -1 for odd ones."""
+    weight: Float[Tensor, "v"] = dataclasses.field(default_factory=lambda: torch.ones(VALUES))
+    """How much of a value pictures show; equal to its own mirror image."""
+    dead_zone: Float[Tensor, "2"] = dataclasses.field(default_factory=lambda: torch.tensor(DEAD_ZONE))
+    """Start and width, see DEAD_ZONE."""
 
     def encode(self, cells: Float[Tensor, "*b k v"]) -> Float[Tensor, "*b c 32 32"]:
         """Latents of cells; loses what lies outside the basis."""
-        latents = (cells - self.mean) @ self.basis.T * SLAB_UNIT
+        latents = (cells - self.mean) @ (self.basis * self.weight).T * SLAB_UNIT
         return latents.transpose(-1, -2).unflatten(-1, (GRID, GRID))
 
     def decode(self, latents: Float[Tensor, "*b c 32 32"]) -> Float[Tensor, "*b k v"]:
         """Cells of latents, unclamped."""
-        return latents.flatten(-2).transpose(-1, -2) @ self.basis / SLAB_UNIT + self.mean
+        return latents.flatten(-2).transpose(-1, -2) @ (self.basis / self.weight) / SLAB_UNIT + self.mean
 
     def mirror(self, latents: Float[Tensor, "*b c 32 32"]) -> Float[Tensor, "*b c 32 32"]:
-        """The person seen in a mirror: columns reversed, each cell reversed along W (the layout is symmetric)."""
-        return latents.flip(-1) * self.parity[:, None, None]
+        """The person seen in a mirror: columns reversed, each cell reversed along W (the layout is symmetric).
+
+        Also of the leading channels alone.
+        """
+        return latents.flip(-1) * self.parity[: latents.shape[-3], None, None]
 
 
 def cells_from_voxels(
@@ -64,21 +77,25 @@ def cells_from_voxels(
     return torch.cat([values, scale * SCALE_VALUE], dim=-1)
 
 
-def cells_from_payload(payload: Payload, full_density: float) -> Float[Tensor, "*b k v"]:
+def cells_from_payload(
+    payload: Payload, full_density: float, dead_zone: tuple[float, float] = DEAD_ZONE
+) -> Float[Tensor, "*b k v"]:
     """What `payload_from_cells` makes this payload of; `full_density` (1/m) is the density that counts as 1.
 
     Denser voxels are clamped to it. The dead zone is undone between empty and full voxels, which stay 0 and 1.
     """
-    start, width = DEAD_ZONE
+    start, width = dead_zone
     relative = (payload.density / full_density).clamp(0, 1)
     density = torch.where((relative > 0) & (relative < 1), relative * width + start, relative).unsqueeze(-4)
     voxels = torch.cat([encode_srgb(payload.rgb.clamp(0, 1)), density], dim=-4).flatten(-4)
     return torch.cat([voxels, payload.delta_scale * SCALE_VALUE], dim=-1)
 
 
-def payload_from_cells(cells: Float[Tensor, "*b k v"], full_density: float) -> Payload:
+def payload_from_cells(
+    cells: Float[Tensor, "*b k v"], full_density: float, dead_zone: tuple[float, float] = DEAD_ZONE
+) -> Payload:
     """The payload of decoded cells: clamped, with the dead zone on density."""
-    start, width = DEAD_ZONE
+    start, width = dead_zone
     voxels, scale = cells.split((VOXEL_VALUES, 3), dim=-1)
     voxels = voxels.unflatten(-1, (4, S, S, S))
     density = ((voxels[..., 3, :, :, :] - start) / width).clamp(0, 1) * full_density
@@ -97,6 +114,8 @@ def fit_codec(
 ) -> LinearCodec:
     """Per-cell mean, and shared principal components of `cells_each` random cells of every person and their mirrors.
 
+    Values are weighted by the marcher's window: what a picture does not show takes no component.
+
     Raises ValueError for fewer samples than channels.
     """
     if cells.shape[0] * cells_each < channels or tuple(cells.shape[1:]) != (K, VALUES):
@@ -105,10 +124,11 @@ def fit_codec(
         )
     mean = cells.mean(0)
     mean = ((mean + mirror_cells(mean)) / 2).half().float()  # stored in half precision: encode with what is stored
+    weight = window_weight()
     moments = [torch.zeros(count, count, dtype=torch.float64) for count in (VOXEL_VALUES // 2 + 3, VOXEL_VALUES // 2)]
     for person in cells:
         chosen = torch.randperm(K, generator=generator)[:cells_each]
-        for moment, part in zip(moments, _parity_parts(person[chosen] - mean[chosen]), strict=True):
+        for moment, part in zip(moments, _parity_parts((person[chosen] - mean[chosen]) * weight), strict=True):
             moment += (part.T @ part).double()
     variances, rows, parity = [], [], []
     for sign, moment in zip((1.0, -1.0), moments, strict=True):
@@ -118,7 +138,19 @@ def fit_codec(
         parity.append(torch.full_like(value, sign))
     order = torch.cat(variances).argsort(descending=True)[:channels]
     basis, parity = torch.cat(rows)[order], torch.cat(parity)[order].float()
-    return LinearCodec(mean, basis.contiguous(), parity)
+    return LinearCodec(mean, basis.contiguous(), parity, weight, torch.tensor(FITTED_DEAD_ZONE))
+
+
+@functools.cache
+def window_weight() -> Float[Tensor, "v"]:
+    """Root of the share of each voxel's trilinear hat that the marcher's window lets through; 1 for delta scales."""
+    place = torch.linspace(-1, 1, 2801, dtype=torch.float64)
+    window = torch.exp(-WINDOW_SHARPNESS * place**WINDOW_POWER)
+    pitch = 2 / (S - 1)
+    hats = (1 - (place - torch.linspace(-1, 1, S, dtype=torch.float64)[:, None]).abs() / pitch).clamp_min(0)
+    share = (hats * window).sum(1) / hats[S // 2].sum()
+    voxel = (share[:, None, None] * share[:, None] * share).sqrt().clamp_min(LEAST_WEIGHT)
+    return torch.cat([voxel.flatten().repeat(4), torch.ones(3, dtype=torch.float64)]).float()
 
 
 def _parity_parts(values: Float[Tensor, "n v"]) -> tuple[Tensor, Tensor]:

@@ -7,6 +7,7 @@ import dataclasses
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn import functional
 
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.local_unet import LocalUNet, LocalUNetConfig, PersonNetwork, PersonNetworkConfig
@@ -97,7 +98,7 @@ class PersonDenoiser(nn.Module):
         if self.local is None:
             return guess
         total = (signal**2 * prior.rest_variance + noise**2).sqrt()
-        picture = (coefficients @ prior.basis).unflatten(1, prior.mean.shape) / self.picture_std[:, None, None]
+        picture = prior.picture(coefficients) / self.picture_std[:, None, None]
         with self._precision(rest):
             correction = self.local(rest / total, picture, coefficients / self.component_std, t, condition)
         return guess + prior.rest_variance.sqrt() * noise / total * correction
@@ -110,4 +111,5 @@ class PersonDenoiser(nn.Module):
 def _picture_std(prior: PersonPrior, component_std: Float[Tensor, "r"]) -> Float[Tensor, "c"]:
     """Root mean square over the grid of what the person components draw in each channel."""
     energy = component_std**2 @ prior.basis**2
-    return energy.unflatten(0, prior.mean.shape).mean((1, 2)).sqrt()
+    energy = functional.pad(energy, (0, prior.mean.numel() - len(energy)))
+    return energy.unflatten(0, prior.mean.shape).mean((1, 2)).sqrt().clamp_min(1e-6)

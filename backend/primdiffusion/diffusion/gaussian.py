@@ -16,6 +16,7 @@ import dataclasses
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from primdiffusion.geometry.records import TensorRecord
 
@@ -29,7 +30,8 @@ class PersonPrior(TensorRecord):
 
     mean: Float[Tensor, "c h w"]
     basis: Float[Tensor, "r d"]
-    """Orthonormal rows: person components in the order of their variance."""
+    """Orthonormal rows: person components in the order of their variance. They may live in the leading channels alone:
+    d is a multiple of H*W, up to D."""
     parity: Float[Tensor, "r"]
     """Sign of each component in the mirror image of a person."""
     rest_variance: Float[Tensor, "c h w"]
@@ -47,13 +49,20 @@ class PersonPrior(TensorRecord):
     def split(self, z: Float[Tensor, "b c h w"], signal: Tensor | float = 1.0) -> tuple[Tensor, Tensor]:
         """Person coefficients [b, R] and rest [b, C, H, W] of latents whose mean is scaled by `signal` [b, 1, 1, 1]."""
         centred = z - signal * self.mean
-        coefficients = centred.flatten(1) @ self.basis.T
-        return coefficients, centred - (coefficients @ self.basis).unflatten(1, self.mean.shape)
+        coefficients = self._along(centred)
+        return coefficients, centred - self.picture(coefficients)
 
     def join(self, coefficients: Float[Tensor, "b r"], rest: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """Latents of person coefficients and rest; the rest's share along the components is removed."""
-        coefficients = coefficients - rest.flatten(1) @ self.basis.T
-        return self.mean + rest + (coefficients @ self.basis).unflatten(1, self.mean.shape)
+        return self.mean + rest + self.picture(coefficients - self._along(rest))
+
+    def picture(self, coefficients: Float[Tensor, "b r"]) -> Float[Tensor, "b c h w"]:
+        """What person coefficients draw."""
+        flat = coefficients @ self.basis
+        return functional.pad(flat, (0, self.mean.numel() - flat.shape[1])).unflatten(1, self.mean.shape)
+
+    def _along(self, z: Float[Tensor, "b c h w"]) -> Float[Tensor, "b r"]:
+        return z.flatten(1)[:, : self.basis.shape[1]] @ self.basis.T
 
     def log_weights(self, condition: Float[Tensor, "b a"] | None) -> Float[Tensor, "b g m"] | Float[Tensor, "1 g m"]:
         """Logarithms of the parts' weights, those that are not what is asked for made IMPOSSIBLE.

@@ -60,11 +60,16 @@ class CellCodec:
 
     def to_payload(self, x0: Float[Tensor, "*b c h w"], full_density: float) -> Payload:
         """Clamped, dead zone applied."""
-        return payload_from_cells(self.codec.decode(x0), full_density)
+        return payload_from_cells(self.codec.decode(x0), full_density, self._dead_zone)
 
     def from_payload(self, payload: Payload, full_density: float) -> Float[Tensor, "*b c h w"]:
         """Latents; what the basis leaves out is lost."""
-        return self.codec.encode(cells_from_payload(payload, full_density))
+        return self.codec.encode(cells_from_payload(payload, full_density, self._dead_zone))
+
+    @property
+    def _dead_zone(self) -> tuple[float, float]:
+        start, width = self.codec.dead_zone.tolist()
+        return start, width
 
     @property
     def cell_side(self) -> int:

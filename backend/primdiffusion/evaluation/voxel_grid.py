@@ -14,8 +14,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
-from primdiffusion.primitives.primitives import Frames, Payload, Primitives
-from primdiffusion.render.lattice import WINDOW_POWER, WINDOW_SHARPNESS
+from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Frames, Payload, Primitives
 
 SIDE = 64
 """Voxels along each side (paper Table 2)."""

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
 from numpy import ndarray as Array
 
-from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.lattice import WINDOW_POWER, WINDOW_SHARPNESS
+from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives
 
 CELL = 0.04
 """Side of the cells that list the boxes in reach, metres; no effect on the result."""

@@ -12,8 +12,7 @@ from primdiffusion.export.field import pack_field
 from primdiffusion.export.surface import depth_below
 from primdiffusion.formats.requests import GAUSSIANS
 from primdiffusion.geometry.records import TensorRecord
-from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.lattice import WINDOW_POWER, WINDOW_SHARPNESS
+from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives
 
 WIDTH = 1 / 6**0.5
 """Standard deviation of a voxel's trilinear kernel, in voxel spacings: the Gaussian has the kernel's own variance."""

@@ -17,6 +17,9 @@ K = GRID * GRID
 """Primitives of a person."""
 S = 8
 """Voxels along a side of a primitive."""
+WINDOW_SHARPNESS = 8.0
+WINDOW_POWER = 8
+"""The window exp(-8 * sum |y|^8) fades a box's density towards its faces; payloads are made for it: no setting."""
 
 
 @dataclasses.dataclass(frozen=True)

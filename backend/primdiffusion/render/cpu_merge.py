@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS
 from primdiffusion.render.cpu_compiled import kernel, take
-from primdiffusion.render.lattice import WINDOW_POWER, WINDOW_SHARPNESS
 
 _HALF_POWER = WINDOW_POWER // 2
 

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
+from primdiffusion.primitives.primitives import WINDOW_SHARPNESS
 from primdiffusion.render.cpu_compiled import index, part
 from primdiffusion.render.cpu_hits import (
     AT_CENTRE,
@@ -27,7 +28,6 @@ from primdiffusion.render.cpu_hits import (
     TO_LOCAL,
 )
 from primdiffusion.render.cpu_vectors import add_sample, power_of_two
-from primdiffusion.render.lattice import WINDOW_SHARPNESS
 from primdiffusion.render.tiles import TILE
 
 SAMPLES = 8

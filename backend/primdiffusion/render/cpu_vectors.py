@@ -13,7 +13,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from primdiffusion.render.lattice import WINDOW_POWER, WINDOW_SHARPNESS
+from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS
 
 _compiled_call: Any = intrinsic  # its callers do not give the typing context, nor see the real types
 

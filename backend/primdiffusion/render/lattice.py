@@ -27,10 +27,6 @@ LARGEST_STRIDE = 2**20
 MOST_POINTS = 2**24
 """Lattice points through one box: more are a slip of units and would take hours."""
 
-WINDOW_SHARPNESS = 8.0
-WINDOW_POWER = 8
-"""The window exp(-8 * sum |y|^8) fades a box's density towards its faces; payloads are made for it: no setting."""
-
 
 @dataclasses.dataclass(frozen=True)
 class MarchSettings:

@@ -10,11 +10,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives
 from primdiffusion.render.compositing import Rendering, composite
 from primdiffusion.render.lattice import (
-    WINDOW_POWER,
-    WINDOW_SHARPNESS,
     Compositing,
     MarchSettings,
     Span,

@@ -18,7 +18,7 @@ from primdiffusion.diffusion.conditioning import Vocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import CellCodec, DiffusionModel, ShapePrior
-from primdiffusion.diffusion.schedule import SCHEDULES
+from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.training.config import PhaseConfig, TrainingConfig, write_atomically
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
 from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors
@@ -69,7 +69,7 @@ class CellTrainee:
         self.codec, self.shapes = prepared.codec.to(device), prepared.shapes.to(device)
         self.train, self.held = prepared.train.to(device), prepared.held.to(device)
         self.vocabulary, self.full_density = prepared.vocabulary, prepared.full_density
-        self.denoiser = PersonDenoiser(config.model, prepared.prior, SCHEDULES[config.schedule]())
+        self.denoiser = PersonDenoiser(config.model, prepared.prior, SCHEDULES[str(config.schedule)]())
         self.denoiser.eval().requires_grad_(False).to(device)
         phases = {"person": config.person, "local": config.local}
         self.phases: Mapping[str, PhaseConfig] = {
@@ -108,7 +108,10 @@ class CellTrainee:
     def model(self) -> DiffusionModel:
         """What is in place, without a card."""
         codec, denoiser = CellCodec(self.codec), self.denoiser
-        return DiffusionModel(denoiser, denoiser.schedule, codec, self.shapes, self.full_density, {}, self.vocabulary)
+        return DiffusionModel(
+            denoiser, denoiser.schedule, codec, self.shapes, self.full_density, {}, self.vocabulary,
+            CHAINS[self.config.chain],
+        )  # fmt: skip
 
     def _objective(self, name: str) -> PersonObjective | RestObjective:
         denoiser, phase = self.denoiser, self.phases[name]

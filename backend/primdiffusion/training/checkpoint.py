@@ -21,7 +21,7 @@ from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkConfig
 from primdiffusion.diffusion.model import STANDARD_SHAPES, CellCodec, DiffusionModel, ShapePrior, WholeSlab
-from primdiffusion.diffusion.schedule import SCHEDULES
+from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.training.config import write_atomically
 
@@ -47,11 +47,14 @@ def default_checkpoint() -> Path:
 def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
     """Write a model; networks, prior and codec in half precision. `schedule` is its schedule's name."""
     tensors: dict[str, Tensor] = {f"denoiser.{key}": value for key, value in model.denoiser.state_dict().items()}
-    architecture: dict[str, Any] = {"schedule": schedule, "full_density": model.full_density}
+    chain = next(name for name, chain in CHAINS.items() if chain is model.chain)
+    architecture: dict[str, Any] = {"schedule": schedule, "chain": chain, "full_density": model.full_density}
     architecture |= {"vocabulary": model.vocabulary.to_json()}
     if isinstance(model.codec, CellCodec):
         codec = model.codec.codec
-        tensors |= {f"codec.{name}": getattr(codec, name) for name in ("mean", "basis", "parity")}
+        tensors |= {
+            f"codec.{name}": getattr(codec, name) for name in ("mean", "basis", "parity", "weight", "dead_zone")
+        }
         tensors |= {
             f"shapes.{field.name}": getattr(model.shapes, field.name) for field in dataclasses.fields(ShapePrior)
         }
@@ -134,7 +137,9 @@ def _build(tensors: Mapping[str, Tensor], architecture: dict[str, Any], card: di
     denoiser.load_state_dict(weights)
     denoiser.eval().requires_grad_(False)
     vocabulary = Vocabulary.from_json(architecture["vocabulary"])
-    return DiffusionModel(denoiser, schedule, codec, shapes, float(architecture["full_density"]), card, vocabulary)
+    chain = CHAINS[architecture.get("chain", "trailing")]
+    density = float(architecture["full_density"])
+    return DiffusionModel(denoiser, schedule, codec, shapes, density, card, vocabulary, chain)
 
 
 def denoiser_config(tree: Mapping[str, Any]) -> DenoiserConfig:

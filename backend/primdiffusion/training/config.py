@@ -13,13 +13,14 @@ from primdiffusion.diffusion.unet import PAPER, UNetConfig
 from primdiffusion.staging import written_whole
 
 Weighting = Literal["whitened", "plain", "min_snr"]
+Levels = Literal["uniform", "log_uniform"]
 
 
 @dataclasses.dataclass(frozen=True)
 class CodecConfig:
     """The frozen linear codec."""
 
-    channels: int = 96
+    channels: int = 192
     """Latent channels of a primitive."""
     people: int = 160
     """People (geometry and colours) that the basis is fitted to, drawn at random."""
@@ -31,6 +32,8 @@ class PriorConfig:
 
     components: int = 128
     """Person components."""
+    channels: int = 64
+    """Leading latent channels in which person components live; they hold what whole people differ in."""
     groups: tuple[str, ...] = ("sex", "outfit", "pattern")
     """Attributes that people of one covariance have in common; those that the people do not have are left out."""
     features: tuple[tuple[str, ...], ...] = (("sex", "hair", "hat"), ("shoes",))
@@ -62,6 +65,8 @@ class PhaseConfig:
     min(SNR of the level, gamma) (Hang et al. 2023)."""
     error_power: float = 1.0
     """Whitened errors, in units of posterior std s, are weighted by s^power: 2 is the paper's error on one level."""
+    levels: Levels = "uniform"
+    """Of noise that are trained: uniform in t, as the paper; log_uniform in noise over signal."""
     min_snr_gamma: float = 5.0
     """Largest weight of a level with min_snr."""
     blend: float = 0.3
@@ -103,8 +108,12 @@ class TrainingConfig:
     """Stop after this time, to be resumed; None trains to the end."""
     seed: int = 0
     """Of everything random."""
-    schedule: Literal["linear", "sqrt_linear"] = "linear"
-    """Noise schedule over 1000 steps."""
+    schedule: Literal["linear", "sqrt_linear", "fine_linear"] | None = None
+    """Noise schedule over 1000 steps: linear (the paper's; None in the paper preset), fine_linear (the same from less
+    noise on; None in the default preset) or sqrt_linear (the released code's)."""
+    chain: Literal["trailing", "dense"] | None = None
+    """Steps that the model is sampled in: trailing (evenly spaced; None in the paper preset) or dense (closer where
+    there is little noise; None in the default preset)."""
     holdout: float = 0.05
     """Share of geometries, with all their colour variants, that is evaluated on and never trained on."""
     save_every: float = 60.0
@@ -119,11 +128,13 @@ class TrainingConfig:
     prior: PriorConfig = dataclasses.field(default_factory=PriorConfig)
     model: DenoiserConfig = dataclasses.field(default_factory=DenoiserConfig)
     person: PhaseConfig = dataclasses.field(
-        default_factory=lambda: PhaseConfig(steps=2400, batch=256, evaluate_every=800)
+        default_factory=lambda: PhaseConfig(steps=8000, batch=256, evaluate_every=1000)
     )
     """The default preset's network over person components, trained first."""
     local: PhaseConfig = dataclasses.field(
-        default_factory=lambda: PhaseConfig(steps=6500, batch=16, blend=0.2, weight_decay=0.0, bfloat16=True)
+        default_factory=lambda: PhaseConfig(
+            steps=38_000, batch=16, blend=0.2, weight_decay=0.0, levels="log_uniform", bfloat16=True
+        )
     )
     """The default preset's network over the grid."""
     unet: UNetConfig = PAPER
@@ -137,7 +148,11 @@ class TrainingConfig:
     """The paper preset's only phase; the batch is that of each process."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for settings that cannot be."""
+        """Fills in what follows from the preset; raises ValueError for settings that cannot be."""
+        usual = {"default": ("fine_linear", "dense"), "paper": ("linear", "trailing")}[self.preset]
+        for name, value in zip(("schedule", "chain"), usual, strict=True):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
         for name in ("log_every", "pictures_every", "threads"):
             value = getattr(self, name)
             _check(name, value, value is None or value >= 1, "1 or more")

@@ -69,7 +69,7 @@ def train(config: TrainingConfig) -> DiffusionModel:
     model = trainee.model()
     if accelerator.is_main_process:
         model = dataclasses.replace(model, card=_card(config, people, chosen, held, trainee, states))
-        save_checkpoint(config.run / MODEL, model, config.schedule)
+        save_checkpoint(config.run / MODEL, model, str(config.schedule))
     accelerator.end_training()
     return model
 

@@ -17,7 +17,7 @@ from primdiffusion.diffusion.conditioning import Vocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.samplers import gaussian_noise
 from primdiffusion.diffusion.schedule import Schedule
-from primdiffusion.training.config import PhaseConfig
+from primdiffusion.training.config import Levels, PhaseConfig
 from primdiffusion.training.latents import LatentSet
 
 LEVELS = (50, 100, 300, 500, 700, 900)
@@ -75,7 +75,7 @@ class PersonObjective:
         c = torch.einsum("bk,bkr->br", weights, self.coefficients[indices])
         flip = torch.rand(len(c), 1, generator=generator, device=generator.device) < 0.5
         c = torch.where(flip, c * self.denoiser.prior_parity, c)
-        t = random_steps(self.denoiser.schedule, len(c), generator)
+        t = random_steps(self.denoiser.schedule, len(c), generator, self.config.levels)
         y = self.denoiser.schedule.q_sample(c, t, gaussian_noise(c, generator))
         signal, noise = self.denoiser.schedule.levels(t, c)
         std = self.denoiser.component_std
@@ -105,7 +105,7 @@ class RestObjective:
         z = torch.einsum("bk,bkchw->bchw", weights, self.people.latents[indices].float())
         flip = torch.rand(len(z), 1, 1, 1, generator=generator, device=generator.device) < 0.5
         z = torch.where(flip, self.codec.mirror(z), z)
-        t = random_steps(self.denoiser.schedule, len(z), generator)
+        t = random_steps(self.denoiser.schedule, len(z), generator, self.config.levels)
         x = self.denoiser.schedule.q_sample(z, t, gaussian_noise(z, generator))
         signal, noise = self.denoiser.schedule.levels(t, z)
         with torch.no_grad():
@@ -118,9 +118,20 @@ class RestObjective:
         return objective(error, std, signal, noise, self.config)
 
 
-def random_steps(schedule: Schedule, count: int, generator: torch.Generator) -> Int[Tensor, "b"]:
-    """Uniform steps (paper eq. 9)."""
-    return torch.randint(schedule.length, (count,), generator=generator, device=generator.device)
+def random_steps(
+    schedule: Schedule, count: int, generator: torch.Generator, levels: Levels = "uniform"
+) -> Int[Tensor, "b"]:
+    """Random steps: "uniform" in t (paper eq. 9), or "log_uniform" in noise over signal.
+
+    Uniform steps are nearly all so noisy that they drown what person components leave out.
+    """
+    if levels == "uniform":
+        return torch.randint(schedule.length, (count,), generator=generator, device=generator.device)
+    alpha_bar = schedule.alpha_bar.to(generator.device)
+    noise_over_signal = 0.5 * ((1 - alpha_bar).log() - alpha_bar.log())
+    low, high = noise_over_signal[0], noise_over_signal[-1]
+    drawn = torch.rand(count, generator=generator, device=generator.device, dtype=alpha_bar.dtype)
+    return torch.searchsorted(noise_over_signal, low + (high - low) * drawn).clamp_max(schedule.length - 1)
 
 
 def _present(network: nn.Module | None) -> nn.Module:

@@ -22,7 +22,7 @@ def fit_prior(people: LatentSet, codec: LinearCodec, vocabulary: Vocabulary, con
     the mirror. Variances of trailing components fitted to few people are too large for new people and those of the rest
     too small: both are corrected by leaving `config.folds` parts of the geometries out in turn.
     """
-    parts = _mirror_parts(people, codec)
+    parts = _mirror_parts(people, codec, config.channels)
     grams = [part @ part.T for _, part in parts]
     vectors = [_principal(gram, config.components) for gram in grams]
     signs, order = _merge([variance for variance, _ in vectors], config.components)
@@ -30,16 +30,18 @@ def fit_prior(people: LatentSet, codec: LinearCodec, vocabulary: Vocabulary, con
         (vector.T @ part) / (variance * len(people)).sqrt()[:, None]
         for (_, part), (variance, vector) in zip(parts, vectors, strict=True)
     ]
-    mean = parts[0][0]
     del parts
+    mean = people.latents.float().mean(0)
+    mean = (mean + codec.mirror(mean)) / 2
     basis = torch.linalg.qr(torch.cat(rows)[order].T)[0].T.contiguous()
     kept, rest_ratio = _held_out_ratios(grams, people.geometry, config)
-    coefficients, rest_energy = [], torch.zeros(basis.shape[1])
+    coefficients, rest_energy = [], torch.zeros(mean.numel())
     for chunk in people.latents.split(256):
         centred = (chunk.float() - mean).flatten(1)
-        c = centred @ basis.T
+        c = centred[:, : basis.shape[1]] @ basis.T
         coefficients.append(c)
-        rest_energy += (centred - c @ basis).square().sum(0)
+        centred[:, : basis.shape[1]] -= c @ basis
+        rest_energy += centred.square().sum(0)
     rest = (rest_energy / len(people)).unflatten(0, mean.shape)
     rest = (rest + codec.mirror(rest).abs()) / 2 * rest_ratio
     c = torch.cat(coefficients) * kept.sqrt()
@@ -47,9 +49,9 @@ def fit_prior(people: LatentSet, codec: LinearCodec, vocabulary: Vocabulary, con
     return PersonPrior(mean, basis, signs, rest.clamp_min(1e-6), **mixture._asdict())
 
 
-def _mirror_parts(people: LatentSet, codec: LinearCodec) -> list[tuple[Tensor, Tensor]]:
-    """Mean and centred rows of (z + Mz)/2, and zero and rows of (z - Mz)/2."""
-    latents = people.latents.float()
+def _mirror_parts(people: LatentSet, codec: LinearCodec, channels: int) -> list[tuple[Tensor, Tensor]]:
+    """Mean and centred rows of (z + Mz)/2, and zero and rows of (z - Mz)/2; of the leading channels."""
+    latents = people.latents[:, :channels].float()
     mirrored = codec.mirror(latents)
     even, odd = (latents + mirrored) / 2, (latents - mirrored) / 2
     mean = even.mean(0)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel, WholeSlab
 from primdiffusion.diffusion.samplers import gaussian_noise
-from primdiffusion.diffusion.schedule import SCHEDULES
+from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet
 from primdiffusion.primitives.slab import pack
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
@@ -29,7 +29,8 @@ class SlabTrainee:
         self, config: TrainingConfig, people: People, train: Sequence[int], held: Sequence[int], device: torch.device
     ) -> None:
         torch.manual_seed(config.seed)
-        self.schedule = SCHEDULES[config.schedule]()
+        self.schedule = SCHEDULES[str(config.schedule)]()
+        self.chain = CHAINS[str(config.chain)]
         self.config, self.people, self.held, self.device = config.slab, people, held[:MEASURED], device
         self.places = [(index, number) for index in train for number in range(people.variants[index])]
         self.denoiser: nn.Module = SlabUNet(config.unet).to(device)
@@ -61,7 +62,7 @@ class SlabTrainee:
             len(self.places), (self.config.batch,), generator=generator, device=generator.device
         ).tolist()
         slab = self.slabs([self.places[index] for index in chosen])
-        t = random_steps(self.schedule, len(slab), generator)
+        t = random_steps(self.schedule, len(slab), generator, self.config.levels)
         x = self.schedule.q_sample(slab, t, gaussian_noise(slab, generator))
         error = self._guess(x, t) - slab
         return (level_weight(*self.schedule.levels(t, slab), self.config) * error.square()).mean()
@@ -73,7 +74,8 @@ class SlabTrainee:
 
     def model(self) -> DiffusionModel:
         """What is in place, without a card; it knows nothing of bodies' shapes."""
-        return DiffusionModel(self.denoiser, self.schedule, WholeSlab(), STANDARD_SHAPES, self.people.full_density, {})
+        density = self.people.full_density
+        return DiffusionModel(self.denoiser, self.schedule, WholeSlab(), STANDARD_SHAPES, density, {}, chain=self.chain)
 
     def _guess(self, x: Float[Tensor, "b 56 256 256"], t: Tensor) -> Float[Tensor, "b 56 256 256"]:
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.config.bfloat16):
