@@ -4,6 +4,7 @@ import errno
 import json
 import logging
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -69,12 +70,21 @@ def small(monkeypatch):
     make_small(monkeypatch)
 
 
+@pytest.fixture(scope="module")
+def one_step(captures, tmp_path_factory):
+    """A run of one step."""
+    with pytest.MonkeyPatch.context() as patch:
+        make_small(patch)
+        config = settings(captures, tmp_path_factory.mktemp("one_step") / "run", minutes=0.0)
+        fit(config)
+        return config.run
+
+
 @pytest.fixture
-def begun(captures, tmp_path):
+def begun(captures, one_step, tmp_path):
     """The settings of a run that took one step."""
-    config = settings(captures, tmp_path / "run", minutes=0.0)
-    fit(config)
-    return config
+    shutil.copytree(one_step, tmp_path / "run")
+    return settings(captures, tmp_path / "run", minutes=0.0)
 
 
 def timeless(run: Path) -> list[dict]:
