@@ -26,7 +26,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE
 # A test is tried again where Blender itself has crashed under it (seen once in ed.undo_push), never where it fails.
 AGAIN_AFTER_A_CRASH := --reruns 1 --only-rerun "no exception says this"
 PYTEST := -m pytest -n logical --maxprocesses 8 --dist worksteal $(AGAIN_AFTER_A_CRASH)
-PYTEST_BLENDER := $(PYTEST) tests/blender --confcutdir tests/blender
+PYTEST_BLENDER := $(PYTEST) tests/blender --confcutdir tests/blender -m "not slow and not gpu and not any_blender"
 
 # Containers set it, and hundreds of child processes would each compile the backend anew.
 unexport PYTHONDONTWRITEBYTECODE
@@ -53,11 +53,11 @@ test:
 test-5.0: $(READY_TO_TEST)
 	$(ONE_THREAD) $(BIN)/python $(PYTEST) $(TEST_ARGS)
 
-## test-4.5: the tests of the extension on Blender 4.5
+## test-4.5: the tests that depend on the version of Blender, on 4.5
 test-4.5: $(VENV45)/ready
 	$(ONE_THREAD) $(VENV45)/bin/python $(PYTEST_BLENDER) $(TEST_ARGS)
 
-## test-5.2: the tests of the extension on Blender 5.2, where a Python 3.13 is found
+## test-5.2: the same on Blender 5.2, where a Python 3.13 is found
 # Without torch, which has its builds for one version of Python each: the backend's own process runs in .venv.
 ifeq ($(PYTHON313),)
 test-5.2:

@@ -222,7 +222,7 @@ def anna(addon, tmp_path, monkeypatch):
 
 @pytest.fixture
 def outside(anna, monkeypatch):
-    """No browser opens, nothing is downloaded or installed, and libraries are written where tests write."""
+    """No browser opens, nothing is downloaded or installed; libraries are small and written where tests write."""
     from blender_primdiffusion.ui.assets import library
     from blender_primdiffusion.worker.setup_job import SetUpJob
 
@@ -233,6 +233,8 @@ def outside(anna, monkeypatch):
     monkeypatch.setattr(SetUpJob, "start", start)
     monkeypatch.setattr("blender_primdiffusion.worker.setup_folder.short_root", lambda *_: anna / "set up")
     monkeypatch.setattr(library, "own_folder", lambda: anna / "own")
+    two = dict(list(library.builtin_poses().items())[:2])  # a picture of each is drawn
+    monkeypatch.setattr(library, "builtin_poses", lambda: two)
     bpy.context.preferences.system.use_online_access = True
     yield
     bpy.context.preferences.system.use_online_access = False
