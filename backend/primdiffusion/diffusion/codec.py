@@ -110,7 +110,7 @@ def mirror_cells(cells: Float[Tensor, "*b k v"]) -> Float[Tensor, "*b k v"]:
 
 
 def fit_codec(
-    cells: Float[Tensor, "n k v"], channels: int, generator: torch.Generator, cells_each: int = 128
+    cells: Float[Tensor, "n k v"], channels: int, generator: torch.Generator, cells_each: int = 512
 ) -> LinearCodec:
     """Per-cell mean, and shared principal components of `cells_each` random cells of every person and their mirrors.
 

@@ -21,9 +21,9 @@ from primdiffusion.diffusion.unet import TimeEmbedding, zeroed
 class PersonNetworkConfig:
     """Size of the perceptron over person components."""
 
-    width: int = 512
+    width: int = 640
     """Features of the residual stream."""
-    blocks: int = 3
+    blocks: int = 4
     """Residual blocks."""
     dropout: float = 0.1
     """Share of hidden features dropped in training; people are few and components are quickly learnt by heart."""
@@ -33,7 +33,7 @@ class PersonNetworkConfig:
 class LocalUNetConfig:
     """Size of the U-Net over the 32 x 32 grid."""
 
-    widths: tuple[int, ...] = (64, 128, 192)
+    widths: tuple[int, ...] = (128, 192, 256)
     """Channels at 32, 16 and 8 cells a side."""
     blocks: int = 1
     """Residual blocks of a level, down and up."""

@@ -20,7 +20,7 @@ Levels = Literal["uniform", "log_uniform"]
 class CodecConfig:
     """The frozen linear codec."""
 
-    channels: int = 192
+    channels: int = 256
     """Latent channels of a primitive."""
     people: int = 160
     """People (geometry and colours) that the basis is fitted to, drawn at random."""
