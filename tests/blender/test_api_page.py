@@ -5,10 +5,14 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "scripts" / "operators_page"))
 
 import page  # noqa: E402
+
+pytestmark = pytest.mark.any_blender
 
 PAGE = ROOT / "docs" / "manual" / "api.md"
 

@@ -20,6 +20,8 @@ from blender_primdiffusion.ui.batch.asking import NoBackend, ask
 from blender_primdiffusion.ui.batch.command import execute
 from blender_primdiffusion.worker.environment import BackendNotFound
 
+pytestmark = pytest.mark.any_blender
+
 DIES, FAILS, TAKES_LONG = 1, 2, 4
 """Seeds that the fake child takes as orders."""
 

@@ -18,6 +18,8 @@ from blender_primdiffusion.ui.batch.command import execute
 from blender_primdiffusion.ui.batch.people import go_round, moving_extent
 from blender_primdiffusion.worker.environment import BackendNotFound
 
+pytestmark = pytest.mark.any_blender
+
 SMALL = ("--size", "24x16")
 
 

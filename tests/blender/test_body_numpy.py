@@ -8,6 +8,8 @@ import synthetic
 
 from blender_primdiffusion.capture.body import BodyError, read_body
 
+pytestmark = pytest.mark.any_blender
+
 
 @pytest.fixture(scope="module")
 def body():

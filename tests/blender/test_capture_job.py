@@ -35,6 +35,8 @@ from blender_primdiffusion.capture.settings import CaptureSettings
 from blender_primdiffusion.capture.verify import repair, verify
 from blender_primdiffusion.motion.motion import Motion
 
+pytestmark = pytest.mark.any_blender
+
 POSES = two_poses()
 VIEWS = 2 * 2
 

@@ -29,6 +29,8 @@ from blender_primdiffusion.ui.captures.operators import RIG
 from blender_primdiffusion.ui.captures.session import captures
 from blender_primdiffusion.ui.captures.settings import words_of
 
+pytestmark = pytest.mark.any_blender
+
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = "--poses 2 --cameras 2 --size 48 48 --samples 2 --device cpu --passes img mask depth"
 

@@ -17,6 +17,8 @@ from test_scan_rigs import load, own_person
 
 from blender_primdiffusion.motion.poses import built_in_poses
 
+pytestmark = pytest.mark.any_blender
+
 
 def test_both_programs_put_cameras_and_joints_in_the_same_places(tmp_path, empty_scene):
     path = own_person(tmp_path / "anna.glb")

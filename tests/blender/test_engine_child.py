@@ -23,6 +23,8 @@ from blender_primdiffusion.engine import final, studio
 from blender_primdiffusion.engine.frames import CHANNELS, Frames
 from blender_primdiffusion.worker.environment import BackendPython
 
+pytestmark = pytest.mark.any_blender
+
 FAKE = Path(__file__).parent / "fake_backend"
 SIZE = (40, 32)
 COLOUR = np.round(255 * np.array([0.5372549, 0.7372549, 0.88235295, 1.0]))

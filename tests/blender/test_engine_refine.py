@@ -13,6 +13,8 @@ from blender_primdiffusion.engine.view import View, view_from_matrices, without_
 from blender_primdiffusion.worker.drawing import Drawing
 from blender_primdiffusion.worker.job import JobError
 
+pytestmark = pytest.mark.any_blender
+
 SIZE = (101, 80)
 
 

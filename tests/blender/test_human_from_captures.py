@@ -23,6 +23,8 @@ from blender_primdiffusion.ui.jobs import work
 from blender_primdiffusion.ui.jobs.queue import queue
 from blender_primdiffusion.worker.environment import BackendPython
 
+pytestmark = pytest.mark.any_blender
+
 FAKE = Path(__file__).parent / "fake_backend"
 
 

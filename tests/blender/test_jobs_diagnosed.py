@@ -24,6 +24,8 @@ from blender_primdiffusion.ui.jobs.queue import queue
 from blender_primdiffusion.worker.job import JobError
 from blender_primdiffusion.worker.memory_advice import memory_advice
 
+pytestmark = pytest.mark.any_blender
+
 DIES, FAILS, TAKES_LONG, NO_MEMORY = 1, 2, 4, 106
 """Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion

@@ -21,6 +21,8 @@ from blender_primdiffusion.ui.jobs.follow import follow, watch
 from blender_primdiffusion.ui.jobs.panel import PRIMDIFFUSION_PT_jobs
 from blender_primdiffusion.ui.jobs.queue import queue
 
+pytestmark = pytest.mark.any_blender
+
 DIES, FAILS, TAKES_LONG, IGNORES_CANCEL, NO_MEMORY = 1, 2, 4, 105, 106
 """Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion

@@ -9,6 +9,8 @@ import pytest
 
 from blender_primdiffusion.worker.redact import redact
 
+pytestmark = pytest.mark.any_blender
+
 NAMES = ("anna", "annas-laptop")
 PRIVATE = ("anna", "Müller", "Secret", "Kunde", "server7", "freigabe")
 

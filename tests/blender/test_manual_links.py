@@ -13,6 +13,8 @@ import build_addon
 import build_manual
 from blender_primdiffusion.ui import manual
 
+pytestmark = pytest.mark.any_blender
+
 
 @pytest.fixture
 def opened(monkeypatch) -> list[str]:

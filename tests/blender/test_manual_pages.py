@@ -10,6 +10,8 @@ import pytest
 import build_manual
 from blender_primdiffusion.ui import manual
 
+pytestmark = pytest.mark.any_blender
+
 ROOT = Path(__file__).resolve().parents[2]
 MANUAL = ROOT / "docs" / "manual"
 PAGES = sorted(MANUAL.glob("*.md"))

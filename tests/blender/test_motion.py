@@ -20,6 +20,8 @@ from blender_primdiffusion.motion.rotation import (
 )
 from blender_primdiffusion.motion.skeleton import FLOOR, REST_JOINTS, chain, joint_positions, unchain
 
+pytestmark = pytest.mark.any_blender
+
 RNG = np.random.default_rng(7)
 
 

@@ -14,6 +14,8 @@ from blender_primdiffusion.motion.motion import Motion
 from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, to_axis_angle
 from blender_primdiffusion.motion.skeleton import REST_JOINTS
 
+pytestmark = pytest.mark.any_blender
+
 REST = np.tile(np.eye(3), (24, 1, 1))
 
 

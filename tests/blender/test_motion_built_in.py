@@ -11,6 +11,8 @@ from blender_primdiffusion.motion.legs import FootTrack, joint, reach
 from blender_primdiffusion.motion.rotation import to_axis_angle
 from blender_primdiffusion.motion.skeleton import FLOOR, REST_JOINTS, chain, joint_positions
 
+pytestmark = pytest.mark.any_blender
+
 ANKLES = [JOINT_NAMES.index("left_ankle"), JOINT_NAMES.index("right_ankle")]
 KNEES = [JOINT_NAMES.index("left_knee"), JOINT_NAMES.index("right_knee")]
 FEET = [JOINT_NAMES.index("left_foot"), JOINT_NAMES.index("right_foot")]

@@ -14,6 +14,8 @@ from blender_primdiffusion.motion.files import DEFAULT_FPS, MotionFileError, rea
 from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, to_axis_angle
 from blender_primdiffusion.motion.skeleton import REST_JOINTS
 
+pytestmark = pytest.mark.any_blender
+
 FRAMES = 7
 RNG = np.random.default_rng(0)
 THETA = RNG.normal(0, 0.3, (FRAMES, 24, 3))

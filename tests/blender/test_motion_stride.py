@@ -21,6 +21,8 @@ from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.ui.motion.placing import Placement, place_motion
 from blender_primdiffusion.ui.motion.settings import FACTS
 
+pytestmark = pytest.mark.any_blender
+
 BALLS = [JOINT_NAMES.index(f"{side}_foot") for side in ("left", "right")]
 STEPS = 8
 

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from blender_primdiffusion import places
 from blender_primdiffusion.ui.setup.plans import plan_of_removal, plan_of_test
+
+pytestmark = pytest.mark.any_blender
 
 
 def test_caches_are_our_own_unless_a_folder_is_named(monkeypatch, tmp_path):

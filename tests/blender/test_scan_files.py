@@ -15,6 +15,8 @@ from blender_primdiffusion.capture.scan_files import own_betas
 from blender_primdiffusion.capture.textures import choose_picture
 from blender_primdiffusion.capture.upright import unit_of
 
+pytestmark = pytest.mark.any_blender
+
 
 def touch(*paths: Path) -> None:
     for path in paths:

@@ -8,6 +8,8 @@ import synthetic
 
 from blender_primdiffusion.scene.human_npz import HumanFileError, read_human
 
+pytestmark = pytest.mark.any_blender
+
 SPOILED = {
     "NaN or infinite": {"density": np.full((4, 8, 8, 8), np.nan, np.float32)},
     "'rgb'.*instead of numbers of shape": {"rgb": np.zeros((4, 3, 8, 8, 8), np.float16)},

@@ -23,6 +23,8 @@ from blender_primdiffusion.ui.setup.session import session
 from blender_primdiffusion.worker.environment import VARIABLE
 from blender_primdiffusion.worker.setup_job import SetUpJob
 
+pytestmark = pytest.mark.any_blender
+
 press = bpy.ops.primdiffusion
 
 

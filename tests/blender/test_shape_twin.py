@@ -22,6 +22,8 @@ from primdiffusion.reshaping import box_growth
 from blender_primdiffusion.scene.human_npz import read_human
 from blender_primdiffusion.scene.shape_model import betas_of_measures, measure, slider_names
 
+pytestmark = pytest.mark.any_blender
+
 SHAPES = np.random.default_rng(4).normal(0, 1.2, (4, 10))
 
 

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 import bpy
 import pytest
 
+pytestmark = pytest.mark.any_blender
+
 _KINDS = (bpy.types.Operator, bpy.types.Panel, bpy.types.Menu, bpy.types.PropertyGroup, bpy.types.AddonPreferences)
 _SMALL = frozenset(
     "a an and as at by for from in into it of on or over per px the to until with vs x".split()  # noqa: SIM905

@@ -9,6 +9,8 @@ from shown_words import said_by_blender
 from blender_primdiffusion.scene.human import BETA_COUNT
 from blender_primdiffusion.ui import translations
 
+pytestmark = pytest.mark.any_blender
+
 SAME = frozenset(
     {
         "-X", "-Y", "-Z", "X", "Y", "Z", "4", "8", "12", "16", "CPU", "GPU", "HDRI", "COLMAP", "NeRF", "OpenCV",
