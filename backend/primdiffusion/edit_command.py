@@ -110,7 +110,7 @@ class EditRegion(Edit):
     """An edit of a part of the person; outside it not a bit changes."""
 
     region: tuple[str, ...] = ()
-    """Parts of the body by name, such as top, bottom, shoes, hair, left_hand; docs/editing.md shows all of them."""
+    """Parts of the body by name, such as top, bottom, shoes, hair, left_hand; docs/design/diffusion_edits.md shows all of them."""
     weights: Path | None = None
     """Instead of --region: an .npz with `weights`, a number from 0 to 1 for each vertex of human.npz's body."""
     seed: int = 0

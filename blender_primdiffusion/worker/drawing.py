@@ -94,7 +94,7 @@ class DrawingChild:
         """Whoever has taken the one element speaks with the child: taking it is atomic and never waits."""
 
     def draw(self, params: Mapping[str, Any]) -> Drawing:
-        """Asks for a picture (`params` of the request `draw`, docs/protocol.md) and returns at once.
+        """Asks for a picture (`params` of the request `draw`, docs/design/protocol.md) and returns at once.
 
         Raises RuntimeError after `close`.
         """

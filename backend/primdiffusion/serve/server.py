@@ -1,4 +1,4 @@
-"""The child's side of the conversation: JSON-RPC 2.0 on stdin and stdout, a message a line (docs/protocol.md).
+"""The child's side of the conversation: JSON-RPC 2.0 on stdin and stdout, a message a line (docs/design/protocol.md).
 
     reader thread     parses lines; answers hello, cancel and shutdown itself, so they work while a person is sampled
     main thread       loads torch, then runs one job at a time (generate, edits, reconstruct, render, draw)

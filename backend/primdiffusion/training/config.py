@@ -93,7 +93,7 @@ class PhaseConfig:
 
 @dataclasses.dataclass(frozen=True)
 class TrainingConfig:
-    """Train a diffusion model on people as primitives; the same line goes on where it stopped (docs/training.md)."""
+    """Train a diffusion model on people as primitives; the same line goes on where it stopped (docs/design/diffusion_training.md)."""
 
     data: Path
     """People of `primdiffusion payloads`: a folder of files, or of the shards that `payloads pack` makes of them."""
