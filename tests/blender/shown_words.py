@@ -10,7 +10,7 @@ import bpy
 from test_tooltips import labels, ours, properties, tooltips
 
 ROOT = Path(__file__).resolve().parents[2] / "blender_primdiffusion"
-FOR_CONSOLES = ("ui/batch", "capture/command.py", "ui/jobs/diagnostics.py", "console.py")
+FOR_CONSOLES = ("ui/batch", "capture/command.py", "console.py")
 """Command lines and bug reports stay English."""
 _SHOWN_KEYWORDS = {"text", "heading", "message", "title"}
 

@@ -17,8 +17,8 @@ from blender_primdiffusion.motion.rotation import from_axis_angle
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.files import person_file, volume_path
 from blender_primdiffusion.scene.human import MARK, armature_of, humans
-from blender_primdiffusion.ui.assets.panel import PRIMDIFFUSION_PT_assets
-from blender_primdiffusion.ui.assets.thumbnails import SIDE, clay_figure, picture_of_file
+from blender_primdiffusion.ui.assets_panel import PRIMDIFFUSION_PT_assets
+from blender_primdiffusion.ui.jobs.thumbnails import SIDE, clay_figure, picture_of_file
 
 PICTURE = Path(__file__).parent / "fake_backend" / "primdiffusion" / "picture.png"
 ops = bpy.ops.primdiffusion
@@ -162,7 +162,7 @@ def test_the_built_in_poses_become_a_library_and_the_open_file_stays(addon, tmp_
 
 def test_what_cannot_be_an_asset_is_said(addon, tmp_path):
     for operator in (ops.mark_human_as_asset, ops.mark_pose_as_asset, ops.unmark_human_asset):
-        with pytest.raises(RuntimeError, match=r"poll\(\) .*Nobody is in the scene"):
+        with pytest.raises(RuntimeError, match=r"poll\(\) .*no person in the scene"):
             operator()
     ops.generate(seed=7, steps=1)
     (tmp_path / "text.png").write_text("no picture")

@@ -21,8 +21,8 @@ from test_missing_volumes import write_person
 
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of, body_of, humans
-from blender_primdiffusion.ui.generate.work import GenerateWork
-from blender_primdiffusion.ui.human.edit_work import VaryWork
+from blender_primdiffusion.ui.jobs.edit import VaryWork
+from blender_primdiffusion.ui.jobs.generate import GenerateWork
 from blender_primdiffusion.ui.jobs.queue import queue
 from blender_primdiffusion.ui.jobs.work import Work
 
@@ -223,7 +223,7 @@ def anna(addon, tmp_path, monkeypatch):
 @pytest.fixture
 def outside(anna, monkeypatch):
     """No browser opens, nothing is downloaded or installed; libraries are small and written where tests write."""
-    from blender_primdiffusion.ui.assets import library
+    from blender_primdiffusion.ui.jobs import assets
     from blender_primdiffusion.worker.setup_job import SetUpJob
 
     def start(job: SetUpJob) -> None:
@@ -232,14 +232,14 @@ def outside(anna, monkeypatch):
     monkeypatch.setattr("webbrowser.open", lambda _: True)
     monkeypatch.setattr(SetUpJob, "start", start)
     monkeypatch.setattr("blender_primdiffusion.worker.setup_folder.short_root", lambda *_: anna / "set up")
-    monkeypatch.setattr(library, "own_folder", lambda: anna / "own")
-    two = dict(list(library.builtin_poses().items())[:2])  # a picture of each is drawn
-    monkeypatch.setattr(library, "builtin_poses", lambda: two)
+    monkeypatch.setattr(assets, "own_folder", lambda: anna / "own")
+    two = dict(list(assets.builtin_poses().items())[:2])  # a picture of each is drawn
+    monkeypatch.setattr(assets, "builtin_poses", lambda: two)
     bpy.context.preferences.system.use_online_access = True
     yield
     bpy.context.preferences.system.use_online_access = False
     libraries = bpy.context.preferences.filepaths.asset_libraries
-    for ours in [one for one in libraries if one.name.startswith(library.LIBRARY)]:
+    for ours in [one for one in libraries if one.name.startswith(assets.LIBRARY)]:
         libraries.remove(ours)
 
 

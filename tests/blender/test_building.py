@@ -15,10 +15,10 @@ from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.files import folder_of, person_file, volume_path
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.shape import shape_model_of
-from blender_primdiffusion.ui.generate.work import GenerateWork
 from blender_primdiffusion.ui.jobs import follow as follow_module
 from blender_primdiffusion.ui.jobs.building import building
 from blender_primdiffusion.ui.jobs.follow import follow
+from blender_primdiffusion.ui.jobs.generate import GenerateWork
 from blender_primdiffusion.ui.jobs.queue import queue
 
 GIVES_GARBAGE = 3

@@ -17,11 +17,11 @@ from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.files import folder_of, person_file, volume_path
 from blender_primdiffusion.scene.human import MARK, humans, remove_human
 from blender_primdiffusion.scene.missing import missing_files
-from blender_primdiffusion.ui.files.works import RegenerateWork, RestoreWork, made_from_seed
-from blender_primdiffusion.ui.human.edit_work import RedressWork, VaryWork
 from blender_primdiffusion.ui.jobs.building import building
+from blender_primdiffusion.ui.jobs.edit import RedressWork, VaryWork
 from blender_primdiffusion.ui.jobs.follow import follow
 from blender_primdiffusion.ui.jobs.queue import queue
+from blender_primdiffusion.ui.jobs.restore import RegenerateWork, RestoreWork, made_from_seed
 from blender_primdiffusion.ui.jobs.target import Target
 
 GIVES_GARBAGE, FINE = 3, 8

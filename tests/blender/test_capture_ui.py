@@ -25,9 +25,9 @@ from blender_primdiffusion.capture.options import MARK, UsageError, parse, setti
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.ui.captures.operators import RIG
 from blender_primdiffusion.ui.captures.session import captures
-from blender_primdiffusion.ui.captures.settings import words_of
+from blender_primdiffusion.ui.captures_panel import RIG
+from blender_primdiffusion.ui.captures_settings import words_of
 
 pytestmark = pytest.mark.any_blender
 

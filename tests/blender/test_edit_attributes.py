@@ -14,9 +14,8 @@ from blender_primdiffusion.formats.requests import PARTS
 
 from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.scene.human import humans
-from blender_primdiffusion.ui.generate import attributes
-from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_attributes
-from blender_primdiffusion.ui.human import edit_settings
+from blender_primdiffusion.ui import attributes, edit_operators
+from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_attributes
 
 VOCABULARY = {
     "categories": {"sex": ["female", "male"], "outfit": ["suit", "fitted tee and jeans"], "age": ["old"]},
@@ -128,4 +127,4 @@ def test_every_part_of_the_body_can_be_chosen(addon):
     panel = addon.scene.primdiffusion_edit
     panel.parts = set(PARTS)
     assert panel.parts == set(PARTS)
-    assert edit_settings.PRIMDIFFUSION_PG_edit.bl_rna.properties["parts"].default_flag == {"top"}
+    assert edit_operators.PRIMDIFFUSION_PG_edit.bl_rna.properties["parts"].default_flag == {"top"}

@@ -13,8 +13,8 @@ from jobs_driven import drive, error_of, notice_of, shown, until_running
 from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.scene.human import armature_of, body_of, humans, remove_human
 from blender_primdiffusion.scene.painting import painted_weights
-from blender_primdiffusion.ui.human import edit_operators, edit_panel
-from blender_primdiffusion.ui.human.edit_work import VaryWork
+from blender_primdiffusion.ui import edit_operators, edit_panel
+from blender_primdiffusion.ui.jobs.edit import VaryWork
 from blender_primdiffusion.ui.jobs.follow import follow
 from blender_primdiffusion.ui.jobs.queue import queue
 
@@ -273,7 +273,7 @@ def test_who_cannot_be_edited_is_said_before_a_job_begins(addon, tmp_path):
         ops.generate(seed=7, steps=1)
     addon.view_layer.objects.active = None
     refused = {
-        "select a part of the one to edit": lambda: ops.vary(),
+        "select the one you mean": lambda: ops.vary(),
         "'Eve' is not in the scene: choose from 'Human', 'Human.001'": lambda: ops.vary(human="Eve"),
         "choose the other person in the panel first": lambda: ops.blend(human="Human"),
         "'Human' cannot be the other person too": lambda: ops.blend(human="Human", other="Human"),
@@ -302,7 +302,9 @@ def test_a_panel_shows_its_own_work_alone_and_cancels_it(person):
 
 
 def test_no_edit_can_be_redone_with_a_slider():
-    for operator in edit_operators.EDITS:
+    edits = edit_operators._Edit.__subclasses__()
+    assert len(edits) >= 3
+    for operator in edits:
         assert not {"REGISTER", "UNDO"} & operator.bl_options
 
 

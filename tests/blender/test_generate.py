@@ -15,11 +15,10 @@ from jobs_driven import drive, error_of, notice_of, shown, until_running
 import blender_primdiffusion
 from blender_primdiffusion.scene.files import folder_of
 from blender_primdiffusion.scene.human import humans
-from blender_primdiffusion.ui.generate.operators import PRIMDIFFUSION_OT_generate
-from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_generate
-from blender_primdiffusion.ui.generate.work import GenerateWork
+from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_OT_generate, PRIMDIFFUSION_PT_generate
 from blender_primdiffusion.ui.jobs import queue as queue_module
 from blender_primdiffusion.ui.jobs.follow import follow
+from blender_primdiffusion.ui.jobs.generate import GenerateWork
 from blender_primdiffusion.ui.jobs.queue import queue
 
 DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4

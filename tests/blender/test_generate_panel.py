@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import random
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -17,7 +18,7 @@ from blender_primdiffusion.scene.build import GAP_M
 from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.scene.human import armature_of, humans
 from blender_primdiffusion.scene.preview import posed_extent
-from blender_primdiffusion.ui.generate import operators, panel, presets, settings
+from blender_primdiffusion.ui import generate_panel
 from blender_primdiffusion.ui.jobs.queue import queue
 
 FAILS = 2
@@ -32,12 +33,14 @@ def panel_settings(addon):
 @pytest.fixture
 def in_line(monkeypatch):
     """Works as with a window: submit returns at once, and `drive` is the timer."""
-    monkeypatch.setattr(operators, "submit", lambda _operator, context, work: queue.add(context, work) and {"FINISHED"})
+    monkeypatch.setattr(
+        generate_panel, "submit", lambda _operator, context, work: queue.add(context, work) and {"FINISHED"}
+    )
 
 
 @pytest.fixture
 def presets_folder(tmp_path, monkeypatch):
-    folder = Path(bpy.utils.user_resource("SCRIPTS", path=f"presets/{presets.SUBDIR}", create=True))
+    folder = Path(bpy.utils.user_resource("SCRIPTS", path=f"presets/{generate_panel.SUBDIR}", create=True))
     for path in folder.glob("*.py"):
         path.unlink()
     return folder
@@ -48,7 +51,7 @@ def seeds(context) -> list[int]:
 
 
 def test_an_unlocked_seed_is_another_one_after_each_result_and_a_locked_one_stays(addon, panel_settings, monkeypatch):
-    monkeypatch.setattr(settings.random, "randrange", lambda _: 99)
+    monkeypatch.setattr(random, "randrange", lambda _: 99)
     panel_settings.seed = 11
     bpy.ops.primdiffusion.generate(steps=1)
     assert (seeds(addon), panel_settings.seed) == ([11], 99)
@@ -116,7 +119,7 @@ def test_seeds_beyond_blenders_numbers_are_refused(addon):
 
 
 def test_random_seed_puts_another_one_into_the_panel(panel_settings, monkeypatch):
-    monkeypatch.setattr(settings.random, "randrange", lambda end: end - 1)
+    monkeypatch.setattr(random, "randrange", lambda end: end - 1)
     assert bpy.ops.primdiffusion.random_seed() == {"FINISHED"}
     assert panel_settings.seed == 2**31 - 1
 
@@ -171,13 +174,13 @@ def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_o
 ):
     def drawn() -> list[str]:
         layout = MagicMock()
-        panel.PRIMDIFFUSION_PT_generate.draw(SimpleNamespace(layout=layout), addon)
+        generate_panel.PRIMDIFFUSION_PT_generate.draw(SimpleNamespace(layout=layout), addon)
         return [call.args[1] for call in layout.column().prop.call_args_list]
 
     assert drawn() == ["count", "quality"]
     panel_settings.quality = "CUSTOM"
     assert drawn() == ["count", "quality", "steps", "sampler"]
-    monkeypatch.setattr(panel.setup, "draw_set_up", lambda layout: layout.label(text="not set up"))
-    texts = shown(panel.PRIMDIFFUSION_PT_generate, addon)
+    monkeypatch.setattr(generate_panel.setup, "draw_set_up", lambda layout: layout.label(text="not set up"))
+    texts = shown(generate_panel.PRIMDIFFUSION_PT_generate, addon)
     assert texts[0] == "not set up"
     assert {"primdiffusion.random_seed", "primdiffusion.generate"} <= set(texts)

@@ -16,11 +16,11 @@ from jobs_driven import drive, error_of, notice_of, shown, until_running
 import blender_primdiffusion
 from blender_primdiffusion.scene.files import folder_of
 from blender_primdiffusion.scene.human import humans
-from blender_primdiffusion.ui.captures import reconstruct_operators, reconstruct_settings, reconstruct_work
-from blender_primdiffusion.ui.captures.reconstruct_panel import PRIMDIFFUSION_PT_human_from_captures
-from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_generate
-from blender_primdiffusion.ui.jobs import work
+from blender_primdiffusion.ui import reconstruct_panel
+from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
+from blender_primdiffusion.ui.jobs import reconstruct, work
 from blender_primdiffusion.ui.jobs.queue import queue
+from blender_primdiffusion.ui.reconstruct_panel import PRIMDIFFUSION_PT_human_from_captures
 from blender_primdiffusion.worker.environment import BackendPython
 
 pytestmark = pytest.mark.any_blender
@@ -85,7 +85,7 @@ def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_j
 
 
 def test_the_operator_cannot_be_redone_with_a_slider():
-    options = reconstruct_operators.PRIMDIFFUSION_OT_human_from_captures.bl_options
+    options = reconstruct_panel.PRIMDIFFUSION_OT_human_from_captures.bl_options
     assert not {"REGISTER", "UNDO"} & options
 
 
@@ -94,7 +94,7 @@ def test_without_a_folder_a_script_gets_an_error_and_a_user_the_file_browser(add
         bpy.ops.primdiffusion.human_from_captures()
     operator, context = SimpleNamespace(directory=""), MagicMock()
     context.scene.primdiffusion_reconstruct.capture = ""
-    invoke = reconstruct_operators.PRIMDIFFUSION_OT_human_from_captures.invoke
+    invoke = reconstruct_panel.PRIMDIFFUSION_OT_human_from_captures.invoke
     assert invoke(operator, context, None) == {"RUNNING_MODAL"}
     context.window_manager.fileselect_add.assert_called_once_with(operator)
 
@@ -119,7 +119,7 @@ def test_a_warning_of_the_backend_is_shown(addon, captures):
 
 def test_the_panel_shows_progress_and_cancel_ends_the_job_without_a_person(addon, captures):
     assert "primdiffusion.human_from_captures" in shown(PRIMDIFFUSION_PT_human_from_captures, addon)
-    queue.add(addon, reconstruct_work.ReconstructWork(str(order(captures, "take long")), "", 0, 8))
+    queue.add(addon, reconstruct.ReconstructWork(str(order(captures, "take long")), "", 0, 8))
     until_running()
     texts = shown(PRIMDIFFUSION_PT_human_from_captures, addon)
     assert texts == ["primdiffusion.human_from_captures", "Reconstructing", "primdiffusion.cancel"]
@@ -130,7 +130,7 @@ def test_the_panel_shows_progress_and_cancel_ends_the_job_without_a_person(addon
 
 
 def test_the_timer_builds_the_person(addon, captures):
-    queue.add(addon, reconstruct_work.ReconstructWork(str(captures), "", 0, 8))
+    queue.add(addon, reconstruct.ReconstructWork(str(captures), "", 0, 8))
     drive()
     assert len(humans(addon.scene)) == 1
 
@@ -139,18 +139,18 @@ def test_subjects_are_those_of_the_list_or_of_the_folders(captures):
     for name in ("berta", "anna"):
         (captures / name).mkdir()
         (captures / name / "cameras.json").write_text("{}")
-    assert reconstruct_settings.subjects_in(captures) == ["anna", "berta"]
-    assert reconstruct_settings.subjects_in(captures / "anna") == []
+    assert reconstruct_panel.subjects_in(captures) == ["anna", "berta"]
+    assert reconstruct_panel.subjects_in(captures / "anna") == []
     (captures / "release_human_list.txt").write_text("clara\n\nanna\n")
-    assert reconstruct_settings.subjects_in(captures) == ["anna", "clara"]
-    assert reconstruct_settings.subjects_in(captures / "nowhere") == []
+    assert reconstruct_panel.subjects_in(captures) == ["anna", "clara"]
+    assert reconstruct_panel.subjects_in(captures / "nowhere") == []
 
 
 def test_the_search_offers_subjects_that_hold_what_was_typed(captures):
     (captures / "release_human_list.txt").write_text("clara\nanna\nHANNA\n")
     asked = SimpleNamespace(capture=str(captures))
-    assert list(reconstruct_settings._search(asked, None, "ann")) == ["HANNA", "anna"]
-    assert list(reconstruct_settings._search(SimpleNamespace(capture=""), None, "")) == []
+    assert list(reconstruct_panel._search(asked, None, "ann")) == ["HANNA", "anna"]
+    assert list(reconstruct_panel._search(SimpleNamespace(capture=""), None, "")) == []
 
 
 @pytest.mark.slow

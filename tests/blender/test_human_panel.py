@@ -22,9 +22,12 @@ from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, shape_model_of
 from blender_primdiffusion.scene.shape_model import measure, slider_names
 from blender_primdiffusion.scene.surface import node_inputs
-from blender_primdiffusion.ui.human.panel import PRIMDIFFUSION_MT_people, PRIMDIFFUSION_PT_human
-from blender_primdiffusion.ui.human.shape_operators import PRIMDIFFUSION_OT_random_shape
-from blender_primdiffusion.ui.human.shape_panel import PRIMDIFFUSION_PT_details, PRIMDIFFUSION_PT_shape
+from blender_primdiffusion.ui.human_panel import PRIMDIFFUSION_MT_people, PRIMDIFFUSION_PT_human
+from blender_primdiffusion.ui.shape_panel import (
+    PRIMDIFFUSION_OT_random_shape,
+    PRIMDIFFUSION_PT_details,
+    PRIMDIFFUSION_PT_shape,
+)
 
 ops = bpy.ops.primdiffusion
 TALL = [2.0] + [0.0] * 9

@@ -15,10 +15,11 @@ import pytest
 from jobs_driven import drive, shown, until_running
 
 from blender_primdiffusion.scene.human import humans
-from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_generate
-from blender_primdiffusion.ui.generate.work import GenerateWork
-from blender_primdiffusion.ui.jobs import diagnostics, drawing, memory, remedies
+from blender_primdiffusion.ui import drawing, jobs_panel
+from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
+from blender_primdiffusion.ui.jobs import memory, remedies
 from blender_primdiffusion.ui.jobs.follow import follow
+from blender_primdiffusion.ui.jobs.generate import GenerateWork
 from blender_primdiffusion.ui.jobs.pictures import SoFar, so_far
 from blender_primdiffusion.ui.jobs.queue import queue
 from blender_primdiffusion.worker.job import JobError
@@ -147,21 +148,21 @@ def test_diagnostics_tell_versions_and_the_error_and_no_folder_or_name(addon, tm
     monkeypatch.setenv("USER", "annabel")
     with pytest.raises(RuntimeError):
         ops.generate(seed=FAILS, steps=1)
-    told = diagnostics.diagnostics()
+    told = jobs_panel.diagnostics()
     for part in (bpy.app.version_string, "0-fake", "fake device", "seed 2", "CheckpointError", "checkpoint is damaged"):
         assert part in told
     assert str(tmp_path) not in told
     assert str(Path.home()) not in told
     assert "annabel" not in told
     assert ops.copy_diagnostics() == {"FINISHED"}
-    assert bpy.data.texts[diagnostics.TEXT].as_string().strip() == told.strip()
+    assert bpy.data.texts[jobs_panel.TEXT].as_string().strip() == told.strip()
     ops.copy_diagnostics()
     assert len(bpy.data.texts) == 1
 
 
 def test_diagnostics_can_be_copied_before_anything_was_done(addon):
     queue.last = None
-    assert "not started yet" in diagnostics.diagnostics()
+    assert "not started yet" in jobs_panel.diagnostics()
 
 
 def test_release_ends_the_child_says_what_was_freed_and_the_next_person_starts_another(addon):

@@ -14,12 +14,12 @@ from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.scene.human import humans
-from blender_primdiffusion.ui.generate.panel import PRIMDIFFUSION_PT_generate
-from blender_primdiffusion.ui.generate.work import GenerateWork
+from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
 from blender_primdiffusion.ui.jobs import follow as follow_module
 from blender_primdiffusion.ui.jobs.follow import follow, watch
-from blender_primdiffusion.ui.jobs.panel import PRIMDIFFUSION_PT_jobs
+from blender_primdiffusion.ui.jobs.generate import GenerateWork
 from blender_primdiffusion.ui.jobs.queue import queue
+from blender_primdiffusion.ui.jobs_panel import PRIMDIFFUSION_PT_jobs
 
 pytestmark = pytest.mark.any_blender
 
@@ -189,7 +189,7 @@ def test_a_scene_deleted_meanwhile_is_told_and_nothing_is_added(addon):
 
 def test_a_result_waits_for_the_user_to_let_go_of_what_is_being_moved(addon, monkeypatch):
     monkeypatch.setattr(follow_module, "in_the_way", lambda: "Move")
-    monkeypatch.setattr("blender_primdiffusion.ui.jobs.drawing.in_the_way", lambda: "Move")
+    monkeypatch.setattr("blender_primdiffusion.ui.drawing.in_the_way", lambda: "Move")
     ask(11)
     while not queue.ready:
         follow()
@@ -226,7 +226,7 @@ def test_loading_a_file_ends_the_child_and_drops_all_jobs(addon):
 
 
 def test_progress_is_shown_once_beside_the_button_and_the_jobs_panel_tells_what_ended(addon, monkeypatch):
-    monkeypatch.setattr("blender_primdiffusion.ui.jobs.drawing._progress_text", lambda: "step 1")
+    monkeypatch.setattr("blender_primdiffusion.ui.drawing._progress_text", lambda: "step 1")
     for seed, steps in ((FAILS, 1), (11, 1), (TAKES_LONG, 50)):
         ask(seed, steps)
     while len(queue.ended) < 2:

@@ -22,10 +22,11 @@ from blender_primdiffusion.scene.human import MARK, armature_of, humans, remove_
 from blender_primdiffusion.scene.keyframes import keyframe_poses
 from blender_primdiffusion.scene.material import density_gain
 from blender_primdiffusion.scene.merged import merged_of, merged_state
+from blender_primdiffusion.ui import render_panel
 from blender_primdiffusion.ui.jobs.follow import follow
 from blender_primdiffusion.ui.jobs.queue import queue
 from blender_primdiffusion.ui.jobs.target import Target
-from blender_primdiffusion.ui.render import merge_work, panel
+from blender_primdiffusion.ui.render import merge_work
 from blender_primdiffusion.ui.render.merge_work import MergeFramesWork, MergeWork, Moment
 
 ops = bpy.ops.primdiffusion
@@ -93,16 +94,16 @@ def test_unmerging_goes_back_to_the_surface_where_that_was_shown(person):
 def test_the_panel_says_when_the_pose_is_another_one(person):
     raise_left_arm(person, 0.3)
     ops.merge()
-    assert not panel.outdated(person, bpy.context.scene)
+    assert not render_panel.outdated(person, bpy.context.scene)
     armature_of(person).location.x = 2  # the merged volume moves along
     bpy.context.view_layer.update()
-    assert not panel.outdated(person, bpy.context.scene)
+    assert not render_panel.outdated(person, bpy.context.scene)
     raise_left_arm(person, 0.4)
-    assert panel.outdated(person, bpy.context.scene)
-    assert "of another pose" in drawn(panel.PRIMDIFFUSION_PT_merge, bpy.context).replace(" | ", " ")
+    assert render_panel.outdated(person, bpy.context.scene)
+    assert "of another pose" in drawn(render_panel.PRIMDIFFUSION_PT_merge, bpy.context).replace(" | ", " ")
     ops.merge()
-    assert not panel.outdated(person, bpy.context.scene)
-    assert "of another pose" not in drawn(panel.PRIMDIFFUSION_PT_merge, bpy.context).replace(" | ", " ")
+    assert not render_panel.outdated(person, bpy.context.scene)
+    assert "of another pose" not in drawn(render_panel.PRIMDIFFUSION_PT_merge, bpy.context).replace(" | ", " ")
 
 
 def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(person):
@@ -125,7 +126,7 @@ def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(perso
     np.testing.assert_allclose(found, 10 + 10 * np.sin(0.2 * np.arange(4)), rtol=2e-3)
     for frame in (5, 6, 8):
         scene.frame_set(frame)
-        assert not panel.outdated(person, scene)
+        assert not render_panel.outdated(person, scene)
     assert ops.merge_frames(frame_start=6, frame_end=7) == {"FINISHED"}
     assert merged_of(person).data.frame_duration == 2
     ops.merge()
@@ -217,15 +218,15 @@ def test_set_attachment_reports_what_stands_in_the_way(person):
 
 def test_panels_show_modes_warnings_and_memory(person):
     context = bpy.context
-    assert "merge_frames" in drawn(panel.PRIMDIFFUSION_PT_merge, context)
-    assert drawn(panel.PRIMDIFFUSION_PT_attachment, context).count("set_attachment") == 2
+    assert "merge_frames" in drawn(render_panel.PRIMDIFFUSION_PT_merge, context)
+    assert drawn(render_panel.PRIMDIFFUSION_PT_attachment, context).count("set_attachment") == 2
     ops.merge()
-    assert drawn(panel.PRIMDIFFUSION_PT_attachment, context).count("set_attachment") == 3
+    assert drawn(render_panel.PRIMDIFFUSION_PT_attachment, context).count("set_attachment") == 3
     ops.unmerge()
     person[MARK] = person[MARK].replace('"most_overlapping": ', '"most_overlapping": 9')
-    assert "volumes of 'Human' overlap" in drawn(panel.PRIMDIFFUSION_PT_cycles_look, context).replace(" | ", " ")
-    assert "MB" in drawn(panel.PRIMDIFFUSION_PT_memory, context)
-    assert "primdiffusion.set_up_cycles" in shown(panel.PRIMDIFFUSION_PT_render, context)
+    assert "volumes of 'Human' overlap" in drawn(render_panel.PRIMDIFFUSION_PT_cycles_look, context).replace(" | ", " ")
+    assert "MB" in drawn(render_panel.PRIMDIFFUSION_PT_memory, context)
+    assert "primdiffusion.set_up_cycles" in shown(render_panel.PRIMDIFFUSION_PT_render, context)
 
 
 def test_setting_up_cycles_leaves_camera_world_and_bounces_between_objects(person):

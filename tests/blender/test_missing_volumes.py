@@ -16,8 +16,8 @@ from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.files import HOME, folder_of, person_file, volume_path
 from blender_primdiffusion.scene.human import MARK, humans
 from blender_primdiffusion.scene.missing import missing_files
-from blender_primdiffusion.ui.files.watching import look, state
-from blender_primdiffusion.ui.human.panel import PRIMDIFFUSION_PT_human
+from blender_primdiffusion.ui.human_panel import PRIMDIFFUSION_PT_human
+from blender_primdiffusion.ui.jobs.missing_files import look, state
 
 ops = bpy.ops.primdiffusion
 COUNT = 8

@@ -21,9 +21,8 @@ from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.human import armature_of
-from blender_primdiffusion.ui.motion.import_motion import PRIMDIFFUSION_OT_import_motion, look_at
-from blender_primdiffusion.ui.motion.panels import PRIMDIFFUSION_MT_actions, PRIMDIFFUSION_PT_motion
-from blender_primdiffusion.ui.motion.under_cursor import nearest_to
+from blender_primdiffusion.ui.import_motion import PRIMDIFFUSION_OT_import_motion, look_at, nearest_to
+from blender_primdiffusion.ui.motion_panel import PRIMDIFFUSION_MT_actions, PRIMDIFFUSION_PT_motion
 
 ops = bpy.ops.primdiffusion
 
@@ -271,7 +270,7 @@ def test_any_armature_with_smpls_joints_can_be_moved(addon, tmp_path):
 
 
 def test_nobody_in_the_scene_is_said(addon, tmp_path):
-    with pytest.raises(RuntimeError, match="Nobody is in the scene"):
+    with pytest.raises(RuntimeError, match="no person in the scene"):
         ops.import_motion(filepath=amass(tmp_path / "m.npz"))
 
 

@@ -18,8 +18,8 @@ from blender_primdiffusion.motion.skeleton import REST_JOINTS, joint_positions
 from blender_primdiffusion.motion.stride import stride_ratio
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.ui.motion.placing import Placement, place_motion
-from blender_primdiffusion.ui.motion.settings import FACTS
+from blender_primdiffusion.ui.motion_armatures import FACTS
+from blender_primdiffusion.ui.motion_placing import Placement, place_motion
 
 pytestmark = pytest.mark.any_blender
 

@@ -17,7 +17,7 @@ from blender_primdiffusion.scene.overlap import current_overlap, max_overlap, ov
 from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import generated_betas
 from blender_primdiffusion.scene.volumes import bake
-from blender_primdiffusion.ui.human.shape_panel import details
+from blender_primdiffusion.ui.shape_panel import details
 
 COUNT = 96
 SMALL = (-4.0, -4.0)

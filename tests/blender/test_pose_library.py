@@ -25,9 +25,9 @@ from blender_primdiffusion.motion.skeleton import joint_positions
 from blender_primdiffusion.scene.actions import action_curves
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of
-from blender_primdiffusion.ui.assets.thumbnails import clay_figure, picture_of_file
-from blender_primdiffusion.ui.motion import pose_pictures
-from blender_primdiffusion.ui.motion.panels import PRIMDIFFUSION_PT_poses
+from blender_primdiffusion.ui import pose_pictures
+from blender_primdiffusion.ui.jobs.thumbnails import clay_figure, picture_of_file
+from blender_primdiffusion.ui.pose_panel import PRIMDIFFUSION_PT_poses
 
 ops = bpy.ops.primdiffusion
 REST = np.tile(np.eye(3), (24, 1, 1))

@@ -15,7 +15,7 @@ from blender_primdiffusion.scene.human import body_of
 from blender_primdiffusion.scene.proxy import build_proxy, is_outdated, proxy_of, read_proxy, shown_betas
 from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import betas_of, generated_betas
-from blender_primdiffusion.ui.export.mesh_work import AddProxyWork
+from blender_primdiffusion.ui.jobs.export_mesh import AddProxyWork
 from blender_primdiffusion.ui.jobs.target import Target
 
 TALLER, WIDER = np.eye(10)[0] * 2.0, np.eye(10)[1] * 2.0

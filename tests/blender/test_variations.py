@@ -11,11 +11,10 @@ from jobs_driven import drive, error_of, shown, until_running
 
 from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.scene.human import armature_of, humans
+from blender_primdiffusion.ui import variations_operators, variations_panel
+from blender_primdiffusion.ui.jobs.pictures import icons
 from blender_primdiffusion.ui.jobs.queue import queue
-from blender_primdiffusion.ui.variations import operators, panel
-from blender_primdiffusion.ui.variations.icons import icons
-from blender_primdiffusion.ui.variations.sheet import sheet
-from blender_primdiffusion.ui.variations.work import VariationsWork
+from blender_primdiffusion.ui.jobs.variations import VariationsWork, sheet
 
 FAILS, TAKES_LONG = 2, 4
 """Seeds that the fake child takes as orders."""
@@ -147,12 +146,12 @@ def test_pictures_appear_one_by_one_while_they_are_made_and_cancelling_keeps_the
     addon, shown_people, monkeypatch
 ):
     drawn = []
-    monkeypatch.setattr(panel, "_draw_picture", lambda _cell, path, _units: drawn.append(path))
+    monkeypatch.setattr(variations_panel, "_draw_picture", lambda _cell, path, _units: drawn.append(path))
     queue.add(addon, VariationsWork((31, TAKES_LONG, 33), 3, "ddim"))
     until_running()
     while len(queue.job.pictures) < 2:
         queue.tick()
-    texts = shown(panel.PRIMDIFFUSION_PT_variations, addon)
+    texts = shown(variations_panel.PRIMDIFFUSION_PT_variations, addon)
     assert [path is not None for path in drawn] == [True, True, False]
     assert {"31", "4", "33", "primdiffusion.cancel"} <= set(texts)
     ops.cancel()
@@ -162,7 +161,7 @@ def test_pictures_appear_one_by_one_while_they_are_made_and_cancelling_keeps_the
 
 def test_the_panel_shows_the_sheet_and_what_can_be_done_with_those_selected(addon, shown_people):
     ops.select_variation(index=1)
-    texts = shown(panel.PRIMDIFFUSION_PT_variations, addon)
+    texts = shown(variations_panel.PRIMDIFFUSION_PT_variations, addon)
     assert texts.count("primdiffusion.select_variation") == 4
     assert {"primdiffusion.build_variation", "primdiffusion.more_like_variation", "New people: 4"} <= set(texts)
 
@@ -172,7 +171,7 @@ def test_as_many_pictures_stand_side_by_side_as_fit(width, columns):
     from types import SimpleNamespace as Named
 
     preferences = Named(system=Named(ui_scale=2.0))
-    number, units = panel._columns(Named(preferences=preferences, region=Named(width=width * 2)))
+    number, units = variations_panel._columns(Named(preferences=preferences, region=Named(width=width * 2)))
     assert number == columns
     assert number * units * 20 <= max(width, 100)
 
@@ -217,7 +216,7 @@ def test_a_disk_that_is_full_keeps_the_former_sheet(addon, shown_people, monkeyp
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("blender_primdiffusion.ui.variations.sheet.shutil.move", full)
+    monkeypatch.setattr("blender_primdiffusion.ui.jobs.variations.shutil.move", full)
     with pytest.raises(RuntimeError, match="No space left"):
         ops.variations(seed=40, count=2, steps=1)
     assert seeds() == [11, 12, 13, 14]
@@ -225,5 +224,8 @@ def test_a_disk_that_is_full_keeps_the_former_sheet(addon, shown_people, monkeyp
 
 
 def test_none_can_be_redone_with_a_slider():
-    for operator in (operators.PRIMDIFFUSION_OT_variations, operators.PRIMDIFFUSION_OT_more_like_variation):
+    for operator in (
+        variations_operators.PRIMDIFFUSION_OT_variations,
+        variations_operators.PRIMDIFFUSION_OT_more_like_variation,
+    ):
         assert not {"REGISTER", "UNDO"} & operator.bl_options

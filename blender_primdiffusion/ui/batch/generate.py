@@ -17,7 +17,7 @@ from ...console import Stop, duration
 from ...places import preference
 from ...worker.backend import Backend
 from ...worker.job import Job
-from ..generate.attributes import Attributes, parsed
+from ..attributes import Attributes, parsed
 from .asking import NoBackend, Stopped, ask, backend_of
 from .people import NPZ_FILE, PERSON_FILE, Movement, motion_name, movement_of, person_blend
 from .running import Clock, Say, begun, reason, run

@@ -65,7 +65,7 @@ def selected_person(context: bpy.types.Context) -> bpy.types.Collection:
         return people[0]
     if not people:
         raise ValueError("there is no person in the scene: generate one first")
-    raise ValueError(f"{len(people)} people are in the scene: select a part of the one to edit")
+    raise ValueError(f"{len(people)} people are in the scene: select the one you mean")
 
 
 def named_person(context: bpy.types.Context, name: str) -> bpy.types.Collection:
@@ -74,5 +74,6 @@ def named_person(context: bpy.types.Context, name: str) -> bpy.types.Collection:
     for person in people:
         if person.name == name:
             return person
-    there = ", ".join(repr(person.name) for person in people) or "nobody"
-    raise ValueError(f"the person {name!r} is not in the scene: choose from {there}")
+    if not people:
+        raise ValueError(f"the person {name!r} is not in the scene: it has no people")
+    raise ValueError(f"the person {name!r} is not in the scene: choose from {', '.join(repr(p.name) for p in people)}")

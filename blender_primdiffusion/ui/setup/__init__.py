@@ -7,7 +7,7 @@ import bpy
 from . import operators, preferences, session
 from .drawing import draw_set_up
 
-__all__ = ["draw_set_up", "register", "unregister"]
+__all__ = ["CLASSES", "draw_set_up", "unregister"]
 
 CLASSES = (
     operators.PRIMDIFFUSION_OT_set_up_backend,
@@ -20,16 +20,8 @@ CLASSES = (
 )
 
 
-def register() -> None:
-    """Make the room known to Blender."""
-    for cls in CLASSES:
-        bpy.utils.register_class(cls)
-
-
 def unregister() -> None:
-    """Undo `register`; a set-up under way is ended, and can be resumed."""
+    """End a set-up under way; it can be resumed."""
     session.session.cancel()
     if bpy.app.timers.is_registered(session.follow):
         bpy.app.timers.unregister(session.follow)
-    for cls in reversed(CLASSES):
-        bpy.utils.unregister_class(cls)

@@ -1,0 +1,146 @@
+"""What a person may be asked to be: menus of what the checkpoint knows, all of them Any unless chosen."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import bpy
+
+from ..places import backend_module_path, preference
+from .translations import CONTEXT
+
+if TYPE_CHECKING:
+    from ..worker.vocabulary import Vocabulary
+
+ANY = "ANY"
+CATEGORIES = ("sex", "outfit", "pattern", "shoes", "hair", "hat")
+"""Those that have a menu; scripts may ask for whatever else a checkpoint knows."""
+SCALARS = {"height": "m", "weight": "kg"}
+_DEFAULT_CHECKPOINT = Path("primdiffusion", "weights", "default.safetensors")
+
+Attributes = dict[str, str | float]
+Item = tuple[str, str, str, int]
+
+_read: dict[Path, tuple[float, Vocabulary]] = {}
+"""By path, with the time of the file."""
+_items: dict[tuple[str, ...], list[Item]] = {}
+"""Blender does not keep the strings of a menu that is made when it is drawn: they are kept here."""
+
+
+def known() -> Vocabulary:
+    """Of the checkpoint that will be used; an empty one where it cannot be read, which generating will explain."""
+    from ..worker.vocabulary import Vocabulary, read_vocabulary
+
+    chosen, bundled = preference("checkpoint"), backend_module_path()
+    if chosen:
+        path = Path(chosen)
+    elif bundled is not None:
+        path = bundled / _DEFAULT_CHECKPOINT
+    else:
+        return Vocabulary()
+    try:
+        time = path.stat().st_mtime
+        if path not in _read or _read[path][0] != time:
+            _read[path] = (time, read_vocabulary(path))
+    except (OSError, ValueError):
+        return Vocabulary()
+    return _read[path][1]
+
+
+def menu(name: str) -> list[Item]:
+    """The items of the menu of a category. Their numbers, which a .blend keeps, depend on the value alone, so another
+    checkpoint that knows the same value shows it."""
+    import zlib
+
+    values = known().categories.get(name, ())
+    if values not in _items:
+        numbered = [(value, choice_label(value), "", zlib.crc32(value.encode()) & 0x7FFFFFFF or 1) for value in values]
+        _items[values] = [(ANY, "Any", "Whatever comes", 0), *numbered]
+    return _items[values]
+
+
+def choice_label(value: str) -> str:
+    """A value of the backend's, for people: side parting -> Side parting, shoes01 -> Shoes 1."""
+    spaced = re.sub(r"(?<=[a-z])0*(\d+)$", r" \1", value)
+    return spaced[:1].upper() + spaced[1:]
+
+
+def title(name: str) -> str:
+    """A name of the backend's, for people."""
+    return name.replace("_", " ").title()
+
+
+def _menu_property(name: str):
+    items: Callable = lambda _self, _context: menu(name)  # noqa: E731  bpy wants a function of its own for each
+    return bpy.props.EnumProperty(
+        name=title(name), description="What the person is asked to be", items=items, translation_context=CONTEXT
+    )
+
+
+class PRIMDIFFUSION_PG_attributes(bpy.types.PropertyGroup):
+    """What a person is asked to be; nothing unless something is chosen."""
+
+    sex: _menu_property("sex")
+    outfit: _menu_property("outfit")
+    pattern: _menu_property("pattern")
+    shoes: _menu_property("shoes")
+    hair: _menu_property("hair")
+    hat: _menu_property("hat")
+    use_height: bpy.props.BoolProperty(name="Ask for a Height", description="The body is of this height")
+    height: bpy.props.FloatProperty(
+        name="Height", description="Metres", default=1.7, min=0.5, max=2.5, step=1, translation_context=CONTEXT
+    )
+    use_weight: bpy.props.BoolProperty(name="Ask for a Weight", description="The body is of this weight")
+    weight: bpy.props.FloatProperty(
+        name="Weight", description="Kilograms", default=70.0, min=10.0, max=300.0, step=100, translation_context=CONTEXT
+    )
+
+
+def asked(group: PRIMDIFFUSION_PG_attributes) -> Attributes:
+    """What is chosen in `group` of what the checkpoint knows, as the child wants it."""
+    vocabulary = known()
+    chosen: Attributes = {}
+    for name in CATEGORIES:
+        if name in vocabulary.categories and getattr(group, name) not in (ANY, ""):
+            chosen[name] = getattr(group, name)
+    for name in SCALARS:
+        if name in vocabulary.scalars and getattr(group, f"use_{name}"):
+            chosen[name] = round(getattr(group, name), 4)
+    return chosen
+
+
+def parsed(text: str) -> Attributes:
+    """Attributes as scripts write them: "sex=female, height=1.7"; empty asks for nothing. Raises ValueError."""
+    found: Attributes = {}
+    for part in filter(None, re.split(r"[,;]\s*", text.strip())):
+        name, equals, value = (piece.strip() for piece in part.partition("="))
+        if not (equals and name and value):
+            raise ValueError(f"the attribute {part!r} is no name=value: write them like sex=female, height=1.7")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            found[name] = value
+    return found
+
+
+def draw_attributes(layout: bpy.types.UILayout, group: PRIMDIFFUSION_PG_attributes) -> None:
+    """Menus and numbers of what the checkpoint knows."""
+    vocabulary = known()
+    for name in CATEGORIES:
+        if name in vocabulary.categories:
+            layout.prop(group, name)
+    for name in SCALARS:
+        if name in vocabulary.scalars:
+            row = layout.row(align=True, heading=title(name), heading_ctxt=CONTEXT)
+            row.prop(group, f"use_{name}", text="")
+            number = row.row()
+            number.enabled = getattr(group, f"use_{name}")
+            number.prop(group, name, text="")
+    if not (vocabulary.categories or vocabulary.scalars):
+        layout.label(text="This checkpoint knows no attributes", icon="INFO")
+
+
+CLASSES = (PRIMDIFFUSION_PG_attributes,)

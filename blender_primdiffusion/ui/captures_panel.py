@@ -1,0 +1,350 @@
+"""The sidebar panel Captures: render, cancel, verify, and a preview of the cameras."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import bpy
+from mathutils import Vector
+
+from .captures.session import Busy, captures
+from .captures_settings import words_of
+from .drawing import SidebarPanel, draw_lines, property_columns
+from .jobs.follow import redraw
+from .manual import draw_manual_button
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+RIG = "Capture Rig"
+_TICK_S = 0.1
+_TOLD_S = 1.0
+_PERSON_M = 1.1
+"""Radius of the sphere around a person in the T-pose about the world's origin, where there is nothing to look at."""
+
+
+class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
+    """Render everybody in the folder of people from all sides, into the folder of captures"""
+
+    bl_idname = "primdiffusion.render_captures"
+    bl_label = "Render Captures"
+    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO: the scene stays as it is
+
+    people: bpy.props.StringProperty(name="People", description="Empty: the panel's")
+    out: bpy.props.StringProperty(name="Captures", description="Empty: the panel's")
+    options: bpy.props.StringProperty(name="Options", description="More words, as on the command line")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """With a window a Blender of its own renders and a timer follows it; in background mode this one renders."""
+        from ..capture.options import parse, settings_of
+
+        try:
+            if captures.busy:
+                raise Busy("captures are being rendered; wait for them or press Cancel")
+            words = words_of(
+                context.scene.primdiffusion_captures, context, captures.new_folder(), self.people, self.out
+            )
+            words += shlex.split(self.options)
+            if bpy.app.background:
+                return self._render_here(context, words)
+            settings_of(parse(words))  # what is impossible is said at once
+            captures.start(words)
+        except (Busy, OSError, ValueError, RuntimeError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        bpy.app.timers.register(follow, first_interval=_TICK_S, persistent=True)
+        return {"FINISHED"}
+
+    def _render_here(self, context: bpy.types.Context, words: list[str]) -> set[str]:
+        from ..capture.command import describe, scans_in
+        from ..capture.job import run
+        from ..capture.options import parse, settings_of
+        from ..capture.report import Report, report_path
+
+        options = parse(words)
+        settings, report, printed = settings_of(options), Report(), 0.0
+        captures.close()  # the file of cameras is read
+        scans = scans_in(options.people, options.only)
+        with contextlib.closing(run(context, settings, scans, report)) as steps:
+            for progress in steps:
+                for line in progress.news:
+                    print(f"PrimDiffusion: {line}", flush=True)
+                if time.monotonic() - printed > _TOLD_S:
+                    printed = time.monotonic()
+                    print(f"PrimDiffusion: {describe(progress)}", flush=True)
+        if report.failed:
+            first, path = report.failed[0], report_path(settings.out, settings.shard)
+            who = first["subject"] or first["what"]
+            self.report({"ERROR"}, f"{len(report.failed)} failed; {who}: {first['why']} (all: {path})")
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_cancel_captures(bpy.types.Operator):
+    """Stop rendering; what is there stays, and the next run goes on from it"""
+
+    bl_idname = "primdiffusion.cancel_captures"
+    bl_label = "Cancel"
+    bl_options: set[str] = set()  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        """Only while something runs."""
+        cls.poll_message_set("No captures are being rendered")
+        return captures.busy
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        """Ask; the timer sees it through."""
+        captures.cancel()
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_verify_captures(bpy.types.Operator):
+    """Read every file of the captures and name what is missing, cut short or altered"""
+
+    bl_idname = "primdiffusion.verify_captures"
+    bl_label = "Verify"
+    bl_options: set[str] = set()  # noqa: RUF012
+
+    out: bpy.props.StringProperty(name="Captures", description="Empty: the panel's")
+    repair: bpy.props.BoolProperty(
+        name="Repair", description="Take away what is damaged, so that the next run renders just that anew"
+    )
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """With a window in a Blender of its own; in background mode here, and it fails where something is wrong."""
+        from ..capture.options import parse
+        from ..capture.verify import repair, verify
+
+        out = bpy.path.abspath(self.out or context.scene.primdiffusion_captures.out)
+        try:
+            if not out:
+                raise ValueError("choose the folder of captures first")
+            words = ["--out", out, "--verify", *(["--repair"] if self.repair else [])]
+            if not bpy.app.background:
+                captures.start(words)
+                bpy.app.timers.register(follow, first_interval=_TICK_S, persistent=True)
+                return {"FINISHED"}
+            root = parse(words).out
+            wrong = repair(root) if self.repair else verify(root)
+        except (Busy, OSError, ValueError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        for sentence in wrong:
+            print(f"PrimDiffusion: {sentence}")
+        if wrong and not self.repair:
+            self.report({"ERROR"}, f"{len(wrong)} problems; the first: {wrong[0]}")
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_preview_rig(bpy.types.Operator):
+    """Show the cameras around the active object, or take them away again"""
+
+    bl_idname = "primdiffusion.preview_rig"
+    bl_label = "Preview Cameras"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """A collection of camera objects; they are only for looking at."""
+        from ..capture.blender_camera import aim
+
+        collection = context.scene.collection.children.get(RIG)
+        if collection is not None:
+            remove_rig(collection)
+            return {"FINISHED"}
+        try:
+            rig = context.scene.primdiffusion_captures.rig()
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        collection = bpy.data.collections.new(RIG)
+        context.scene.collection.children.link(collection)
+        for number, view in enumerate(rig.views(*_sphere_around(context))):
+            camera = bpy.data.objects.new(f"Capture {number:04d}", bpy.data.cameras.new(f"Capture {number:04d}"))
+            collection.objects.link(camera)
+            aim(camera, view)
+            camera.data.display_size = 0.1
+            camera.hide_select = True
+        return {"FINISHED"}
+
+
+def remove_rig(collection: bpy.types.Collection) -> None:
+    """Take the preview out of the file, and nothing that the user has put into its collection."""
+    ours = [thing for thing in collection.objects if thing.type == "CAMERA" and thing.name.startswith("Capture ")]
+    cameras = [thing.data for thing in ours]
+    bpy.data.batch_remove([*ours, *cameras, collection])
+
+
+def follow() -> float | None:
+    """The timer: take in what the child has said, draw it."""
+    if captures.tick():
+        redraw()
+    return _TICK_S if captures.busy else None
+
+
+def _sphere_around(context: bpy.types.Context) -> tuple[NDArray[np.float64], float]:
+    """Of the active object and what hangs on it; of a person at the origin where there is none."""
+    import numpy as np
+
+    from ..formats.camera_rig import bounding_sphere
+    from ..scene.convention import points_to_backend
+
+    active = context.active_object
+    things = [active, *active.children_recursive] if active is not None and active.type != "CAMERA" else []
+    depsgraph = context.evaluated_depsgraph_get()
+    corners = [
+        thing.matrix_world @ corner
+        for thing in (thing.evaluated_get(depsgraph) for thing in things)
+        for corner in map(Vector, thing.bound_box)
+        if thing.type in ("MESH", "ARMATURE")
+    ]
+    if not corners:
+        return np.zeros(3), _PERSON_M
+    centre, radius = bounding_sphere(points_to_backend(np.array(corners)))
+    return (centre, radius) if radius > 0 else (centre, _PERSON_M)
+
+
+_SHOWN_LINES = 4
+
+
+class PRIMDIFFUSION_PT_captures(SidebarPanel, bpy.types.Panel):
+    """From where to where, the button, and how far it is."""
+
+    bl_label = "Captures"
+    bl_order = 5
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw_header_preset(self, _context: bpy.types.Context) -> None:
+        """The manual's page."""
+        draw_manual_button(self.layout, "captures")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Reads the session; starts nothing."""
+        layout, asked = property_columns(self.layout), context.scene.primdiffusion_captures
+        column = layout.column()
+        column.enabled = not captures.busy
+        column.prop(asked, "people")
+        column.prop(asked, "out")
+        if captures.busy:
+            left = f" ({_minutes(captures.eta_s)} left)" if captures.eta_s else ""
+            layout.progress(factor=captures.fraction, text=f"{captures.message}{left}", translate=False)
+            layout.operator("primdiffusion.cancel_captures", icon="CANCEL")
+        else:
+            layout.operator("primdiffusion.render_captures", icon="RENDER_ANIMATION")
+        for text, icon in ((captures.error, "ERROR"), (captures.notice, "INFO")):
+            draw_lines(layout, text, icon)
+        if captures.busy or captures.error:
+            for text in list(captures.lines)[-_SHOWN_LINES:]:
+                draw_lines(layout, text, "DOT")
+
+
+def _sub_panel(name: str, label: str, content: Callable) -> type:
+    class SubPanel(SidebarPanel, bpy.types.Panel):
+        bl_idname = f"PRIMDIFFUSION_PT_captures_{name}"
+        bl_label = label
+        bl_parent_id = "PRIMDIFFUSION_PT_captures"
+        bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+        __doc__ = content.__doc__
+
+        def draw(self, context: bpy.types.Context) -> None:
+            layout = property_columns(self.layout)
+            layout.enabled = not captures.busy
+            content(layout, context.scene.primdiffusion_captures, context)
+
+    SubPanel.__name__ = SubPanel.bl_idname
+    return SubPanel
+
+
+def _draw_input(layout: bpy.types.UILayout, asked, _context) -> None:
+    """Whose body, and which part of the people."""
+    layout.prop(asked, "body")
+    layout.prop(asked, "seed")
+    row = layout.row(align=True)
+    row.prop(asked, "shard")
+    row.prop(asked, "shards")
+
+
+def _draw_poses(layout: bpy.types.UILayout, asked, _context) -> None:
+    """Which poses they take."""
+    layout.prop(asked, "poses")
+    layout.prop(asked, "pose_count")
+
+
+def _draw_cameras(layout: bpy.types.UILayout, asked, context: bpy.types.Context) -> None:
+    """Where the cameras stand."""
+    layout.prop(asked, "arrangement")
+    if asked.arrangement == "custom":
+        layout.prop(asked, "cameras")
+        if asked.cameras is None:
+            layout.label(text="Without a collection: the selected cameras", icon="INFO")
+        return
+    layout.prop(asked, "camera_count")
+    if asked.arrangement == "rings":
+        for name in ("rings", "lowest", "highest"):
+            layout.prop(asked, name)
+    layout.prop(asked, "fov")
+    layout.prop(asked, "margin")
+    shown = RIG in context.scene.collection.children
+    layout.operator(
+        "primdiffusion.preview_rig", text="Hide Cameras" if shown else "Preview Cameras", icon="CAMERA_DATA"
+    )
+
+
+def _draw_cycles(layout: bpy.types.UILayout, asked, _context) -> None:
+    """How Cycles renders."""
+    layout.prop(asked, "samples")
+    layout.prop(asked, "device")
+    layout.prop(asked, "light")
+    if asked.light == "hdri":
+        layout.prop(asked, "hdri")
+    if asked.light != "uniform":
+        layout.prop(asked, "denoise")
+
+
+def _draw_output(layout: bpy.types.UILayout, asked, _context) -> None:
+    """What is written."""
+    for name in ("width", "height", "background"):
+        layout.prop(asked, name)
+    layout.column().prop(asked, "passes")
+    layout.column().prop(asked, "layouts")
+    layout.prop(asked, "released_reference")
+    row = layout.row(align=True)
+    row.operator("primdiffusion.verify_captures", icon="CHECKMARK").repair = False
+    row.operator("primdiffusion.verify_captures", text="Repair", icon="TOOL_SETTINGS").repair = True
+
+
+SUB_PANELS = (
+    _sub_panel("input", "Input", _draw_input),
+    _sub_panel("poses", "Poses", _draw_poses),
+    _sub_panel("cameras", "Cameras", _draw_cameras),
+    _sub_panel("cycles", "Cycles", _draw_cycles),
+    _sub_panel("output", "Output", _draw_output),
+)
+
+
+def _minutes(seconds: float) -> str:
+    minutes = round(seconds / 60)
+    return f"{seconds:.0f} s" if seconds < 90 else f"{minutes} min" if minutes < 120 else f"{minutes / 60:.1f} h"
+
+
+CLASSES = (
+    PRIMDIFFUSION_OT_render_captures,
+    PRIMDIFFUSION_OT_cancel_captures,
+    PRIMDIFFUSION_OT_verify_captures,
+    PRIMDIFFUSION_OT_preview_rig,
+    PRIMDIFFUSION_PT_captures,
+    *SUB_PANELS,
+)
+
+
+def unregister() -> None:
+    """End the child and the timer."""
+    captures.close()
+    if bpy.app.timers.is_registered(follow):
+        bpy.app.timers.unregister(follow)

@@ -1,0 +1,221 @@
+"""What the panel Render Captures asks for; saved with the scene."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import bpy
+
+from ..capture.names import LAYOUTS, PASSES
+from .translations import CONTEXT
+
+if TYPE_CHECKING:
+    from ..formats.camera_rig import Rig
+
+_PASS_NAMES = {
+    "img": ("Colour", "What the camera sees, over black"),
+    "mask": ("Mask", "Share of each pixel that the person covers"),
+    "depth": ("Depth", "Metres along the optical axis, 16 bits"),
+    "normal": ("Normal", "Of the surface, in the world"),
+    "part": ("Part", "Which of the 24 joints moves the surface"),
+}
+_LAYOUT_NAMES = {"nerf": "NeRF", "opencv": "OpenCV", "colmap": "COLMAP"}
+_PASS_ITEMS = [(kind, *_PASS_NAMES[kind], 1 << i) for i, kind in enumerate(PASSES)]
+_LAYOUT_ITEMS = [(name, _LAYOUT_NAMES[name], "", 1 << i) for i, name in enumerate(LAYOUTS)]
+
+
+class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
+    """`scene.primdiffusion_captures`."""
+
+    people: bpy.props.StringProperty(
+        name="People", description="Folder of scans (.glb, .fbx, .obj) or of generated people", subtype="DIR_PATH"
+    )
+    out: bpy.props.StringProperty(
+        name="Captures", description="Folder of the dataset; one begun before is gone on with", subtype="DIR_PATH"
+    )
+    seed: bpy.props.IntProperty(name="Seed", description="Of the choice of poses and of the noise", min=0)
+    body: bpy.props.StringProperty(
+        name="Body", description="Your SMPL body as .npz of plain arrays; empty: the default body", subtype="FILE_PATH"
+    )
+    shard: bpy.props.IntProperty(name="Shard", description="Which part of the people this machine renders", min=0)
+    shards: bpy.props.IntProperty(name="of", description="Into how many parts the people are dealt", min=1, default=1)
+
+    poses: bpy.props.StringProperty(
+        name="Poses",
+        description="A file or folder of AMASS or pose .npz, .npy, .json or .bvh; empty: built-in poses",
+        subtype="FILE_PATH",
+    )
+    pose_count: bpy.props.IntProperty(
+        name="Count", description="The first is near the T-pose", default=20, min=1, max=10000, soft_max=100
+    )
+
+    arrangement: bpy.props.EnumProperty(
+        name="Arrangement",
+        description="Where the cameras stand",
+        items=[
+            ("rings", "Rings", "Rings at several heights"),
+            ("sphere", "Sphere", "Evenly all round (Fibonacci)"),
+            ("hemisphere", "Hemisphere", "Evenly from above and the sides"),
+            ("custom", "Cameras of the Scene", "The cameras of a collection; they stand still while people change"),
+        ],
+    )
+    camera_count: bpy.props.IntProperty(
+        name="Cameras", description="Views of each pose", default=36, min=1, soft_max=200
+    )
+    rings: bpy.props.IntProperty(name="Rings", description="Over which the cameras are dealt", default=3, min=1, max=50)
+    lowest: bpy.props.FloatProperty(
+        name="Lowest",
+        description="Ring, above the horizon",
+        default=math.radians(-10),
+        min=math.radians(-89),
+        max=math.radians(89),
+        subtype="ANGLE",
+    )
+    highest: bpy.props.FloatProperty(
+        name="Highest",
+        description="Ring, above the horizon",
+        default=math.radians(40),
+        min=math.radians(-89),
+        max=math.radians(89),
+        subtype="ANGLE",
+    )
+    fov: bpy.props.FloatProperty(
+        name="Field of View", translation_context=CONTEXT, description="Vertical", default=math.radians(30),
+        min=math.radians(1), max=math.radians(150), subtype="ANGLE",
+    )  # fmt: skip
+    margin: bpy.props.FloatProperty(name="Margin", description="Room around people", default=1.05, min=0.1, max=100)
+    cameras: bpy.props.PointerProperty(
+        name="Collection", description="Whose cameras take the pictures", type=bpy.types.Collection
+    )
+
+    samples: bpy.props.IntProperty(name="Samples", description="Of a pixel", default=16, min=1, soft_max=1024)
+    light: bpy.props.EnumProperty(
+        name="Light",
+        translation_context=CONTEXT,
+        description="What the people are seen in",
+        items=[
+            ("uniform", "Uniform", "Every surface shows its own colour"),
+            ("dome", "Dome", "A white sky, soft shadows"),
+            ("hdri", "HDRI", "A picture of the surroundings"),
+        ],
+    )
+    hdri: bpy.props.StringProperty(
+        name="HDRI", description="Picture of the surroundings, .exr or .hdr", subtype="FILE_PATH"
+    )
+    denoise: bpy.props.BoolProperty(
+        name="Denoise", description="Colours under a dome or HDRI light; never masks, depth, normals or parts"
+    )
+    device: bpy.props.EnumProperty(
+        name="Device",
+        description="What Cycles renders on",
+        items=[("auto", "Automatic", "A GPU where there is one"), ("cpu", "CPU", ""), ("gpu", "GPU", "")],
+    )
+
+    width: bpy.props.IntProperty(
+        name="Width", description="Of the pictures", default=512, min=1, max=16384, subtype="PIXEL"
+    )
+    height: bpy.props.IntProperty(
+        name="Height", description="Of the pictures", default=512, min=1, max=16384, subtype="PIXEL"
+    )
+    background: bpy.props.EnumProperty(
+        name="Background",
+        description="Behind the people",
+        items=[("black", "Black", ""), ("transparent", "Transparent", "One pass more: PNG with straight alpha")],
+    )
+    passes: bpy.props.EnumProperty(
+        name="Passes",
+        description="Kinds of pictures to write",
+        options={"ENUM_FLAG"},
+        items=_PASS_ITEMS,
+        default=set(PASSES),
+    )
+    layouts: bpy.props.EnumProperty(
+        name="Also for",
+        description="Camera files of other projects beside the same pictures",
+        options={"ENUM_FLAG"},
+        items=_LAYOUT_ITEMS,
+        default=set(LAYOUTS),
+    )
+    released_reference: bpy.props.BoolProperty(
+        name="Released Reference", description="One subject also under the name that the released code looks for"
+    )
+
+    def elevations(self) -> list[float]:
+        """Of the rings, degrees."""
+        lowest, highest = math.degrees(self.lowest), math.degrees(self.highest)
+        if self.rings == 1:
+            return [round((lowest + highest) / 2, 4)]
+        return [round(lowest + (highest - lowest) * ring / (self.rings - 1), 4) for ring in range(self.rings)]
+
+    def rig(self) -> Rig:
+        """The rig asked for. Raises ValueError where it is the scene's cameras, or impossible."""
+        from ..formats.camera_rig import Rig
+
+        if self.arrangement == "custom":
+            raise ValueError("the scene's cameras are no rig: they stand where they stand")
+        return Rig(
+            arrangement=self.arrangement,
+            count=self.camera_count,
+            elevations=tuple(self.elevations()),
+            vertical_fov=math.degrees(self.fov),
+            width=self.width,
+            height=self.height,
+            margin=self.margin,
+        )
+
+
+def words_of(
+    asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, folder: Path, people: str = "", out: str = ""
+) -> list[str]:
+    """The command `capture` in words (`capture.options`); a file of cameras, where needed, goes to `folder`.
+
+    `people` and `out` go before the panel's. Raises ValueError where something is missing.
+    """
+    people, out = bpy.path.abspath(people or asked.people), bpy.path.abspath(out or asked.out)
+    if not people or not out:
+        raise ValueError(f"choose a folder {'of people' if not people else 'for the captures'} first")
+    words = ["--people", people, "--out", out, "--seed", str(asked.seed)]
+    words += ["--shard", f"{min(asked.shard, asked.shards - 1)}/{asked.shards}"]
+    words += ["--poses", str(asked.pose_count), "--size", str(asked.width), str(asked.height)]
+    words += ["--samples", str(asked.samples), "--light", asked.light, "--device", asked.device]
+    words += ["--background", asked.background]
+    for name, path in (("--body", asked.body), ("--pose-files", asked.poses)):
+        words += [name, bpy.path.abspath(path)] if path else []
+    words += ["--hdri", bpy.path.abspath(asked.hdri)] if asked.light == "hdri" and asked.hdri else []
+    words += ["--denoise"] if asked.denoise else []
+    words += ["--released-reference"] if asked.released_reference else []
+    words += ["--passes", *(kind for kind in PASSES if kind in asked.passes)]
+    words += ["--layouts", *(name for name in LAYOUTS if name in asked.layouts)]
+    return words + (_custom_words(asked, context, folder) if asked.arrangement == "custom" else _rig_words(asked.rig()))
+
+
+def _rig_words(rig: Rig) -> list[str]:
+    angles = [f"{angle:g}" for angle in rig.elevations]
+    words = ["--arrangement", rig.arrangement, "--cameras", str(rig.count), "--elevations", *angles]
+    return [*words, "--fov", f"{rig.vertical_fov:.6g}", "--margin", f"{rig.margin:.6g}"]
+
+
+def _custom_words(asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, folder: Path) -> list[str]:
+    from ..capture.blender_camera import CameraError, view_of
+
+    depsgraph, render = context.evaluated_depsgraph_get(), context.scene.render
+    aspect = (render.pixel_aspect_x, render.pixel_aspect_y)
+    things = asked.cameras.all_objects if asked.cameras is not None else context.selected_objects
+    cameras = sorted((thing for thing in things if thing.type == "CAMERA"), key=lambda thing: thing.name)
+    if not cameras:
+        raise CameraError("no camera takes pictures: choose a collection with cameras, or select some")
+    views = [view_of(camera, depsgraph, (asked.width, asked.height), aspect) for camera in cameras]
+    named = {
+        f"camera{i:04d}": {"K": v.intrinsics.tolist(), "R": v.rotation.tolist(), "T": v.translation.tolist()}
+        for i, v in enumerate(views)
+    }
+    path = folder / "cameras.json"
+    path.write_text(json.dumps(named), encoding="utf-8")
+    return ["--camera-file", str(path)]
+
+
+CLASSES = (PRIMDIFFUSION_PG_captures,)
+PROPERTIES = ((bpy.types.Scene, "primdiffusion_captures", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_captures)),)

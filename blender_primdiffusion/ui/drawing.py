@@ -1,0 +1,140 @@
+"""How works look in panels: button, progress, line, errors and what to do about them."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from typing import TYPE_CHECKING
+
+import bpy
+
+from ..places import EXTENSION
+from .jobs.building import building
+from .jobs.entering import in_the_way
+from .jobs.pictures import so_far
+from .jobs.queue import Outcome, queue
+from .jobs.remedies import remedy_for
+
+if TYPE_CHECKING:
+    from ..worker.job import JobError
+
+_LINE = 34
+"""Letters that fit a sidebar as wide as Blender makes it, beside an icon."""
+_QUANTITY = re.compile(r"\d (s|min|mm|MB|GB)\b")
+_NO_BREAK = "\N{NO-BREAK SPACE}"
+_PICTURE_SCALE = 8.0
+_MINUTES_FROM_S = 90.0
+
+
+class SidebarPanel:
+    """A panel of the sidebar's tab PrimDiffusion."""
+
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "PrimDiffusion"
+
+
+def property_columns(layout: bpy.types.UILayout) -> bpy.types.UILayout:
+    """Names on the left, values on the right, no dots for keyframes."""
+    layout.use_property_split = True
+    layout.use_property_decorate = False
+    return layout
+
+
+def draw_job(
+    layout: bpy.types.UILayout, kind: str, operator_idname: str, icon: str, ready: bool = True
+) -> bpy.types.OperatorProperties | None:
+    """The button of an operator that submits works of `kind`, the progress of one, and how the last one ended.
+
+    The one place where that is shown; the panel Jobs names what is in line. `ready`: whether what the button needs has
+    been chosen; it is grey until then. Returns the button's properties, to be filled in.
+    """
+    button = layout.row()
+    button.enabled = ready
+    props = button.operator(operator_idname, icon=icon)
+    if queue.current is not None and queue.current.work.kind == kind:
+        if so_far.icon:
+            layout.template_icon(icon_value=so_far.icon, scale=_PICTURE_SCALE)
+        _draw_progress(layout)
+    if waiting := sum(entry.work.kind == kind for entry in queue.waiting):
+        layout.label(text=f"In Line: {waiting}", icon="SORTTIME", translate=False)
+    if (outcome := queue.outcomes.get(kind)) is not None:
+        _draw_outcome(layout, outcome)
+    return props
+
+
+def draw_lines(layout: bpy.types.UILayout, text: str, icon: str) -> None:
+    """A sentence in the interface's language, on as many lines as it needs."""
+    column = layout.column(align=True)
+    for number, line in enumerate(_wrapped(text)):
+        column.label(text=line, icon=icon if number == 0 else "BLANK1", translate=False)
+
+
+def _wrapped(text: str) -> list[str]:
+    """Lines that fit; numbers keep their units."""
+    together = _QUANTITY.sub(lambda match: match[0].replace(" ", _NO_BREAK), text)
+    return [line.replace(_NO_BREAK, " ") for line in textwrap.wrap(together, _LINE)]
+
+
+def _draw_progress(layout: bpy.types.UILayout) -> None:
+    """What is at work: how far it is, how long it will take, Cancel."""
+    row = layout.row(align=True)
+    row.progress(
+        factor=building.fraction if queue.ready else queue.job.fraction, text=_progress_text(), translate=False
+    )
+    row.operator("primdiffusion.cancel", text="", icon="CANCEL").number = 0
+
+
+def draw_in_line(layout: bpy.types.UILayout) -> None:
+    """What is at work and what waits for its turn, each removable."""
+    if not queue.busy:
+        return  # an empty column would leave a gap
+    column = layout.column(align=True)
+    for entry in queue.in_line:
+        row = column.row(align=True)
+        icon = "PLAY" if entry is queue.current else "SORTTIME"
+        row.label(text=entry.work.label, icon=icon, translate=False)
+        row.operator("primdiffusion.cancel", text="", icon="X").number = entry.number
+
+
+def draw_ended(layout: bpy.types.UILayout) -> None:
+    """What has ended of late, and how; the news are beside the button that asked."""
+    if not queue.ended:
+        return
+    column = layout.column(align=True)
+    for outcome in queue.ended:
+        icon = "ERROR" if outcome.error is not None else "CHECKMARK" if outcome.went_well else "CANCEL"
+        column.label(text=outcome.entry.work.label, icon=icon, translate=False)
+
+
+def _draw_outcome(layout: bpy.types.UILayout, outcome: Outcome) -> None:
+    """News, or an error with what can be done about it."""
+    if outcome.error is None:
+        draw_lines(layout, outcome.notice, "INFO")
+        return
+    draw_lines(layout, outcome.sentence, "ERROR")
+    column = layout.column(align=True)  # beside each other their words would be cut
+    _draw_remedy(column, outcome.error, outcome.entry.work.kind)
+    column.operator("primdiffusion.copy_diagnostics", icon="COPYDOWN")
+
+
+def _draw_remedy(layout: bpy.types.UILayout, error: JobError, kind: str) -> None:
+    remedy = remedy_for(error)
+    if remedy is None:
+        return
+    props = layout.operator(remedy.operator, text=remedy.label, icon=remedy.icon)
+    if remedy.operator == "primdiffusion.try_again":
+        props.kind = kind
+    elif remedy.operator == "preferences.addon_show":
+        props.module = EXTENSION
+
+
+def _progress_text() -> str:
+    job = queue.job
+    if queue.ready:
+        waits_for = in_the_way()
+        return f"Done: waits for {waits_for}" if waits_for else "Putting it into the scene"
+    if not job.eta_s:
+        return job.message
+    left = f"{job.eta_s:.0f} s" if job.eta_s < _MINUTES_FROM_S else f"{job.eta_s / 60:.0f} min"
+    return f"{job.message} ({left} left)"

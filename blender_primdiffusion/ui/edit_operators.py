@@ -1,0 +1,305 @@
+"""Vary, Re-dress Region, Transfer Texture and Blend change the selected person in place."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import bpy
+
+from ..formats.requests import AMOUNT, FRACTION, PARTS, STEPS, TRANSFERS
+from ..scene.files import person_file
+from ..scene.human import BODY_MARK, MARK, body_of, humans
+from .attributes import PRIMDIFFUSION_PG_attributes, asked, parsed, title
+from .jobs.follow import submit
+from .jobs.target import named_person, selected_person
+from .on_person import PANELS, SKIP, OnPerson
+from .translations import CONTEXT
+
+if TYPE_CHECKING:
+    pass
+
+PAINTED_GROUP = "PrimDiffusion Region"
+"""Vertex group of the body mesh that Paint Region makes."""
+
+_TRANSFERS = {
+    "texture": ("Texture", "Colours alone, on the person's own shape"),
+    "garment": ("Garment", "Colours and shape: what the other person wears there"),
+}
+TRANSFER_ITEMS = [(name, *_TRANSFERS[name]) for name in TRANSFERS]
+
+
+def parts_property():
+    """Several parts of the body may be chosen."""
+    return bpy.props.EnumProperty(
+        name="Parts",
+        translation_context=CONTEXT,
+        description="What to change: Shift-click for several. A person's left and right",
+        items=[(name, title(name), "", 1 << i) for i, name in enumerate(PARTS)],
+        options={"ENUM_FLAG", "SKIP_SAVE"},
+        default={"top"},
+    )
+
+
+def _may_be_other(_self: PRIMDIFFUSION_PG_edit, collection: bpy.types.Collection) -> bool:
+    return MARK in collection and collection in humans(bpy.context.scene)
+
+
+class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
+    """`scene.primdiffusion_edit`."""
+
+    seed: bpy.props.IntProperty(
+        name="Seed", description="Another seed is another result; the same seed is the same", default=1, min=0
+    )
+    amount: bpy.props.FloatProperty(
+        name="Amount",
+        description="How far the new person may be from this one: 0 is the same, 1 anybody",
+        default=AMOUNT,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+    )
+    region: bpy.props.EnumProperty(
+        name="Region",
+        description="Where to change the person; everything else stays exactly as it is",
+        items=[
+            ("PARTS", "Parts", "Parts of the body, by name"),
+            ("PAINTED", "Painted", "A vertex group of the body mesh: where its weight is one half or more"),
+        ],
+    )
+    parts: parts_property()
+    vertex_group: bpy.props.StringProperty(
+        name="Vertex Group", description="Of the body mesh of the person", default=PAINTED_GROUP
+    )
+    attributes: bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_attributes)
+    other: bpy.props.PointerProperty(
+        name="Other Person", description="From whom", type=bpy.types.Collection, poll=_may_be_other
+    )
+    what: bpy.props.EnumProperty(name="Transfer", description="What the person gets", items=TRANSFER_ITEMS)
+    harmonise: bpy.props.FloatProperty(
+        name="Harmonise",
+        description="How much the region is denoised once more to fit the rest of the person: 0 copies it exactly",
+        default=0.0,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+    )
+    fraction: bpy.props.FloatProperty(
+        name="Fraction",
+        translation_context=CONTEXT,
+        description="How much of the other person: 0 is this one, 1 the other",
+        default=FRACTION,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+    )
+
+
+class PRIMDIFFUSION_OT_paint_region(bpy.types.Operator):
+    """Show the body mesh of the selected person and paint on it where to change them"""
+
+    bl_idname = "primdiffusion.paint_region"
+    bl_label = "Paint Region"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """To Weight Paint mode, with the panel's vertex group, made if there is none."""
+        from ..scene.painting import start_painting
+
+        settings = context.scene.primdiffusion_edit
+        try:
+            person = selected_person(context)
+            body = body_of(person)
+            if body is None:
+                raise ValueError(f"the body mesh of {person.name!r} was deleted: choose parts by name instead")
+            start_painting(context, body, settings.vertex_group)
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        settings.region = "PAINTED"
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_finish_painting(bpy.types.Operator):
+    """Back to Object mode; the body mesh is hidden again, its vertex group stays"""
+
+    bl_idname = "primdiffusion.finish_painting"
+    bl_label = "Finish Painting"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Only while a body mesh is painted."""
+        cls.poll_message_set("No region is being painted: press Paint Region first")
+        return painting(context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """The active object is the body mesh."""
+        from ..scene.painting import end_painting
+
+        end_painting(context, context.view_layer.objects.active)
+        return {"FINISHED"}
+
+
+def painting(context: bpy.types.Context) -> bool:
+    """A person's body mesh is being weight painted."""
+    active = context.view_layer.objects.active
+    return active is not None and active.mode == "WEIGHT_PAINT" and BODY_MARK in active
+
+
+class _Edit(OnPerson):
+    """What a script does not give is the panel's."""
+
+    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo would start the job again) nor UNDO (the result has one)
+    job: str
+    """Class of `jobs.edit`."""
+    seed: bpy.props.IntProperty(name="Seed", min=0, description=PANELS, options=SKIP)
+    steps: bpy.props.IntProperty(name="Steps", min=1, max=1000, default=STEPS, description=PANELS, options=SKIP)
+
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        from .jobs import edit
+
+        steps = self.chosen("steps", context.scene.primdiffusion)
+        return submit(self, context, getattr(edit, self.job).of(person, steps, self.params(context, person)))
+
+    def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
+        """Of the child's method, with the edit's own ones only (see `EditWork.asked`)."""
+        raise NotImplementedError
+
+    def chosen(self, name: str, settings: bpy.types.PropertyGroup) -> Any:
+        """What the script gives, else what the panel holds."""
+        return getattr(self if self.properties.is_property_set(name) else settings, name)
+
+
+class _Region:
+    """Where to edit."""
+
+    parts: parts_property()
+    vertex_group: bpy.props.StringProperty(
+        name="Vertex Group", description="A painted region instead of parts", options=SKIP
+    )
+
+    def region(
+        self, settings: bpy.types.PropertyGroup, person: bpy.types.Collection
+    ) -> list[str] | dict[str, list[float]]:
+        """Names of parts, or painted weights [V]."""
+        from ..scene.painting import painted_weights
+
+        given = self.properties.is_property_set
+        if given("vertex_group") or (not given("parts") and settings.region == "PAINTED"):
+            body = body_of(person)
+            if body is None:
+                raise ValueError(f"the body mesh of {person.name!r} was deleted: choose parts by name instead")
+            return {"painted": painted_weights(body, self.chosen("vertex_group", settings)).tolist()}
+        parts = sorted(self.chosen("parts", settings))
+        if not parts:
+            raise ValueError("no part of the body is chosen: choose one or more in the panel")
+        return parts
+
+
+class PRIMDIFFUSION_OT_vary(_Edit, bpy.types.Operator):
+    """Turn the selected person into a neighbour: similar, more so the smaller the amount"""
+
+    bl_idname = "primdiffusion.vary"
+    bl_label = "Vary"
+    job = "VaryWork"
+
+    amount: bpy.props.FloatProperty(name="Amount", min=0.0, max=1.0, description=PANELS, options=SKIP)
+    attributes: bpy.props.StringProperty(
+        name="Attributes", description="Like sex=female, height=1.7; empty: whatever comes", options=SKIP
+    )
+    guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=PANELS, options=SKIP)
+
+    def params(self, context: bpy.types.Context, _person: bpy.types.Collection) -> dict[str, Any]:
+        """Of the child's method vary."""
+        settings = context.scene.primdiffusion_edit
+        params = {"amount": self.chosen("amount", settings), "seed": self.chosen("seed", settings)}
+        wanted = parsed(self.attributes)
+        if wanted:
+            params |= {"attributes": wanted, "guidance": self.chosen("guidance", context.scene.primdiffusion)}
+        return params
+
+
+class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
+    """Generate a region of the selected person anew; everything else stays exactly as it is"""
+
+    bl_idname = "primdiffusion.redress"
+    bl_label = "Re-dress Region"
+    job = "RedressWork"
+
+    attributes: bpy.props.StringProperty(name="Attributes", description=f"Like outfit=suit. {PANELS}", options=SKIP)
+    guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=PANELS, options=SKIP)
+
+    def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
+        """Of the child's method inpaint."""
+        settings = context.scene.primdiffusion_edit
+        params: dict[str, Any] = {"region": self.region(settings, person), "seed": self.chosen("seed", settings)}
+        given = self.properties.is_property_set("attributes")
+        wanted = parsed(self.attributes) if given else asked(settings.attributes)
+        if wanted:
+            params |= {"attributes": wanted, "guidance": self.chosen("guidance", context.scene.primdiffusion)}
+        return params
+
+
+class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
+    """Give a region of the selected person the texture of another one, or the garment"""
+
+    bl_idname = "primdiffusion.transfer_texture"
+    bl_label = "Transfer Texture"
+    job = "TransferWork"
+
+    source: bpy.props.StringProperty(name="Source", description=f"Name of the other person. {PANELS}", options=SKIP)
+    what: bpy.props.EnumProperty(name="Transfer", items=TRANSFER_ITEMS, description=PANELS, options=SKIP)
+    harmonise: bpy.props.FloatProperty(name="Harmonise", min=0.0, max=1.0, description=PANELS, options=SKIP)
+
+    def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
+        """Of the child's method transfer."""
+        settings = context.scene.primdiffusion_edit
+        return {
+            "source": _other(context, person, self.source),
+            "region": self.region(settings, person),
+            "what": self.chosen("what", settings),
+            "harmonise": self.chosen("harmonise", settings),
+            "seed": self.chosen("seed", settings),
+        }
+
+
+class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
+    """Move the selected person towards another one, who stays as they are"""
+
+    bl_idname = "primdiffusion.blend"
+    bl_label = "Blend"
+    job = "BlendWork"
+
+    other: bpy.props.StringProperty(name="Other", description=f"Name of the other person. {PANELS}", options=SKIP)
+    fraction: bpy.props.FloatProperty(
+        name="Fraction", translation_context=CONTEXT, min=0.0, max=1.0, description=PANELS, options=SKIP
+    )
+
+    def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
+        """Of the child's method interpolate."""
+        settings = context.scene.primdiffusion_edit
+        other = _other(context, person, self.other)
+        return {"other": other, "fraction": self.chosen("fraction", settings)}
+
+
+def _other(context: bpy.types.Context, person: bpy.types.Collection, name: str) -> str:
+    """The backend's file of the other person, named by a script or picked in the panel."""
+    picked = context.scene.primdiffusion_edit.other
+    if not name and picked is None:
+        raise ValueError("choose the other person in the panel first")
+    other = named_person(context, name or picked.name)
+    if other == person:
+        raise ValueError(f"{person.name!r} cannot be the other person too: choose somebody else")
+    return str(person_file(other))
+
+
+CLASSES = (
+    PRIMDIFFUSION_PG_edit,
+    PRIMDIFFUSION_OT_paint_region,
+    PRIMDIFFUSION_OT_finish_painting,
+    PRIMDIFFUSION_OT_vary,
+    PRIMDIFFUSION_OT_redress,
+    PRIMDIFFUSION_OT_transfer_texture,
+    PRIMDIFFUSION_OT_blend,
+)
+PROPERTIES = ((bpy.types.Scene, "primdiffusion_edit", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_edit)),)

@@ -1,0 +1,374 @@
+"""Export the selected person, and import .human files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import bpy
+
+from ..formats import requests
+from ..scene.human import armature_of
+from .jobs.follow import submit
+from .jobs.target import Target
+from .on_person import PANELS, SKIP, OnPerson
+from .translations import CONTEXT
+
+
+def destination(filepath: str, endings: Sequence[str]) -> Path:
+    """The file to write, with the first ending where it has none. Raises ValueError or OSError with what to do."""
+    if not filepath or filepath.endswith(("/", "\\")):
+        raise ValueError("name a file to export to")
+    path = Path(bpy.path.abspath(filepath))
+    if not path.is_absolute():
+        raise ValueError(f"{filepath!r} is beside a .blend that was never saved: save it first, or give the whole path")
+    if not path.suffix:
+        path = path.with_suffix(endings[0])
+    if path.suffix.lower() not in endings:
+        raise ValueError(f"{path.name!r} has another ending than {', '.join(endings)}: rename it, or choose a format")
+    if path.is_dir():
+        raise ValueError(f"{str(path)!r} is a folder: name a file in it")
+    check_writable(path.parent)
+    if path.exists() and not os.access(path, os.W_OK):
+        raise PermissionError(f"{str(path)!r} may not be written to: choose another file")
+    return path
+
+
+def check_writable(folder: Path) -> None:
+    """Raises FileNotFoundError or PermissionError, with what to do, for a folder that takes no files."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"there is no folder {str(folder)!r}: make it first, or choose another")
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(f"the folder {str(folder)!r} may not be written to: choose another")
+
+
+FORMATS = (
+    ("GLB", "glTF", "One .glb file: for game engines, web viewers and most other programs"),
+    ("FBX", "FBX", "One .fbx file with the texture in it"),
+    ("USD", "USD", "A .usd file with its texture beside it, or one .usdz file"),
+)
+MODEL_ENDINGS = {"GLB": (".glb",), "FBX": (".fbx",), "USD": (".usdc", ".usda", ".usd", ".usdz")}
+"""Of files, by the format; the first is the usual one."""
+HUMAN_ENDINGS = (".human", ".safetensors")
+SHOWN = (
+    ("VOLUMES", "Volumes", "Show and render the volumes; the mesh proxy is hidden"),
+    ("VIEWPORT", "Mesh in Viewport", "Show the mesh proxy while working, and render the volumes"),
+    ("MESH", "Mesh", "Show and render the mesh proxy, in any engine; the volumes are hidden"),
+)
+
+
+class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
+    """Of a scene."""
+
+    format: bpy.props.EnumProperty(name="Format", description="What Export Mesh writes", items=FORMATS)
+    animation: bpy.props.BoolProperty(
+        name="Animation",
+        description="The scene's frames, constraints and layers included; otherwise the current pose",
+        default=True,
+    )
+    texture_px: bpy.props.EnumProperty(
+        name="Texture",
+        description="Pixels a side of the mesh proxy's texture",
+        items=[(str(px), f"{px} px", "") for px in (512, 1024, 2048, 4096)],
+        default=str(requests.TEXTURE_SIZE),
+    )
+    triangles: bpy.props.IntProperty(
+        name="Triangles",
+        translation_context=CONTEXT,
+        description="Of the mesh proxy, at most",
+        default=requests.TRIANGLES,
+        min=500,
+        max=1_000_000,
+    )
+    gaussians: bpy.props.IntProperty(
+        name="Gaussians",
+        description="At most; a person has some 130 thousand that can be seen",
+        default=requests.GAUSSIANS,
+        min=1000,
+        max=1_000_000,
+    )
+    voxel: bpy.props.FloatProperty(
+        name="Voxel Size",
+        description="Side of the voxels of a VDB sequence: half of it, eight times the memory",
+        default=requests.VOXEL,
+        min=0.002,
+        max=0.05,
+        precision=3,
+        step=0.1,
+        subtype="DISTANCE",
+    )
+    motion: bpy.props.BoolProperty(
+        name="With Motion",
+        description="Keep the scene's frames of the person in the .human file; otherwise the person alone",
+        default=False,
+    )
+
+
+class _Export(OnPerson):
+    """Not redoable: a redo slider must not start the job again."""
+
+    bl_options: set[str] = set()  # noqa: RUF012  no UNDO either: those that change the scene make a step
+
+    def chosen(self, context: bpy.types.Context, name: str):
+        """What the script gives, else what the panel holds."""
+        given = self.properties.is_property_set(name)
+        return getattr(self if given else context.scene.primdiffusion_export, name)
+
+
+class _ToFile(_Export):
+    """Exports that ask for a file."""
+
+    filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH", options=SKIP)
+    check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        """The file browser, at the person's name; it asks before it replaces a file."""
+        try:
+            person = self.person(context)
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        if not self.filepath:
+            self.filepath = bpy.path.clean_name(person.name) + self.endings(context)[0]
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def check(self, context: bpy.types.Context) -> bool:
+        """Keep the ending that belongs to the format."""
+        endings = self.endings(context)
+        if self.filepath and Path(self.filepath).suffix.lower() not in endings:
+            self.filepath = bpy.path.ensure_ext(self.filepath, endings[0])
+            return True
+        return False
+
+
+class PRIMDIFFUSION_OT_export_mesh(_ToFile, bpy.types.Operator):
+    """Export the selected person as a textured mesh with their armature"""
+
+    bl_idname = "primdiffusion.export_mesh"
+    bl_label = "Export Mesh"
+
+    format: bpy.props.EnumProperty(name="Format", items=FORMATS, description=PANELS, options=SKIP)
+    animation: bpy.props.BoolProperty(name="Animation", description=PANELS, options=SKIP)
+    texture_px: bpy.props.IntProperty(name="Texture", description=PANELS, min=64, max=8192, options=SKIP)
+    triangles: bpy.props.IntProperty(
+        name="Triangles", translation_context=CONTEXT, description=PANELS, min=500, max=1_000_000, options=SKIP
+    )
+
+    def endings(self, context: bpy.types.Context) -> tuple[str, ...]:
+        """Of the format."""
+        return MODEL_ENDINGS[self.chosen(context, "format")]
+
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """A format that is not given follows the file's ending."""
+        from ..scene.export_model import check_ready
+        from .jobs.export_mesh import ExportMeshWork, scene_frames
+
+        kind = self.chosen(context, "format")
+        if not self.properties.is_property_set("format"):
+            ending = Path(self.filepath).suffix.lower()
+            kind = next((name for name, endings in MODEL_ENDINGS.items() if ending in endings), kind)
+        path = destination(self.filepath, MODEL_ENDINGS[kind])
+        target, frames = Target.of(person), scene_frames(context.scene, self.chosen(context, "animation"))
+        check_ready(armature_of(person))
+        px, triangles = int(self.chosen(context, "texture_px")), self.chosen(context, "triangles")
+        return submit(self, context, ExportMeshWork(target, px, triangles, path, kind, frames))
+
+
+class PRIMDIFFUSION_OT_add_proxy(_Export, bpy.types.Operator):
+    """Add a textured mesh of the selected person that follows the armature: fast in any viewport and engine"""
+
+    bl_idname = "primdiffusion.add_proxy"
+    bl_label = "Add Mesh Proxy"
+
+    texture_px: bpy.props.IntProperty(name="Texture", description=PANELS, min=64, max=8192, options=SKIP)
+    triangles: bpy.props.IntProperty(
+        name="Triangles", translation_context=CONTEXT, description=PANELS, min=500, max=1_000_000, options=SKIP
+    )
+
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """In line."""
+        from ..scene.export_model import check_ready
+        from .jobs.export_mesh import AddProxyWork
+
+        target = Target.of(person)
+        check_ready(armature_of(person))
+        px, triangles = int(self.chosen(context, "texture_px")), self.chosen(context, "triangles")
+        return submit(self, context, AddProxyWork(target, px, triangles))
+
+
+class PRIMDIFFUSION_OT_show_proxy(_Export, bpy.types.Operator):
+    """Choose what is seen of the selected person: the volumes, or the mesh proxy"""
+
+    bl_idname = "primdiffusion.show_proxy"
+    bl_label = "Show Volumes or Mesh"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    shown: bpy.props.EnumProperty(
+        name="Show", translation_context=CONTEXT, description="What is seen of the person", items=SHOWN
+    )
+
+    def run(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """At once."""
+        from .jobs.export_mesh import show
+
+        show(person, self.shown)
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_remove_proxy(_Export, bpy.types.Operator):
+    """Remove the mesh proxy of the selected person and show the volumes"""
+
+    bl_idname = "primdiffusion.remove_proxy"
+    bl_label = "Remove Mesh Proxy"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    def run(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """At once."""
+        from ..scene.proxy import proxy_of, remove_proxy
+        from .jobs.export_mesh import show
+
+        show(person, "VOLUMES")
+        remove_proxy(proxy_of(person))
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_export_gaussians(_ToFile, bpy.types.Operator):
+    """Export the selected person in the current pose as 3D Gaussians for splat viewers"""
+
+    bl_idname = "primdiffusion.export_gaussians"
+    bl_label = "Export Gaussians"
+
+    gaussians: bpy.props.IntProperty(name="Gaussians", description=PANELS, min=1, options=SKIP)
+
+    def endings(self, _context: bpy.types.Context) -> tuple[str, ...]:
+        """Of PLY."""
+        return (".ply",)
+
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """In line, in the pose of now."""
+        from .jobs.export_person import ExportGaussiansWork, posed_now
+
+        path = destination(self.filepath, self.endings(context))
+        work = ExportGaussiansWork(
+            Target.of(person), path, posed_now(context, person), self.chosen(context, "gaussians")
+        )
+        return submit(self, context, work)
+
+
+class PRIMDIFFUSION_OT_export_vdb_sequence(_Export, bpy.types.Operator):
+    """Export the selected person as one volume file for each frame, for any renderer that reads OpenVDB"""
+
+    bl_idname = "primdiffusion.export_vdb_sequence"
+    bl_label = "Export VDB Sequence"
+
+    directory: bpy.props.StringProperty(name="Folder", subtype="DIR_PATH", options=SKIP)
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    first: bpy.props.IntProperty(name="First Frame", description="Not given: the scene's", options=SKIP)
+    last: bpy.props.IntProperty(name="Last Frame", description="Not given: the scene's", options=SKIP)
+    voxel: bpy.props.FloatProperty(name="Voxel Size", description=PANELS, min=0.002, max=0.05, options=SKIP)
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        """The file browser, for a folder."""
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """In line, with the poses of now."""
+        from .jobs.export_person import ExportVdbSequenceWork, posed_frames
+
+        if not self.directory:
+            raise ValueError("name a folder to export to")
+        folder = Path(bpy.path.abspath(self.directory))
+        check_writable(folder)
+        scene, given = context.scene, self.properties.is_property_set
+        first = self.first if given("first") else scene.frame_start
+        last = self.last if given("last") else scene.frame_end
+        if last < first:
+            raise ValueError(f"the last frame {last} is before the first, {first}: exchange them")
+        target, stem = Target.of(person), bpy.path.clean_name(person.name)
+        people = posed_frames(context, person, range(first, last + 1))
+        work = ExportVdbSequenceWork(target, folder, stem, people, first, self.chosen(context, "voxel"))
+        return submit(self, context, work)
+
+
+class PRIMDIFFUSION_OT_export_human(_ToFile, bpy.types.Operator):
+    """Export the selected person as a .human file, to be dropped into another scene or given to somebody else"""
+
+    bl_idname = "primdiffusion.export_human"
+    bl_label = "Export Human File"
+
+    motion: bpy.props.BoolProperty(name="With Motion", description=PANELS, options=SKIP)
+
+    def endings(self, _context: bpy.types.Context) -> tuple[str, ...]:
+        """Of people."""
+        return HUMAN_ENDINGS
+
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """At once: it needs no backend."""
+        from .jobs.export_mesh import scene_frames
+        from .jobs.export_person import write_human
+
+        path = destination(self.filepath, HUMAN_ENDINGS)
+        write_human(
+            context, person, path, scene_frames(context.scene, True) if self.chosen(context, "motion") else None
+        )
+        self.report({"INFO"}, f"Exported {person.name} to {path.name}")
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
+    """Add the person of a .human file to the scene"""
+
+    bl_idname = "primdiffusion.import_human"
+    bl_label = "Import Human File"
+    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO (the result has one)
+
+    filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH", options=SKIP)
+    filter_glob: bpy.props.StringProperty(
+        default=";".join(f"*{ending}" for ending in HUMAN_ENDINGS), options={"HIDDEN"}
+    )
+    location: bpy.props.FloatVectorProperty(
+        name="Location",
+        description="Not given: the world's origin",
+        subtype="XYZ",
+        options=SKIP,
+    )
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        """A dropped file is taken at once; otherwise the file browser asks for one."""
+        if self.filepath:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Look into the file, then put it in line; in background mode this waits for the person."""
+        from ..scene.human_file import motion_in, read_tensors
+        from .jobs.export_person import ImportHumanWork
+
+        path = Path(bpy.path.abspath(self.filepath))
+        try:
+            if not self.filepath or not path.is_file():
+                raise FileNotFoundError(f"there is no file {str(path)!r}: choose a .human file")
+            motion_in(read_tensors(path))
+        except (ValueError, OSError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        at = tuple(self.location) if self.properties.is_property_set("location") else None
+        return submit(self, context, ImportHumanWork(str(path), at))
+
+
+CLASSES = (
+    PRIMDIFFUSION_PG_export,
+    PRIMDIFFUSION_OT_export_mesh,
+    PRIMDIFFUSION_OT_add_proxy,
+    PRIMDIFFUSION_OT_show_proxy,
+    PRIMDIFFUSION_OT_remove_proxy,
+    PRIMDIFFUSION_OT_export_gaussians,
+    PRIMDIFFUSION_OT_export_vdb_sequence,
+    PRIMDIFFUSION_OT_export_human,
+    PRIMDIFFUSION_OT_import_human,
+)
+PROPERTIES = ((bpy.types.Scene, "primdiffusion_export", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_export)),)

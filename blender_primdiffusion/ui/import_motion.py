@@ -1,0 +1,279 @@
+"""Who is under the mouse: volumes cannot be hit by rays, so the skeleton as it is drawn decides."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import bpy
+from bpy_extras.io_utils import ImportHelper
+
+from ..formats.joints import JOINT_NAMES
+from ..scene.human import armature_of, humans
+from ..worker.sentence import sentence
+from .drawing import draw_lines, property_columns
+from .motion_armatures import OnArmature, WhereTo, target_armature
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_MARGIN = 0.12
+"""How far around the joints' rectangle still counts as the person, of its height."""
+
+
+def person_under(context: bpy.types.Context, event: bpy.types.Event) -> str:
+    """Name of the person under the mouse in the 3D view; empty where there is none."""
+    import numpy as np
+    from bpy_extras.view3d_utils import location_3d_to_region_2d
+
+    region, view = context.region, context.region_data
+    if region is None or view is None:
+        return ""
+    seen = {}
+    for person in humans(context.scene):
+        try:
+            armature = armature_of(person)
+        except ValueError:
+            continue
+        bones = [armature.pose.bones[name] for name in JOINT_NAMES if name in armature.pose.bones]
+        spots = [location_3d_to_region_2d(region, view, armature.matrix_world @ bone.head) for bone in bones]
+        seen[person.name] = np.array([spot for spot in spots if spot is not None]).reshape(-1, 2)
+    return nearest_to((event.mouse_region_x, event.mouse_region_y), seen)
+
+
+def nearest_to(mouse: tuple[float, float], seen: dict[str, NDArray]) -> str:
+    """Of people's joints in the picture [n, 2], pixels, the name of those around the mouse; the closest of several."""
+    import numpy as np
+
+    best, name = np.inf, ""
+    for person, spots in seen.items():
+        if len(spots) == 0:
+            continue
+        low, high = spots.min(0), spots.max(0)
+        margin = _MARGIN * (high - low).max()
+        if np.all(mouse >= low - margin) and np.all(mouse <= high + margin):
+            apart = float(np.linalg.norm(spots - mouse, axis=-1).min())
+            if apart < best:
+                best, name = apart, person
+    return name
+
+
+SUFFIXES = (".npz", ".npy", ".json", ".bvh")
+_UP_ITEMS = [
+    ("AUTO", "Found in the File", "From how the pelvis stands"),
+    *[
+        (axis.upper().replace("-", "MINUS_"), axis.upper(), f"{axis} points up")
+        for axis in ("x", "y", "z", "-x", "-y", "-z")
+    ],
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """What a file holds, for the options beside the file browser."""
+
+    facts: dict[str, str]
+    bones: tuple[str, ...]
+    """Of a .bvh."""
+    found: dict[str, str]
+    """SMPL's joint -> bone, as far as the names tell."""
+    error: str = ""
+
+
+def look_at(filepath: str, up: str = "") -> Look:
+    """What is in a file; kept until the file changes. Raises nothing: faults are told in `error`."""
+    path = Path(bpy.path.abspath(filepath))
+    if path.suffix.lower() not in SUFFIXES or not path.is_file():
+        return Look({}, (), {})
+    stat = path.stat()
+    return _look_at(str(path), up, stat.st_mtime_ns, stat.st_size)
+
+
+@functools.lru_cache(maxsize=8)
+def _look_at(path: str, up: str, _changed: int, _size: int) -> Look:
+    from ..motion.bones import UnknownBonesError, map_bones
+    from ..motion.bvh import BvhError, bone_names, parse_bvh
+    from ..motion.files import MotionFileError, read_motion
+    from .motion_placing import facts
+
+    bones: tuple[str, ...] = ()
+    try:
+        if path.lower().endswith(".bvh"):
+            bones = tuple(bone_names(parse_bvh(Path(path))))
+            map_bones(bones)
+        motion = read_motion(path, up)
+    except (MotionFileError, UnknownBonesError, BvhError, OSError) as error:
+        return Look({}, bones, {}, str(error))
+    return Look(facts(motion), bones, dict(motion.detected.bones))
+
+
+def bone_property(joint: str) -> str:
+    """The operator's property that holds the bone for a joint."""
+    return f"bone_{joint}"
+
+
+def _bones_of(self, _context: bpy.types.Context, text: str) -> list[str]:
+    return [bone for bone in look_at(self.filepath).bones if text.lower() in bone.lower()]
+
+
+class _BoneMap:
+    """A field for each of SMPL's joints."""
+
+    __annotations__ = {
+        bone_property(joint): bpy.props.StringProperty(
+            name=joint.replace("_", " ").title(),
+            description=f"The file's bone that is SMPL's {joint}",
+            search=_bones_of,
+        )
+        for joint in JOINT_NAMES
+    }
+
+
+class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper, bpy.types.Operator):
+    """Put the motion of an AMASS .npz, a pose file or a .bvh onto the person"""
+
+    bl_idname = "primdiffusion.import_motion"
+    bl_label = "Import Motion"
+    bl_options = {"UNDO", "PRESET"}  # noqa: RUF012
+
+    filename_ext = ""
+    filepath: bpy.props.StringProperty(
+        name="File", description="Path of the motion", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
+    filter_glob: bpy.props.StringProperty(default=";".join(f"*{s}" for s in SUFFIXES), options={"HIDDEN"})
+    up: bpy.props.EnumProperty(name="Up Axis", description="Which axis of the file points up", items=_UP_ITEMS)
+    fps: bpy.props.FloatProperty(
+        name="Source Rate", description="Frames a second of the file; 0: as the file tells", default=0, min=0, max=10000
+    )
+    timing: bpy.props.EnumProperty(
+        name="Keys",
+        description="Where keys are set",
+        items=[
+            ("SCENE", "Scene Rate", "A key on every frame of the scene; the motion keeps its speed"),
+            ("SOURCE", "Every Source Frame", "A key for every frame of the file, between the scene's if need be"),
+        ],
+    )
+    first: bpy.props.IntProperty(name="From", description="First frame of the file, counted from 1", default=1, min=1)
+    last: bpy.props.IntProperty(name="To", description="Last frame of the file; 0: all there are", default=0, min=0)
+    stride: bpy.props.IntProperty(name="Step", description="Take every n-th frame of the file", default=1, min=1)
+    scale: bpy.props.FloatProperty(
+        name="Scale Path", description="How much longer the way becomes; turns stay", default=1.0, min=0.0, soft_max=10
+    )
+    fit_stride: bpy.props.BoolProperty(
+        name="Fit Stride",
+        description="Make the way as long as this person's legs go, so that feet stay where they are put down",
+        default=True,
+    )
+    ground: bpy.props.BoolProperty(
+        name="Feet on the Floor",
+        description="Raise or lower the whole motion until its lowest feet stand",
+        default=True,
+    )
+    bones: bpy.props.EnumProperty(
+        name="Bones",
+        description="How the bones of a .bvh are told apart",
+        items=[
+            ("AUTO", "By Name", "Rigs whose names are known: SMPL, Mixamo, CMU, Unreal, Rigify, Daz and others"),
+            ("CHOSEN", "Chosen", "The map below, which can be kept as a preset"),
+        ],
+    )
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """A dropped file asks for options at the cursor and goes to the person under it; else the file browser."""
+        if self.filepath:
+            self.person = person_under(context, event) or self.person
+            title = f"Import {Path(self.filepath).name}"
+            return context.window_manager.invoke_props_dialog(self, width=420, title=title, confirm_text="Import")
+        return ImportHelper.invoke(self, context, event)
+
+    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+        """Read, fit, key."""
+        from ..motion.files import read_motion
+        from .motion_placing import Placement, extend_range, place_motion
+
+        if not self.filepath:
+            raise ValueError("no file was chosen: choose an .npz, .npy, .json or .bvh file")
+        chosen = None
+        if self.bones == "CHOSEN":
+            chosen = {joint: getattr(self, bone_property(joint)) for joint in JOINT_NAMES}
+        motion = read_motion(bpy.path.abspath(self.filepath), self.axis(), chosen)
+        if self.fps:
+            motion = dataclasses.replace(motion, fps=self.fps)
+        names = [field.name for field in dataclasses.fields(Placement)]
+        how = Placement(**{name: getattr(self, name) for name in names})
+        first, last = place_motion(context, armature, motion, how)
+        if self.extend:
+            extend_range(context.scene, last)
+        if armature.data.pose_position == "REST":
+            self.report(
+                {"WARNING"}, f"{armature.name!r} shows its rest position: switch to Pose Position to see it move"
+            )
+        self.report({"INFO"}, f"{motion.name}: {len(motion)} frames of the file on frames {first:g} to {last:g}")
+        return {"FINISHED"}
+
+    def axis(self) -> str:
+        """As `read_motion` wants it."""
+        return "" if self.up == "AUTO" else self.up.lower().replace("minus_", "-")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """What was found, then what can be changed."""
+        layout = property_columns(self.layout)
+        look = look_at(self.filepath, self.axis())
+        self._draw_found(context, look)
+        layout.prop(self, "up")
+        layout.prop(self, "fps")
+        column = layout.column(align=True)
+        column.prop(self, "first")
+        column.prop(self, "last")
+        column.prop(self, "stride")
+        layout.prop(self, "into")
+        row = layout.column()
+        row.enabled = self.into != "APPEND"
+        row.prop(self, "start")
+        layout.prop(self, "timing")
+        layout.prop(self, "root")
+        layout.prop(self, "fit_stride")
+        layout.prop(self, "scale")
+        layout.prop(self, "ground")
+        layout.prop(self, "extend")
+        if look.bones:
+            layout.prop(self, "bones")
+            if self.bones == "CHOSEN":
+                column = layout.column(align=True)
+                for joint in JOINT_NAMES:
+                    column.prop(self, bone_property(joint), placeholder=look.found.get(joint, ""))
+
+    def _draw_found(self, context: bpy.types.Context, look: Look) -> None:
+        box = self.layout.box().column(align=True)
+        try:
+            box.label(text=target_armature(context, self.person).name, icon="OUTLINER_OB_ARMATURE")
+        except ValueError as error:
+            draw_lines(box, sentence(error), "ERROR")
+        for label, text in look.facts.items():
+            row = box.split(factor=0.4)
+            row.label(text=label)
+            row.label(text=text, translate=False)
+        if look.error:
+            draw_lines(box, sentence(look.error), "ERROR")
+
+
+class PRIMDIFFUSION_FH_motion(bpy.types.FileHandler):
+    """AMASS .npz and .bvh onto the person under the cursor, else the selected one."""
+
+    bl_idname = "PRIMDIFFUSION_FH_motion"
+    bl_label = "Motion for a Person"
+    bl_import_operator = "primdiffusion.import_motion"
+    bl_file_extensions = ".npz;.bvh"
+
+    @classmethod
+    def poll_drop(cls, context: bpy.types.Context) -> bool:
+        """Onto a 3D view; without a person the operator says what is missing."""
+        return context.area is not None and context.area.type == "VIEW_3D"
+
+
+CLASSES = (
+    PRIMDIFFUSION_OT_import_motion,
+    PRIMDIFFUSION_FH_motion,
+)

@@ -1,0 +1,105 @@
+"""Which files of people are missing, looked up after loading, saving and undo, and by a slow timer."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ...scene.human import any_humans
+from .follow import redraw
+
+SOON_S = 0.5
+OFTEN_S = 15.0
+
+
+@dataclasses.dataclass
+class State:
+    """What was found when it was last looked."""
+
+    told: str = ""
+    """Like: 12 volumes of 'Human'; empty when nobody misses anything."""
+    without_person_file: tuple[str, ...] = ()
+    """People who cannot be made again from their file: their names."""
+
+
+state = State()
+
+
+def look() -> None:
+    """Find out now."""
+    before = state.told
+    state.told, state.without_person_file = _found() if any_humans() else ("", ())
+    if state.told != before:
+        redraw()
+
+
+def _found() -> tuple[str, tuple[str, ...]]:
+    from ...scene.missing import find_person, missing_files
+
+    lost = missing_files()
+    alone = [one.person.name for one in lost if one.person_file and not one.linked and find_person(one) is None]
+    return "; ".join(one.summary() for one in lost), tuple(alone)
+
+
+@persistent
+def look_after(*_: object) -> None:
+    """Handler of load_post and save_post."""
+    look()
+
+
+@persistent
+def look_soon(*_: object) -> None:
+    """Handler of undo_post and redo_post: several may follow on each other quickly."""
+    if bpy.app.background:
+        look()
+    else:
+        start()
+
+
+def start() -> None:
+    """Have Blender call `look` soon and now and then."""
+    if bpy.app.background:
+        return
+    stop()
+    bpy.app.timers.register(_tick, first_interval=SOON_S, persistent=True)
+
+
+def stop() -> None:
+    """Undo `start`."""
+    if bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.unregister(_tick)
+
+
+def _tick() -> float:
+    look()
+    return OFTEN_S
+
+
+@persistent
+def collect_before_saving(blend_path: str, *_: object) -> None:
+    """Handler of save_pre; what collects is imported once there is somebody."""
+    if any_humans():
+        from ...scene import collect
+
+        collect.collect_before_saving(blend_path)
+
+
+HANDLERS = (
+    ("save_pre", collect_before_saving),
+    ("load_post", look_after),
+    ("save_post", look_after),
+    ("undo_post", look_soon),
+    ("redo_post", look_soon),
+)
+
+
+def register() -> None:
+    """Start to look now and then."""
+    start()
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    stop()

@@ -1,0 +1,250 @@
+"""The sidebar panel Jobs: queued and finished jobs, memory, diagnostics."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+from collections.abc import Iterator
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..places import EXTENSION, backend_module_path, preference
+from .drawing import SidebarPanel, draw_ended, draw_in_line, draw_lines
+from .jobs import follow, memory
+from .jobs.building import building
+from .jobs.entering import PRIMDIFFUSION_OT_take_result
+from .jobs.follow import redraw, submit
+from .jobs.memory import device_line
+from .jobs.pictures import so_far
+from .jobs.queue import queue
+
+TEXT = "PrimDiffusion Diagnostics"
+_LOG_LINES = 60
+_PATHS = ("backend_python", "checkpoint", "encoder")
+
+
+def diagnostics() -> str:
+    """Versions, device, memory, the last work, its error and the end of the child's log; redacted."""
+    from ..worker.redact import redact
+
+    return redact("\n".join(_lines()), _names())
+
+
+def _lines() -> Iterator[str]:
+    info = queue.info
+    yield f"PrimDiffusion {_version()} ({'extension' if EXTENSION.startswith('bl_ext.') else 'from source'})"
+    yield f"Blender {bpy.app.version_string} ({bpy.app.build_hash.decode(errors='replace')}), {_window()}"
+    yield f"System {platform.platform()}, {platform.machine()}, {os.cpu_count()} processors"
+    python, torch = info.get("python", "?"), info.get("torch", "?")
+    yield f"Backend {info.get('version', 'not started yet')}, Python {python}, torch {torch}"
+    yield f"Backend found: {'yes' if backend_module_path() else 'no'}"
+    yield "Set in the preferences: " + (", ".join(filter(preference, _PATHS)) or "nothing")
+    yield f"Device {device_line()}"
+    yield f"Memory {info.get('memory_gb', '?')} GB, {info.get('memory_free_gb', '?')} GB free at the backend's start"
+    yield f"Running: {queue.child_pid is not None}; queued: {len(queue.waiting)}"
+    if queue.current is not None:
+        yield f"At work: {queue.current.work.label}: {queue.job.state}, {queue.job.message}"
+    if (outcome := queue.last) is not None:
+        spent = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in outcome.seconds.items())
+        yield f"Last work: {outcome.entry.work.label} ({outcome.entry.work.method}) {spent}"
+        yield f"Ended: {outcome.notice or 'with an error'}"
+        if outcome.error is not None:
+            yield f"Error ({outcome.error.kind}): {outcome.sentence}"
+    error = queue.last.error if queue.last is not None else None
+    log = error.log if error is not None and error.log else queue.log
+    yield f"Log, the last {min(len(log), _LOG_LINES)} lines:"
+    yield from (f"    {line}" for line in log[-_LOG_LINES:])
+
+
+def _version() -> str:
+    manifest = os.path.join(os.path.dirname(os.path.dirname(__file__)), "blender_manifest.toml")
+    try:
+        import tomllib
+
+        with open(manifest, "rb") as file:
+            return tomllib.load(file)["version"]
+    except (OSError, ValueError, KeyError):
+        return "of unknown version"
+
+
+def _window() -> str:
+    return "no window" if bpy.app.background else "with a window"
+
+
+def _names() -> set[str]:
+    """Of the user and the machine; those of the home folder too, which may differ."""
+    import getpass
+    import socket
+
+    home = os.path.basename(os.path.expanduser("~"))
+    names = {home, os.environ.get("USER", ""), os.environ.get("USERNAME", ""), socket.gethostname(), platform.node()}
+    with contextlib.suppress(OSError, KeyError, ImportError):  # no such user on this system (containers)
+        names.add(getpass.getuser())
+    return names
+
+
+class PRIMDIFFUSION_OT_copy_diagnostics(bpy.types.Operator):
+    """Copy what a bug report needs: versions, device, the last error and the log, without names and folders"""
+
+    bl_idname = "primdiffusion.copy_diagnostics"
+    bl_label = "Copy Diagnostics"
+    bl_options: set[str] = set()  # noqa: RUF012
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Without a window there is no clipboard: then a text block of the file holds it."""
+        text = diagnostics()
+        if bpy.app.background:
+            block = bpy.data.texts.get(TEXT) or bpy.data.texts.new(TEXT)
+            block.from_string(text)
+            self.report({"INFO"}, f"the text {TEXT!r} holds them")
+        else:
+            context.window_manager.clipboard = text
+            self.report({"INFO"}, "copied: paste it into the report, and read it first")
+        return {"FINISHED"}
+
+
+_SKIP = {"SKIP_SAVE"}
+
+
+class PRIMDIFFUSION_OT_cancel(bpy.types.Operator):
+    """Stop this work, or take it out of the line; nothing is added to the scene"""
+
+    bl_idname = "primdiffusion.cancel"
+    bl_label = "Cancel"
+    bl_options: set[str] = set()  # noqa: RUF012
+
+    number: bpy.props.IntProperty(
+        name="Number", description="Of the work in line; 0 is the one under way", min=0, options=_SKIP
+    )
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        """Only while something is in line."""
+        cls.poll_message_set("Nothing is in line")
+        return queue.busy
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        """Ask; the timer sees it through."""
+        if not queue.cancel(self.number):
+            which = f"work {self.number} is not in line any more" if self.number else "nothing is under way yet"
+            self.report({"ERROR"}, which)
+            return {"CANCELLED"}
+        redraw()
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_try_again(bpy.types.Operator):
+    """Ask for the same once more"""
+
+    bl_idname = "primdiffusion.try_again"
+    bl_label = "Try Again"
+    bl_options: set[str] = set()  # noqa: RUF012
+
+    kind: bpy.props.StringProperty(
+        name="Kind", description="Of work, like generate; empty: the last one that ended", options=_SKIP
+    )
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        """Only after something has failed."""
+        cls.poll_message_set("Nothing has failed")
+        return any(outcome.error is not None for outcome in queue.outcomes.values())
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Put the failed work in line again, for the scene at hand."""
+        outcome = queue.outcomes.get(self.kind) if self.kind else queue.last
+        if outcome is None or outcome.error is None:
+            why = f"no work {self.kind!r} has failed" if self.kind else "the last work went well"
+            self.report({"ERROR"}, why)
+            return {"CANCELLED"}
+        return submit(self, context, outcome.entry.work)
+
+
+class PRIMDIFFUSION_OT_release_memory(bpy.types.Operator):
+    """End the processes that generate and draw, and so give back what they hold; the next person starts them anew"""
+
+    bl_idname = "primdiffusion.release_memory"
+    bl_label = "Release Memory"
+    bl_options: set[str] = set()  # noqa: RUF012
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        """Tell what was freed."""
+        try:
+            freed = memory.release()
+        except RuntimeError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, freed)
+        redraw()
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_PT_jobs(SidebarPanel, bpy.types.Panel):
+    """Queued and finished jobs, and the device. Progress is shown below the button that started the job."""
+
+    bl_label = "Jobs"
+    bl_order = 9
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        """Something is in line or has ended, or holds memory, or has died."""
+        return queue.busy or bool(queue.ended) or queue.child_pid is not None or bool(queue.child_news)
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        """Reads what is in line; starts nothing."""
+        layout = self.layout
+        draw_in_line(layout)
+        draw_ended(layout)
+        draw_lines(layout, f"Device: {device_line()}", "MEMORY")
+        column = layout.column(align=True)
+        column.operator("primdiffusion.release_memory", icon="TRASH")
+        column.operator("primdiffusion.copy_diagnostics", icon="COPYDOWN")
+
+
+CLASSES = (
+    PRIMDIFFUSION_OT_copy_diagnostics,
+    PRIMDIFFUSION_OT_take_result,
+    PRIMDIFFUSION_OT_cancel,
+    PRIMDIFFUSION_OT_try_again,
+    PRIMDIFFUSION_OT_release_memory,
+    PRIMDIFFUSION_PT_jobs,
+)
+
+
+@persistent
+def drop_before_loading(*_: object) -> None:
+    """Handler of load_pre: the results of jobs belong into the file that is being closed."""
+    queue.drop()
+    building.close()
+    so_far.show(None)
+
+
+@persistent
+def watch_after_loading(*_: object) -> None:
+    """Handler of load_post, and of a load that failed: the timers start again."""
+    follow.keep_watching()
+
+
+HANDLERS = (
+    ("load_pre", drop_before_loading),
+    ("load_post", watch_after_loading),
+    ("load_post_fail", watch_after_loading),
+)
+
+
+def register() -> None:
+    """Notice a child that dies between jobs; in background mode no timer runs."""
+    if not bpy.app.background:
+        follow.keep_watching()
+
+
+def unregister() -> None:
+    """End the child and the timers."""
+    queue.close()
+    building.close()
+    so_far.close()
+    for timer in (follow.follow, follow.watch):
+        if bpy.app.timers.is_registered(timer):
+            bpy.app.timers.unregister(timer)

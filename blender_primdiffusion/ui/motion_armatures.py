@@ -1,0 +1,98 @@
+"""Which armature an operator is about, and where on it a motion goes."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..formats.joints import JOINT_NAMES
+from ..scene.human import armature_of, human_of, humans
+from .jobs.target import named_person, selected_person
+
+FACTS = "primdiffusion_motion"
+"""Custom property of an action: what its motion is, as JSON."""
+
+
+def target_armature(context: bpy.types.Context, person: str = "") -> bpy.types.Object:
+    """The armature of the person named, else the active armature if it has SMPL's joints, else the selected person's.
+
+    Raises ValueError, in a sentence; for an active armature with some of SMPL's bones it names the first that lacks.
+    """
+    if person:
+        return armature_of(named_person(context, person))
+    active = context.view_layer.objects.active
+    if active is not None and active.type == "ARMATURE":
+        missing = [name for name in JOINT_NAMES if name not in active.data.bones]
+        if not missing:
+            return active
+        if len(missing) < len(JOINT_NAMES) or human_of(active, context.scene) is not None:
+            raise ValueError(f"the armature {active.name!r} has no bone {missing[0]!r}: rename it back, or undo")
+    return armature_of(selected_person(context))
+
+
+def warn_of_rest(operator: bpy.types.Operator, armature: bpy.types.Object) -> None:
+    """Say so where the armature does not show how it is posed."""
+    if armature.data.pose_position == "REST":
+        operator.report({"WARNING"}, f"{armature.name!r} shows its rest position: switch it to Pose Position")
+
+
+def scene_fps(scene: bpy.types.Scene) -> float:
+    """Frames a second, such as 23.976."""
+    return scene.render.fps / scene.render.fps_base
+
+
+class OnArmature:
+    """What operators on one armature have in common."""
+
+    person: bpy.props.StringProperty(
+        name="Person",
+        description="Name of the person (of their collection); empty: the active armature or the selected person",
+        options={"SKIP_SAVE"},
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Somebody is there; which one, and whether they can be posed, is told when the button is pressed."""
+        active = context.view_layer.objects.active
+        cls.poll_message_set("There is no person in the scene: generate one, or select an armature with SMPL's joints")
+        return bool(humans(context.scene)) or (active is not None and active.type == "ARMATURE")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Find the armature, do the work, or say in a sentence why not."""
+        try:
+            return self.on(context, target_armature(context, self.person))
+        except (ValueError, OSError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+
+    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+        """The work."""
+        raise NotImplementedError
+
+
+class WhereTo:
+    """Properties of operators that key a motion; their values are those of `placing.Placement`."""
+
+    start: bpy.props.IntProperty(name="Start Frame", description="Frame of the scene with the first pose", default=1)
+    root: bpy.props.EnumProperty(
+        name="Root Motion",
+        description="What becomes of the way through space",
+        items=[
+            ("ORIGIN", "From the Person", "The path begins where the person is"),
+            ("KEEP", "As It Is", "The path keeps its place, which may be metres away"),
+            ("PLACE", "In Place", "The person stays where they are; only heights are kept"),
+        ],
+    )
+    into: bpy.props.EnumProperty(
+        name="Into",
+        description="Where the keys go",
+        items=[
+            ("NEW", "New Action", "A new action; the one before stays in the file"),
+            ("APPEND", "Append", "After the last key of the action the person has"),
+            ("STRIP", "NLA Strip", "A strip on a new track of the nonlinear animation"),
+        ],
+    )
+    extend: bpy.props.BoolProperty(
+        name="Extend Scene",
+        description="Move the end of the scene to the end of the motion if it is later",
+        default=True,
+    )

@@ -1,0 +1,245 @@
+"""The sidebar panel Motion."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import bpy
+from bpy_extras.io_utils import ExportHelper
+
+from ..scene.actions import action_curves, loops
+from ..worker.sentence import sentence
+from .drawing import SidebarPanel, draw_lines, property_columns
+from .manual import draw_manual_button
+from .motion_armatures import FACTS, OnArmature, WhereTo, scene_fps, target_armature
+from .translations import CONTEXT
+
+_BUILT_IN = [
+    ("WALK", "Walk", "An easy walk straight ahead; the feet do not slide"),
+    ("IDLE", "Idle", "Standing, breathing, the weight going from leg to leg"),
+    ("WAVE", "Wave", "Standing and waving with the right hand"),
+    ("TURN", "Turn Left", "A quarter turn to the left in two steps"),
+]
+
+
+class PRIMDIFFUSION_OT_use_action(bpy.types.Operator):
+    """Let the person move by another action of this file"""
+
+    bl_idname = "primdiffusion.use_action"
+    bl_label = "Use Motion"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    action: bpy.props.StringProperty(name="Action", description="Name of the action", options={"SKIP_SAVE"})
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Give the armature the action and a slot of it that fits."""
+        from ..motion.pose_library import check_posable
+
+        action = bpy.data.actions.get(self.action)
+        try:
+            armature = target_armature(context)
+            check_posable(armature)
+            if action is None:
+                raise ValueError(f"there is no action {self.action!r} in this file")
+            if not moves_bones(action):
+                raise ValueError(f"the action {self.action!r} moves no bones of a person")
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        animation = armature.animation_data_create()
+        animation.action = action
+        if action_curves(armature) is None:
+            animation.action_slot = next(slot for slot in action.slots if slot.target_id_type == "OBJECT")
+        return {"FINISHED"}
+
+
+def moves_bones(action: bpy.types.Action) -> bool:
+    """Whether an action turns the pelvis of some armature."""
+    return any(
+        curve.data_path == 'pose.bones["pelvis"].rotation_quaternion'
+        for layer in action.layers
+        for strip in layer.strips
+        for bag in strip.channelbags
+        for curve in bag.fcurves
+    )
+
+
+class PRIMDIFFUSION_OT_add_motion(OnArmature, WhereTo, bpy.types.Operator):
+    """Put a built-in motion onto the person"""
+
+    bl_idname = "primdiffusion.add_motion"
+    bl_label = "Add Motion"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    motion: bpy.props.EnumProperty(
+        name="Motion", translation_context=CONTEXT, description="What the person does", items=_BUILT_IN
+    )
+    rounds: bpy.props.IntProperty(name="Rounds", description="How often, in a row", default=2, min=1, max=500)
+    speed: bpy.props.FloatProperty(name="Speed", description="2 is twice as fast", default=1.0, min=0.1, max=10.0)
+
+    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+        """Make it at the scene's rate and key it."""
+        import dataclasses
+
+        from ..motion.built_in_motions import built_in_motion
+        from .motion_placing import Placement, extend_range, place_motion
+
+        rate = scene_fps(context.scene)
+        made = dataclasses.replace(built_in_motion(self.motion, self.rounds, rate / self.speed), fps=rate)
+        how = Placement(start=self.start, timing="SOURCE", root=self.root, ground=False, into=self.into)
+        _, last = place_motion(context, armature, made, how)
+        if self.extend:
+            extend_range(context.scene, last)
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_clear_motion(OnArmature, bpy.types.Operator):
+    """Take the motion off the person; the action stays in the file, the person goes back to the rest pose"""
+
+    bl_idname = "primdiffusion.clear_motion"
+    bl_label = "Clear Motion"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    def on(self, _context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+        """The action and the tracks of the nonlinear animation."""
+        from ..motion.pose_library import check_posable
+        from ..scene.armature import pose_from_joint_rotations
+
+        check_posable(armature)
+        animation = armature.animation_data
+        if animation is None or (animation.action is None and not animation.nla_tracks):
+            raise ValueError(f"{armature.name!r} has no motion to clear")
+        animation.action = None
+        for track in list(animation.nla_tracks):
+            animation.nla_tracks.remove(track)
+        import numpy as np
+
+        pose_from_joint_rotations(armature, np.tile(np.eye(3), (24, 1, 1)))
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_loop_motion(OnArmature, bpy.types.Operator):
+    """Let the motion go on for ever, or end that again; a walk goes on from where it has got to"""
+
+    bl_idname = "primdiffusion.loop_motion"
+    bl_label = "Loop"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    def on(self, _context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+        """Cycles modifiers on all curves, or none."""
+        from ..scene.actions import action_curves, end_repeat, loops, repeat
+
+        if action_curves(armature) is None:
+            raise ValueError(f"{armature.name!r} has no action to loop: import or add a motion first")
+        (end_repeat if loops(armature) else repeat)(armature)
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operator):
+    """Write the person's motion as the .npz files of AMASS: axis-angles, places and shape, z up"""
+
+    bl_idname = "primdiffusion.export_motion"
+    bl_label = "Export Motion"
+    bl_options: set[str] = set()  # noqa: RUF012  changes nothing
+
+    filename_ext = ".npz"
+    filter_glob: bpy.props.StringProperty(default="*.npz", options={"HIDDEN"})
+    first: bpy.props.IntProperty(name="From", description="First frame; 0 with To 0: the scene's range", default=0)
+    last: bpy.props.IntProperty(name="To", description="Last frame", default=0)
+
+    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+        """Sample the evaluated bones on every frame, write the file."""
+        from ..motion.amass_file import write_amass
+        from .motion_placing import sample_motion
+
+        scene = context.scene
+        first, last = (self.first, self.last) if self.first or self.last else (scene.frame_start, scene.frame_end)
+        if last < first:
+            raise ValueError(f"frames {first} to {last} were wanted: give a last frame that is not before the first")
+        motion, betas, pelvis = sample_motion(context, armature, first, last)
+        path = Path(bpy.path.abspath(self.filepath))
+        write_amass(path, motion, betas, pelvis)
+        self.report({"INFO"}, f"{len(motion)} frames of {armature.name!r} written to {path.name!r}")
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_PT_motion(SidebarPanel, bpy.types.Panel):
+    """Motion from files and of our own, what it is, and out again."""
+
+    bl_label = "Motion"
+    bl_order = 3
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw_header_preset(self, _context: bpy.types.Context) -> None:
+        """The manual."""
+        draw_manual_button(self.layout, "motion")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Reads the scene; changes nothing."""
+        layout = property_columns(self.layout)
+        layout.operator("primdiffusion.import_motion", icon="IMPORT")
+        layout.operator_menu_enum("primdiffusion.add_motion", "motion", text="Add Built-in Motion", icon="ADD")
+        try:
+            armature = target_armature(context)
+        except ValueError as error:
+            draw_lines(layout, sentence(error), "INFO")
+            return
+        self._draw_action(layout, armature)
+        column = layout.column(align=True)
+        column.operator("primdiffusion.key_pose", icon="KEY_HLT")
+        clear = column.row(align=True)
+        clear.enabled = bool(armature.animation_data and armature.animation_data.action)
+        clear.operator("primdiffusion.clear_motion", icon="X")
+        layout.operator("primdiffusion.export_motion", icon="EXPORT")
+
+    def _draw_action(self, layout: bpy.types.UILayout, armature: bpy.types.Object) -> None:
+        action = armature.animation_data.action if armature.animation_data else None
+        layout.menu("PRIMDIFFUSION_MT_actions", text=action.name if action else "No Motion", icon="ACTION")
+        if action is None:
+            return
+        box = layout.box().column(align=True)
+        for label, text in facts_of(action).items():
+            row = box.split(factor=0.4)
+            row.label(text=label)
+            row.label(text=text, translate=False)
+        start, end = action.frame_range
+        row = box.split(factor=0.4)
+        row.label(text="In the Scene")
+        row.label(text=f"{start:g} \N{EN DASH} {end:g}", translate=False)
+        if action_curves(armature) is not None:
+            layout.operator("primdiffusion.loop_motion", icon="FILE_REFRESH", depress=loops(armature))
+
+
+class PRIMDIFFUSION_MT_actions(bpy.types.Menu):
+    """The motions of this file."""
+
+    bl_label = "Motions"
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        """A row for each."""
+        actions = [action for action in bpy.data.actions if moves_bones(action)]
+        for action in actions:
+            self.layout.operator("primdiffusion.use_action", text=action.name, icon="ACTION").action = action.name
+        if not actions:
+            self.layout.label(text="No motion in this file: import one")
+
+
+def facts_of(action: bpy.types.Action) -> dict[str, str]:
+    """What was found when the motion was imported; nothing for actions of other origin."""
+    try:
+        found = json.loads(action.get(FACTS, "{}"))
+    except (ValueError, TypeError):
+        return {}
+    return {str(k): str(v) for k, v in found.items()} if isinstance(found, dict) else {}
+
+
+CLASSES = (
+    PRIMDIFFUSION_OT_use_action,
+    PRIMDIFFUSION_OT_add_motion,
+    PRIMDIFFUSION_OT_clear_motion,
+    PRIMDIFFUSION_OT_loop_motion,
+    PRIMDIFFUSION_OT_export_motion,
+    PRIMDIFFUSION_PT_motion,
+    PRIMDIFFUSION_MT_actions,
+)

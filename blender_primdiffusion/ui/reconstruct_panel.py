@@ -1,0 +1,124 @@
+"""The sub-panel Human from Captures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+
+from ..formats.requests import CAPTURE_VIEWS
+from .drawing import SidebarPanel, draw_job, property_columns
+from .jobs.follow import submit
+
+_CAMERAS_FILE = "cameras.json"
+
+
+def subjects_in(folder: Path) -> list[str]:
+    """Names of the people in a dataset of captures; none where the folder is one subject's own, or cannot be read."""
+    from ..formats.capture_layout import LIST_FILE
+
+    try:
+        if (folder / _CAMERAS_FILE).is_file():
+            return []
+        if (folder / LIST_FILE).is_file():
+            text = (folder / LIST_FILE).read_text(encoding="utf-8", errors="replace")
+            return sorted({line.strip() for line in text.splitlines()} - {""})
+        return sorted(path.parent.name for path in folder.glob(f"*/{_CAMERAS_FILE}"))
+    except OSError:
+        return []
+
+
+def _search(self: PRIMDIFFUSION_PG_reconstruct, _context: bpy.types.Context, typed: str) -> Iterator[str]:
+    if self.capture:
+        names = subjects_in(Path(bpy.path.abspath(self.capture)))
+        yield from (name for name in names if typed.lower() in name.lower())
+
+
+class PRIMDIFFUSION_PG_reconstruct(bpy.types.PropertyGroup):
+    """`scene.primdiffusion_reconstruct`."""
+
+    capture: bpy.props.StringProperty(
+        name="Captures",
+        description="Folder of a dataset of captures, or of one subject in it",
+        subtype="DIR_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
+    subject: bpy.props.StringProperty(
+        name="Subject", description="Whom of the dataset; empty where there is only one", search=_search
+    )
+    frame: bpy.props.IntProperty(
+        name="Frame",
+        description="Which captured pose to look at; 0 is near the T-pose, where most of a person is seen",
+        default=0,
+        min=0,
+    )
+    views: bpy.props.IntProperty(
+        name="Views",
+        description="How many cameras, spread around the person; all where there are fewer",
+        default=CAPTURE_VIEWS,
+        min=1,
+        soft_max=36,
+    )
+
+
+class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
+    """Make a person of pictures from several sides, and add it to the scene with an armature"""
+
+    bl_idname = "primdiffusion.human_from_captures"
+    bl_label = "Human from Captures"
+    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO: the result has one
+
+    directory: bpy.props.StringProperty(
+        name="Captures", description="Empty: the panel's", subtype="DIR_PATH", options={"SKIP_SAVE"}
+    )
+    subject: bpy.props.StringProperty(name="Subject", description="Empty: the panel's", options={"SKIP_SAVE"})
+    frame: bpy.props.IntProperty(name="Frame", default=-1, min=-1, description="-1: the panel's", options={"SKIP_SAVE"})
+    views: bpy.props.IntProperty(name="Views", default=0, min=0, description="0: the panel's", options={"SKIP_SAVE"})
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        """Where the panel names no folder, the file browser asks for one."""
+        if self.directory or context.scene.primdiffusion_reconstruct.capture:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Put it in line; in background mode this waits for the person."""
+        from .jobs.reconstruct import ReconstructWork
+
+        asked = context.scene.primdiffusion_reconstruct
+        folder = bpy.path.abspath(self.directory or asked.capture)
+        subject = self.subject or ("" if self.directory else asked.subject)  # the panel's is somebody of its folder
+        if not folder:
+            self.report({"ERROR"}, "choose the folder of captures first")
+            return {"CANCELLED"}
+        frame, views = self.frame if self.frame >= 0 else asked.frame, self.views or asked.views
+        return submit(self, context, ReconstructWork(folder, subject, frame, views))
+
+
+class PRIMDIFFUSION_PT_human_from_captures(SidebarPanel, bpy.types.Panel):
+    """From which pictures, of whom, the button; progress and errors."""
+
+    bl_label = "Human from Captures"
+    bl_parent_id = "PRIMDIFFUSION_PT_captures"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Reads what is in line; starts nothing."""
+        layout, asked = property_columns(self.layout), context.scene.primdiffusion_reconstruct
+        column = layout.column()
+        for name in ("capture", "subject", "frame", "views"):
+            column.prop(asked, name)
+        draw_job(layout, "reconstruct", "primdiffusion.human_from_captures", "OUTLINER_OB_ARMATURE")
+
+
+CLASSES = (
+    PRIMDIFFUSION_PG_reconstruct,
+    PRIMDIFFUSION_OT_human_from_captures,
+    PRIMDIFFUSION_PT_human_from_captures,
+)
+PROPERTIES = (
+    (bpy.types.Scene, "primdiffusion_reconstruct", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_reconstruct)),
+)

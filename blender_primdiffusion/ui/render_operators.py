@@ -1,0 +1,162 @@
+"""Operators on the selected person: attachment, merging, density gain."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import bpy
+
+from ..formats.requests import VOXEL
+from ..scene.attachment import attachment_before_merge, attachment_of, set_attachment
+from ..scene.human import armature_of
+from .jobs.follow import submit
+from .jobs.target import Target
+from .on_person import SKIP, OnPerson
+
+if TYPE_CHECKING:
+    from .render.merge_work import Moment
+
+ATTACHMENT_ITEMS = (
+    ("ARMATURE", "Armature", "Each volume is an object that follows the bones; quick, and the default"),
+    ("SURFACE", "Surface", "Volumes lie on the posed skin, anew in each pose, as the exact engine has them"),
+    ("MERGED", "Merged", "The merged volume, in the pose it was merged in; far faster in Cycles"),
+)
+_MOST_FRAMES = 10_000
+
+
+class PRIMDIFFUSION_OT_set_attachment(OnPerson, bpy.types.Operator):
+    """Choose how the selected person's volumes follow the body"""
+
+    bl_idname = "primdiffusion.set_attachment"
+    bl_label = "Set Attachment"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    mode: bpy.props.EnumProperty(
+        name="Attachment", description="How volumes follow the body", items=ATTACHMENT_ITEMS, default="ARMATURE"
+    )
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        """The mode's own."""
+        return next(text for name, _, text in ATTACHMENT_ITEMS if name == properties.mode)
+
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """Switch."""
+        set_attachment(person, self.mode)
+        return {"FINISHED"}
+
+
+class _Merging(OnPerson):
+    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO (the result has one)
+
+    voxel: bpy.props.FloatProperty(
+        name="Voxel Size",
+        description="Metres. Not given: the panel's",
+        min=0.0005,
+        default=VOXEL,
+        options=SKIP,
+    )
+
+    def chosen_voxel(self, context: bpy.types.Context) -> float:
+        """Metres."""
+        given = self.properties.is_property_set("voxel")
+        return self.voxel if given else context.scene.primdiffusion_merging.voxel
+
+
+class PRIMDIFFUSION_OT_merge(_Merging, bpy.types.Operator):
+    """Make one volume of the selected person's, as posed now, which Cycles draws far faster"""
+
+    bl_idname = "primdiffusion.merge"
+    bl_label = "Merge Pose"
+
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """Put it in line; in background mode this waits for the merged volume."""
+        from .render.merge_work import MergeWork
+
+        moment = _moment(person, context.evaluated_depsgraph_get())
+        return submit(self, context, MergeWork(Target.of(person), moment, self.chosen_voxel(context)))
+
+
+class PRIMDIFFUSION_OT_merge_frames(_Merging, bpy.types.Operator):
+    """Make one volume for each frame of the scene's range; you can work on meanwhile"""
+
+    bl_idname = "primdiffusion.merge_frames"
+    bl_label = "Merge Frame Range"
+
+    frame_start: bpy.props.IntProperty(name="Start", description="Not given: the scene's", options=SKIP)
+    frame_end: bpy.props.IntProperty(name="End", description="Not given: the scene's", options=SKIP)
+
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """Put it in line; in background mode this waits for the merged volumes."""
+        from .render.merge_work import MergeFramesWork
+
+        given = self.properties.is_property_set
+        start, end = (getattr(self if given(name) else context.scene, name) for name in ("frame_start", "frame_end"))
+        if not 1 < end - start + 1 <= _MOST_FRAMES:
+            raise ValueError(
+                f"frames {start} to {end} are no sequence: give a start and a later end, of at most {_MOST_FRAMES}"
+            )
+        moments = _moments(context, person, range(start, end + 1))
+        return submit(self, context, MergeFramesWork(Target.of(person), moments, start, self.chosen_voxel(context)))
+
+
+class PRIMDIFFUSION_OT_unmerge(OnPerson, bpy.types.Operator):
+    """Show the person's own volumes again and remove the merged one"""
+
+    bl_idname = "primdiffusion.unmerge"
+    bl_label = "Unmerge"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """Files stay, for undo."""
+        from ..scene.merged import merged_of, remove_merged
+
+        if merged_of(person) is None:
+            raise ValueError(f"{person.name!r} has no merged volume")
+        if attachment_of(person) == "MERGED":
+            set_attachment(person, attachment_before_merge(person))
+        remove_merged(person)
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_fit_density_gain(OnPerson, bpy.types.Operator):
+    """Find the density gain by which Cycles shows the selected person as opaque as the exact engine does"""
+
+    bl_idname = "primdiffusion.fit_density_gain"
+    bl_label = "Fit Density Gain"
+    bl_options: set[str] = set()  # noqa: RUF012  the result has an undo step
+
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        """Put it in line; in background mode this waits for the gain."""
+        from .render.merge_work import FitGainWork
+
+        graph = context.evaluated_depsgraph_get()
+        return submit(self, context, FitGainWork(Target.of(person), _moment(person, graph)))
+
+
+def _moment(person: bpy.types.Collection, graph: bpy.types.Depsgraph) -> Moment:
+    from .render.merge_work import Moment
+
+    return Moment.now(person, armature_of(person).evaluated_get(graph))
+
+
+def _moments(context: bpy.types.Context, person: bpy.types.Collection, frames: range) -> list[Moment]:
+    """The person in each frame; the scene is at its own frame again afterwards."""
+    scene, now = context.scene, context.scene.frame_current
+    moments = []
+    try:
+        for frame in frames:
+            scene.frame_set(frame)
+            moments.append(_moment(person, context.evaluated_depsgraph_get()))
+    finally:
+        scene.frame_set(now)
+    return moments
+
+
+CLASSES = (
+    PRIMDIFFUSION_OT_set_attachment,
+    PRIMDIFFUSION_OT_merge,
+    PRIMDIFFUSION_OT_merge_frames,
+    PRIMDIFFUSION_OT_unmerge,
+    PRIMDIFFUSION_OT_fit_density_gain,
+)

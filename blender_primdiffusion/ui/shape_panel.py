@@ -1,0 +1,268 @@
+"""The sub-panels Shape and Details of the selected person."""
+
+from __future__ import annotations
+
+import json
+import random
+from typing import TYPE_CHECKING
+
+import bpy
+from bpy.app.translations import pgettext_iface
+
+from ..scene.human import BETA_COUNT, BETAS, MARK, armature_of
+from ..worker.sentence import sentence
+from .drawing import SidebarPanel, draw_lines, property_columns
+from .jobs.target import named_person, selected_person
+from .on_person import SKIP, OnPerson
+from .translations import CONTEXT
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_FARTHEST = 3.0
+
+
+class _Shape(OnPerson):
+    """Quick, so that it can be redone with other settings."""
+
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        from ..scene.reshape import reshape
+
+        warning = reshape(person, self.betas_for(context, person))
+        if warning:
+            self.report({"WARNING"}, warning)
+        return {"FINISHED"}
+
+    def betas_for(self, context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
+        """The new shape [10]."""
+        raise NotImplementedError
+
+
+class PRIMDIFFUSION_OT_reshape(_Shape, bpy.types.Operator):
+    """Give the selected person a shape: numbers, or a height and a weight to reach from there"""
+
+    bl_idname = "primdiffusion.reshape"
+    bl_label = "Reshape Human"
+
+    betas: bpy.props.FloatVectorProperty(
+        name="Shape", size=BETA_COUNT, description="Standard deviations. Not given: as it is", options=SKIP
+    )
+    height: bpy.props.FloatProperty(name="Height (m)", description="Not given: any", options=SKIP)
+    weight: bpy.props.FloatProperty(name="Weight (kg)", description="Not given: any", options=SKIP)
+
+    def betas_for(self, _context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
+        """Those given, then moved to the measures."""
+        import numpy as np
+
+        from ..scene.shape import betas_of, shape_model_of
+        from ..scene.shape_model import betas_of_measures
+
+        given = self.properties.is_property_set
+        betas = np.array(self.betas) if given("betas") else betas_of(person)
+        height, weight = (getattr(self, name) if given(name) else None for name in ("height", "weight"))
+        return betas_of_measures(shape_model_of(person), betas, height, weight)
+
+
+class PRIMDIFFUSION_OT_reset_shape(_Shape, bpy.types.Operator):
+    """Give the selected person the shape they were generated with, or got from their last edit"""
+
+    bl_idname = "primdiffusion.reset_shape"
+    bl_label = "Reset Shape"
+
+    def betas_for(self, _context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
+        """From the person's provenance."""
+        from ..scene.shape import generated_betas
+
+        return generated_betas(person)
+
+
+class PRIMDIFFUSION_OT_random_shape(_Shape, bpy.types.Operator):
+    """Give the selected person a body at random; the same seed is the same body"""
+
+    bl_idname = "primdiffusion.random_shape"
+    bl_label = "Random Shape"
+
+    seed: bpy.props.IntProperty(name="Seed", description="Another seed is another body", min=0)
+    spread: bpy.props.FloatProperty(
+        name="Spread",
+        translation_context=CONTEXT,
+        description="How far bodies are from the mean one: 1 as people are",
+        default=1.0,
+        min=0.0,
+        max=2.0,
+    )
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        """Each press of the button is another body."""
+        self.seed = random.randrange(2**31)
+        return self.execute(context)
+
+    def betas_for(self, _context: bpy.types.Context, _person: bpy.types.Collection) -> NDArray:
+        """Normal, kept within what looks like people."""
+        import numpy as np
+
+        drawn = np.random.default_rng(self.seed).normal(0.0, self.spread, BETA_COUNT)
+        return np.clip(drawn, -_FARTHEST, _FARTHEST)
+
+
+class PRIMDIFFUSION_OT_copy_shape(_Shape, bpy.types.Operator):
+    """Give the selected person the shape of the other person, who stays as they are"""
+
+    bl_idname = "primdiffusion.copy_shape"
+    bl_label = "Copy Shape"
+
+    source: bpy.props.StringProperty(
+        name="Source", description="Name of the other person. Not given: the panel's", options=SKIP
+    )
+
+    def betas_for(self, context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
+        """As the engine draws the other person now."""
+        from ..scene.shape import betas_of, shape_model_of
+
+        picked = context.scene.primdiffusion_edit.other
+        if not self.source and picked is None:
+            raise ValueError("choose the other person in the panel first")
+        other = named_person(context, self.source or picked.name)
+        if other == person:
+            raise ValueError(f"{person.name!r} cannot be the other person too: choose somebody else")
+        if len(shape_model_of(other).template) != len(shape_model_of(person).template):
+            raise ValueError(f"{other.name!r} stands on another body than {person.name!r}: shapes mean something else")
+        return betas_of(other)
+
+
+_SHOWN = ("seed", "steps", "sampler", "guidance", "checkpoint", "version")
+"""Of the provenance, in this order."""
+_ANIMATED = "The shape is animated: the exact engine draws it in each frame; bones and volumes keep one shape"
+
+
+class _InHuman(SidebarPanel):
+    bl_parent_id = "PRIMDIFFUSION_PT_human"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Somebody is selected."""
+        try:
+            selected_person(context)
+        except ValueError:
+            return False
+        return True
+
+
+class PRIMDIFFUSION_PT_shape(_InHuman, bpy.types.Panel):
+    """Height, weight and the sliders of the body's shape."""
+
+    bl_label = "Shape"
+    bl_order = 0
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Reads the scene; changes nothing."""
+        from ..scene.reshape import check_shapeable
+        from ..scene.shape import has_custom_shape, shape_model_of
+        from ..scene.shape_model import slider_names
+
+        layout = property_columns(self.layout)
+        person = selected_person(context)
+        try:
+            armature, names = armature_of(person), slider_names(shape_model_of(person))
+            check_shapeable(person)
+        except (OSError, ValueError) as error:
+            draw_lines(layout, sentence(error), "INFO")
+            return
+        settings = armature.primdiffusion_human
+        layout.prop(settings, "height")
+        layout.prop(settings, "weight")
+        shown = in_the_scene(context.scene, armature, settings.height)
+        if shown:
+            layout.label(text=f"In the scene: {shown}", icon="BLANK1", translate=False)
+        column = layout.column(align=True)
+        for index, name in enumerate(names):
+            column.prop(settings, "betas", index=index, text=name, slider=True)
+        row = layout.row(align=True)
+        row.operator("primdiffusion.random_shape", text="Random", icon="FILE_REFRESH")
+        reset = row.row(align=True)
+        reset.enabled = has_custom_shape(person)
+        reset.operator("primdiffusion.reset_shape", text="Reset", icon="LOOP_BACK")
+        row = layout.row(align=True)
+        row.prop(context.scene.primdiffusion_edit, "other", text="Copy From")
+        copy = row.row(align=True)
+        copy.enabled = context.scene.primdiffusion_edit.other is not None
+        copy.operator("primdiffusion.copy_shape", text="", icon="PASTEDOWN")
+        if _animated(armature):
+            draw_lines(layout, _ANIMATED, "INFO")
+
+
+class PRIMDIFFUSION_PT_details(_InHuman, bpy.types.Panel):
+    """Where the selected person comes from and what they take."""
+
+    bl_label = "Details"
+    bl_order = 90
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Reads the scene; changes nothing."""
+        person = selected_person(context)
+        column = self.layout.column(align=True)
+        for name, value in details(person):
+            column.label(text=f"{pgettext_iface(name)}: {value}", translate=False)
+
+
+def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
+    """What Details says: names and values."""
+    from ..scene.grid_cache import person_memory
+    from ..scene.overlap import current_overlap
+
+    provenance = json.loads(person[MARK])
+    lines = [(name.capitalize(), f"{provenance[name]}") for name in _SHOWN if provenance.get(name) not in (None, "")]
+    lines += [(name.capitalize(), f"{value}") for name, value in (provenance.get("attributes") or {}).items()]
+    for edit in provenance.get("edits", ()):
+        rest = ", ".join(
+            f"{key} {value}" for key, value in edit.items() if key != "edit" and not isinstance(value, dict)
+        )
+        lines.append((f"Edit: {edit['edit']}", rest))
+    volumes = [thing for thing in person.all_objects if thing.type == "VOLUME"]
+    memory = person_memory(person)
+    try:
+        most = str(current_overlap(person))
+    except (ValueError, KeyError, TypeError):  # changed by hand
+        most = "?"
+    lines.append(("Volumes", f"{len(volumes)}, up to {most} overlap"))
+    lines.append(("Memory once drawn", f"{memory.grids / 1e6:.0f} MB"))
+    lines.append(("Files", f"{memory.files / 1e6:.0f} MB"))
+    return lines
+
+
+def in_the_scene(scene: bpy.types.Scene, armature: bpy.types.Object, height: float) -> str:
+    """How tall that is in the scene's units, with the armature's scale; empty where it is metres as they are."""
+    units, scale = scene.unit_settings, armature.matrix_world.to_scale().z
+    metric = units.system == "METRIC" and units.length_unit in ("METERS", "ADAPTIVE")
+    if metric and abs(units.scale_length * scale - 1) < 1e-4:
+        return ""
+    if units.system == "NONE":
+        return f"{height * scale:.3f} units"
+    return bpy.utils.units.to_string(units.system, "LENGTH", height * scale * units.scale_length, precision=3)
+
+
+def _animated(armature: bpy.types.Object) -> bool:
+    """Keys or drivers move the betas."""
+    animation = armature.animation_data
+    if animation is None:
+        return False
+    curves = list(animation.drivers)
+    if animation.action is not None and animation.action_slot is not None:
+        for layer in animation.action.layers:
+            for strip in layer.strips:
+                bag = strip.channelbag(animation.action_slot)
+                curves += bag.fcurves if bag is not None else ()
+    return any(curve.data_path == f'["{BETAS}"]' for curve in curves)
+
+
+CLASSES = (
+    PRIMDIFFUSION_OT_reshape,
+    PRIMDIFFUSION_OT_reset_shape,
+    PRIMDIFFUSION_OT_random_shape,
+    PRIMDIFFUSION_OT_copy_shape,
+    PRIMDIFFUSION_PT_shape,
+    PRIMDIFFUSION_PT_details,
+)

@@ -1,0 +1,161 @@
+"""A person's name and shape as properties of the armature: what one reads is what is in the scene, what one sets is
+done at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import bpy
+
+from ..scene.human import BETA_COUNT, LARGEST_BETA, MARK
+
+if TYPE_CHECKING:
+    from ..scene.shape_model import Measures
+
+_NOT_ANIMATED: set[str] = set()
+"""Options: each frame would move the bones' rest; the custom property with the betas may be animated instead."""
+
+
+def person_of(armature: bpy.types.Object) -> bpy.types.Collection:
+    """The person whose armature this is. Raises ValueError for another object."""
+    for collection in armature.users_collection:
+        if MARK in collection:
+            return collection
+    raise ValueError(f"the object {armature.name!r} is no person's armature: select one")
+
+
+def measures_of(armature: bpy.types.Object) -> Measures:
+    """Height and weight as the sliders set them. Raises ValueError or FileNotFoundError where these are not known."""
+    from ..scene.shape import betas_of, shape_model_of
+    from ..scene.shape_model import measure
+
+    person = person_of(armature)
+    return measure(shape_model_of(person), betas_of(person))
+
+
+def _name(self: PRIMDIFFUSION_PG_human) -> str:
+    try:
+        return person_of(self.id_data).name
+    except ValueError:
+        return ""
+
+
+def _rename(self: PRIMDIFFUSION_PG_human, name: str) -> None:
+    from ..scene.duplicate import rename_human
+
+    _said(lambda: rename_human(person_of(self.id_data), name))
+
+
+def _betas(self: PRIMDIFFUSION_PG_human) -> Sequence[float]:
+    from ..scene.shape import betas_of
+
+    try:
+        return betas_of(person_of(self.id_data)).tolist()
+    except ValueError:
+        return (0.0,) * BETA_COUNT
+
+
+def _set_betas(self: PRIMDIFFUSION_PG_human, betas: Sequence[float]) -> None:
+    import numpy as np
+
+    from ..scene.reshape import reshape
+
+    _said(lambda: reshape(person_of(self.id_data), np.clip(list(betas), -LARGEST_BETA, LARGEST_BETA)))
+
+
+def _measure(self: PRIMDIFFUSION_PG_human) -> Measures:
+    from ..scene.shape_model import Measures
+
+    try:
+        return measures_of(self.id_data)
+    except (OSError, ValueError):
+        return Measures(0.0, 0.0)
+
+
+def _height(self: PRIMDIFFUSION_PG_human) -> float:
+    return _measure(self).height
+
+
+def _weight(self: PRIMDIFFUSION_PG_human) -> float:
+    return _measure(self).weight
+
+
+def _set_height(self: PRIMDIFFUSION_PG_human, height: float) -> None:
+    _said(lambda: set_measures(person_of(self.id_data), height=height))
+
+
+def _set_weight(self: PRIMDIFFUSION_PG_human, weight: float) -> None:
+    _said(lambda: set_measures(person_of(self.id_data), measures_of(self.id_data).height, weight))
+
+
+def set_measures(person: bpy.types.Collection, height: float | None = None, weight: float | None = None) -> str:
+    """Reshape a person as little as possible until they are `height` metres tall and weigh `weight` kilograms.
+
+    Raises ValueError where no body does, and as `reshape`.
+    """
+    from ..scene.reshape import reshape
+    from ..scene.shape import betas_of, shape_model_of
+    from ..scene.shape_model import betas_of_measures
+
+    return reshape(person, betas_of_measures(shape_model_of(person), betas_of(person), height, weight))
+
+
+def _said(change) -> None:
+    """Setters cannot fail: Blender would print a traceback. The panel says beforehand what cannot be set."""
+    try:
+        change()
+    except (OSError, ValueError) as error:
+        print(f"PrimDiffusion: {error}")
+
+
+class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
+    """`armature.primdiffusion_human`."""
+
+    person: bpy.props.StringProperty(
+        name="Name", description="What the person is called: the collection and its parts", get=_name, set=_rename
+    )
+    betas: bpy.props.FloatVectorProperty(
+        name="Shape",
+        description="How the body differs from the mean one, in standard deviations of people",
+        size=BETA_COUNT,
+        min=-LARGEST_BETA,
+        max=LARGEST_BETA,
+        soft_min=-3.0,
+        soft_max=3.0,
+        step=5,
+        precision=2,
+        options=_NOT_ANIMATED,
+        get=_betas,
+        set=_set_betas,
+    )
+    height: bpy.props.FloatProperty(
+        name="Height (m)",
+        description="Metres from sole to crown at rest, barefoot; weight and proportions follow",
+        min=0.5,
+        max=3.0,
+        soft_min=1.4,
+        soft_max=2.1,
+        step=1,
+        precision=3,
+        options=_NOT_ANIMATED,
+        get=_height,
+        set=_set_height,
+    )
+    weight: bpy.props.FloatProperty(
+        name="Weight (kg)",
+        description="Kilograms of the body without clothes; the height stays",
+        min=10.0,
+        max=300.0,
+        soft_min=40.0,
+        soft_max=120.0,
+        step=50,
+        precision=1,
+        options=_NOT_ANIMATED,
+        get=_weight,
+        set=_set_weight,
+    )
+
+
+CLASSES = (PRIMDIFFUSION_PG_human,)
+PROPERTIES = ((bpy.types.Object, "primdiffusion_human", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_human)),)
