@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from PIL import Image
 from primdiffusion.body.model import BodyPose
+from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.evaluation.portraits import PORTRAITS, camera_of
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
@@ -25,7 +26,6 @@ from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.image import depth_colours, over
 from primdiffusion.render.march import march
-from primdiffusion.training.checkpoint import load_checkpoint
 
 BACKGROUND = (0.72, 0.72, 0.72)
 LARGE = 512

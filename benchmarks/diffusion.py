@@ -17,6 +17,8 @@ from pathlib import Path
 import torch
 from diffusion_sets import decoded, front, gaussian, generated, placed, seeds_of, stored, stored_voxels, voxels
 from march import from_script
+from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.diffusion.checkpoint import default_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.attribute_network import features_of
 from primdiffusion.evaluation.clip_vision import load_clip_vision
@@ -27,7 +29,6 @@ from primdiffusion.evaluation.inception import load_inception
 from primdiffusion.evaluation.neighbours import nearest_stored
 from primdiffusion.evaluation.voxel_baseline import load_voxel_model
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.training.checkpoint import default_checkpoint, load_checkpoint
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person
 from record import tell

@@ -19,6 +19,7 @@ import torch
 from diffusion import epoch, progress
 from diffusion_sets import gaussian, generated, placed, seeds_of, stored_voxels, voxels
 from PIL import Image, ImageDraw, ImageFont
+from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.attribute_network import features_of
 from primdiffusion.evaluation.distances import nearest
@@ -33,7 +34,6 @@ from primdiffusion.people.payloads import rest_frames
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.image import over
 from primdiffusion.render.march import march
-from primdiffusion.training.checkpoint import load_checkpoint
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person
 from torch import Tensor

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 from primdiffusion.body.model import BodyPose
+from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.editing.inpaint import harmonise, inpaint
 from primdiffusion.editing.interpolate import interpolate
@@ -33,7 +34,6 @@ from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.machine import best_device
 from primdiffusion.render.image import over
 from primdiffusion.render.march import march
-from primdiffusion.training.checkpoint import load_checkpoint
 from record import tell
 
 COLUMNS = 6

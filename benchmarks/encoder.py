@@ -24,6 +24,7 @@ from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import Captures, open_captures
+from primdiffusion.encoder.checkpoint import load_encoder
 from primdiffusion.encoder.encode import EncoderModel
 from primdiffusion.evaluation.image_metrics import Lpips, load_lpips
 from primdiffusion.evaluation.reconstruction import EvaluationSettings, Means, evaluate, summary, table
@@ -31,7 +32,6 @@ from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
-from primdiffusion.training.encoder_checkpoint import load_encoder
 from record import tell
 
 FIRST_SEED = 30_000_000

@@ -18,6 +18,7 @@ from primdiffusion.capture.conditioning import conditioning_views, default_betas
 from primdiffusion.capture.reader import Captures, open_captures
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Look, Scene
+from primdiffusion.encoder.checkpoint import load_encoder
 from primdiffusion.encoder.encode import EncoderModel
 from primdiffusion.evaluation.reconstruction import picture
 from primdiffusion.geometry.camera import Camera
@@ -25,7 +26,6 @@ from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import march
-from primdiffusion.training.encoder_checkpoint import load_encoder
 from torch import Tensor
 
 VIEWS = 8

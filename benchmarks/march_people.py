@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.export.proxy import vertex_normals
 from primdiffusion.export.surface import Surface
 from primdiffusion.geometry.camera import Camera, look_at
@@ -21,7 +22,6 @@ from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import from_mesh
 from primdiffusion.primitives.primitives import GRID, Primitives
-from primdiffusion.training.checkpoint import load_checkpoint
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))

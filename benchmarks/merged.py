@@ -19,6 +19,7 @@ import numpy as np
 import psutil
 import torch
 from primdiffusion.body.model import BodyPose
+from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.formats.requests import DENSITY_GAIN
 from primdiffusion.human import body_of, generate, pose_body
 from primdiffusion.human_file import export_for_blender, load_human, save_human
@@ -26,7 +27,6 @@ from primdiffusion.primitives.anchors import attach
 from primdiffusion.serve.draw_params import PersonParams
 from primdiffusion.serve.merge_params import FitGainParams, MergeParams
 from primdiffusion.serve.merging import fit_gain_of, merge_people
-from primdiffusion.training.checkpoint import load_checkpoint
 from record import tell
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))

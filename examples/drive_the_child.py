@@ -1,4 +1,4 @@
-"""The backend from any program: start the child, send a line, read lines (docs/design/protocol.md). Only the standard library.
+"""The backend from any program: start the child, send a line, read lines (docs/design/protocol.md); stdlib only.
 
 python examples/drive_the_child.py --out people/7 --seed 7
 """

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import torch
+from primdiffusion.encoder.checkpoint import save_encoder
 from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.encode import EncoderModel
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.training.encoder_checkpoint import save_encoder
 
 TINY = EncoderConfig(
     stem=(2, 2, 4), grid=(4, 4), motion=4, attention_width=4, attention_heads=1, fused=4, colour=(2, 2),

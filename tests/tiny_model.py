@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import torch
+from primdiffusion.diffusion.checkpoint import save_checkpoint
 from primdiffusion.diffusion.codec import SCALE_VALUE, LinearCodec
 from primdiffusion.diffusion.conditioning import Vocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
@@ -10,7 +11,6 @@ from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import STANDARD_SHAPES, CellCodec, DiffusionModel
 from primdiffusion.diffusion.schedule import SCHEDULES
 from primdiffusion.primitives.primitives import GRID, K, S
-from primdiffusion.training.checkpoint import save_checkpoint
 
 FULL_DENSITY = 100.0
 CHANNELS = 4

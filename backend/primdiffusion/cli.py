@@ -118,10 +118,10 @@ class Info:
         """Prints one JSON object."""
         import torch
 
+        from primdiffusion.diffusion.checkpoint import default_checkpoint, read_card
+        from primdiffusion.encoder.checkpoint import default_encoder
         from primdiffusion.human_file import NoPersonError, format_version, load_human
         from primdiffusion.machine import best_device, device_info, memory
-        from primdiffusion.training.checkpoint import default_checkpoint, read_card
-        from primdiffusion.training.encoder_checkpoint import default_encoder
 
         if self.file is None:
             cards = {
@@ -287,14 +287,14 @@ def _evaluate(arguments: Sequence[str]) -> None:
     from primdiffusion.evaluation.command import StageTwo, TrainedReconstructor, run
 
     def load(path: Path | None) -> TrainedReconstructor:
+        from primdiffusion.encoder.checkpoint import load_encoder
         from primdiffusion.machine import best_device
-        from primdiffusion.training.encoder_checkpoint import load_encoder
 
         return load_encoder(path, best_device())
 
     def stage_two() -> StageTwo:
+        from primdiffusion.checkpoints import load_checkpoint
         from primdiffusion.machine import best_device
-        from primdiffusion.training.checkpoint import load_checkpoint
         from primdiffusion.training.latents import split_people
         from primdiffusion.training.stored_people import find_people, read_person
 

@@ -44,11 +44,11 @@ class Edit:
         """Edits, and prints the folder. Raises ValueError, FileNotFoundError, OSError."""
         from tqdm import tqdm
 
+        from primdiffusion.checkpoints import load_checkpoint
         from primdiffusion.human_file import load_human
         from primdiffusion.machine import best_device
         from primdiffusion.person_folder import write_person
         from primdiffusion.staging import staged
-        from primdiffusion.training.checkpoint import load_checkpoint
 
         if self.size < 1:
             raise ValueError(f"pictures of {self.size} pixels a side: choose 1 or more")
@@ -110,7 +110,7 @@ class EditRegion(Edit):
     """An edit of a part of the person; outside it not a bit changes."""
 
     region: tuple[str, ...] = ()
-    """Parts of the body by name, such as top, bottom, shoes, hair, left_hand; docs/design/diffusion_edits.md shows all of them."""
+    """Parts of the body by name, such as top, bottom, shoes, hair, left_hand (all: docs/design/diffusion_edits.md)."""
     weights: Path | None = None
     """Instead of --region: an .npz with `weights`, a number from 0 to 1 for each vertex of human.npz's body."""
     seed: int = 0

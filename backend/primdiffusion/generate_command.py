@@ -46,12 +46,12 @@ class Generate:
                 raise ValueError(f"{name} is {getattr(self, name)}: ask for one person or more")
         from tqdm import tqdm
 
+        from primdiffusion.checkpoints import load_checkpoint
         from primdiffusion.diffusion.conditioning import read_attributes
         from primdiffusion.human import generate_batch
         from primdiffusion.machine import best_device
         from primdiffusion.person_folder import write_person
         from primdiffusion.staging import staged
-        from primdiffusion.training.checkpoint import load_checkpoint
 
         model, attributes = None, read_attributes(self.attributes)
         end = self.seed + self.count

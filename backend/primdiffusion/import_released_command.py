@@ -23,7 +23,7 @@ from primdiffusion.released.imported import Reference, write_imported
 from primdiffusion.released.inventory import Inventory, take_inventory
 from primdiffusion.released.reading import ReleasedFileError, read_weights
 from primdiffusion.released.stage_one import PREFIX as STAGE_ONE
-from primdiffusion.training.config import write_atomically
+from primdiffusion.staging import write_atomically
 
 SMPL_CELLS_OUTSIDE = 214
 """Of 1024 grid points outside every chart with SMPL's own UV (SPEC 1.2)."""

@@ -47,9 +47,9 @@ class EncodePayloads:
             ValueError, FileNotFoundError: captures or encoder are missing or damaged; somebody failed; OSError.
         """
         from primdiffusion.capture.reader import open_captures
+        from primdiffusion.encoder.checkpoint import load_encoder
         from primdiffusion.machine import best_device
         from primdiffusion.training.captured_people import EncodeSettings, encode_people, read_cards
-        from primdiffusion.training.encoder_checkpoint import load_encoder
 
         settings = EncodeSettings(self.views, self.looks, self.refine_steps, self.refine_size, self.seed)
         captures = open_captures(self.captures)

@@ -41,11 +41,11 @@ class Reconstruct:
             ValueError, FileNotFoundError: captures or checkpoint are missing, damaged or do not fit; OSError.
         """
         from primdiffusion.capture.conditioning import captured_person
+        from primdiffusion.encoder.checkpoint import load_encoder
         from primdiffusion.machine import best_device
         from primdiffusion.person_folder import write_person
         from primdiffusion.reconstruction import reconstruct
         from primdiffusion.staging import staged
-        from primdiffusion.training.encoder_checkpoint import load_encoder
 
         if self.size < 1:
             raise ValueError(f"pictures of {self.size} pixels a side: choose 1 or more")

@@ -123,9 +123,9 @@ class Refine:
 
     def _encoded(self, captures: Captures, name: str, betas: Tensor, given: Sequence[int]) -> Human:
         from primdiffusion.capture.conditioning import CapturedPerson, conditioning_views
+        from primdiffusion.encoder.checkpoint import load_encoder
         from primdiffusion.machine import best_device
         from primdiffusion.reconstruction import reconstruct
-        from primdiffusion.training.encoder_checkpoint import load_encoder
 
         cameras = tuple(given[:: math.ceil(len(given) / ENCODER_VIEWS)])
         views = conditioning_views(captures, name, 0, cameras)

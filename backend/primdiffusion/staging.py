@@ -88,3 +88,10 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         raise type(e)(e.errno, e.strerror or str(e), str(path)) from e
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """The whole file or none, and nothing beside it. Raises OSError, which names `path`."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as unfinished:
+        unfinished.write_bytes(content.encode() if isinstance(content, str) else content)

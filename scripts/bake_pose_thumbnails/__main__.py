@@ -12,10 +12,10 @@ from pathlib import Path
 import torch
 from PIL import Image
 from primdiffusion.body.model import BodyPose
+from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.human import framing, generate, place
 from primdiffusion.render.image import to_png
 from primdiffusion.render.march import march
-from primdiffusion.training.checkpoint import load_checkpoint
 
 from blender_primdiffusion.motion.library_poses import LIBRARY
 

@@ -11,12 +11,12 @@ import torch
 from PIL import Image
 from primdiffusion.body.measures import betas_of_measures
 from primdiffusion.body.model import default_body
+from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, generate, render
 from primdiffusion.render.image import over
 from primdiffusion.reshaping import reshaped
-from primdiffusion.training.checkpoint import load_checkpoint
 
 from .shrink import save_jpeg
 

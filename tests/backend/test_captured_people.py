@@ -10,10 +10,10 @@ from diffusion_people import write_people
 from primdiffusion import cli
 from primdiffusion.capture.conditioning import captured_person
 from primdiffusion.capture.reader import open_captures
+from primdiffusion.encoder.checkpoint import load_encoder
 from primdiffusion.formats.capture_layout import picture_path
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.training.captured_people import EncodeSettings, encode_people, frames_of_looks, read_cards
-from primdiffusion.training.encoder_checkpoint import load_encoder
 from primdiffusion.training.shards import INDEX
 from primdiffusion.training.stored_people import PeopleFolder, read_person
 from tiny_encoder import save_tiny_encoder, tiny_encoder

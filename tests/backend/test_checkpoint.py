@@ -5,18 +5,18 @@ import json
 import pytest
 import torch
 from diffusion_people import VOCABULARY, small_model
-from primdiffusion.diffusion.codec import DEAD_ZONE, VALUES
-from primdiffusion.diffusion.model import DiffusionModel, WholeSlab, sample
-from primdiffusion.diffusion.schedule import dense_steps, linear, trailing_steps
-from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
-from primdiffusion.training.checkpoint import (
+from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.diffusion.checkpoint import (
     CheckpointError,
     default_checkpoint,
-    load_checkpoint,
     model_card,
     read_card,
     save_checkpoint,
 )
+from primdiffusion.diffusion.codec import DEAD_ZONE, VALUES
+from primdiffusion.diffusion.model import DiffusionModel, WholeSlab, sample
+from primdiffusion.diffusion.schedule import dense_steps, linear, trailing_steps
+from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from safetensors import safe_open
 from safetensors.torch import save_file
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from diffuse_runs import DEFAULT_FILES, child_environment, logged, make_small, settings
 from diffusion_people import write_people
+from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.training.cells import CellTrainee
-from primdiffusion.training.checkpoint import load_checkpoint
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.diffuse import MODEL, train
 from primdiffusion.training.phase import step_seed

@@ -5,10 +5,10 @@ import json
 
 import pytest
 import torch
+from primdiffusion.diffusion.checkpoint import CheckpointError
+from primdiffusion.encoder.checkpoint import load_encoder, save_encoder
 from primdiffusion.encoder.encode import EncoderModel
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.training.checkpoint import CheckpointError
-from primdiffusion.training.encoder_checkpoint import load_encoder, save_encoder
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from tiny_encoder import TINY, save_tiny_encoder, tiny_encoder

@@ -10,6 +10,7 @@ from primdiffusion import cli
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.conditioning import ConditioningError, spread_cameras
 from primdiffusion.capture.reader import open_captures
+from primdiffusion.encoder.checkpoint import save_encoder
 from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.encode import EncoderModel
 from primdiffusion.encoder.network import Encoder
@@ -30,7 +31,6 @@ from primdiffusion.human import pose_body
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.primitives import K, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
-from primdiffusion.training.encoder_checkpoint import save_encoder
 
 COARSE = MarchSettings(step=0.016)
 

@@ -15,13 +15,13 @@ from fit_scenes import WHOLE, files, flags, make_small, rows, sentence, settings
 from PIL import Image
 from primdiffusion.capture.dataset import ALONE, FIRST
 from primdiffusion.capture.reader import open_captures
+from primdiffusion.encoder.checkpoint import load_encoder
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.training import fit as fit_module
 from primdiffusion.training import recorder as recorder_module
 from primdiffusion.training import run_folder
-from primdiffusion.training.encoder_checkpoint import load_encoder
 from primdiffusion.training.fit import fit
 from primdiffusion.training.fit_command import run
 from primdiffusion.training.fit_config import FitConfig, LossConfig

@@ -14,6 +14,7 @@ from PIL import Image
 from primdiffusion import cli
 from primdiffusion.capture.conditioning import captured_person, choose_subject, conditioning_views
 from primdiffusion.capture.rasterised import render
+from primdiffusion.encoder.checkpoint import load_encoder
 from primdiffusion.encoder.encode import EncoderModel
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.formats.capture_layout import LIST_FILE, SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE, picture_path
@@ -24,7 +25,6 @@ from primdiffusion.reconstruction import reconstruct
 from primdiffusion.serve import reconstruction
 from primdiffusion.serve.jobs import Jobs
 from primdiffusion.serve.params import ReconstructParams
-from primdiffusion.training.encoder_checkpoint import load_encoder
 from tiny_encoder import TINY, save_tiny_encoder, tiny_encoder
 from tiny_model import save_tiny_checkpoint
 

@@ -12,6 +12,8 @@ import safetensors.torch
 import torch
 from primdiffusion import cli
 from primdiffusion.body.smpl_files import load_body
+from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.diffusion.checkpoint import CheckpointError, read_card
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Look, Scene
 from primdiffusion.human import framing, generate, place, place_skinned
@@ -22,7 +24,6 @@ from primdiffusion.primitives.stand import StandError, stand_of_files
 from primdiffusion.released.conventions import ReleasedSlab, released_steps
 from primdiffusion.serve.draw_params import DrawParams, PersonParams
 from primdiffusion.serve.drawing import FrameDrawer, map_frame
-from primdiffusion.training.checkpoint import CheckpointError, load_checkpoint, read_card
 from released_files import TINY, body_arrays, random_network, save_body, save_released, stage_one, state, template
 
 

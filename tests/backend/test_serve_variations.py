@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.editing.vary import vary
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
 from primdiffusion.serve.jobs import Jobs
 from primdiffusion.serve.step_pictures import Allowance
 from primdiffusion.serve.variation_params import VariationsParams
-from primdiffusion.training.checkpoint import load_checkpoint
 from tiny_model import save_tiny_checkpoint
 
 

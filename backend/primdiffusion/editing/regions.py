@@ -2,7 +2,7 @@
 
 A part is a set of primitives: those whose anchor follows a certain joint most, cut where cloth and
 hair are rather than where bones end. The cuts were chosen by looking at which rows of the grid have the colour of the
-shirt, of the face, of the hair on the people that the default checkpoint learnt from; docs/design/diffusion_edits.md shows them.
+shirt, of the face, of the hair on the people that the default checkpoint learnt from (docs/design/diffusion_edits.md).
 """
 
 from __future__ import annotations

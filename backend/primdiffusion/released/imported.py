@@ -18,6 +18,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from primdiffusion.body.model import BodyPose
+from primdiffusion.diffusion.checkpoint import FORMAT, FORMAT_VERSION
 from primdiffusion.diffusion.model import BETAS, DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import SCHEDULES, trailing_steps
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
@@ -26,8 +27,7 @@ from primdiffusion.human_file import LARGEST_BETA
 from primdiffusion.primitives.stand import BodyFiles, Stand, StandError, find_stand
 from primdiffusion.released.conventions import FULL_DENSITY, ReleasedSlab, released_steps, rest_half_extent
 from primdiffusion.released.schedule_buffers import SCHEDULE
-from primdiffusion.training.checkpoint import FORMAT, FORMAT_VERSION
-from primdiffusion.training.config import write_atomically
+from primdiffusion.staging import write_atomically
 
 KIND = "released"
 """Of the architecture in the file's metadata."""

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
+from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.diffusion.checkpoint import read_card
 from primdiffusion.diffusion.conditioning import NOTHING
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.human import Human, framing, generate, people_of, place
@@ -32,7 +34,6 @@ from primdiffusion.serve.step_pictures import step_pictures
 from primdiffusion.serve.variation_params import VariationsParams
 from primdiffusion.serve.variations import variations
 from primdiffusion.staging import staged, written_whole
-from primdiffusion.training.checkpoint import load_checkpoint, read_card
 
 if TYPE_CHECKING:
     from primdiffusion.serve.reconstruction import Reconstructor

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from primdiffusion.capture.conditioning import captured_person
+from primdiffusion.encoder.checkpoint import load_encoder
 from primdiffusion.encoder.encode import EncoderModel
 from primdiffusion.machine import peak_memory_gb
 from primdiffusion.person_folder import FILES, write_person
@@ -16,7 +17,6 @@ from primdiffusion.reconstruction import reconstruct
 from primdiffusion.serve.drawing import Report
 from primdiffusion.serve.params import ReconstructParams
 from primdiffusion.staging import staged
-from primdiffusion.training.encoder_checkpoint import load_encoder
 
 STEPS = 4
 """Read, load, encode, write."""

@@ -19,7 +19,8 @@ from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import CellCodec, DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
-from primdiffusion.training.config import PhaseConfig, TrainingConfig, write_atomically
+from primdiffusion.staging import write_atomically
+from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
 from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors
 from primdiffusion.training.prior import fit_prior, fit_shapes

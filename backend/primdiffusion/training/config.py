@@ -10,7 +10,6 @@ from typing import Any, Literal, Protocol
 
 from primdiffusion.diffusion.denoiser import DenoiserConfig
 from primdiffusion.diffusion.unet import PAPER, UNetConfig
-from primdiffusion.staging import written_whole
 
 Weighting = Literal["whitened", "plain", "min_snr"]
 Levels = Literal["uniform", "log_uniform"]
@@ -93,7 +92,7 @@ class PhaseConfig:
 
 @dataclasses.dataclass(frozen=True)
 class TrainingConfig:
-    """Train a diffusion model on people as primitives; the same line goes on where it stopped (docs/design/diffusion_training.md)."""
+    """Train a diffusion model; the same command line resumes (docs/design/diffusion_training.md)."""
 
     data: Path
     """People of `primdiffusion payloads`: a folder of files, or of the shards that `payloads pack` makes of them."""
@@ -226,10 +225,3 @@ def _comparable(tree: dict, prefix: str = "") -> dict[str, object]:
         elif name not in MAY_CHANGE:
             flat[name] = value
     return {key: value for key, value in flat.items() if not key.endswith((".steps", ".evaluate_every"))}
-
-
-def write_atomically(path: Path, content: str | bytes) -> None:
-    """The whole file or none, and nothing beside it. Raises OSError, which names `path`."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(path) as unfinished:
-        unfinished.write_bytes(content.encode() if isinstance(content, str) else content)

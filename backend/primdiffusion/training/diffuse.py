@@ -12,11 +12,11 @@ import tyro
 from accelerate import Accelerator, PartialState
 
 from primdiffusion import __version__
+from primdiffusion.diffusion.checkpoint import save_checkpoint
 from primdiffusion.diffusion.codec import VALUES
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.training.accelerated import AcceleratedState, accelerator_of
 from primdiffusion.training.cells import CellTrainee, prepare
-from primdiffusion.training.checkpoint import save_checkpoint
 from primdiffusion.training.config import TrainingConfig
 from primdiffusion.training.interrupt import Interrupt
 from primdiffusion.training.latents import split_people

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from primdiffusion.capture.reader import Captures
+from primdiffusion.encoder.checkpoint import save_encoder
 from primdiffusion.encoder.encode import EncoderModel
 from primdiffusion.training import run_folder
-from primdiffusion.training.encoder_checkpoint import save_encoder
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.fit_state import FitState
 

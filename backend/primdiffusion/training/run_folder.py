@@ -21,7 +21,8 @@ import psutil
 import torch
 
 from primdiffusion import __version__
-from primdiffusion.training.config import RunConfig, check_resumable, to_json, write_atomically
+from primdiffusion.staging import write_atomically
+from primdiffusion.training.config import RunConfig, check_resumable, to_json
 
 log = logging.getLogger(__name__)
 

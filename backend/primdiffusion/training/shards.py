@@ -25,8 +25,7 @@ from torch import Tensor
 
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.primitives.primitives import K
-from primdiffusion.staging import written_whole
-from primdiffusion.training.config import write_atomically
+from primdiffusion.staging import write_atomically, written_whole
 from primdiffusion.training.stored_people import People, PeopleFolder, StoredPerson, attributes_of
 
 INDEX, FORMAT, VERSION = "index.json", "primdiffusion-payloads", 1

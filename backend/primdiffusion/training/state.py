@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from primdiffusion.training.config import write_atomically
+from primdiffusion.staging import write_atomically
 
 
 class OptimiserConfig(Protocol):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,11 @@ from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkCon
 from primdiffusion.diffusion.model import STANDARD_SHAPES, CellCodec, DiffusionModel, ShapePrior, WholeSlab
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
-from primdiffusion.training.config import write_atomically
+from primdiffusion.staging import write_atomically
 
 FORMAT = "primdiffusion-checkpoint"
 ENCODER_FORMAT = "primdiffusion-encoder"
-"""Of encoders' files, which `encoder_checkpoint` reads."""
+"""Format of the files of `encoder.checkpoint`."""
 FORMAT_VERSION = 2
 _READABLE = {FORMAT: str(FORMAT_VERSION), ENCODER_FORMAT: "1"}
 _HALVED = ("codec.mean", "codec.basis", "denoiser.")
@@ -77,31 +78,31 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
     write_atomically(path, save(contents, metadata=metadata))
 
 
-def load_checkpoint(path: Path | str | None = None, device: torch.device | str = "cpu") -> DiffusionModel:
-    """A model ready to sample, in float32; without a path the package's default.
+def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Any]]:
+    """Tensors in float32, architecture and card (with the file's SHA-256) of a checkpoint of any kind.
 
     Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
-    format or version, does not match its own architecture or holds values that are not finite. An imported one
-    (`released`) also raises StandError (a ValueError) where the user's body that it needs is gone or changed.
+    format or version, or holds values that are not finite.
     """
-    path = default_checkpoint() if path is None else Path(path)
-    tensors, metadata = _read(path)
+    metadata = read_metadata(path)
+    with safe_open(path, framework="pt") as file:
+        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
     _check_finite(path, tensors)
-    tensors = {key: value.float() for key, value in tensors.items()}
-    try:
-        architecture = json.loads(metadata["architecture"])
-        card = {**json.loads(metadata["card"]), "sha256": file_hash(path)}
-        if architecture["kind"] == "released":
-            from primdiffusion.released.imported import released_model  # the top room: pyproject.toml allows this one
+    with mismatches_named(path):
+        architecture, card = json.loads(metadata["architecture"]), json.loads(metadata["card"])
+        return {key: value.float() for key, value in tensors.items()}, architecture, {**card, "sha256": file_hash(path)}
 
-            return released_model(tensors, architecture, card, path.parent).to(device)
-        model = _build(tensors, architecture, card)
+
+@contextlib.contextmanager
+def mismatches_named(path: Path) -> Iterator[None]:
+    """Turn what a file raises that contradicts its own description into CheckpointError."""
+    try:
+        yield
     except (KeyError, TypeError, json.JSONDecodeError, RuntimeError) as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
         raise CheckpointError(
             f"{path} does not match its own description ({reason}): download or train it again"
         ) from error
-    return model.to(device)
 
 
 def file_hash(path: Path) -> str:
@@ -111,17 +112,20 @@ def file_hash(path: Path) -> str:
 
 
 def read_card(path: Path | str | None = None) -> dict[str, Any]:
-    """The card of a checkpoint or an encoder, without its weights; errors as in `load_checkpoint`.
+    """The card of a checkpoint or an encoder, without its weights; errors as in `read_checkpoint`.
 
     A checkpoint's says under "attributes" what its model can be asked for, as `Vocabulary.to_json`.
     """
     path = default_checkpoint() if path is None else Path(path)
-    metadata = _read_metadata(path, (FORMAT, ENCODER_FORMAT))
+    metadata = read_metadata(path, (FORMAT, ENCODER_FORMAT))
     known = json.loads(metadata.get("architecture", "{}")).get("vocabulary")
     return json.loads(metadata["card"]) | ({"attributes": known} if known else {})
 
 
-def _build(tensors: Mapping[str, Tensor], architecture: dict[str, Any], card: dict[str, Any]) -> DiffusionModel:
+def build_model(
+    tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card: Mapping[str, Any]
+) -> DiffusionModel:
+    """The model of a checkpoint that was trained here, on the CPU; raises as `mismatches_named` catches."""
     schedule = SCHEDULES[architecture["schedule"]]()
     config = architecture["config"]
     weights = _under(tensors, "denoiser.")
@@ -151,13 +155,8 @@ def denoiser_config(tree: Mapping[str, Any]) -> DenoiserConfig:
     )
 
 
-def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    metadata = _read_metadata(path)
-    with safe_open(path, framework="pt") as file:
-        return {key: file.get_tensor(key) for key in file.keys()}, metadata  # noqa: SIM118 - safe_open is no mapping
-
-
-def _read_metadata(path: Path, formats: Sequence[str] = (FORMAT,)) -> dict[str, str]:
+def read_metadata(path: Path, formats: Sequence[str] = (FORMAT,)) -> dict[str, str]:
+    """The metadata of a checkpoint or encoder; errors as in `read_checkpoint`."""
     if not path.is_file():
         raise FileNotFoundError(
             f"there is no checkpoint at {path}: give the path of a .safetensors file, or reinstall the package"
@@ -205,7 +204,7 @@ def model_card(card: Mapping[str, Any]) -> str:
         [
             f"# Model card: {card['name']}",
             "",
-            "Made from the checkpoint by `python -m primdiffusion.training.checkpoint`; not written by hand.",
+            "Made from the checkpoint by `python -m primdiffusion.diffusion.checkpoint`; not written by hand.",
             "",
             *(f"- {key.replace('_', ' ')}: {_plain(value)}" for key, value in facts.items()),
             "",

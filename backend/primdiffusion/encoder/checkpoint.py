@@ -12,11 +12,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from primdiffusion.diffusion.checkpoint import ENCODER_FORMAT, CheckpointError
 from primdiffusion.encoder.config import config_from_json
 from primdiffusion.encoder.encode import EncoderModel
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.training.checkpoint import ENCODER_FORMAT, CheckpointError
-from primdiffusion.training.config import write_atomically
+from primdiffusion.staging import write_atomically
 
 FORMAT_VERSION = 1
 
