@@ -32,6 +32,16 @@ def no_variable(monkeypatch):
     monkeypatch.delenv(VARIABLE, raising=False)
 
 
+@pytest.fixture
+def bundled(tmp_path) -> Path:
+    """A folder with a backend and a torch that are imported at once."""
+    folder = tmp_path / "bundled"
+    (folder / "primdiffusion").mkdir(parents=True)
+    (folder / "primdiffusion" / "__init__.py").write_text("__version__ = 'bundled'")
+    (folder / "torch.py").write_text("__version__ = '2'")
+    return folder
+
+
 def test_the_running_python_will_do_where_it_has_torch():
     found = run_to_end(search())
     assert found.path == PYTHON
@@ -74,9 +84,9 @@ def test_a_python_that_will_not_do_is_named_with_its_reason_and_what_to_do(tmp_p
 
 
 @pytest.mark.skipif(os.name == "nt", reason="shell scripts")
-def test_a_broken_environment_of_the_extension_is_passed_over(tmp_path):
+def test_a_broken_environment_of_the_extension_is_passed_over(bundled, tmp_path):
     script(python_of_environment(tmp_path), "exit 1")
-    assert run_to_end(search(own_environment=tmp_path)).path == PYTHON
+    assert run_to_end(search(own_environment=tmp_path, module_path=bundled)).path == PYTHON
 
 
 def test_an_old_python_is_told_so():
@@ -91,8 +101,5 @@ def test_a_folder_is_no_python(tmp_path):
         run_to_end(search(tmp_path))
 
 
-def test_the_bundled_package_is_the_one_that_is_tried(tmp_path):
-    package = tmp_path / "primdiffusion"
-    package.mkdir()
-    (package / "__init__.py").write_text("__version__ = 'bundled'")
-    assert run_to_end(search(PYTHON, module_path=tmp_path)).version == "bundled"
+def test_the_bundled_package_is_the_one_that_is_tried(bundled):
+    assert run_to_end(search(PYTHON, module_path=bundled)).version == "bundled"
