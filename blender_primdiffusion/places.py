@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from .worker.backend import Backend
     from .worker.client import BackendClient
-    from .worker.setup_folder import SetUpFolder
+    from .worker.setup import SetUpFolder
 
 EXTENSION = str(__package__)
 """The extension's full module name; `bl_ext.<repository>.primdiffusion` once installed."""
@@ -46,15 +46,15 @@ def cache_folder() -> Path:
 
 def set_up_folder() -> SetUpFolder:
     """Where the private environment is, or would be: lasting, and short enough for Windows."""
-    from .worker import setup_folder
+    from .worker import setup
 
     try:
         own = Path(bpy.utils.extension_path_user(EXTENSION))
     except ValueError:  # not installed as an extension
         own = Path(bpy.utils.user_resource("DATAFILES", path="primdiffusion"))
     local = os.environ.get("LOCALAPPDATA") if os.name == "nt" else None
-    root = setup_folder.short_root(own, Path(local) if local else None, "{}{}".format(*bpy.app.version))
-    return setup_folder.SetUpFolder(root)
+    root = setup.short_root(own, Path(local) if local else None, "{}{}".format(*bpy.app.version))
+    return setup.SetUpFolder(root)
 
 
 def preference(name: str) -> str:

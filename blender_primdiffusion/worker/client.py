@@ -131,7 +131,7 @@ class BackendClient:
             raise RuntimeError("this client has been started before: make a new one")
         output, errors = Output(), Output()
         try:
-            self._process = subprocess.Popen(
+            process = subprocess.Popen(
                 self._command,
                 stdin=subprocess.PIPE,
                 stdout=output.target,
@@ -146,7 +146,9 @@ class BackendClient:
             raise
         output.target.close()
         errors.target.close()
-        self._input, self._output, self._errors = Input(self._process.stdin), output, errors
+        assert process.stdin is not None
+        self._process = process
+        self._input, self._output, self._errors = Input(process.stdin), output, errors
         self._polled_at = time.monotonic()
         self._hello = self.request("hello", {})
 

@@ -13,9 +13,10 @@ from pathlib import Path
 
 from .child_streams import Output
 from .client import child_environment
-from .setup_folder import is_half_installed
 
 VARIABLE = "PRIMDIFFUSION_PYTHON"
+MARK = "ready.json"
+"""In the extension's own environment, when it is finished."""
 TRIAL_S = 90.0
 """A first import of torch from a slow disk, with a virus scanner, takes most of a minute."""
 TRIAL = (
@@ -52,7 +53,7 @@ def candidates(preference: str | Path | None, own_environment: Path | None) -> I
     """Who may name the Python, strongest first: the preferences, the variable, the extension's own, the running one.
 
     An explicit wish (preferences or variable) that fails is an error and not a reason to look further. An environment
-    of the extension's own that is half installed is passed over.
+    of the extension's own that is not finished is passed over.
     """
     if preference and str(preference).strip():
         yield "the extension's preferences", Path(preference)
@@ -60,11 +61,7 @@ def candidates(preference: str | Path | None, own_environment: Path | None) -> I
     if os.environ.get(VARIABLE):
         yield f"the environment variable {VARIABLE}", Path(os.environ[VARIABLE])
         return
-    if (
-        own_environment is not None
-        and python_of_environment(own_environment).exists()
-        and not is_half_installed(own_environment)
-    ):
+    if own_environment is not None and (own_environment / MARK).exists():
         yield "the extension's own environment", python_of_environment(own_environment)
     yield "Blender's own Python", Path(sys.executable)
 

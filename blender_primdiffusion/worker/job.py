@@ -138,8 +138,8 @@ class Job:
         try:
             next(self._connecting)
         except StopIteration as connected:
-            self._client = connected.value
-            if not self._client.info.get("ready"):
+            self._client = client = connected.value
+            if not client.info.get("ready"):
                 self.message = "Loading PyTorch"
         except Exception as error:  # whatever it is, the user is to read it
             self._fail(JobError(str(error) or type(error).__name__, "", "environment"))

@@ -11,7 +11,7 @@ TICK_S = 0.02
 Result = TypeVar("Result")
 
 
-def run_to_end(work: Generator[None, None, Result]) -> Result:
+def run_to_end(work: Generator[object, None, Result]) -> Result:
     """What `work` returns; sleeps at each of its yields. Raises what it raises."""
     while True:
         try:

@@ -30,13 +30,13 @@ def set_up_real(module: str, _python: str) -> Steps:
     session = import_module(f"{module}.ui.setup.session").session
     began = time.monotonic()
     press("primdiffusion.set_up_backend")
-    yield from wait(lambda: not session.busy or session.job.fraction > 0.1, _MOST_S)
+    yield from wait(lambda: not session.busy or session.fraction > 0.1, _MOST_S)
     press("primdiffusion.cancel_set_up")
     yield 1.0
     yield "set_up_real_cancelled"
     press("primdiffusion.set_up_backend")
     for number, stage in enumerate(_STAGES):
-        yield from wait(lambda stage=stage: not session.busy or _is_amid(session.job, stage), _MOST_S)
+        yield from wait(lambda stage=stage: not session.busy or _is_amid(session, stage), _MOST_S)
         if session.busy:
             yield 1.5
             yield f"set_up_real_{number}"
@@ -55,9 +55,9 @@ def set_up_real(module: str, _python: str) -> Steps:
     yield 0.5
 
 
-def _is_amid(job, stage: str) -> bool:
+def _is_amid(session, stage: str) -> bool:
     middle = {"Downloading": 0.35, "Installing": 0.75}.get(stage, 0.0)
-    return job.fraction >= middle if middle else job.fraction >= 0.9
+    return session.fraction >= middle if middle else session.fraction >= 0.9
 
 
 def _preferences_window(module: str) -> bpy.types.Window:

@@ -224,14 +224,14 @@ def anna(addon, tmp_path, monkeypatch):
 def outside(anna, monkeypatch):
     """No browser opens, nothing is downloaded or installed; libraries are small and written where tests write."""
     from blender_primdiffusion.ui.jobs import assets
-    from blender_primdiffusion.worker.setup_job import SetUpJob
+    from blender_primdiffusion.ui.setup.session import SetUpSession
 
-    def start(job: SetUpJob) -> None:
-        job.state, job.message = "done", "as if it were done"
+    def start(session: SetUpSession, _steps: object) -> None:
+        session.notice = "as if it were done"
 
     monkeypatch.setattr("webbrowser.open", lambda _: True)
-    monkeypatch.setattr(SetUpJob, "start", start)
-    monkeypatch.setattr("blender_primdiffusion.worker.setup_folder.short_root", lambda *_: anna / "set up")
+    monkeypatch.setattr(SetUpSession, "start", start)
+    monkeypatch.setattr("blender_primdiffusion.worker.setup.short_root", lambda *_: anna / "set up")
     monkeypatch.setattr(assets, "own_folder", lambda: anna / "own")
     two = dict(list(assets.builtin_poses().items())[:2])  # a picture of each is drawn
     monkeypatch.setattr(assets, "builtin_poses", lambda: two)

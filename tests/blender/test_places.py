@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from blender_primdiffusion import places
-from blender_primdiffusion.ui.setup.plans import plan_of_removal, plan_of_test
+from blender_primdiffusion.ui.setup import operators
+from blender_primdiffusion.worker import setup
 
 pytestmark = pytest.mark.any_blender
 
@@ -22,8 +21,11 @@ def test_caches_are_our_own_unless_a_folder_is_named(monkeypatch, tmp_path):
 def test_set_up_uses_the_folder_that_children_use_and_removes_it_only_where_it_is_ours(
     empty_scene, monkeypatch, tmp_path
 ):
+    removed = []
+    monkeypatch.setattr(setup, "remove", lambda _folder, cache: removed.append(cache))
     monkeypatch.delenv(places.CACHE_VARIABLE)
-    assert Path(plan_of_test().cache) == Path(plan_of_removal().cache) == places.cache_folder()
+    operators.removing()
     monkeypatch.setenv(places.CACHE_VARIABLE, str(tmp_path))
-    assert Path(plan_of_test().cache) == tmp_path
-    assert plan_of_removal().cache == ""
+    assert places.cache_folder() == tmp_path
+    operators.removing()
+    assert removed == [places.own_folder() / "cache", None]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from worker.environment import (
+    MARK,
     TRIAL,
     VARIABLE,
     BackendNotFound,
@@ -54,6 +55,7 @@ def test_the_preference_goes_before_the_variable_and_that_before_the_extensions_
     own = python_of_environment(tmp_path)
     own.parent.mkdir()
     own.touch()
+    (tmp_path / MARK).touch()
     assert [path for _, path in candidates(None, tmp_path)] == [own, PYTHON]
     monkeypatch.setenv(VARIABLE, "/by/variable")
     assert [path for _, path in candidates("", tmp_path)] == [Path("/by/variable")]
@@ -86,6 +88,7 @@ def test_a_python_that_will_not_do_is_named_with_its_reason_and_what_to_do(tmp_p
 @pytest.mark.skipif(os.name == "nt", reason="shell scripts")
 def test_a_broken_environment_of_the_extension_is_passed_over(bundled, tmp_path):
     script(python_of_environment(tmp_path), "exit 1")
+    (tmp_path / MARK).touch()
     assert run_to_end(search(own_environment=tmp_path, module_path=bundled)).path == PYTHON
 
 

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
-from worker.setup_folder import LONGEST_INSIDE, WINDOWS_LONGEST, short_root
-from worker.setup_locks import grouped, locks_for, read_lock
-from worker.setup_machine import Machine, chosen_compute, this_machine
+from worker.setup import LONGEST_INSIDE, WINDOWS_LONGEST, short_root
+from worker.setup_packages import Machine, chosen_compute, locks_for, read_lock, this_machine
 
 ROOT = Path(__file__).parents[2]
 LOCKS = ROOT / "blender_primdiffusion" / "requirements"
@@ -120,17 +119,10 @@ def _holds_the_pins(path: Path, pins: dict[str, str]) -> None:
     assert lock.download_bytes > 150e6
     assert lock.installed_bytes > lock.download_bytes
     assert all(package.bytes for package in lock.packages)
-    assert bool(lock.indexes) == any("+" in package.version for package in lock.packages)
+    own_builds = any("+" in package.version for package in lock.packages)
+    assert ("--extra-index-url https://download.pytorch.org" in path.read_text()) == own_builds
 
 
 def test_cpu_locks_hold_no_cuda_packages():
     for path in LOCKS.glob("*-cpu.txt"):
         assert not [package.name for package in read_lock(path).packages if package.name.startswith(("nvidia", "cuda"))]
-
-
-def test_groups_keep_the_order_and_end_when_they_are_large_enough():
-    packages = read_lock(LOCKS / "linux_x86_64-py311-cpu.txt").packages
-    groups = grouped(packages, 20_000_000)
-    assert sum(groups, ()) == packages
-    assert all(sum(package.bytes for package in group) >= 20e6 for group in groups[:-1])
-    assert all(sum(package.bytes for package in group[:-1]) < 20e6 for group in groups)

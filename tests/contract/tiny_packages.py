@@ -7,6 +7,7 @@ import contextlib
 import hashlib
 import http.server
 import os
+import sys
 import threading
 import time
 import zipfile
@@ -65,7 +66,14 @@ def own_index(monkeypatch, index: str = "") -> None:
     monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
     monkeypatch.setenv("PIP_RETRIES", "1")
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    monkeypatch.setenv("PIP_TRUSTED_HOST", "127.0.0.1")  # pip's cache is for hosts that it trusts
     monkeypatch.setenv("PIP_INDEX_URL", index or "http://127.0.0.1:9/simple")
+
+
+def with_this_pip(monkeypatch, setup) -> None:
+    """Environments get no pip of their own, which takes seconds: that of the tests' Python installs into them."""
+    monkeypatch.setattr(setup, "_VENV", (*setup._VENV, "--without-pip"))
+    monkeypatch.setattr(setup, "_pip", lambda python: [sys.executable, "-m", "pip", "--python", str(python)])
 
 
 class TinyIndex(http.server.SimpleHTTPRequestHandler):
@@ -90,6 +98,8 @@ class TinyIndex(http.server.SimpleHTTPRequestHandler):
         self.send_response(200)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(data)))
+        if kind != "text/html":  # as the package index says of its files
+            self.send_header("Cache-Control", "max-age=365000000, immutable, public")
         self.end_headers()
         if self.stalls and self.path.startswith(f"/{self.stalls}-"):
             self.wfile.write(data[:100])

@@ -21,7 +21,7 @@ CLASSES = (
 
 
 def unregister() -> None:
-    """End a set-up under way; it can be resumed."""
+    """End a set-up under way."""
     session.session.cancel()
     if bpy.app.timers.is_registered(session.follow):
         bpy.app.timers.unregister(session.follow)

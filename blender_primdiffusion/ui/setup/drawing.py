@@ -32,7 +32,7 @@ def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
     if not draw_cost(box, width):
         props = box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES")
         props.module = EXTENSION
-    elif now.state == "moved":
+    elif now.state == "broken":
         box.operator("primdiffusion.repair_backend", icon="TOOL_SETTINGS")
     else:
         box.operator("primdiffusion.set_up_backend", icon="IMPORT")
@@ -42,11 +42,9 @@ def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
 
 def draw_progress(layout: bpy.types.UILayout, width: int) -> None:
     """The bar, what is being done, and Cancel. A bar cuts words that are too long for it."""
-    job = session.job
-    if job is not None:
-        layout.progress(factor=job.fraction, text=f"{job.fraction:.0%}")
-        draw_text(layout, job.message, "BLANK1", width)
-        layout.operator("primdiffusion.cancel_set_up", icon="CANCEL")
+    layout.progress(factor=session.fraction, text=f"{session.fraction:.0%}")
+    draw_text(layout, session.message, "BLANK1", width)
+    layout.operator("primdiffusion.cancel_set_up", icon="CANCEL")
 
 
 def draw_cost(layout: bpy.types.UILayout, width: int) -> bool:

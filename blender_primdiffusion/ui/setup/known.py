@@ -1,4 +1,4 @@
-"""What is known of the backend without starting it: cheap enough for drawing."""
+"""What is known of the backend without starting it, cheap enough for drawing; and what setting it up would take."""
 
 from __future__ import annotations
 
@@ -14,12 +14,9 @@ import bpy
 from ...places import EXTENSION, preference, set_up_folder
 
 if TYPE_CHECKING:
-    from ...worker.setup_locks import Lock
-    from ...worker.setup_machine import Machine
+    from ...worker.setup_packages import Lock, Machine
 
 LOCKS = Path(__file__).resolve().parents[2] / "requirements"
-OWN_LOCK = "requirements.txt"
-"""In a folder of wheels: a list of packages that goes before ours."""
 _LINE_BYTES_PER_S = 50e6 / 8
 """Of the network, for the estimate: 50 Mbit/s."""
 _UNPACKED_BYTES_PER_S = 30e6
@@ -30,18 +27,18 @@ _SELF_TEST_S = 30.0
 class Known:
     """Which Python would run the backend."""
 
-    state: Literal["named", "own Python", "ready", "outdated", "half", "moved", "absent"]
+    state: Literal["named", "own Python", "ready", "outdated", "broken", "absent"]
     usable: bool
     line: str
-    """For people."""
+    """For the panels."""
     about: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """What the environment's marker tells."""
+    """What the environment's mark says."""
 
 
 def known() -> Known:
     """Follows the order in which a Python is looked for when the backend starts."""
     from ...worker.environment import VARIABLE
-    from ...worker.setup_folder import state_of
+    from ...worker.setup import state_of
 
     if named := preference("backend_python"):
         return Known("named", True, f"Uses {named}")
@@ -56,10 +53,8 @@ def known() -> Known:
         return Known("ready", True, line, about)
     if _has_torch():
         return Known("own Python", True, "Uses Blender's own Python, which has torch")
-    if state == "moved":
-        return Known("moved", False, "Made by a Blender that is gone: press Repair", about)
-    if state == "half":
-        return Known("half", False, "Half installed: Set Up Backend goes on from there")
+    if state == "broken":
+        return Known("broken", False, "Half installed, or made by a Blender that is gone: press Repair", about)
     return Known("absent", False, "The backend is not set up yet")
 
 
@@ -77,7 +72,7 @@ def _made_of_another_lock(about: dict[str, Any]) -> bool:
 @functools.cache
 def machine() -> Machine:
     """The machine we run on."""
-    from ...worker.setup_machine import this_machine
+    from ...worker.setup_packages import this_machine
 
     return this_machine()
 
@@ -85,7 +80,7 @@ def machine() -> Machine:
 @functools.lru_cache(maxsize=16)
 def read_once(path: Path) -> Lock:
     """The lock in a file. Raises OSError, ValueError."""
-    from ...worker.setup_locks import read_lock
+    from ...worker.setup_packages import read_lock
 
     return read_lock(path)
 
@@ -93,15 +88,9 @@ def read_once(path: Path) -> Lock:
 @functools.cache
 def available() -> dict[str, Path]:
     """The locks for this machine, by what they compute on."""
-    from ...worker.setup_locks import locks_for
+    from ...worker.setup_packages import locks_for
 
     return locks_for(LOCKS, machine().platform, machine().python)
-
-
-def wished_compute() -> str:
-    """The preference: automatic, cpu, cuda, apple."""
-    addon = bpy.context.preferences.addons.get(EXTENSION)
-    return addon.preferences.compute.lower() if addon is not None else "automatic"
 
 
 def chosen() -> tuple[str, Lock, str]:
@@ -109,9 +98,11 @@ def chosen() -> tuple[str, Lock, str]:
 
     Raises ValueError in a sentence.
     """
-    from ...worker.setup_machine import chosen_compute
+    from ...worker.setup_packages import chosen_compute
 
-    compute, note = chosen_compute(machine(), wished_compute(), available())
+    addon = bpy.context.preferences.addons.get(EXTENSION)
+    wish = addon.preferences.compute.lower() if addon is not None else "automatic"
+    compute, note = chosen_compute(machine(), wish, available())
     return compute, read_once(available()[compute]), note
 
 
@@ -125,5 +116,5 @@ def cost(lock: Lock) -> str:
 
 
 def gigabytes(size: float) -> str:
-    """Bytes for people."""
+    """Bytes in GB or MB."""
     return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB"

@@ -1,30 +1,74 @@
-"""Set up, cancel, repair, remove and try the backend. None touches the scene."""
+"""Set up, cancel, repair, remove and test the backend. None touches the scene."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import bpy
 
-from ...places import set_up_folder
+from ...places import CACHE_VARIABLE, backend_module_path, cache_folder, preference, set_up_folder
 from ...worker.sentence import sentence
 from . import known
 from .session import redraw, see_through, session
 
 if TYPE_CHECKING:
-    from ...worker.setup_job import Kind
-    from ...worker.setup_steps import Plan
+    from ...worker.setup import Steps
+
+OWN_LOCK = "requirements.txt"
+"""In a folder of wheels: a list of packages that goes before ours."""
 
 
-def _begin(operator: bpy.types.Operator, kind: Kind, make_plan: Callable[[], Plan]) -> set[str]:
-    """Start and follow; a sentence where that cannot be."""
+def installing(wheels: Path | None = None) -> Steps:
+    """From the package index, or from a folder of wheels, whose own list of packages goes before ours.
+
+    Raises ValueError where there are no packages for this machine or Blender may not use the network, and OSError.
+    """
+    from ...worker import setup
+
+    compute, lock, _ = known.chosen()
+    if wheels is None and not bpy.app.online_access:
+        raise ValueError(setup.OFFLINE)
+    if wheels is not None and (wheels / OWN_LOCK).is_file():
+        lock = known.read_once(wheels / OWN_LOCK)
+    return setup.set_up(set_up_folder(), lock, compute, _module_path(), cache_folder(), wheels)
+
+
+def removing() -> Steps:
+    """Also where there are no packages for this machine any more. A cache that is shared with others stays."""
+    from ...worker import setup
+
+    return setup.remove(set_up_folder(), None if os.environ.get(CACHE_VARIABLE) else cache_folder())
+
+
+def testing() -> Steps:
+    """On the Python that would run the backend."""
+    from ...worker import environment, setup
+
+    named = preference("backend_python")
+    own = None if known.known().state == "own Python" else set_up_folder().environment
+    _, python = next(environment.candidates(named, own))
+    return setup.self_test(set_up_folder(), python, _module_path(), cache_folder())
+
+
+def _module_path() -> Path:
+    path = backend_module_path()
+    if path is None:
+        raise ValueError("the extension lacks its backend: install its zip again")
+    return path
+
+
+def _begin(operator: bpy.types.Operator, make: Callable[[], Steps], *, replaces: bool = True) -> set[str]:
+    """Start and follow; a sentence where that cannot be. `replaces`: the environment, which children run on."""
     try:
-        plan = make_plan()
-        if kind != "self_test":
+        if session.busy:
+            raise ValueError("The backend is being set up already; wait for it, or press Cancel")
+        steps = make()
+        if replaces:
             _release_environment()
-        session.start(kind, plan)
+        session.start(steps)
     except (ValueError, OSError) as error:
         operator.report({"ERROR"}, sentence(error))
         return {"CANCELLED"}
@@ -36,8 +80,6 @@ def _release_environment() -> None:
     from ...engine import studio
     from ..jobs.queue import queue
 
-    if session.busy:
-        raise ValueError("The backend is being set up already; wait for it, or press Cancel")
     if queue.busy:
         raise ValueError("The backend is at work; wait until it is done, or press Cancel")
     queue.close()
@@ -45,7 +87,7 @@ def _release_environment() -> None:
 
 
 class PRIMDIFFUSION_OT_set_up_backend(bpy.types.Operator):
-    """Download the backend's packages into a private environment and try it; what was begun before goes on"""
+    """Download the backend's packages into a private environment and test it"""
 
     bl_idname = "primdiffusion.set_up_backend"
     bl_label = "Set Up Backend"
@@ -53,23 +95,16 @@ class PRIMDIFFUSION_OT_set_up_backend(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """With a window a timer follows; in background mode this waits."""
-        from ...worker.setup_steps import OFFLINE
-
+        now = known.known()
         try:
-            compute = known.chosen()[0]
+            there = now.state == "ready" and now.about.get("compute") == known.chosen()[0]
         except (ValueError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        now = known.known()
-        if now.state == "ready" and now.about.get("compute") == compute:
-            self.report({"INFO"}, f"{now.line}; press Repair to check it")
+        if there:
+            self.report({"INFO"}, f"{now.line}; press Repair to install it anew")
             return {"FINISHED"}
-        if not bpy.app.online_access:
-            self.report({"ERROR"}, OFFLINE)
-            return {"CANCELLED"}
-        from .plans import plan_of_set_up
-
-        return _begin(self, "set_up", plan_of_set_up)
+        return _begin(self, installing)
 
 
 class PRIMDIFFUSION_OT_install_from_folder(bpy.types.Operator):
@@ -93,13 +128,11 @@ class PRIMDIFFUSION_OT_install_from_folder(bpy.types.Operator):
         if folder is None or not folder.is_dir():
             self.report({"ERROR"}, f"{self.directory!r} is no folder: choose the one that holds the wheels")
             return {"CANCELLED"}
-        from .plans import plan_of_set_up
-
-        return _begin(self, "set_up", lambda: plan_of_set_up(folder))
+        return _begin(self, lambda: installing(folder))
 
 
 class PRIMDIFFUSION_OT_cancel_set_up(bpy.types.Operator):
-    """Stop; what has been downloaded is kept, and Set Up Backend goes on from there"""
+    """Stop; what has been downloaded is used by the next Set Up Backend"""
 
     bl_idname = "primdiffusion.cancel_set_up"
     bl_label = "Cancel"
@@ -112,14 +145,14 @@ class PRIMDIFFUSION_OT_cancel_set_up(bpy.types.Operator):
         return session.busy
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """End the process with all it has started."""
+        """End the process at work."""
         session.cancel()
         redraw()
         return {"FINISHED"}
 
 
 class PRIMDIFFUSION_OT_repair_backend(bpy.types.Operator):
-    """Compare every installed file with its record, and set up anew where one differs or something is missing"""
+    """Set up the backend anew in the place of the one that is there"""
 
     bl_idname = "primdiffusion.repair_backend"
     bl_label = "Repair"
@@ -127,9 +160,7 @@ class PRIMDIFFUSION_OT_repair_backend(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """As Set Up Backend."""
-        from .plans import plan_of_set_up
-
-        return _begin(self, "repair", plan_of_set_up)
+        return _begin(self, installing)
 
 
 class PRIMDIFFUSION_OT_remove_backend(bpy.types.Operator):
@@ -154,12 +185,10 @@ class PRIMDIFFUSION_OT_remove_backend(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Without asking when called from Python."""
-        if not any(path.exists() for path in (set_up_folder().environment, set_up_folder().wheels)):
+        if not any(path.exists() for path in (set_up_folder().environment, set_up_folder().pip_cache)):
             self.report({"ERROR"}, "There is no backend to remove: none was set up here")
             return {"CANCELLED"}
-        from .plans import plan_of_removal
-
-        return _begin(self, "remove", plan_of_removal)
+        return _begin(self, removing)
 
 
 class PRIMDIFFUSION_OT_test_backend(bpy.types.Operator):
@@ -175,6 +204,4 @@ class PRIMDIFFUSION_OT_test_backend(bpy.types.Operator):
         if not now.usable:
             self.report({"ERROR"}, f"{now.line}: press Set Up Backend first, or name a Python")
             return {"CANCELLED"}
-        from .plans import plan_of_test
-
-        return _begin(self, "self_test", plan_of_test)
+        return _begin(self, testing, replaces=False)

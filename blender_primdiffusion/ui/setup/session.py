@@ -7,58 +7,60 @@ from typing import TYPE_CHECKING
 
 import bpy
 
+from ...worker.sentence import sentence
+
 if TYPE_CHECKING:
-    from ...worker.setup_job import Kind, SetUpJob
-    from ...worker.setup_steps import Plan
+    from ...worker.setup import Steps
 
 TICK_S = 0.2
-_TOLD_S = 2.0
+_PRINT_S = 2.0
 """Between lines of progress on the console in background mode."""
 
 
 class SetUpSession:
-    """Owns the process that sets up. All methods are for Blender's main thread."""
+    """Drives the steps of a set-up, a repair, a test or a removal. All methods are for Blender's main thread."""
 
     def __init__(self) -> None:
-        self.job: SetUpJob | None = None
-        """Under way; None when idle."""
+        self.message = ""
+        """What is being done."""
+        self.fraction = 0.0
         self.error = ""
         """Why the last one failed, in a sentence."""
         self.notice = ""
         """How the last one ended otherwise."""
+        self._steps: Steps | None = None
 
     @property
     def busy(self) -> bool:
-        """Something is being set up, repaired, tried or removed."""
-        return self.job is not None
+        """Something is being set up, repaired, tested or removed."""
+        return self._steps is not None
 
-    def start(self, kind: Kind, plan: Plan) -> None:
-        """Raises ValueError while another is under way, and OSError."""
-        from ...worker.setup_job import SetUpJob
-
-        if self.job is not None:
+    def start(self, steps: Steps) -> None:
+        """Begin at the next tick. Raises ValueError while another is under way."""
+        if self.busy:
             raise ValueError("The backend is being set up already; wait for it, or press Cancel")
-        job = SetUpJob(kind, plan)
-        job.start()
-        self.job, self.error, self.notice = job, "", ""
+        self._steps, self.error, self.notice, self.message, self.fraction = steps, "", "", "Starting", 0.0
 
     def tick(self) -> bool:
-        """Take in news; True when something visible changed. A finished job leaves its notice or error behind."""
-        job = self.job
-        if job is None:
+        """Go on; True when something visible changed. One that has ended leaves its notice or error behind."""
+        if self._steps is None:
             return False
-        changed = job.tick()
-        if job.finished:
-            self.job = None
-            self.error = job.message if job.state == "failed" else ""
-            self.notice = "" if job.state == "failed" else job.message
-        return changed or job.finished
+        before = (self.message, self.fraction)
+        try:
+            step = next(self._steps)
+        except StopIteration as done:
+            self._steps, self.notice = None, done.value
+        except (RuntimeError, OSError) as error:  # SetUpFailed is one
+            self._steps, self.error = None, sentence(error)
+        else:
+            self.message, self.fraction = step.message, step.fraction
+        return not self.busy or before != (self.message, self.fraction)
 
     def cancel(self) -> None:
-        """End it at once."""
-        if self.job is not None:
-            self.job.cancel()
-            self.tick()
+        """End it and what it has started, at once."""
+        if self._steps is not None:
+            self._steps.close()
+            self._steps, self.notice = None, "Cancelled; what has been downloaded is used by the next Set Up Backend"
 
 
 session = SetUpSession()
@@ -73,10 +75,10 @@ def see_through(operator: bpy.types.Operator) -> set[str]:
         return {"FINISHED"}
     printed = 0.0
     try:
-        while (job := session.job) is not None:
-            if session.tick() and session.busy and time.monotonic() - printed > _TOLD_S:
+        while session.busy:
+            if session.tick() and session.busy and time.monotonic() - printed > _PRINT_S:
                 printed = time.monotonic()
-                print(f"PrimDiffusion: {job.message}", flush=True)
+                print(f"PrimDiffusion: {session.message}", flush=True)
             time.sleep(TICK_S / 4)
     finally:
         session.cancel()
@@ -95,7 +97,7 @@ def follow() -> float | None:
 
 
 def redraw() -> None:
-    """Draw sidebars and preferences anew: nothing else tells them that the work has moved on."""
+    """Draw sidebars and preferences anew: nothing else tells them that there is news."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type in {"VIEW_3D", "PREFERENCES"}:

@@ -17,6 +17,8 @@ for line in sys.stdin:
     if request["method"] == "hello":
         say(id=id, result={"pid": 0, "device_name": None})
         say(method="ready", params={"ready": True, "problem": tiny.PROBLEM, "device_name": "tiny device"})
+    elif request["method"] == "generate" and tiny.PROBLEM:
+        say(id=id, error={"code": -32002, "message": tiny.PROBLEM, "data": {"kind": "environment"}})
     elif request["method"] == "generate":
         Path(params["out_dir"]).mkdir(parents=True)
         human = Path(params["out_dir"], "human.npz")

@@ -1,8 +1,12 @@
-"""What this machine can compute on, found without starting anything; which lock suits it."""
+"""Which wheels make the backend's environment on this machine: locks, and what a machine can compute on.
+
+A lock is a file of pip's requirements format. Nothing is started to find out what the machine is.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import os
 import platform
 import re
@@ -15,8 +19,71 @@ CUDA_DRIVER = 580
 MACOS = 14
 """The oldest macOS that torch has wheels for."""
 NAMES = {"cpu": "CPU", "cuda": "NVIDIA (CUDA)", "apple": "Apple Silicon"}
-_OWNERS = {"Linux": "linux", "Windows": "windows", "Darwin": "macos"}
+_SYSTEMS = {"Linux": "linux", "Windows": "windows", "Darwin": "macos"}
 _CHIPS = {"x86_64": "x86_64", "AMD64": "x86_64", "arm64": "arm64", "aarch64": "arm64"}
+_REQUIREMENT = re.compile(
+    r"(?P<name>[A-Za-z0-9._-]+)==(?P<version>[^\s;#]+) +--hash=sha256:[0-9a-f]{64}"
+    r"(?: +# (?P<bytes>\d+) bytes, (?P<installed>\d+|\?) installed)?"
+)
+_UNPACKED_TO_PACKED = 3.0
+"""For a wheel of which it is not known what it unpacks to; torch's CPU build for Linux has 3.6."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Package:
+    """One wheel of a lock."""
+
+    name: str
+    version: str
+    bytes: int
+    """Of the file; 0 where the lock does not say."""
+    installed: int
+    """Bytes that it unpacks to, or about that."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Lock:
+    """Every package of an environment, each with the hash of its one wheel."""
+
+    path: Path
+    digest: str
+    """SHA-256 of the file: says whether an environment was made of this very lock."""
+    packages: tuple[Package, ...]
+
+    @property
+    def download_bytes(self) -> int:
+        """Of all wheels."""
+        return sum(package.bytes for package in self.packages)
+
+    @property
+    def installed_bytes(self) -> int:
+        """Of the environment, about."""
+        return sum(package.installed for package in self.packages)
+
+
+def read_lock(path: Path) -> Lock:
+    """The lock in a file. Raises OSError, and ValueError for a line that is not `name==version --hash=sha256:...`."""
+    data = path.read_bytes()
+    packages = []
+    for number, line in enumerate(map(str.strip, data.decode("utf-8", "replace").splitlines()), 1):
+        if not line or line.startswith(("#", "--extra-index-url ")):
+            continue
+        found = _REQUIREMENT.fullmatch(line)
+        if found is None:
+            raise ValueError(f"line {number} of {path} is not 'name==version --hash=sha256:...': {line[:60]!r}")
+        size = int(found["bytes"] or 0)
+        unknown = found["installed"] in (None, "?")
+        installed = int(size * _UNPACKED_TO_PACKED) if unknown else int(found["installed"])
+        packages.append(Package(found["name"], found["version"], size, installed))
+    if not packages:
+        raise ValueError(f"{path} names no packages")
+    return Lock(path, hashlib.sha256(data).hexdigest(), tuple(packages))
+
+
+def locks_for(folder: Path, platform: str, python: tuple[int, int]) -> dict[str, Path]:
+    """The locks in `folder` for a platform and a Python, by what they compute on: cpu, cuda, apple."""
+    start = f"{platform}-py{python[0]}{python[1]}-"
+    return {path.stem.removeprefix(start): path for path in sorted(folder.glob(f"{start}*.txt"))}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +114,7 @@ def this_machine() -> Machine:
     version = platform.mac_ver()[0]
     nvidia, driver = _nvidia()
     return Machine(
-        f"{_OWNERS.get(platform.system(), platform.system().lower())}_{chip}",
+        f"{_SYSTEMS.get(platform.system(), platform.system().lower())}_{chip}",
         sys.version_info[:2],
         int(version.split(".")[0]) if version else None,
         nvidia,
