@@ -20,7 +20,6 @@ import numpy as np
 import torch
 from PIL import Image
 from primdiffusion.body.model import BodyPose, J, default_body
-from primdiffusion.capture.rasterise import Picture, rasterise
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.srgb import encode_srgb
@@ -31,6 +30,7 @@ from primdiffusion.people.person import make_person
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import colour, surface_field
 from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.raster.rasterise import Picture, rasterise
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.march import march
 from record import tell

@@ -16,11 +16,11 @@ import numpy as np
 import torch
 from people_sheet import arms_down, posed
 from primdiffusion.body.model import J
-from primdiffusion.capture.rasterise import draw
-from primdiffusion.capture.soup import flatten
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people import load_base_mesh, make_person, open_assets
+from primdiffusion.raster.rasterise import draw
+from primdiffusion.raster.triangle_soup import flatten
 from record import tell
 
 REACH = 0.02

@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from PIL import Image
 from primdiffusion.body.model import BodyPose, J, default_body
-from primdiffusion.capture.rasterise import draw, shade
-from primdiffusion.capture.soup import Soup, flatten
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people import Person, load_base_mesh, make_person, open_assets
+from primdiffusion.raster.rasterise import draw, shade
+from primdiffusion.raster.triangle_soup import TriangleSoup, flatten
 
 YAW, PITCH, FIELD_OF_VIEW = math.radians(28), math.radians(6), math.radians(26)
 SUPERSAMPLE = 3
@@ -75,7 +75,7 @@ def picture(mesh: TexturedMesh, width: int, height: int, heads: bool, lit: bool)
     return np.rint(encode_srgb(np.clip(blocks, 0, 1)) * 255).astype(np.uint8)
 
 
-def normals(soup: Soup) -> np.ndarray:
+def normals(soup: TriangleSoup) -> np.ndarray:
     """[V, 3] smooth normals, not of unit length."""
     corners = soup.vertices[soup.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -13,7 +13,6 @@ from PIL import Image
 from primdiffusion import cli
 from primdiffusion.body.model import BodyPose
 from primdiffusion.body.smpl_pickle import UnsafePickleError
-from primdiffusion.capture.multisample import shoot
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.rasterised import render
 from primdiffusion.capture.reader import CaptureFileError, open_captures
@@ -22,6 +21,7 @@ from primdiffusion.capture.subject import sit
 from primdiffusion.capture.verify import verify
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.arrays import ArrayFileError, read_numbers
+from primdiffusion.raster.multisample import shoot
 
 NAME = "person_000000"
 

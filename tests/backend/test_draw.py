@@ -13,12 +13,12 @@ from primdiffusion.drawing.scene import NOTHING, Look, Picture, Scene
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.raster.nearest_triangle import nearest_triangles
 from primdiffusion.render.boxes import draw_boxes
 from primdiffusion.render.image import depth_colours
 from primdiffusion.render.lattice import MarchSettings, Span
 from primdiffusion.render.reference import march_reference
 from primdiffusion.render.solids import Solids, shade_solids
-from primdiffusion.render.triangles import nearest_triangles
 
 RED = (0.8, 0.1, 0.1)
 BACKGROUND = (0.1, 0.3, 0.6)

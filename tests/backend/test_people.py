@@ -13,7 +13,6 @@ import numpy as np
 import psutil
 import pytest
 import torch
-from primdiffusion.capture.rasterise import rasterise
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.people import assets as assets_module
 from primdiffusion.people import fitted as fitted_module
@@ -28,6 +27,7 @@ from primdiffusion.people.skin import SkinColours, skin_texture
 from primdiffusion.people.wardrobe import HAIR, HATS, OUTFITS, choose, draw_body, required_meshes
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, from_mesh
 from primdiffusion.primitives.primitives import Payload, Primitives
+from primdiffusion.raster.rasterise import rasterise
 from primdiffusion.render.march import march
 
 NEARBY = Path(__file__).resolve().parents[3] / "shared" / "data" / "makehuman"

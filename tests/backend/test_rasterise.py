@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from primdiffusion.capture.rasterise import rasterise
-from primdiffusion.capture.soup import UnusableMesh
-from primdiffusion.capture.views import OrthographicView, view_along
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+from primdiffusion.raster.orthographic import OrthographicView, view_along
+from primdiffusion.raster.rasterise import rasterise
+from primdiffusion.raster.triangle_soup import UnusableMesh
 
 
 def part(vertices, faces, texture=((255, 255, 255, 255),), corner_uv=None, name="part") -> TexturedPart:

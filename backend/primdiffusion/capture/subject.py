@@ -13,14 +13,14 @@ from jaxtyping import Float
 from PIL import Image
 
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.capture.figure import Figure, figure_of
-from primdiffusion.capture.multisample import Shot, shoot
 from primdiffusion.capture.people_files import SkinnedPerson
-from primdiffusion.capture.texture_pyramid import BYTE_OF_LINEAR, encode_bytes
 from primdiffusion.formats import camera_files, capture_layout, picture_files
 from primdiffusion.formats.arrays import ArrayFileError, read_numbers
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
+from primdiffusion.raster.figure import Figure, figure_of
+from primdiffusion.raster.multisample import Shot, shoot
+from primdiffusion.raster.texture_pyramid import BYTE_OF_LINEAR, encode_bytes
 
 JPEG_QUALITY = 95
 

@@ -8,9 +8,9 @@ import numba
 import numpy as np
 from jaxtyping import UInt8
 
-from primdiffusion.capture.rasterise import LINEAR_OF_BYTE
-from primdiffusion.capture.texture_pyramid import BYTE_OF_LINEAR
 from primdiffusion.formats.camera_rig import View
+from primdiffusion.raster.rasterise import LINEAR_OF_BYTE
+from primdiffusion.raster.texture_pyramid import BYTE_OF_LINEAR
 
 
 @dataclasses.dataclass(frozen=True)

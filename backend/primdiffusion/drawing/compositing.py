@@ -17,8 +17,8 @@ from numpy import ndarray
 
 from primdiffusion.drawing.scene import NOTHING, Picture
 from primdiffusion.geometry.camera import Camera
+from primdiffusion.raster.nearest_triangle import nearest_triangles
 from primdiffusion.render.solids import Layer, Solids, shade_solids
-from primdiffusion.render.triangles import nearest_triangles
 
 FINER = 2
 """Points of a pixel along each side at which solids are looked for."""

@@ -15,7 +15,7 @@ from torch.utils.data import get_worker_info
 
 from primdiffusion.body.model import BodyModel
 from primdiffusion.capture.dataset import Views
-from primdiffusion.render.triangles import nearest_triangles
+from primdiffusion.raster.nearest_triangle import nearest_triangles
 
 TOLERANCE = 0.020
 """Metres behind the body's surface within which a point counts as seen (SPEC 2)."""

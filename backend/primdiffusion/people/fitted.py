@@ -16,11 +16,11 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from primdiffusion.body.model import default_body
-from primdiffusion.capture.rasterise import rasterise_colourings
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Frames, Payload
+from primdiffusion.raster.rasterise import rasterise_colourings
 from primdiffusion.render.inverse import InverseSettings, Target, fit_colours, fit_payload
 
 BODY_VIEWS, BODY_SIZE, BODY_FOV = 28, 176, math.radians(30)

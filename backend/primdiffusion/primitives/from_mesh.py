@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Int32
 
-from primdiffusion.capture.mip import pyramid
-from primdiffusion.capture.soup import Soup, flatten
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.primitives.primitives import Frames, Payload, S
 from primdiffusion.primitives.surface_points import carve, look_around, nearest, visible_points
+from primdiffusion.raster.mip import pyramid
+from primdiffusion.raster.triangle_soup import TriangleSoup, flatten
 
 FULL_DENSITY = 200.0
 """Opacity per metre of solid matter; one over this is the depth at which solid matter hides what is behind it."""
@@ -139,7 +139,9 @@ def _spacing(
     return along.reshape(-1), across.reshape(-1)
 
 
-def _texture_coordinates(soup: Soup, face: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _texture_coordinates(
+    soup: TriangleSoup, face: np.ndarray, barycentric: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Texture coordinates of surface points, and texture coordinates per metre there."""
     uv = np.einsum("ni,nij->nj", barycentric, soup.corner_uv[face])
     corners = soup.vertices[soup.faces]

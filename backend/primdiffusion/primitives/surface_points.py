@@ -8,9 +8,9 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
-from primdiffusion.capture.rasterise import Fragments, draw
-from primdiffusion.capture.soup import Soup
-from primdiffusion.capture.views import OrthographicView, view_along
+from primdiffusion.raster.orthographic import OrthographicView, view_along
+from primdiffusion.raster.rasterise import Fragments, draw
+from primdiffusion.raster.triangle_soup import TriangleSoup
 
 DIRECTIONS = (
     (0.0, 0.0, -1.0),
@@ -52,7 +52,7 @@ class SurfacePoints:
     """Where on the face."""
 
 
-def look_around(soup: Soup) -> tuple[list[OrthographicView], list[Fragments]]:
+def look_around(soup: TriangleSoup) -> tuple[list[OrthographicView], list[Fragments]]:
     """The mesh drawn along all DIRECTIONS."""
     used = soup.vertices[np.unique(soup.faces)]
     bounds = np.stack([used.min(0), used.max(0)])
@@ -60,7 +60,7 @@ def look_around(soup: Soup) -> tuple[list[OrthographicView], list[Fragments]]:
     return views, [draw(soup, view) for view in views]
 
 
-def visible_points(soup: Soup, views: list[OrthographicView], drawn: list[Fragments]) -> SurfacePoints:
+def visible_points(soup: TriangleSoup, views: list[OrthographicView], drawn: list[Fragments]) -> SurfacePoints:
     """What the views see, thinned to one point a cube of PIXEL; the one that most faces its viewer stays."""
     corners = soup.vertices[soup.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

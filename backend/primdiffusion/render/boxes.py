@@ -14,8 +14,8 @@ from torch import Tensor
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.raster.nearest_triangle import nearest_triangles
 from primdiffusion.render.solids import Layer, eye_of
-from primdiffusion.render.triangles import nearest_triangles
 
 LIT = (0.35, 0.65)
 """A face's light: the first part always, the second times |n . ray|."""

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32, UInt8
 
 from primdiffusion.body.model import J
-from primdiffusion.capture.soup import flatten
-from primdiffusion.capture.texture_pyramid import TexturePyramid, texture_pyramid
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+from primdiffusion.raster.texture_pyramid import TexturePyramid, texture_pyramid
+from primdiffusion.raster.triangle_soup import flatten
 
 SAME_PLACE = 1e-6
 """Vertices of a part nearer than this (metres, in the rest pose) are one to normals: seams of textures stay smooth."""

@@ -8,10 +8,10 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Int32, Int64, UInt8
 
-from primdiffusion.capture.rasterise import LINEAR_OF_BYTE
-from primdiffusion.capture.soup import UnusableMesh
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
+from primdiffusion.raster.rasterise import LINEAR_OF_BYTE
+from primdiffusion.raster.triangle_soup import UnusableMesh
 
 LEVELS = 4
 """Full size and three halvings; coarser ones would mix what lies apart on the body."""

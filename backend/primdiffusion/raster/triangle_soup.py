@@ -15,7 +15,7 @@ class UnusableMesh(ValueError):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Soup:
+class TriangleSoup:
     """Triangles of all parts, parts one after the other."""
 
     vertices: Float64[np.ndarray, "V 3"]
@@ -47,7 +47,7 @@ ALPHA_TEST = 128
 """Texels with a smaller alpha (of 255) are holes."""
 
 
-def flatten(mesh: TexturedMesh) -> Soup:
+def flatten(mesh: TexturedMesh) -> TriangleSoup:
     """The mesh as a soup.
 
     Raises:
@@ -60,7 +60,7 @@ def flatten(mesh: TexturedMesh) -> Soup:
     for part in parts:
         _check(part)
     first = np.cumsum([0] + [len(part.vertices) for part in mesh.parts])
-    return Soup(
+    return TriangleSoup(
         vertices=np.concatenate([np.asarray(part.vertices, np.float64) for part in mesh.parts]),
         faces=np.concatenate([part.faces.astype(np.int32) + np.int32(first[i]) for i, part in enumerate(mesh.parts)]),
         corner_uv=np.concatenate([part.corner_uv.astype(np.float32) for part in mesh.parts]),

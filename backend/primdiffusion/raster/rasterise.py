@@ -14,11 +14,11 @@ import numba
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from primdiffusion.capture.soup import ALPHA_TEST, Soup, flatten, gather_textures
-from primdiffusion.capture.views import OrthographicView
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
+from primdiffusion.raster.orthographic import OrthographicView
+from primdiffusion.raster.triangle_soup import ALPHA_TEST, TriangleSoup, flatten, gather_textures
 
 NEAR = 1e-3
 """Triangles with a corner closer to a camera's plane than this (metres) are left out, not clipped."""
@@ -86,7 +86,7 @@ def rasterise_colourings(
     return pictures
 
 
-def _picture(soup: Soup, fragments: Fragments, view: Camera | OrthographicView, supersample: int) -> Picture:
+def _picture(soup: TriangleSoup, fragments: Fragments, view: Camera | OrthographicView, supersample: int) -> Picture:
     rgb = shade(soup, fragments)
     distance = fragments.depth * _ray_lengths(view, supersample)
     part = np.where(fragments.face >= 0, soup.part[fragments.face], -1).astype(np.int32)
@@ -101,7 +101,7 @@ def _picture(soup: Soup, fragments: Fragments, view: Camera | OrthographicView, 
     )
 
 
-def draw(soup: Soup, view: Camera | OrthographicView) -> Fragments:
+def draw(soup: TriangleSoup, view: Camera | OrthographicView) -> Fragments:
     """The nearest triangle behind each pixel centre; where two are equally near, the one of lower number."""
     if isinstance(view, OrthographicView):
         in_view = soup.vertices @ view.world_to_view[:, :3].T + view.world_to_view[:, 3]
@@ -127,7 +127,7 @@ def draw(soup: Soup, view: Camera | OrthographicView) -> Fragments:
     return Fragments(face, barycentric, buffer)
 
 
-def shade(soup: Soup, fragments: Fragments) -> Float32[np.ndarray, "H W 3"]:
+def shade(soup: TriangleSoup, fragments: Fragments) -> Float32[np.ndarray, "H W 3"]:
     """Linear colour of every fragment, bilinear between texels that pass the alpha test; black where there is none."""
     rgb = np.zeros((*fragments.face.shape, 3), np.float32)
     texels = soup.texels

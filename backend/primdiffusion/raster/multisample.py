@@ -15,9 +15,9 @@ import numba
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from primdiffusion.capture.figure import PosedFigure
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.raster.figure import PosedFigure
 
 NEAR = 1e-3
 """Metres along the optical axis: nearer surfaces are not seen."""

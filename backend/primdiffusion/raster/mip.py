@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from primdiffusion.capture.rasterise import LINEAR_OF_BYTE
-from primdiffusion.capture.soup import ALPHA_TEST
+from primdiffusion.raster.rasterise import LINEAR_OF_BYTE
+from primdiffusion.raster.triangle_soup import ALPHA_TEST
 
 
 def pyramid(texture: UInt8[np.ndarray, "H W 4"], levels: int) -> list[Float32[np.ndarray, "h w 4"]]:

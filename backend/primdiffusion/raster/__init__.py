@@ -1,0 +1,1 @@
+"""Textured triangles as pictures: z-buffers, textures at several sizes, orthographic views."""
