@@ -21,6 +21,7 @@ from primdiffusion.training.losses import (
     blends,
     closed_form,
     level_weight,
+    mixed,
     objective,
     random_steps,
     weighted_error,
@@ -215,6 +216,15 @@ def test_blends_stay_within_a_geometry_and_keep_the_variance():
     assert weight.square().sum(1).mean().item() == pytest.approx(1.0, abs=0.02)
     alone, _ = blends(geometry, 100, 0.0, torch.Generator().manual_seed(0))
     assert torch.equal(alone[:, 1], torch.zeros(100))
+
+
+def test_mixtures_are_weighted_sums_of_two():
+    generator = torch.Generator().manual_seed(0)
+    samples = torch.randn(5, 3, 4, generator=generator).half()
+    weights = torch.tensor([[1.0, 0.0], [0.3, 0.7], [1.4, -0.4]])
+    indices = torch.tensor([[0, 4], [1, 2], [3, 3]])
+    expected = torch.einsum("bk,bkcd->bcd", weights, samples[indices].float())
+    torch.testing.assert_close(mixed(samples, weights, indices), expected)
 
 
 def test_error_weights_have_mean_one_at_every_level():

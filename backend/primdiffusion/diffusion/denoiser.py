@@ -92,16 +92,29 @@ class PersonDenoiser(nn.Module):
         condition: Float[Tensor, "b a"] | None = None,
     ) -> Float[Tensor, "b c h w"]:
         """The guess of the clean rest of a noisy one, for guessed person coefficients."""
+        guess, deviation, correction = self.rest_parts(rest, coefficients, t, condition)
+        return guess if correction is None else guess + deviation * correction
+
+    def rest_parts(
+        self,
+        rest: Float[Tensor, "b c h w"],
+        coefficients: Float[Tensor, "b r"],
+        t: Int[Tensor, "b"],
+        condition: Float[Tensor, "b a"] | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """The closed form's guess, its posterior standard deviation, and the network's correction in units of it."""
         signal, noise = self.schedule.levels(t, rest)
         prior = self.prior
-        guess = prior.denoise_rest(rest, signal, noise)
+        total = torch.addcmul(noise**2, signal**2, prior.rest_variance)
+        guess = rest * (signal * prior.rest_variance / total)
+        total = total.sqrt()
+        deviation = noise * prior.rest_variance.sqrt() / total
         if self.local is None:
-            return guess
-        total = (signal**2 * prior.rest_variance + noise**2).sqrt()
+            return guess, deviation, None
         picture = prior.picture(coefficients) / self.picture_std[:, None, None]
         with self._precision(rest):
             correction = self.local(rest / total, picture, coefficients / self.component_std, t, condition)
-        return guess + prior.rest_variance.sqrt() * noise / total * correction
+        return guess, deviation, correction.float()
 
     def _precision(self, like: Tensor) -> torch.autocast:
         """Networks may compute in `network_dtype`; the closed form never does."""

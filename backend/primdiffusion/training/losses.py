@@ -29,7 +29,7 @@ def weighted_error(error: Float[Tensor, "b n"], std: Float[Tensor, "b n"], power
 
     power 2 is the paper's unweighted x0 error (eq. 9) divided by the error of the closed form at the same level.
     """
-    weight = std**power
+    weight = std if power == 1 else std**power
     return (weight / weight.mean(1, keepdim=True) * error.square()).mean()
 
 
@@ -102,9 +102,9 @@ class RestObjective:
         """Weighted x0 error of a random batch at random levels."""
         weights, indices = blends(self.people.geometry, self.config.batch, self.config.blend, generator)
         condition = asked_of(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
-        z = torch.einsum("bk,bkchw->bchw", weights, self.people.latents[indices].float())
-        flip = torch.rand(len(z), 1, 1, 1, generator=generator, device=generator.device) < 0.5
-        z = torch.where(flip, self.codec.mirror(z), z)
+        z = mixed(self.people.latents, weights, indices)
+        flip = torch.rand(len(z), 1, 1, 1, generator=generator, device=generator.device)[:, 0, 0, 0] < 0.5
+        z[flip] = self.codec.mirror(z[flip])
         t = random_steps(self.denoiser.schedule, len(z), generator, self.config.levels)
         x = self.denoiser.schedule.q_sample(z, t, gaussian_noise(z, generator))
         signal, noise = self.denoiser.schedule.levels(t, z)
@@ -112,10 +112,11 @@ class RestObjective:
             _, clean = self.denoiser.prior.split(z)
             y, rest = self.denoiser.prior.split(x, signal)
             coefficients = self.denoiser.coefficients(y, t, condition)
-        std = self.denoiser.prior_rest_variance.sqrt()
-        std = std * noise / (signal**2 * std**2 + noise**2).sqrt()
-        error = self.denoiser.rest(rest, coefficients, t, condition) - clean
-        return objective(error, std, signal, noise, self.config)
+        guess, std, correction = self.denoiser.rest_parts(rest, coefficients, t, condition)
+        missing = guess - clean
+        if self.config.weighting == "whitened":
+            return weighted_error((missing / std + correction).flatten(1), std.flatten(1), self.config.error_power)
+        return objective(missing + std * correction, std, signal, noise, self.config)
 
 
 def random_steps(
@@ -156,6 +157,19 @@ def blends(
     second = starts[own] + (which * counts[own]).long()
     part = (0.5 + 3**0.5 * (mixed - 0.5)) * (chosen < share)
     return torch.stack([1 - part, part], dim=1), torch.stack([first, second], dim=1)
+
+
+def mixed(
+    samples: Float[Tensor, "n *s"], weights: Float[Tensor, "b 2"], indices: Int[Tensor, "b 2"]
+) -> Float[Tensor, "b *s"]:
+    """The weighted sums of two samples each, in float32; those with weight 0 are not read."""
+    result = samples[indices[:, 0]].float()
+    both = weights[:, 1] != 0
+    if both.any():
+        shape = (-1, *[1] * (result.ndim - 1))
+        second = samples[indices[both, 1]].float()
+        result[both] = weights[both, 0].reshape(shape) * result[both] + weights[both, 1].reshape(shape) * second
+    return result
 
 
 def asked_of(
