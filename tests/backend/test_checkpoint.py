@@ -64,6 +64,15 @@ def test_a_codec_of_before_weights_is_read_as_it_was(path):
     assert codec.dead_zone.tolist() == pytest.approx(DEAD_ZONE)
 
 
+def test_a_codec_of_another_network_is_named(path):
+    def narrow(tensors):
+        return {k: v[:-1].contiguous() if k in ("codec.basis", "codec.parity") else v for k, v in tensors.items()}
+
+    rewrite(path, narrow)
+    with pytest.raises(CheckpointError, match=r"\(3, 32, 32\).*\(4, 32, 32\)"):
+        load_checkpoint(path)
+
+
 def without(tree: str, key: str) -> str:
     return json.dumps({k: v for k, v in json.loads(tree).items() if k != key})
 

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.people.fitted import orbit_camera
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+from primdiffusion.people.fitted import fitted_payloads, orbit_camera
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.raster.triangle_soup import UnusableMesh
 from primdiffusion.render.cpu import march_cpu
 from primdiffusion.render.inverse import InverseSettings, Target, fit_colours, fit_payload
 
@@ -130,3 +132,15 @@ def test_input_that_cannot_be_fitted_is_named():
         fit_colours([start, start], start, [targets, targets * 2])
     with pytest.raises(ValueError, match="steps is 0"):
         InverseSettings(steps=0)
+
+
+def test_a_mesh_without_textures_is_named():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
+    bare = TexturedPart(
+        "body", corners, np.array([[0, 1, 2]], np.int32), np.zeros((1, 3, 2), np.float32),
+        np.zeros((0, 0, 4), np.uint8), np.zeros((3, 1), np.int32), np.ones((3, 1)),
+    )  # fmt: skip
+    with pytest.raises(UnusableMesh, match="body"):
+        fitted_payloads([TexturedMesh((bare,))], sheet_frames(), np.zeros(10))
+    with pytest.raises(ValueError, match="at least one colouring"):
+        fitted_payloads([], sheet_frames(), np.zeros(10))

@@ -113,6 +113,13 @@ def test_an_index_that_cannot_be_used_is_refused(copied, content, word):
         open_people(copied)
 
 
+def test_shards_without_people_are_named(copied):
+    index = json.loads((copied / INDEX).read_text())
+    (copied / INDEX).write_text(json.dumps({**index, "shards": []}))
+    with pytest.raises(FileNotFoundError, match="lists 0 people"):
+        open_people(copied)
+
+
 def test_a_damaged_person_is_named_and_leaves_no_index(folder, tmp_path):
     for path in folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())

@@ -137,6 +137,8 @@ def build_model(
         prior = PersonPrior(**_under(weights, "prior_"))
         denoiser = PersonDenoiser(denoiser_config(config), prior, schedule)
         codec = CellCodec(LinearCodec(**_under(tensors, "codec.")))
+        if codec.shape != tuple(prior.mean.shape):
+            raise RuntimeError(f"its codec makes latents {codec.shape}, its network is for {tuple(prior.mean.shape)}")
         shapes = ShapePrior(**_under(tensors, "shapes."))
     denoiser.load_state_dict(weights)
     denoiser.eval().requires_grad_(False)

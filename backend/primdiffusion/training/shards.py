@@ -122,6 +122,8 @@ class PackedPeople:
             self._firsts = [0, *itertools.accumulate(len(shard["people"]) for shard in index["shards"])]
         except (KeyError, TypeError, ValueError) as error:
             raise ShardError(f"{folder / INDEX} is damaged ({error}): pack the people again") from error
+        if len(self.names) < 2:
+            raise FileNotFoundError(f"{folder / INDEX} lists {len(self.names)} people: training needs two or more")
         self._open: dict[int, Any] = {}
 
     def known(self, index: int) -> tuple[Attributes, ...]:
