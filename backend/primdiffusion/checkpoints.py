@@ -16,7 +16,7 @@ def load_checkpoint(path: Path | str | None = None, device: torch.device | str =
 
     Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
     format or version, does not match its own architecture or holds values that are not finite. An imported one
-    (`released`) also raises StandError (a ValueError) if the user's body file that it needs is missing or changed.
+    (`released`) also raises BodySetupError (a ValueError) if the user's body file that it needs is missing or changed.
     """
     path = default_checkpoint() if path is None else Path(path)
     tensors, architecture, card = read_checkpoint(path)

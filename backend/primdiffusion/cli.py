@@ -137,7 +137,7 @@ class Info:
             print(json.dumps(dict(read_card(self.file)), indent=2))
         else:
             betas = [round(beta, 4) for beta in human.betas.tolist()]
-            body = "default" if human.stand is None else dataclasses.asdict(human.stand.files)
+            body = "default" if human.body_setup is None else dataclasses.asdict(human.body_setup.files)
             about = {"format_version": format_version(human), **human.provenance, "betas": betas, "body": body}
             print(json.dumps(about, indent=2))
 

@@ -124,8 +124,8 @@ class EditRegion(Edit):
         if bool(self.region) == (self.weights is not None):
             raise ValueError("say where to edit with either --region NAME or --weights FILE")
         if self.weights is not None:
-            return region_from_weights(read_weights(self.weights), stand=human.stand)
-        return region_of(self.region, human.stand)
+            return region_from_weights(read_weights(self.weights), body_setup=human.body_setup)
+        return region_of(self.region, human.body_setup)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

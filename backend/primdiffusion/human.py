@@ -32,8 +32,8 @@ from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.rotation import polar
 from primdiffusion.primitives.anchors import Anchors, attach, default_anchors
+from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
-from primdiffusion.primitives.stand import Stand
 from primdiffusion.render.march import MarchSettings, Rendering, march
 
 DEFAULT_SETTINGS = MarchSettings()
@@ -57,7 +57,7 @@ class Human(TensorRecord):
     provenance: Mapping[str, Any]
     """Where the person comes from; JSON values. Of a generated one: seed, steps, sampler, attributes if any were asked
     for, checkpoint, checkpoint_sha256, full_density, version."""
-    stand: Stand | None = None
+    body_setup: BodySetup | None = None
     """Body and anchors that they stand on; None is the default body."""
 
     def validate(self) -> Human:
@@ -127,11 +127,11 @@ def people_of(
     attributes: Attributes = MappingProxyType({}),
 ) -> list[Human]:
     """The people whom clean samples of these seeds stand for, on the CPU; without provenance, and unchecked."""
-    body = default_body() if model.stand is None else model.stand.body
+    body = default_body() if model.body_setup is None else model.body_setup.body
     people = []
     for sample_of_one, betas in zip(x0, model.betas(x0, seeds), strict=True):
         betas = betas_of_measures(betas.cpu(), model.shapes.scale.cpu(), body, *measures_of(attributes))
-        people.append(Human(model.decode(sample_of_one), betas, {}, model.stand).to("cpu"))
+        people.append(Human(model.decode(sample_of_one), betas, {}, model.body_setup).to("cpu"))
     return people
 
 
@@ -216,7 +216,9 @@ def place_skinned(
 def body_of(human: Human, body: BodyModel | None = None, anchors: Anchors | None = None) -> tuple[BodyModel, Anchors]:
     """The body and anchors that are given, or those that the person stands on; ValueError for one without the other."""
     if body is None and anchors is None:
-        return (default_body(), default_anchors()) if human.stand is None else (human.stand.body, human.stand.anchors)
+        if human.body_setup is None:
+            return default_body(), default_anchors()
+        return human.body_setup.body, human.body_setup.anchors
     if body is None or anchors is None:
         raise ValueError("a body and its anchors go together: give both, or neither for the person's own")
     return body, anchors

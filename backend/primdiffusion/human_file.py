@@ -29,8 +29,8 @@ from primdiffusion.body.model import BodyModel
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.human import Human, body_of
 from primdiffusion.primitives.anchors import Anchors, anchor_skin_weights, attach
+from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, BodySetupError, find_body_setup
 from primdiffusion.primitives.primitives import K, Payload, S
-from primdiffusion.primitives.stand import BodyFiles, Stand, StandError, find_stand
 from primdiffusion.staging import written_whole
 
 FORMAT = "primdiffusion.human"
@@ -69,16 +69,16 @@ def save_human(path: str | Path, human: Human) -> None:
         "format_version": str(format_version(human)),
         "provenance": json.dumps(dict(human.provenance), allow_nan=False),
     }
-    if human.stand is not None:
-        tensors["rest_half_extent"] = human.stand.anchors.rest_half_extent.detach().cpu().contiguous()
-        metadata |= {"body": human.stand.files.to_json()}
+    if human.body_setup is not None:
+        tensors["rest_half_extent"] = human.body_setup.anchors.rest_half_extent.detach().cpu().contiguous()
+        metadata |= {"body": human.body_setup.files.to_json()}
     with written_whole(path) as unfinished:
         unfinished.write_bytes(safetensors.torch.save(tensors, metadata))
 
 
 def format_version(human: Human) -> int:
     """The version of the file that this person is written to: the lowest that can hold them."""
-    return FORMAT_VERSION if human.stand is None else FORMAT_VERSION_ON_FILES
+    return FORMAT_VERSION if human.body_setup is None else FORMAT_VERSION_ON_FILES
 
 
 def load_human(path: str | Path) -> Human:
@@ -99,10 +99,10 @@ def load_human(path: str | Path) -> Human:
     _check_shapes(path, tensors)
     payload = Payload(tensors["rgb"], tensors["density"], tensors["delta_scale"])
     try:
-        stand = _stand(path, metadata, tensors) if "body" in metadata else None
-        human = Human(payload, tensors["betas"], _provenance(metadata), stand).validate()
+        body_setup = _body_setup(path, metadata, tensors) if "body" in metadata else None
+        human = Human(payload, tensors["betas"], _provenance(metadata), body_setup).validate()
         _check_betas(human)
-    except StandError as e:
+    except BodySetupError as e:
         raise HumanFileError(f"{path}: {e}") from e
     except ValueError as e:
         raise HumanFileError(f"{path} holds no whole person: {e}") from e
@@ -122,9 +122,9 @@ def _check_format(path: Path, metadata: Mapping[str, str]) -> None:
         )
 
 
-def _stand(path: Path, metadata: Mapping[str, str], tensors: Mapping[str, torch.Tensor]) -> Stand:
+def _body_setup(path: Path, metadata: Mapping[str, str], tensors: Mapping[str, torch.Tensor]) -> BodySetup:
     extents = tensors.get("rest_half_extent", torch.empty(0))
-    return find_stand(BodyFiles.from_json(metadata["body"]), extents, [path.parent])
+    return find_body_setup(BodyFiles.from_json(metadata["body"]), extents, [path.parent])
 
 
 def _check_shapes(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:

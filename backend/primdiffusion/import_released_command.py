@@ -16,8 +16,8 @@ from torch import Tensor
 from primdiffusion.body.model import BodyModel
 from primdiffusion.capture.smpl_parameters import read_smpl
 from primdiffusion.diffusion.model import BETAS
+from primdiffusion.primitives.body_setup import BodySetup, body_setup_from_files
 from primdiffusion.primitives.primitives import K
-from primdiffusion.primitives.stand import Stand, stand_of_files
 from primdiffusion.released.denoiser import PREFIX
 from primdiffusion.released.imported import Reference, write_imported
 from primdiffusion.released.inventory import Inventory, take_inventory
@@ -67,15 +67,15 @@ class ImportReleased:
             )
         if not 1 <= len(self.uv) <= 2:
             raise ValueError(f"uv names {len(self.uv)} files: give one .obj or .npz, or the pair vt.npy ft.npy")
-        stand = stand_of_files(self.smpl, self.uv)
-        notes = [*_about_body(weights, stand.body), _about_layout(stand)]
+        body_setup = body_setup_from_files(self.smpl, self.uv)
+        notes = [*_about_body(weights, body_setup.body), _about_layout(body_setup)]
         denoiser = {key.removeprefix(PREFIX): value for key, value in weights.items() if key.startswith(PREFIX)}
         card = _card(self.checkpoint, inventory, denoiser, self.reference)
-        write_imported(self.out, denoiser, inventory.unet, stand, _reference(self.reference), self.chain, card)
+        write_imported(self.out, denoiser, inventory.unet, body_setup, _reference(self.reference), self.chain, card)
         for note in notes:
             print(note)
         if self.report is not None:
-            _write_report(self.report, inventory, card, notes, stand)
+            _write_report(self.report, inventory, card, notes, body_setup)
         print(self.out)
 
 
@@ -106,9 +106,9 @@ def _about_body(weights: Mapping[str, Tensor], body: BodyModel) -> list[str]:
     return [f"the SMPL file differs from the body the checkpoint was trained on by up to {1000 * difference:.1f} mm"]
 
 
-def _about_layout(stand: Stand) -> str:
-    centred = (stand.anchors.barycentric == 1 / 3).all(-1)  # where the rule puts them, on the last face
-    outside = int((centred & (stand.anchors.face == len(stand.body.faces) - 1)).sum())
+def _about_layout(body_setup: BodySetup) -> str:
+    centred = (body_setup.anchors.barycentric == 1 / 3).all(-1)  # where the rule puts them, on the last face
+    outside = int((centred & (body_setup.anchors.face == len(body_setup.body.faces) - 1)).sum())
     return f"{outside} of {K} primitives lie outside of the UV charts; with SMPL's own UV {SMPL_CELLS_OUTSIDE} do"
 
 
@@ -127,10 +127,12 @@ def _card(path: Path, inventory: Inventory, denoiser: Mapping[str, Tensor], refe
     }
 
 
-def _write_report(path: Path, inventory: Inventory, card: Mapping[str, Any], notes: list[str], stand: Stand) -> None:
+def _write_report(
+    path: Path, inventory: Inventory, card: Mapping[str, Any], notes: list[str], body_setup: BodySetup
+) -> None:
     content = {
         "card": card,
-        "body": dataclasses.asdict(stand.files),
+        "body": dataclasses.asdict(body_setup.files),
         "unet": None if inventory.unet is None else dataclasses.asdict(inventory.unet),
         "notes": notes,
         "groups": inventory.account.groups(),

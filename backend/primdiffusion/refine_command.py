@@ -114,10 +114,10 @@ class Refine:
             human = meshed_person(self.start)
         else:
             human = load_human(self.start)
-        if human.stand is not None:
+        if human.body_setup is not None:
             raise ValueError(
-                f"{self.start} stands on the body {human.stand.files.smpl.path}; captures are fitted to the default "
-                "body: start from a person on that, or from the encoder"
+                f"{self.start} uses the body {human.body_setup.files.smpl.path}, but captures are fitted to the "
+                "default body: start from a human on the default body, or from the encoder"
             )
         return dataclasses.replace(human, betas=betas, provenance={**human.provenance, "refined_from": name})
 

@@ -18,8 +18,8 @@ from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
+from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, FileFingerprint
 from primdiffusion.primitives.primitives import K
-from primdiffusion.primitives.stand import BodyFiles, FileFingerprint, Stand
 from tiny_model import tiny_model
 
 FIELDS = ("rgb", "density", "delta_scale")
@@ -221,8 +221,8 @@ def test_exchanging_textures_twice_gives_both_people_back(human, other):
 
 
 def test_people_on_different_bodies_do_not_correspond(human, other):
-    stand = Stand(None, None, BodyFiles(FileFingerprint("smpl.npz", "12"), ()))
-    foreign = dataclasses.replace(other, stand=stand)
+    body_setup = BodySetup(None, None, BodyFiles(FileFingerprint("smpl.npz", "12"), ()))
+    foreign = dataclasses.replace(other, body_setup=body_setup)
     for edit in (
         lambda: transfer_texture(foreign, human, TOP),
         lambda: transfer_garment(human, foreign, TOP),

@@ -14,8 +14,8 @@ from primdiffusion.editing.regions import (
 )
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.primitives.anchors import attach, build_anchors, default_anchors
+from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import GRID, K
-from primdiffusion.primitives.stand import Stand
 
 
 @pytest.fixture(scope="module")
@@ -173,8 +173,8 @@ def test_a_region_is_told_by_its_parts_or_bit_by_bit():
 
 def test_another_bodys_people_have_parts_too():
     body = default_body()
-    stand = Stand(body, build_anchors(body, "released"), None)
-    parts = parts_of(stand)
+    body_setup = BodySetup(body, build_anchors(body, "released"), None)
+    parts = parts_of(body_setup)
     assert torch.stack([parts[name] for name in DISJOINT]).sum(0).eq(1).all()
     whole = torch.ones(len(body.template))
-    assert region_from_weights(whole, stand=stand).all()
+    assert region_from_weights(whole, body_setup=body_setup).all()

@@ -9,9 +9,9 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.schedule import sqrt_linear
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.primitives.anchors import attach, build_anchors
+from primdiffusion.primitives.body_setup import BodySetup, body_setup_from_files
 from primdiffusion.primitives.primitives import GRID, K, Payload, Primitives, S
 from primdiffusion.primitives.slab import RELEASED_FULL_DENSITY
-from primdiffusion.primitives.stand import Stand, stand_of_files
 from primdiffusion.released.conventions import SMALLEST_DELTA_S, ReleasedSlab, released_steps, rest_half_extent
 from primdiffusion.released.imported import Reference, reference_extents
 from primdiffusion.render.march import MarchSettings, march
@@ -19,9 +19,9 @@ from released_files import save_body
 
 
 @pytest.fixture(scope="module")
-def stand(tmp_path_factory) -> Stand:
+def body_setup(tmp_path_factory) -> BodySetup:
     smpl, uv = save_body(tmp_path_factory.mktemp("body"))
-    return stand_of_files(smpl, (uv,))
+    return body_setup_from_files(smpl, (uv,))
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +37,12 @@ def network_values(slab: torch.Tensor) -> torch.Tensor:
     return (slab / 255 * 2 - 1) * 0.182
 
 
-def marched_by_hand(slab: torch.Tensor, stand: Stand, k: int, camera: Camera) -> np.ndarray:
+def marched_by_hand(slab: torch.Tensor, body_setup: BodySetup, k: int, camera: Camera) -> np.ndarray:
     """Alpha and linear colours of one box, by SPEC 1 to 4: millimetres, B = T x N, the marcher's reciprocal scale."""
-    vertices = 1000 * stand.body.template.numpy()
-    corners = vertices[stand.body.faces[stand.anchors.face[k]]]
-    centre = stand.anchors.barycentric[k].numpy() @ corners
-    corner_uv = stand.body.uv[stand.body.uv_faces[stand.anchors.face[k]]].numpy()
+    vertices = 1000 * body_setup.body.template.numpy()
+    corners = vertices[body_setup.body.faces[body_setup.anchors.face[k]]]
+    centre = body_setup.anchors.barycentric[k].numpy() @ corners
+    corner_uv = body_setup.body.uv[body_setup.body.uv_faces[body_setup.anchors.face[k]]].numpy()
     tangent = np.linalg.solve(corner_uv[1:] - corner_uv[0], corners[1:] - corners[0])[0]
     tangent /= np.linalg.norm(tangent)
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
@@ -52,7 +52,7 @@ def marched_by_hand(slab: torch.Tensor, stand: Stand, k: int, camera: Camera) ->
     row, column = divmod(k, GRID)
     box = slab[:, row * S : (row + 1) * S, column * S : (column + 1) * S].reshape(S, 7, S, S).double().numpy()
     delta_s = box[:, 4:].mean((0, 2, 3)) / 255 * 20
-    scale = 10_000 / (1000 * stand.anchors.rest_half_extent[k].double().numpy()) * delta_s  # of a box of 10 m
+    scale = 10_000 / (1000 * body_setup.anchors.rest_half_extent[k].double().numpy()) * delta_s  # of a box of 10 m
     encoded = box[:, :3] / 255
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
@@ -81,13 +81,13 @@ def marched_by_hand(slab: torch.Tensor, stand: Stand, k: int, camera: Camera) ->
 
 
 @pytest.mark.parametrize("degrees", [-35, 40])
-def test_a_painted_box_looks_as_by_the_released_conventions(stand, painted, degrees):
+def test_a_painted_box_looks_as_by_the_released_conventions(body_setup, painted, degrees):
     k = 10 * GRID + 2  # on the drum's front left
-    frames = attach(stand.anchors, stand.body.template, stand.body.faces)
+    frames = attach(body_setup.anchors, body_setup.body.template, body_setup.body.faces)
     centre, normal = frames.position[k], frames.rotation[k, :, 2]
     sideways = frames.rotation[k, :, 0] * math.tan(math.radians(degrees)) + torch.tensor([0.0, 0.25, 0.0])
     camera = look_at(centre + 0.6 * (normal + sideways), centre, vertical_fov=math.radians(9), width=12, height=12)
-    expected = marched_by_hand(painted, stand, k, camera)
+    expected = marched_by_hand(painted, body_setup, k, camera)
 
     payload = ReleasedSlab().to_payload(network_values(painted), RELEASED_FULL_DENSITY)
     whole = Primitives.place(frames, payload)
@@ -127,10 +127,12 @@ def test_stray_delta_scales_give_bounded_boxes_and_boxes_without_size_are_refuse
         ReleasedSlab().from_payload(Payload(payload.rgb, payload.density, 0 * payload.delta_scale), 25.5)
 
 
-def test_boxes_are_sized_as_at_released_inference(stand):
+def test_boxes_are_sized_as_at_released_inference(body_setup):
     """In millimetres: 15000 / d is the scale, below 350 it loses 70, half extents are 10000 / scale."""
-    vertices = stand.body.template
-    position = 1000 * (vertices[stand.body.faces[stand.anchors.face]] * stand.anchors.barycentric[..., None]).sum(1)
+    vertices = body_setup.body.template
+    position = 1000 * (
+        vertices[body_setup.body.faces[body_setup.anchors.face]] * body_setup.anchors.barycentric[..., None]
+    ).sum(1)
     distance = np.sort(np.linalg.norm(position[:, None] - position[None], axis=-1), -1)[:, 1:24].mean(-1)
     scale = 15_000 / np.clip(distance, 5, 50)
     scale[scale < 350] -= 70
@@ -138,25 +140,25 @@ def test_boxes_are_sized_as_at_released_inference(stand):
     np.testing.assert_allclose(1000 * found, np.repeat(10_000 / scale[:, None], 3, 1), rtol=1e-4)
     assert (scale < 280).any()
     assert (scale > 350).any()
-    torch.testing.assert_close(reference_extents(stand, Reference.template()), found)
+    torch.testing.assert_close(reference_extents(body_setup, Reference.template()), found)
 
 
-def test_a_narrower_reference_makes_smaller_boxes_and_its_place_does_not_matter(stand):
+def test_a_narrower_reference_makes_smaller_boxes_and_its_place_does_not_matter(body_setup):
     narrow = torch.zeros(10)
     narrow[0] = -9.0
     turned = BodyPose.from_axis_angle(torch.zeros(72).index_fill(0, torch.tensor([1]), 1.0), torch.tensor([1.0, 2, 3]))
-    template = reference_extents(stand, Reference.template())
-    shrunk = reference_extents(stand, Reference(narrow, BodyPose.rest()))
-    torch.testing.assert_close(reference_extents(stand, Reference(narrow, turned)), shrunk, rtol=1e-3, atol=1e-5)
+    template = reference_extents(body_setup, Reference.template())
+    shrunk = reference_extents(body_setup, Reference(narrow, BodyPose.rest()))
+    torch.testing.assert_close(reference_extents(body_setup, Reference(narrow, turned)), shrunk, rtol=1e-3, atol=1e-5)
     assert (shrunk <= template + 1e-6).all()
     assert (shrunk < 0.7 * template).any()
 
 
-def test_degenerate_cells_all_stand_on_the_last_face(stand):
-    outside = stand.anchors.face.reshape(GRID, GRID)[:, 25:]  # the charts end at u = 0.75
-    assert (outside == len(stand.body.faces) - 1).all()
-    assert len(build_anchors(stand.body, "paper").face.unique()) > len(stand.anchors.face.unique())
-    assert len(stand.anchors.face) == K
+def test_degenerate_cells_all_stand_on_the_last_face(body_setup):
+    outside = body_setup.anchors.face.reshape(GRID, GRID)[:, 25:]  # the charts end at u = 0.75
+    assert (outside == len(body_setup.body.faces) - 1).all()
+    assert len(build_anchors(body_setup.body, "paper").face.unique()) > len(body_setup.anchors.face.unique())
+    assert len(body_setup.anchors.face) == K
 
 
 def test_released_chains():

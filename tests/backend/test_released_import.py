@@ -19,8 +19,8 @@ from primdiffusion.drawing.scene import Look, Scene
 from primdiffusion.human import framing, generate, place, place_skinned
 from primdiffusion.human_file import HumanFileError, load_human, save_human
 from primdiffusion.primitives.anchors import build_anchors
+from primdiffusion.primitives.body_setup import BodySetupError, body_setup_from_files
 from primdiffusion.primitives.primitives import K, Payload
-from primdiffusion.primitives.stand import StandError, stand_of_files
 from primdiffusion.released.conventions import ReleasedSlab, released_steps
 from primdiffusion.serve.draw_params import DrawParams, PersonParams
 from primdiffusion.serve.drawing import FrameDrawer, map_frame
@@ -112,7 +112,7 @@ def test_the_engines_frames_and_boxes_show_people_on_the_users_body(person, tmp_
     save_human(tmp_path / "a.human.safetensors", human)
     primitives, still = place(human), torch.eye(3, 4).tolist()
     camera = framing(primitives, 0.4, 40, 56)
-    for view, chart in (("colour", None), ("boxes", human.stand.anchors.chart)):
+    for view, chart in (("colour", None), ("boxes", human.body_setup.anchors.chart)):
         np.full(40 * 56 * 5, np.nan, np.float32).tofile(tmp_path / "frame")
         params = DrawParams(
             frame=str(tmp_path / "frame"), width=40, height=56, view=view, intrinsics=camera.intrinsics.tolist(),
@@ -165,17 +165,17 @@ def test_a_body_that_is_gone_changed_or_moved(copied):
     checkpoint, smpl = copied / "imported.safetensors", copied / "SMPL_NEUTRAL.pkl"
     content = smpl.read_bytes()
     smpl.unlink()
-    with pytest.raises(StandError, match=r"SMPL_NEUTRAL\.pkl is not there any more: put it back"):
+    with pytest.raises(BodySetupError, match=r"SMPL_NEUTRAL\.pkl is not there any more: put it back"):
         load_checkpoint(checkpoint)
     smpl.write_bytes(content[:-1] + b"!")
-    with pytest.raises(StandError, match=r"SMPL_NEUTRAL\.pkl is not the body file it was"):
+    with pytest.raises(BodySetupError, match=r"SMPL_NEUTRAL\.pkl is not the body file it was"):
         load_checkpoint(checkpoint)
     smpl.unlink()
     elsewhere = copied / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / smpl.name).write_bytes(content)
     shutil.copy(checkpoint, elsewhere)
-    assert load_checkpoint(elsewhere / checkpoint.name).stand is not None
+    assert load_checkpoint(elsewhere / checkpoint.name).body_setup is not None
 
 
 def test_a_person_whose_body_is_gone_is_told_by_its_file(copied, person):
@@ -206,7 +206,7 @@ def test_an_imported_file_that_contradicts_itself_is_refused(copied):
     tensors = safetensors.torch.load_file(path)
     moved = {**tensors, "stand.face": tensors["stand.face"].flip(0).contiguous()}
     safetensors.torch.save_file(moved, path, metadata)
-    with pytest.raises(StandError, match="import it again"):
+    with pytest.raises(BodySetupError, match="import it again"):
         load_checkpoint(path)
     del tensors["denoiser.time_embed.0.bias"]
     safetensors.torch.save_file(tensors, path, metadata)
@@ -257,7 +257,7 @@ def test_uv_files_of_every_kind_give_the_same_anchors(folder, tmp_path):
     np.save(tmp_path / "ft.npy", body.uv_faces)
     expected = build_anchors(body, "released")
     for uv in ((tmp_path / "uv.npz",), (tmp_path / "vt.npy", tmp_path / "ft.npy"), (obj,)):
-        anchors = stand_of_files(smpl, uv).anchors
+        anchors = body_setup_from_files(smpl, uv).anchors
         assert torch.equal(anchors.face, expected.face)
         torch.testing.assert_close(anchors.barycentric, expected.barycentric)
 
@@ -276,7 +276,7 @@ def test_the_reference_subject_sets_sizes_and_shape(folder, tmp_path):
     arguments[arguments.index(str(folder / "imported.safetensors"))] = str(out)
     cli.run(arguments)
     model, plain = load_checkpoint(out), load_checkpoint(folder / "imported.safetensors")
-    assert (model.stand.anchors.rest_half_extent < 0.7 * plain.stand.anchors.rest_half_extent).any()
+    assert (model.body_setup.anchors.rest_half_extent < 0.7 * plain.body_setup.anchors.rest_half_extent).any()
     assert model.chain(1000, 10)[0] == 999
     shapes = model.betas(torch.zeros(2, 1, 1, 1), [1, 2])
     assert shapes.tolist() == [[-5.0] + [0.0] * 9] * 2, "betas beyond what people files hold are limited"

@@ -17,9 +17,9 @@ from primdiffusion.diffusion.samplers import SAMPLERS, Step, gaussian_noise
 from primdiffusion.diffusion.schedule import Schedule, trailing_steps
 from primdiffusion.formats import requests
 from primdiffusion.geometry.records import TensorRecord
+from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import GRID, K, Payload, S
 from primdiffusion.primitives.slab import CHANNELS_PER_LAYER, pack, unpack
-from primdiffusion.primitives.stand import Stand
 
 BETAS = 10
 """What `sample` does where nothing else is said; guidance is of no effect without a condition."""
@@ -141,8 +141,8 @@ class DiffusionModel:
     """What it can be asked for."""
     chain: Callable[[int, int], list[int]] = trailing_steps
     """Descending t that a sampler visits, from the schedule's length and the number of steps."""
-    stand: Stand | None = None
-    """What its people stand on; None is the default body."""
+    body_setup: BodySetup | None = None
+    """Body and anchors of the humans it generates; None is the default body."""
 
     @property
     def device(self) -> torch.device:

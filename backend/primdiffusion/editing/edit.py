@@ -16,8 +16,8 @@ from primdiffusion.diffusion.samplers import Denoise, Step
 from primdiffusion.diffusion.schedule import Schedule, trailing_steps
 from primdiffusion.editing.shares import check_share
 from primdiffusion.human import Human
+from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import Payload
-from primdiffusion.primitives.stand import Stand
 
 EVENNESS = 0.7
 EDITING = 0x6ED1F7A9C35B2D84
@@ -31,17 +31,18 @@ def fitted(model: DiffusionModel, human: Human) -> DiffusionModel:
 
     Raises ValueError for a person who stands on another body than the model's people.
     """
-    check_correspondence("the person", human.stand, "the checkpoint's people", model.stand)
+    check_correspondence("the person", human.body_setup, "the checkpoint's people", model.body_setup)
     own = human.provenance.get("full_density", model.full_density)
     if isinstance(own, bool) or not isinstance(own, int | float) or not (math.isfinite(own) and own > 0):
         raise ValueError(f"the person's full_density is {own!r}, not a positive number of 1/m: generate them again")
     return dataclasses.replace(model, full_density=float(own))
 
 
-def check_correspondence(name: str, stand: Stand | None, other_name: str, other: Stand | None) -> None:
+def check_correspondence(name: str, body_setup: BodySetup | None, other_name: str, other: BodySetup | None) -> None:
     """ValueError unless both stand on one body: on two, primitives with one number are different places."""
     contents = [
-        None if one is None else [file.sha256 for file in (one.files.smpl, *one.files.uv)] for one in (stand, other)
+        None if one is None else [file.sha256 for file in (one.files.smpl, *one.files.uv)]
+        for one in (body_setup, other)
     ]
     if contents[0] != contents[1]:
         raise ValueError(

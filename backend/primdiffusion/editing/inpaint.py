@@ -57,7 +57,7 @@ def inpaint(
     known, inside = encoded(model, human), model.cell_mask(region)
     start = model.start([generator], chain[0], model.condition(attributes))
     x0 = last(repaint(denoise, model.schedule, start, known, inside, chain, generator), on_step)
-    edit = {"edit": "inpaint", "region": name_region(region, human.stand), "seed": seed, "steps": steps}
+    edit = {"edit": "inpaint", "region": name_region(region, human.body_setup), "seed": seed, "steps": steps}
     edit = {**edit, "attributes": dict(attributes), "guidance": guidance, **made_by(model)}
     return with_edit(human, edit, combined(region, decoded(model, x0), human.payload))
 
@@ -90,7 +90,7 @@ def harmonise(
         payload = combined(region, decoded(model, x0), human.payload)
     edit = {
         "edit": "harmonise",
-        "region": name_region(region, human.stand),
+        "region": name_region(region, human.body_setup),
         "amount": amount,
         "seed": seed,
         "steps": steps,

@@ -19,8 +19,8 @@ from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import PARTS, SIDED_PARTS
 from primdiffusion.geometry.surface import surface_points
 from primdiffusion.primitives.anchors import Anchors, anchor_skin_weights, attach, default_anchors, default_texels
+from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import GRID, K, S
-from primdiffusion.primitives.stand import Stand
 
 HEM, SEAT = -0.028, -0.125
 """Metres above the rest body's pelvis: where most shirts end, and where hips become thighs."""
@@ -65,14 +65,14 @@ DISJOINT = ("face", "hair", "neck", "torso", "hips", *SIDED_PARTS)
 """Parts that share no primitive; together they are the whole person."""
 
 
-def region_of(names: Sequence[str], stand: Stand | None = None) -> Bool[Tensor, "k"]:
-    """The primitives of the parts with these names, together, of people who stand on `stand` (None: the default body).
+def region_of(names: Sequence[str], body_setup: BodySetup | None = None) -> Bool[Tensor, "k"]:
+    """The primitives of the parts with these names, together, for humans on this body (None: the default body).
 
     Raises ValueError for no name or an unknown one.
     """
     if not names:
         raise ValueError(f"the region names no part of the body: choose one or more of {', '.join(PARTS)}")
-    parts = parts_of(stand)
+    parts = parts_of(body_setup)
     for name in names:
         if name not in parts:
             raise ValueError(f"there is no part of the body {name!r}: choose from {', '.join(PARTS)}")
@@ -80,7 +80,7 @@ def region_of(names: Sequence[str], stand: Stand | None = None) -> Bool[Tensor, 
 
 
 def region_from_weights(
-    weights: Float[Tensor, "v"], threshold: float = 0.5, stand: Stand | None = None
+    weights: Float[Tensor, "v"], threshold: float = 0.5, body_setup: BodySetup | None = None
 ) -> Bool[Tensor, "k"]:
     """The primitives under paint: those on whose patch of skin the weight is at least `threshold` on average.
 
@@ -90,7 +90,7 @@ def region_from_weights(
     Raises ValueError for another number of vertices, values that are not finite, a threshold that is not in 0 ... 1 or
     is 0, and paint that covers no primitive.
     """
-    body = default_body() if stand is None else stand.body
+    body = default_body() if body_setup is None else body_setup.body
     if tuple(weights.shape) != (len(body.template),):
         given, wanted = tuple(weights.shape), len(body.template)
         raise ValueError(
@@ -100,7 +100,7 @@ def region_from_weights(
         raise ValueError("the painted weights hold NaN or infinite values: paint them again")
     if not 0 < threshold <= 1:
         raise ValueError(f"the threshold of painted weights is {threshold}: choose one above 0, at most 1")
-    covered = _covered(weights.float().cpu(), stand)
+    covered = _covered(weights.float().cpu(), body_setup)
     # Weights of exactly the threshold, as from a brush of that strength, come back a rounding error below it.
     region = covered >= threshold - 1e-6
     if not region.any():
@@ -121,21 +121,21 @@ def check_region(region: Tensor) -> Bool[Tensor, "k"]:
     return region.cpu()
 
 
-def name_region(region: Bool[Tensor, "k"], stand: Stand | None = None) -> list[str] | str:
+def name_region(region: Bool[Tensor, "k"], body_setup: BodySetup | None = None) -> list[str] | str:
     """How files tell a region: the names of its parts, or 1024 bits in hexadecimal, primitive 0 first, for paint."""
-    parts = parts_of(stand)
+    parts = parts_of(body_setup)
     for name in PARTS:
         if torch.equal(parts[name], region):
             return [name]
     inside = [name for name in DISJOINT if bool(region[parts[name]].all())]
-    if inside and torch.equal(region_of(inside, stand), region):
+    if inside and torch.equal(region_of(inside, body_setup), region):
         return inside
     return int("".join("1" if chosen else "0" for chosen in region.tolist()), 2).to_bytes(K // 8, "big").hex()
 
 
-def parts_of(stand: Stand | None = None) -> Mapping[str, Bool[Tensor, "k"]]:
+def parts_of(body_setup: BodySetup | None = None) -> Mapping[str, Bool[Tensor, "k"]]:
     """The primitives of every part in PARTS."""
-    return _default_parts() if stand is None else _parts(stand.body, stand.anchors)
+    return _default_parts() if body_setup is None else _parts(body_setup.body, body_setup.anchors)
 
 
 @functools.lru_cache(maxsize=1)
@@ -143,11 +143,11 @@ def _default_parts() -> Mapping[str, Bool[Tensor, "k"]]:
     return _parts(default_body(), default_anchors())
 
 
-def _covered(weights: Float[Tensor, "v"], stand: Stand | None) -> Float[Tensor, "k"]:
+def _covered(weights: Float[Tensor, "v"], body_setup: BodySetup | None) -> Float[Tensor, "k"]:
     """Mean weight under each primitive."""
-    if stand is not None:
-        face, barycentric = stand.anchors.face, stand.anchors.barycentric
-        return surface_points(weights[:, None], stand.body.faces, face, barycentric)[:, 0]
+    if body_setup is not None:
+        face, barycentric = body_setup.anchors.face, body_setup.anchors.barycentric
+        return surface_points(weights[:, None], body_setup.body.faces, face, barycentric)[:, 0]
     face, barycentric = default_texels()
     texels = surface_points(weights[:, None], default_body().faces, face.flatten(), barycentric.flatten(0, 1))
     return texels.reshape(GRID, S, GRID, S).mean((1, 3)).flatten()

@@ -36,6 +36,6 @@ def transfer_garment(source: Human, target: Human, region: Bool[Tensor, "k"]) ->
 
 def _transferred(name: str, source: Human, target: Human, region: Tensor, payload: Payload) -> Human:
     region = check_region(region)
-    check_correspondence("the source", source.stand, "the target", target.stand)
-    edit = {"edit": name, "region": name_region(region, target.stand), "source": dict(source.provenance)}
+    check_correspondence("the source", source.body_setup, "the target", target.body_setup)
+    edit = {"edit": name, "region": name_region(region, target.body_setup), "source": dict(source.provenance)}
     return with_edit(target, edit, combined(region, payload, target.payload))

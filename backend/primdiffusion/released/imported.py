@@ -24,7 +24,7 @@ from primdiffusion.diffusion.schedule import SCHEDULES, trailing_steps
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.geometry.surface import surface_points
 from primdiffusion.human_file import LARGEST_BETA
-from primdiffusion.primitives.stand import BodyFiles, Stand, StandError, find_stand
+from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, BodySetupError, find_body_setup
 from primdiffusion.released.conventions import FULL_DENSITY, ReleasedSlab, released_steps, rest_half_extent
 from primdiffusion.released.schedule_buffers import SCHEDULE
 from primdiffusion.staging import write_atomically
@@ -49,18 +49,18 @@ class Reference:
         return cls(torch.zeros(BETAS), BodyPose.rest())
 
 
-def reference_extents(stand: Stand, reference: Reference) -> Float[Tensor, "k 3"]:
+def reference_extents(body_setup: BodySetup, reference: Reference) -> Float[Tensor, "k 3"]:
     """Rest half extents (metres) as the released code computes them from its reference subject."""
-    vertices = stand.body.shape(reference.betas).pose(reference.pose).vertices
-    anchors = stand.anchors
-    return rest_half_extent(surface_points(vertices, stand.body.faces, anchors.face, anchors.barycentric))
+    vertices = body_setup.body.shape(reference.betas).pose(reference.pose).vertices
+    anchors = body_setup.anchors
+    return rest_half_extent(surface_points(vertices, body_setup.body.faces, anchors.face, anchors.barycentric))
 
 
 def write_imported(
     out: Path,
     denoiser: Mapping[str, Tensor],
     unet: UNetConfig,
-    stand: Stand,
+    body_setup: BodySetup,
     reference: Reference,
     chain: Chain,
     card: Mapping[str, Any],
@@ -68,9 +68,9 @@ def write_imported(
     """Writes the file whole or not at all; `denoiser` has the names of `SlabUNet`. Raises OSError."""
     tensors = {f"denoiser.{name}": value.float().contiguous() for name, value in denoiser.items()}
     tensors |= {
-        "stand.face": stand.anchors.face,
-        "stand.barycentric": stand.anchors.barycentric,
-        "stand.rest_half_extent": reference_extents(stand, reference),
+        "stand.face": body_setup.anchors.face,
+        "stand.barycentric": body_setup.anchors.barycentric,
+        "stand.rest_half_extent": reference_extents(body_setup, reference),
         "stand.betas": reference.betas.clamp(-LARGEST_BETA, LARGEST_BETA),
     }
     architecture = {
@@ -78,7 +78,7 @@ def write_imported(
         "schedule": SCHEDULE,
         "full_density": FULL_DENSITY,
         "chain": chain,
-        "body": stand.files.to_json(),
+        "body": body_setup.files.to_json(),
         "config": dataclasses.asdict(unet),
     }
     metadata = {
@@ -95,7 +95,7 @@ def released_model(
 ) -> DiffusionModel:
     """The model in a file that `write_imported` made; `folder` is where the file lies.
 
-    Raises StandError where the body it needs is gone or changed; KeyError, TypeError or RuntimeError where the file
+    Raises BodySetupError where the body it needs is gone or changed; KeyError, TypeError or RuntimeError where the file
     contradicts itself.
     """
     config = architecture["config"]
@@ -106,13 +106,13 @@ def released_model(
     weights = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
     network.load_state_dict(weights, assign=True)
     network.eval().requires_grad_(False)
-    stand = find_stand(BodyFiles.from_json(architecture["body"]), tensors["stand.rest_half_extent"], [folder])
-    anchors = stand.anchors
+    body_setup = find_body_setup(BodyFiles.from_json(architecture["body"]), tensors["stand.rest_half_extent"], [folder])
+    anchors = body_setup.anchors
     if not (
         torch.equal(anchors.face, tensors["stand.face"].long())
         and torch.allclose(anchors.barycentric, tensors["stand.barycentric"], atol=1e-5)
     ):
-        raise StandError(
+        raise BodySetupError(
             "the primitives lie elsewhere on the body than when the checkpoint was imported: import it again"
         )
     nothing = (
@@ -129,5 +129,5 @@ def released_model(
         full_density=float(architecture["full_density"]),
         card=card,
         chain=CHAINS[architecture["chain"]],
-        stand=stand,
+        body_setup=body_setup,
     )

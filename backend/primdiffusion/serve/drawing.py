@@ -89,7 +89,11 @@ class FrameDrawer:
         solids = None if params.solids is None else self._solids(_stamp(params.solids))
         if not people:
             return Scene(None, solids)
-        chart = torch.cat([self._stand(person[0])[1].chart for person in people]) if params.view == "boxes" else None
+        chart = (
+            torch.cat([self._body_and_anchors(person[0])[1].chart for person in people])
+            if params.view == "boxes"
+            else None
+        )
         return Scene(self._everybody(people), solids, None if chart is None else chart.cpu())
 
     def _together(self, people: tuple[Numbers, ...]) -> Primitives:
@@ -98,10 +102,10 @@ class FrameDrawer:
 
     def _place(self, file: Stamp, matrix: Numbers, joints: Numbers, betas: Numbers | None) -> Primitives:
         human = self._human(file) if betas is None else self._shaped(file, betas)
-        return place_skinned(human, self._tensor(joints), self._tensor(matrix), *self._stand(file))
+        return place_skinned(human, self._tensor(joints), self._tensor(matrix), *self._body_and_anchors(file))
 
     def _reshape(self, file: Stamp, betas: Numbers) -> Human:
-        return reshaped(self._human(file), self._tensor(betas), *self._stand(file))
+        return reshaped(self._human(file), self._tensor(betas), *self._body_and_anchors(file))
 
     def _tensor(self, numbers: Numbers) -> torch.Tensor:
         return torch.tensor(numbers, dtype=torch.float32, device=self._device)
@@ -109,9 +113,9 @@ class FrameDrawer:
     def _body(self) -> tuple[BodyModel, Anchors]:
         return default_body().to(self._device), default_anchors().to(self._device)
 
-    def _stand(self, file: Stamp) -> tuple[BodyModel, Anchors]:
-        stand = self._human(file).stand
-        return self._rig() if stand is None else (stand.body, stand.anchors)
+    def _body_and_anchors(self, file: Stamp) -> tuple[BodyModel, Anchors]:
+        body_setup = self._human(file).body_setup
+        return self._rig() if body_setup is None else (body_setup.body, body_setup.anchors)
 
     def _load(self, file: Stamp) -> Human:
         return load_human(file[0]).to(self._device)

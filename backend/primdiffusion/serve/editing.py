@@ -108,8 +108,8 @@ def _guess_inside(model: DiffusionModel, human: Human, region: Bool[Tensor, "k"]
 
 def _region(region: list | dict, human: Human) -> Bool[Tensor, "k"]:
     if isinstance(region, dict):
-        return region_from_weights(read_weights(region["weights"]), stand=human.stand)
-    return region_of(region, human.stand)
+        return region_from_weights(read_weights(region["weights"]), body_setup=human.body_setup)
+    return region_of(region, human.body_setup)
 
 
 def _written(params: EditParams, report: Report, edit: Callable[[Human, Path], Human]) -> dict[str, Any]:

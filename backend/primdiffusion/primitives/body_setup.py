@@ -22,7 +22,7 @@ from primdiffusion.primitives.anchors import Anchors, build_anchors
 from primdiffusion.primitives.primitives import K
 
 
-class StandError(ValueError):
+class BodySetupError(ValueError):
     """A body that a file needs is not there, or not the same; the message names it and says what to do."""
 
 
@@ -63,7 +63,7 @@ class BodyFiles:
 
 
 @dataclasses.dataclass(frozen=True)
-class Stand(TensorRecord):
+class BodySetup(TensorRecord):
     """A body and the anchors on it, which go together."""
 
     body: BodyModel
@@ -71,29 +71,29 @@ class Stand(TensorRecord):
     files: BodyFiles
 
 
-def stand_of_files(smpl: Path, uv: tuple[Path, ...]) -> Stand:
+def body_setup_from_files(smpl: Path, uv: tuple[Path, ...]) -> BodySetup:
     """The stand that files make, fingerprinted; rest extents are those of the template in the T pose.
 
     Raises what `load_body` does, and OSError.
     """
     files = BodyFiles(FileFingerprint.of(smpl), tuple(map(FileFingerprint.of, uv)))
     body = load_body(smpl, uv=uv[0] if len(uv) == 1 else (uv[0], uv[1]))
-    return Stand(body, build_anchors(body, "released"), files)
+    return BodySetup(body, build_anchors(body, "released"), files)
 
 
-def find_stand(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], beside: Iterable[Path]) -> Stand:
+def find_body_setup(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], beside: Iterable[Path]) -> BodySetup:
     """The stand that another file needs, with the rest extents that this file holds.
 
     Each file is looked for where it was, then by its name in the folders `beside`; only its content counts.
-    Raises StandError where one is nowhere, or has another content; BodyFileError.
+    Raises BodySetupError where one is nowhere, or has another content; BodyFileError.
     """
     folders = tuple(beside)
     smpl, *uv = (_found(file, folders) for file in (files.smpl, *files.uv))
-    stand = _loaded(smpl, tuple(uv))
+    body_setup = _loaded(smpl, tuple(uv))
     if tuple(rest_half_extent.shape) != (K, 3) or not bool((rest_half_extent > 0).all()):
-        raise StandError(f"the rest extents are no {K} x 3 positive numbers: import or generate it again")
+        raise BodySetupError(f"the rest extents are no {K} x 3 positive numbers: import or generate it again")
     return dataclasses.replace(
-        stand, anchors=dataclasses.replace(stand.anchors, rest_half_extent=rest_half_extent), files=files
+        body_setup, anchors=dataclasses.replace(body_setup.anchors, rest_half_extent=rest_half_extent), files=files
     )
 
 
@@ -106,11 +106,11 @@ def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> _Stamp:
         if _sha256(stamp) == file.sha256:
             return stamp
     if there:
-        raise StandError(
+        raise BodySetupError(
             f"{there[0]} is not the body file it was (sha256 {file.sha256[:12]}...): put the same file back, or import "
             "the checkpoint again with this one"
         )
-    raise StandError(
+    raise BodySetupError(
         f"the body file {file.path} is not there any more: put it back, or a copy (sha256 {file.sha256[:12]}...) "
         "beside the file that needs it"
     )
@@ -136,5 +136,5 @@ def _sha256(stamp: _Stamp) -> str:
 
 
 @functools.lru_cache(maxsize=2)
-def _loaded(smpl: _Stamp, uv: tuple[_Stamp, ...]) -> Stand:
-    return stand_of_files(smpl.path, tuple(part.path for part in uv))
+def _loaded(smpl: _Stamp, uv: tuple[_Stamp, ...]) -> BodySetup:
+    return body_setup_from_files(smpl.path, tuple(part.path for part in uv))
