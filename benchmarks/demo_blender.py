@@ -47,7 +47,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float]:
     scene_human = import_module(f"{MODULE}.scene.human")
     collection = scene_human.humans(bpy.context.scene)[0]
     armature = scene_human.armature_of(collection)
-    spent = import_module(f"{MODULE}.ui.jobs.queue").queue.last.seconds
+    spent = import_module(f"{MODULE}.jobs.queue").queue.last.seconds
     rotations = walk_and_wave(arguments.frames)
     numbers = np.arange(1, arguments.frames + 1)
     start = time.perf_counter()

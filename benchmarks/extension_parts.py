@@ -103,8 +103,8 @@ def merged(arguments: argparse.Namespace) -> dict[str, float]:
 def soak(arguments: argparse.Namespace) -> dict[str, float]:
     """Generate, pose, delete, again and again: what grows, what stays behind."""
     _enable(arguments)
+    from blender_primdiffusion.jobs.queue import queue
     from blender_primdiffusion.scene.human import armature_of, humans
-    from blender_primdiffusion.ui.jobs.queue import queue
 
     context, megabytes, blender = bpy.context, [], []
     context.preferences.edit.undo_steps = UNDO_STEPS

@@ -22,7 +22,6 @@ _counted: dict[tuple[int, str, tuple[float, ...]], int] = {}
 
 def overlap_warning(collection: bpy.types.Collection) -> str | None:
     """A sentence for the user where Cycles will drop volumes of this human in its current shape, else None."""
-    from .overlap import current_overlap
 
     try:
         most = current_overlap(collection)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bpy
 
+from ..jobs import missing_files
 from . import (
     assets_panel,
     attributes,
@@ -38,7 +39,6 @@ from . import (
     variations_operators,
     variations_panel,
 )
-from .jobs import missing_files
 
 MODULES = (
     translations, setup, jobs_panel, attributes, generate_settings, generate_panel, variations_operators,

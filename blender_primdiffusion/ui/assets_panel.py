@@ -6,11 +6,11 @@ from pathlib import Path
 
 import bpy
 
+from ..jobs.follow import submit
+from ..jobs.target import Target, selected_person
 from ..scene.human import humans
 from ..worker.sentence import sentence
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
-from .jobs.follow import submit
-from .jobs.target import Target, selected_person
 from .manual import draw_manual_button
 from .on_person import SKIP, OnPerson
 from .translations import CONTEXT
@@ -29,7 +29,7 @@ class PRIMDIFFUSION_OT_mark_human_as_asset(OnPerson, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """At once with a picture of the caller's."""
-        from .jobs.assets import HumanAssetWork, mark_human
+        from ..jobs.assets import HumanAssetWork, mark_human
 
         target = Target.of(person)
         if not self.picture:
@@ -51,7 +51,7 @@ class PRIMDIFFUSION_OT_mark_pose_as_asset(OnPerson, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """At once with a picture of the caller's."""
-        from .jobs.assets import PoseAssetWork
+        from ..jobs.assets import PoseAssetWork
 
         work = PoseAssetWork.of(person, self.name.strip() or "Pose")
         if not self.picture:
@@ -91,7 +91,7 @@ class PRIMDIFFUSION_OT_make_pose_assets(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """A .blend with an action for each pose; one written before is replaced."""
-        from .jobs.assets import write_pose_library
+        from ..jobs.assets import write_pose_library
 
         folder = Path(bpy.path.abspath(self.directory)) if self.directory else None
         try:

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import bpy
 from mathutils import Vector
 
-from .captures.session import Busy, captures
+from ..jobs.follow import redraw
+from .captures_session import Busy, captures
 from .captures_settings import words_of
 from .drawing import SidebarPanel, draw_lines, property_columns
-from .jobs.follow import redraw
 from .manual import draw_manual_button
 
 if TYPE_CHECKING:

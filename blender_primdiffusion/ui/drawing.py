@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import bpy
 
+from ..jobs.building import building
+from ..jobs.follow import in_the_way
+from ..jobs.pictures import so_far
+from ..jobs.queue import Outcome, queue
+from ..jobs.remedies import remedy_for
 from ..places import EXTENSION
-from .jobs.building import building
-from .jobs.entering import in_the_way
-from .jobs.pictures import so_far
-from .jobs.queue import Outcome, queue
-from .jobs.remedies import remedy_for
 
 if TYPE_CHECKING:
     from ..worker.job import JobError

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import bpy
 
 from ..formats.requests import AMOUNT, FRACTION, PARTS, STEPS, TRANSFERS
+from ..jobs.follow import submit
+from ..jobs.target import named_person, selected_person
 from ..scene.files import person_file
 from ..scene.human import BODY_MARK, MARK, body_of, humans
 from .attributes import PRIMDIFFUSION_PG_attributes, asked, parsed, title
-from .jobs.follow import submit
-from .jobs.target import named_person, selected_person
 from .on_person import PANELS, SKIP, OnPerson
 from .translations import CONTEXT
 
@@ -156,7 +156,7 @@ class _Edit(OnPerson):
     steps: bpy.props.IntProperty(name="Steps", min=1, max=1000, default=STEPS, description=PANELS, options=SKIP)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from .jobs import edit
+        from ..jobs import edit
 
         steps = self.chosen("steps", context.scene.primdiffusion)
         return submit(self, context, getattr(edit, self.job).of(person, steps, self.params(context, person)))

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import bpy
 
 from ..formats.requests import SIDED_PARTS, WHOLE_PARTS
+from ..jobs.target import selected_person
 from ..scene.human import body_of, humans
 from .attributes import draw_attributes
 from .drawing import SidebarPanel, draw_job, property_columns
 from .edit_operators import painting
-from .jobs.target import selected_person
 
 
 def _sub_panel(name: str, label: str, order: int, content: Callable) -> type:

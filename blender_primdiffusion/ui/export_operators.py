@@ -9,9 +9,9 @@ from pathlib import Path
 import bpy
 
 from ..formats import requests
+from ..jobs.follow import submit
+from ..jobs.target import Target
 from ..scene.human import armature_of
-from .jobs.follow import submit
-from .jobs.target import Target
 from .on_person import PANELS, SKIP, OnPerson
 from .translations import CONTEXT
 
@@ -162,8 +162,8 @@ class PRIMDIFFUSION_OT_export_mesh(_ToFile, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """A format that is not given follows the file's ending."""
+        from ..jobs.export_mesh import ExportMeshWork, scene_frames
         from ..scene.export_model import check_ready
-        from .jobs.export_mesh import ExportMeshWork, scene_frames
 
         kind = self.chosen(context, "format")
         if not self.properties.is_property_set("format"):
@@ -189,8 +189,8 @@ class PRIMDIFFUSION_OT_add_proxy(_Export, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """In line."""
+        from ..jobs.export_mesh import AddProxyWork
         from ..scene.export_model import check_ready
-        from .jobs.export_mesh import AddProxyWork
 
         target = Target.of(person)
         check_ready(armature_of(person))
@@ -211,7 +211,7 @@ class PRIMDIFFUSION_OT_show_proxy(_Export, bpy.types.Operator):
 
     def run(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """At once."""
-        from .jobs.export_mesh import show
+        from ..jobs.export_mesh import show
 
         show(person, self.shown)
         return {"FINISHED"}
@@ -226,8 +226,8 @@ class PRIMDIFFUSION_OT_remove_proxy(_Export, bpy.types.Operator):
 
     def run(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """At once."""
+        from ..jobs.export_mesh import show
         from ..scene.proxy import proxy_of, remove_proxy
-        from .jobs.export_mesh import show
 
         show(person, "VOLUMES")
         remove_proxy(proxy_of(person))
@@ -248,7 +248,7 @@ class PRIMDIFFUSION_OT_export_gaussians(_ToFile, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """In line, in the pose of now."""
-        from .jobs.export_person import ExportGaussiansWork, posed_now
+        from ..jobs.export_person import ExportGaussiansWork, posed_now
 
         path = destination(self.filepath, self.endings(context))
         work = ExportGaussiansWork(
@@ -276,7 +276,7 @@ class PRIMDIFFUSION_OT_export_vdb_sequence(_Export, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """In line, with the poses of now."""
-        from .jobs.export_person import ExportVdbSequenceWork, posed_frames
+        from ..jobs.export_person import ExportVdbSequenceWork, posed_frames
 
         if not self.directory:
             raise ValueError("name a folder to export to")
@@ -307,8 +307,8 @@ class PRIMDIFFUSION_OT_export_human(_ToFile, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """At once: it needs no backend."""
-        from .jobs.export_mesh import scene_frames
-        from .jobs.export_person import write_human
+        from ..jobs.export_mesh import scene_frames
+        from ..jobs.export_person import write_human
 
         path = destination(self.filepath, HUMAN_ENDINGS)
         write_human(
@@ -345,8 +345,8 @@ class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Look into the file, then put it in line; in background mode this waits for the person."""
+        from ..jobs.export_person import ImportHumanWork
         from ..scene.human_file import motion_in, read_tensors
-        from .jobs.export_person import ImportHumanWork
 
         path = Path(bpy.path.abspath(self.filepath))
         try:

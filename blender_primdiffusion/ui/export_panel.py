@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import bpy
 
+from ..jobs.target import selected_person
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
-from .jobs.target import selected_person
 from .manual import draw_manual_button
 
 
@@ -50,9 +50,9 @@ class PRIMDIFFUSION_PT_export_mesh(SidebarPanel, bpy.types.Panel):
             person = selected_person(context)
         except ValueError:
             return
+        from ..jobs.export_mesh import shown
         from ..scene.proxy import is_outdated, proxy_of
         from ..scene.shape import betas_of
-        from .jobs.export_mesh import shown
 
         try:
             proxy = proxy_of(person)

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import bpy
 
+from ..jobs.follow import submit
+from ..jobs.missing_files import look, state
+from ..jobs.target import Target
 from .drawing import draw_job, draw_lines
-from .jobs.follow import submit
-from .jobs.missing_files import look, state
-from .jobs.target import Target
 from .on_person import OnPerson
 
 
@@ -54,8 +54,8 @@ class _Find:
 
     def _restore(self, context: bpy.types.Context, directory: Path | None) -> tuple[int, list[str]]:
         """Works put in line for people whose files are nowhere, and sentences on those who cannot be helped."""
+        from ..jobs.restore import RestoreWork
         from ..scene.missing import find_person, missing_files
-        from .jobs.restore import RestoreWork
 
         works, left = [], []
         for one in missing_files():
@@ -109,8 +109,8 @@ class PRIMDIFFUSION_OT_generate_again(OnPerson, bpy.types.Operator):
     bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO (the result has one)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        from ..jobs.restore import RegenerateWork, made_from_seed
         from ..scene.files import person_file
-        from .jobs.restore import RegenerateWork, made_from_seed
 
         try:
             there = person_file(person)

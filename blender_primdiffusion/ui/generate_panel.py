@@ -8,14 +8,14 @@ import bpy
 from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
 
+from ..jobs.follow import submit
+from ..jobs.memory import device_line
+from ..jobs.queue import queue
+from ..jobs.seeds import last_seed, random_seed
 from . import setup
 from .attributes import CATEGORIES, SCALARS, draw_attributes
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
 from .generate_settings import Asking
-from .jobs.follow import submit
-from .jobs.memory import device_line
-from .jobs.queue import queue
-from .jobs.seeds import last_seed, random_seed
 from .manual import draw_manual_button
 from .translations import CONTEXT
 
@@ -88,7 +88,7 @@ class PRIMDIFFUSION_OT_generate(Asking, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Put them in line; in background mode this waits for all."""
-        from .jobs.generate import GenerateWork
+        from ..jobs.generate import GenerateWork
 
         settings = context.scene.primdiffusion
         from_panel = self.seed < 0

@@ -7,8 +7,8 @@ from typing import Any
 import bpy
 
 from ..formats import requests
+from ..jobs.seeds import LARGEST_SEED
 from .attributes import PRIMDIFFUSION_PG_attributes, asked, parsed
-from .jobs.seeds import LARGEST_SEED
 
 STEPS_AND_SAMPLER = {"DRAFT": (8, "dpmpp_2m"), "STANDARD": (30, "ddim"), "HIGH": (60, "ddim")}
 CUSTOM = "CUSTOM"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import bpy
 
+from ..jobs.target import selected_person
 from ..scene.human import armature_of, humans, remove_human
 from ..worker.sentence import sentence
 from .drawing import SidebarPanel, draw_lines
 from .files_panel import draw_missing
-from .jobs.target import selected_person
 from .manual import draw_manual_button
 from .on_person import OnPerson
 

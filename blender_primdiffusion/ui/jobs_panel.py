@@ -10,15 +10,14 @@ from collections.abc import Iterator
 import bpy
 from bpy.app.handlers import persistent
 
+from ..jobs import follow, memory
+from ..jobs.building import building
+from ..jobs.follow import PRIMDIFFUSION_OT_take_result, redraw, submit
+from ..jobs.memory import device_line
+from ..jobs.pictures import so_far
+from ..jobs.queue import queue
 from ..places import EXTENSION, backend_module_path, preference
 from .drawing import SidebarPanel, draw_ended, draw_in_line, draw_lines
-from .jobs import follow, memory
-from .jobs.building import building
-from .jobs.entering import PRIMDIFFUSION_OT_take_result
-from .jobs.follow import redraw, submit
-from .jobs.memory import device_line
-from .jobs.pictures import so_far
-from .jobs.queue import queue
 
 TEXT = "PrimDiffusion Diagnostics"
 _LOG_LINES = 60

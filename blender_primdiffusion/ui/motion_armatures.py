@@ -5,8 +5,8 @@ from __future__ import annotations
 import bpy
 
 from ..formats.joints import JOINT_NAMES
+from ..jobs.target import named_person, selected_person
 from ..scene.human import armature_of, human_of, humans
-from .jobs.target import named_person, selected_person
 
 FACTS = "primdiffusion_motion"
 """Custom property of an action: what its motion is, as JSON."""

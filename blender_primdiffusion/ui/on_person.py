@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import bpy
 
+from ..jobs.target import named_person, selected_person
 from ..scene.human import humans
-from .jobs.target import named_person, selected_person
 
 SKIP = {"SKIP_SAVE"}
 PANELS = "Not given: the panel's"

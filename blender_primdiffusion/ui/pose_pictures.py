@@ -48,9 +48,9 @@ def draw_picture(pose: Path, rotations: NDArray) -> None:
     """Draw the picture of a pose of the user's own, in joint rotations [24, 3, 3], beside its file. Raises OSError."""
     import numpy as np
 
+    from ..jobs.thumbnails import clay_figure
     from ..motion.png_file import write_png
     from ..motion.skeleton import joint_positions
-    from .jobs.thumbnails import clay_figure
 
     write_png(picture_of(pose), clay_figure(joint_positions(np.asarray(rotations))))
 

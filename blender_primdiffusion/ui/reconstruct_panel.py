@@ -8,8 +8,8 @@ from pathlib import Path
 import bpy
 
 from ..formats.requests import CAPTURE_VIEWS
+from ..jobs.follow import submit
 from .drawing import SidebarPanel, draw_job, property_columns
-from .jobs.follow import submit
 
 _CAMERAS_FILE = "cameras.json"
 
@@ -86,7 +86,7 @@ class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Put it in line; in background mode this waits for the person."""
-        from .jobs.reconstruct import ReconstructWork
+        from ..jobs.reconstruct import ReconstructWork
 
         asked = context.scene.primdiffusion_reconstruct
         folder = bpy.path.abspath(self.directory or asked.capture)

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..formats.requests import VOXEL
+from ..jobs.follow import submit
+from ..jobs.target import Target
 from ..scene.attachment import attachment_before_merge, attachment_of, set_attachment
 from ..scene.human import armature_of
-from .jobs.follow import submit
-from .jobs.target import Target
 from .on_person import SKIP, OnPerson
 
 if TYPE_CHECKING:
-    from .render.merge_work import Moment
+    from ..jobs.merge import Moment
 
 ATTACHMENT_ITEMS = (
     ("ARMATURE", "Armature", "Each volume is an object that follows the bones; quick, and the default"),
@@ -71,7 +71,7 @@ class PRIMDIFFUSION_OT_merge(_Merging, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """Put it in line; in background mode this waits for the merged volume."""
-        from .render.merge_work import MergeWork
+        from ..jobs.merge import MergeWork
 
         moment = _moment(person, context.evaluated_depsgraph_get())
         return submit(self, context, MergeWork(Target.of(person), moment, self.chosen_voxel(context)))
@@ -88,7 +88,7 @@ class PRIMDIFFUSION_OT_merge_frames(_Merging, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """Put it in line; in background mode this waits for the merged volumes."""
-        from .render.merge_work import MergeFramesWork
+        from ..jobs.merge import MergeFramesWork
 
         given = self.properties.is_property_set
         start, end = (getattr(self if given(name) else context.scene, name) for name in ("frame_start", "frame_end"))
@@ -128,14 +128,14 @@ class PRIMDIFFUSION_OT_fit_density_gain(OnPerson, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """Put it in line; in background mode this waits for the gain."""
-        from .render.merge_work import FitGainWork
+        from ..jobs.merge import FitGainWork
 
         graph = context.evaluated_depsgraph_get()
         return submit(self, context, FitGainWork(Target.of(person), _moment(person, graph)))
 
 
 def _moment(person: bpy.types.Collection, graph: bpy.types.Depsgraph) -> Moment:
-    from .render.merge_work import Moment
+    from ..jobs.merge import Moment
 
     return Moment.now(person, armature_of(person).evaluated_get(graph))
 

@@ -9,12 +9,12 @@ from mathutils import Euler, Vector
 
 from ..engine.engine import ENGINE
 from ..formats.requests import DENSITY_GAIN, VOXEL
+from ..jobs.target import selected_person
 from ..scene.attachment import MODES, attachment_of
 from ..scene.human import human_of, humans
 from ..scene.material import density_gain, set_density_gain
 from ..worker.sentence import sentence
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
-from .jobs.target import selected_person
 from .manual import draw_manual_button
 from .render_operators import ATTACHMENT_ITEMS
 
@@ -253,8 +253,8 @@ class PRIMDIFFUSION_PT_memory(_OfPerson, bpy.types.Panel):
 
 def outdated(person: bpy.types.Collection, scene: bpy.types.Scene) -> bool:
     """Whether the merged volume shows another pose, shape or person than the armature as it is now."""
+    from ..jobs.merge import Moment
     from ..scene.merged import merged_of, merged_state
-    from .render.merge_work import Moment
 
     try:
         return not merged_state(merged_of(person)).shows(Moment.now(person).digest, scene.frame_current)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import bpy
 from bpy.app.translations import pgettext_iface
 
+from ..jobs.target import named_person, selected_person
 from ..scene.human import BETA_COUNT, BETAS, MARK, armature_of
 from ..worker.sentence import sentence
 from .drawing import SidebarPanel, draw_lines, property_columns
-from .jobs.target import named_person, selected_person
 from .on_person import SKIP, OnPerson
 from .translations import CONTEXT
 

@@ -9,12 +9,12 @@ import bpy
 from bpy.app.translations import pgettext_tip
 
 from ..formats.requests import AMOUNT
+from ..jobs.follow import redraw, submit
+from ..jobs.pictures import icons
+from ..jobs.seeds import LARGEST_SEED, last_seed
+from ..jobs.variations import Variation, sheet
 from ..worker.sentence import sentence
 from .generate_settings import STEPS_AND_SAMPLER, Asking
-from .jobs.follow import redraw, submit
-from .jobs.pictures import icons
-from .jobs.seeds import LARGEST_SEED, last_seed
-from .jobs.variations import Variation, sheet
 
 COUNT_ITEMS = [(str(count), str(count), f"{count} people") for count in (4, 8, 12, 16)]
 
@@ -264,7 +264,7 @@ def _poll_sheet(cls: type[bpy.types.Operator]) -> bool:
 def _submit(
     operator: bpy.types.Operator, context: bpy.types.Context, seeds: tuple[int, ...], fields: dict[str, Any]
 ) -> set[str]:
-    from .jobs.variations import VariationsWork
+    from ..jobs.variations import VariationsWork
 
     return submit(operator, context, VariationsWork(seeds, **fields))
 

@@ -9,14 +9,14 @@ import bpy
 from bpy.app.handlers import persistent
 from bpy.app.translations import pgettext_iface
 
+from ..jobs.pictures import icons
+from ..jobs.queue import queue
+from ..jobs.variations import sheet
 from .drawing import SidebarPanel, draw_job, property_columns
-from .jobs.pictures import icons
-from .jobs.queue import queue
-from .jobs.variations import sheet
 from .manual import draw_manual_button
 
 if TYPE_CHECKING:
-    from .jobs.variations import VariationsWork
+    from ..jobs.variations import VariationsWork
 
 CELL_PX = 110
 """Width of a picture at which a sidebar of ordinary width holds two or three."""

@@ -51,7 +51,7 @@ def people_file(module: str, count: int = 1) -> Path:
 
 
 def queue_of(module: str):
-    return import_module(f"{module}.ui.jobs.queue").queue
+    return import_module(f"{module}.jobs.queue").queue
 
 
 def cancel_all(module: str) -> Steps:

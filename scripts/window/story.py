@@ -54,7 +54,7 @@ def first_human(module: str, python: str) -> Steps:
     yield from wait(lambda: queue.busy, 5)
     if not queue.busy:
         raise RuntimeError("the click on Generate Human did not reach it")
-    so_far = import_module(f"{module}.ui.jobs.pictures").so_far
+    so_far = import_module(f"{module}.jobs.pictures").so_far
     yield 1.0
     yield "first_starting"
     yield from wait(lambda: bool(so_far.icon) or not queue.busy, 120)
@@ -155,7 +155,7 @@ def edits(module: str, python: str) -> Steps:
     yield "edit_parts"
     press("primdiffusion.redress")
     queue = queue_of(module)
-    so_far = import_module(f"{module}.ui.jobs.pictures").so_far
+    so_far = import_module(f"{module}.jobs.pictures").so_far
     yield from wait(lambda: bool(so_far.icon) or not queue.busy, 120)
     yield "edit_working"
     yield from wait(lambda: not queue.busy, 180)

@@ -67,7 +67,7 @@ def addon(saved_scene, tmp_path, monkeypatch):
 
     import blender_primdiffusion
     from blender_primdiffusion import places
-    from blender_primdiffusion.ui.jobs.queue import queue
+    from blender_primdiffusion.jobs.queue import queue
     from blender_primdiffusion.worker.environment import BackendPython
 
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic.write(tmp_path / "prepared.npz", 8)))

@@ -6,8 +6,8 @@ import time
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
-from blender_primdiffusion.ui.jobs.follow import follow
-from blender_primdiffusion.ui.jobs.queue import queue
+from blender_primdiffusion.jobs.follow import follow
+from blender_primdiffusion.jobs.queue import queue
 
 
 def drive(seconds: float = 60.0) -> None:

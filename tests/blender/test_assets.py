@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import synthetic
 
+from blender_primdiffusion.jobs.thumbnails import SIDE, clay_figure, picture_of_file
 from blender_primdiffusion.motion.pose_library import builtin_poses, current_pose
 from blender_primdiffusion.motion.rotation import from_axis_angle
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.files import person_file, volume_path
 from blender_primdiffusion.scene.human import MARK, armature_of, humans
 from blender_primdiffusion.ui.assets_panel import PRIMDIFFUSION_PT_assets
-from blender_primdiffusion.ui.jobs.thumbnails import SIDE, clay_figure, picture_of_file
 
 PICTURE = Path(__file__).parent / "fake_backend" / "primdiffusion" / "picture.png"
 ops = bpy.ops.primdiffusion

@@ -19,12 +19,12 @@ import synthetic_shape
 from jobs_driven import drive
 from test_missing_volumes import write_person
 
+from blender_primdiffusion.jobs.edit import VaryWork
+from blender_primdiffusion.jobs.generate import GenerateWork
+from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.jobs.work import Work
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of, body_of, humans
-from blender_primdiffusion.ui.jobs.edit import VaryWork
-from blender_primdiffusion.ui.jobs.generate import GenerateWork
-from blender_primdiffusion.ui.jobs.queue import queue
-from blender_primdiffusion.ui.jobs.work import Work
 
 ELSEWHERE = {"open_manual", "repair_backend", "test_backend", "set_up_backend", "make_pose_assets", "copy_diagnostics"}
 """Open a browser, set up, write a library or a text: whatever is in the scene, it stays as it is."""
@@ -223,7 +223,7 @@ def anna(addon, tmp_path, monkeypatch):
 @pytest.fixture
 def outside(anna, monkeypatch):
     """No browser opens, nothing is downloaded or installed; libraries are small and written where tests write."""
-    from blender_primdiffusion.ui.jobs import assets
+    from blender_primdiffusion.jobs import assets
     from blender_primdiffusion.ui.setup.session import SetUpSession
 
     def start(session: SetUpSession, _steps: object) -> None:
@@ -245,9 +245,9 @@ def outside(anna, monkeypatch):
 
 def _asked(monkeypatch, folder: Path) -> None:
     """Works are asked for their parameters, and then end well: what the child does is for other tests."""
-    from blender_primdiffusion.ui.jobs import follow
-    from blender_primdiffusion.ui.jobs.queue import Outcome, queue
-    from blender_primdiffusion.ui.jobs.remedies import error_in_the_scene
+    from blender_primdiffusion.jobs import follow
+    from blender_primdiffusion.jobs.queue import Outcome, queue
+    from blender_primdiffusion.jobs.remedies import error_in_the_scene
 
     def wait_for(entry):
         queue.waiting.remove(entry)

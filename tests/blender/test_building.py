@@ -11,15 +11,15 @@ import synthetic_shape
 from jobs_driven import drive, error_of, notice_of
 
 import blender_primdiffusion
+from blender_primdiffusion.jobs import follow as follow_module
+from blender_primdiffusion.jobs.building import building
+from blender_primdiffusion.jobs.follow import follow
+from blender_primdiffusion.jobs.generate import GenerateWork
+from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.files import folder_of, person_file, volume_path
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.shape import shape_model_of
-from blender_primdiffusion.ui.jobs import follow as follow_module
-from blender_primdiffusion.ui.jobs.building import building
-from blender_primdiffusion.ui.jobs.follow import follow
-from blender_primdiffusion.ui.jobs.generate import GenerateWork
-from blender_primdiffusion.ui.jobs.queue import queue
 
 GIVES_GARBAGE = 3
 """A seed that the fake child takes as an order."""
@@ -31,7 +31,7 @@ COUNT = 12
 def on_their_way(addon, tmp_path, monkeypatch):
     """A person whose volumes are written, and whose grids are about to be read."""
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared.npz", COUNT)))
-    monkeypatch.setattr("blender_primdiffusion.ui.jobs.building.SLICE_S", 0.0)
+    monkeypatch.setattr("blender_primdiffusion.jobs.building.SLICE_S", 0.0)
     bpy.ops.ed.undo_push(message="before")
     queue.add(addon, GenerateWork(7, 1))
     until(lambda: 0.6 < building.fraction < 1.0)
@@ -60,7 +60,7 @@ def check_whole(person: bpy.types.Collection) -> None:
 
 
 def test_no_tick_writes_more_than_its_slice(addon, monkeypatch):
-    monkeypatch.setattr("blender_primdiffusion.ui.jobs.building.SLICE_S", 0.0)
+    monkeypatch.setattr("blender_primdiffusion.jobs.building.SLICE_S", 0.0)
     written, write_file, ticks = [], volumes._write_file, [0]
     monkeypatch.setattr(volumes, "_write_file", lambda *args: written.append(ticks[0]) or write_file(*args))
     queue.add(addon, GenerateWork(7, 1))
@@ -71,7 +71,7 @@ def test_no_tick_writes_more_than_its_slice(addon, monkeypatch):
 
 
 def test_the_bar_goes_on_while_volumes_are_written_and_read(addon, monkeypatch):
-    monkeypatch.setattr("blender_primdiffusion.ui.jobs.building.SLICE_S", 0.0)
+    monkeypatch.setattr("blender_primdiffusion.jobs.building.SLICE_S", 0.0)
     queue.add(addon, GenerateWork(7, 1))
     seen = []
     while follow() is not None:

@@ -13,16 +13,16 @@ import synthetic_shape
 from jobs_driven import drive, error_of, notice_of
 
 import blender_primdiffusion
+from blender_primdiffusion.jobs.building import building
+from blender_primdiffusion.jobs.edit import RedressWork, VaryWork
+from blender_primdiffusion.jobs.follow import follow
+from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.jobs.restore import RegenerateWork, RestoreWork, made_from_seed
+from blender_primdiffusion.jobs.target import Target
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.files import folder_of, person_file, volume_path
 from blender_primdiffusion.scene.human import MARK, humans, remove_human
 from blender_primdiffusion.scene.missing import missing_files
-from blender_primdiffusion.ui.jobs.building import building
-from blender_primdiffusion.ui.jobs.edit import RedressWork, VaryWork
-from blender_primdiffusion.ui.jobs.follow import follow
-from blender_primdiffusion.ui.jobs.queue import queue
-from blender_primdiffusion.ui.jobs.restore import RegenerateWork, RestoreWork, made_from_seed
-from blender_primdiffusion.ui.jobs.target import Target
 
 GIVES_GARBAGE, FINE = 3, 8
 """Seeds that the fake child takes as orders, and one that it does not."""
@@ -30,7 +30,7 @@ COUNT = 12
 """Primitives of the synthetic person."""
 OF_THE_REGION = 2
 """Primitives that the fake child changes where a region is given."""
-MEANWHILE = "blender_primdiffusion.ui.jobs.building.SLICE_S"
+MEANWHILE = "blender_primdiffusion.jobs.building.SLICE_S"
 
 
 @pytest.fixture

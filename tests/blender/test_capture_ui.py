@@ -25,8 +25,8 @@ from blender_primdiffusion.capture.options import MARK, UsageError, parse, setti
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.ui.captures.session import captures
 from blender_primdiffusion.ui.captures_panel import RIG
+from blender_primdiffusion.ui.captures_session import captures
 from blender_primdiffusion.ui.captures_settings import words_of
 
 pytestmark = pytest.mark.any_blender

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
+from blender_primdiffusion.jobs.edit import VaryWork
+from blender_primdiffusion.jobs.follow import follow
+from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.scene.human import armature_of, body_of, humans, remove_human
 from blender_primdiffusion.scene.painting import painted_weights
 from blender_primdiffusion.ui import edit_operators, edit_panel
-from blender_primdiffusion.ui.jobs.edit import VaryWork
-from blender_primdiffusion.ui.jobs.follow import follow
-from blender_primdiffusion.ui.jobs.queue import queue
 
 DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
 """Seeds that the fake child takes as orders."""

@@ -13,9 +13,9 @@ from backend_python import found
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 
 import blender_primdiffusion
+from blender_primdiffusion.jobs import work
 from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.scene.human import MARK, armature_of, body_of, humans
-from blender_primdiffusion.ui.jobs import work
 from blender_primdiffusion.worker.client import BackendClient
 from blender_primdiffusion.worker.environment import BackendPython
 

@@ -13,13 +13,13 @@ import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 import blender_primdiffusion
+from blender_primdiffusion.jobs import queue as queue_module
+from blender_primdiffusion.jobs.follow import follow
+from blender_primdiffusion.jobs.generate import GenerateWork
+from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.files import folder_of
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_OT_generate, PRIMDIFFUSION_PT_generate
-from blender_primdiffusion.ui.jobs import queue as queue_module
-from blender_primdiffusion.ui.jobs.follow import follow
-from blender_primdiffusion.ui.jobs.generate import GenerateWork
-from blender_primdiffusion.ui.jobs.queue import queue
 
 DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
 """Seeds that the fake child takes as orders."""

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from jobs_driven import drive, shown
 
+from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.build import GAP_M
 from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.scene.human import armature_of, humans
 from blender_primdiffusion.scene.preview import posed_extent
 from blender_primdiffusion.ui import generate_panel
-from blender_primdiffusion.ui.jobs.queue import queue
 
 FAILS = 2
 """A seed that the fake child takes as an order."""

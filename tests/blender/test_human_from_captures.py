@@ -14,12 +14,12 @@ from backend_python import found
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 import blender_primdiffusion
+from blender_primdiffusion.jobs import reconstruct, work
+from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.files import folder_of
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui import reconstruct_panel
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
-from blender_primdiffusion.ui.jobs import reconstruct, work
-from blender_primdiffusion.ui.jobs.queue import queue
 from blender_primdiffusion.ui.reconstruct_panel import PRIMDIFFUSION_PT_human_from_captures
 from blender_primdiffusion.worker.environment import BackendPython
 

@@ -14,14 +14,14 @@ import bpy
 import pytest
 from jobs_driven import drive, shown, until_running
 
+from blender_primdiffusion.jobs import memory, remedies
+from blender_primdiffusion.jobs.follow import follow
+from blender_primdiffusion.jobs.generate import GenerateWork
+from blender_primdiffusion.jobs.pictures import SoFar, so_far
+from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui import drawing, jobs_panel
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
-from blender_primdiffusion.ui.jobs import memory, remedies
-from blender_primdiffusion.ui.jobs.follow import follow
-from blender_primdiffusion.ui.jobs.generate import GenerateWork
-from blender_primdiffusion.ui.jobs.pictures import SoFar, so_far
-from blender_primdiffusion.ui.jobs.queue import queue
 from blender_primdiffusion.worker.job import JobError
 from blender_primdiffusion.worker.memory_advice import memory_advice
 

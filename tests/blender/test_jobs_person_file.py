@@ -9,21 +9,16 @@ import bpy
 import pytest
 import synthetic_shape
 
+from blender_primdiffusion.jobs.assets import HumanAssetWork, PoseAssetWork
+from blender_primdiffusion.jobs.edit import BlendWork, RedressWork, TransferWork, VaryWork
+from blender_primdiffusion.jobs.export_mesh import AddProxyWork, ExportMeshWork
+from blender_primdiffusion.jobs.export_person import ExportGaussiansWork, ExportVdbSequenceWork, posed_frames, posed_now
+from blender_primdiffusion.jobs.merge import FitGainWork, MergeWork, Moment
+from blender_primdiffusion.jobs.target import Target
+from blender_primdiffusion.jobs.work import Work
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.export_model import FrameRange
 from blender_primdiffusion.scene.files import person_file
-from blender_primdiffusion.ui.jobs.assets import HumanAssetWork, PoseAssetWork
-from blender_primdiffusion.ui.jobs.edit import BlendWork, RedressWork, TransferWork, VaryWork
-from blender_primdiffusion.ui.jobs.export_mesh import AddProxyWork, ExportMeshWork
-from blender_primdiffusion.ui.jobs.export_person import (
-    ExportGaussiansWork,
-    ExportVdbSequenceWork,
-    posed_frames,
-    posed_now,
-)
-from blender_primdiffusion.ui.jobs.target import Target
-from blender_primdiffusion.ui.jobs.work import Work
-from blender_primdiffusion.ui.render.merge_work import FitGainWork, MergeWork, Moment
 
 
 @pytest.fixture

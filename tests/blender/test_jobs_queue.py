@@ -12,13 +12,13 @@ import bpy
 import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
+from blender_primdiffusion.jobs import follow as follow_module
+from blender_primdiffusion.jobs.follow import follow, watch
+from blender_primdiffusion.jobs.generate import GenerateWork
+from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
-from blender_primdiffusion.ui.jobs import follow as follow_module
-from blender_primdiffusion.ui.jobs.follow import follow, watch
-from blender_primdiffusion.ui.jobs.generate import GenerateWork
-from blender_primdiffusion.ui.jobs.queue import queue
 from blender_primdiffusion.ui.jobs_panel import PRIMDIFFUSION_PT_jobs
 
 pytestmark = pytest.mark.any_blender

@@ -14,6 +14,11 @@ from blender_primdiffusion.formats.requests import DENSITY_GAIN
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 from blender_primdiffusion import places
+from blender_primdiffusion.jobs import merge as merge_work
+from blender_primdiffusion.jobs.follow import follow
+from blender_primdiffusion.jobs.merge import MergeFramesWork, MergeWork, Moment
+from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.jobs.target import Target
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import attachment_of
 from blender_primdiffusion.scene.build import build_human
@@ -23,11 +28,6 @@ from blender_primdiffusion.scene.keyframes import keyframe_poses
 from blender_primdiffusion.scene.material import density_gain
 from blender_primdiffusion.scene.merged import merged_of, merged_state
 from blender_primdiffusion.ui import render_panel
-from blender_primdiffusion.ui.jobs.follow import follow
-from blender_primdiffusion.ui.jobs.queue import queue
-from blender_primdiffusion.ui.jobs.target import Target
-from blender_primdiffusion.ui.render import merge_work
-from blender_primdiffusion.ui.render.merge_work import MergeFramesWork, MergeWork, Moment
 
 ops = bpy.ops.primdiffusion
 

@@ -11,13 +11,13 @@ import pytest
 from backend_python import found
 
 import blender_primdiffusion
+from blender_primdiffusion.jobs import work
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import attachment_of, set_attachment
 from blender_primdiffusion.scene.files import sequence_files, volume_path
 from blender_primdiffusion.scene.human import armature_of, humans
 from blender_primdiffusion.scene.material import density_gain
 from blender_primdiffusion.scene.merged import merged_of
-from blender_primdiffusion.ui.jobs import work
 from blender_primdiffusion.worker.client import BackendClient
 from blender_primdiffusion.worker.environment import BackendPython
 

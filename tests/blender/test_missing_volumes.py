@@ -12,12 +12,12 @@ import pytest
 import synthetic_shape
 from jobs_driven import shown
 
+from blender_primdiffusion.jobs.missing_files import look, state
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.files import HOME, folder_of, person_file, volume_path
 from blender_primdiffusion.scene.human import MARK, humans
 from blender_primdiffusion.scene.missing import missing_files
 from blender_primdiffusion.ui.human_panel import PRIMDIFFUSION_PT_human
-from blender_primdiffusion.ui.jobs.missing_files import look, state
 
 ops = bpy.ops.primdiffusion
 COUNT = 8
@@ -190,7 +190,7 @@ def test_missing_files_of_a_thousand_volumes_are_one_entry(person):
 
 
 def test_a_missing_file_offers_the_button_where_a_work_fails(person):
-    from blender_primdiffusion.ui.jobs.remedies import error_in_the_scene, remedy_for
+    from blender_primdiffusion.jobs.remedies import error_in_the_scene, remedy_for
 
     person_file(person).unlink()
     with pytest.raises(FileNotFoundError, match="Find Missing Volumes") as failed:

@@ -12,6 +12,7 @@ import pytest
 import synthetic
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 
+from blender_primdiffusion.jobs.thumbnails import clay_figure, picture_of_file
 from blender_primdiffusion.motion.own_poses import PoseFileError, load_pose, own_poses, save_pose
 from blender_primdiffusion.motion.pose_library import (
     apply_pose,
@@ -26,7 +27,6 @@ from blender_primdiffusion.scene.actions import action_curves
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.ui import pose_pictures
-from blender_primdiffusion.ui.jobs.thumbnails import clay_figure, picture_of_file
 from blender_primdiffusion.ui.pose_panel import PRIMDIFFUSION_PT_poses
 
 ops = bpy.ops.primdiffusion

@@ -9,14 +9,14 @@ import pytest
 import synthetic_shape
 from scene_stage import replace
 
+from blender_primdiffusion.jobs.export_mesh import AddProxyWork
+from blender_primdiffusion.jobs.target import Target
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.human import body_of
 from blender_primdiffusion.scene.proxy import build_proxy, is_outdated, proxy_of, read_proxy, shown_betas
 from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import betas_of, generated_betas
-from blender_primdiffusion.ui.jobs.export_mesh import AddProxyWork
-from blender_primdiffusion.ui.jobs.target import Target
 
 TALLER, WIDER = np.eye(10)[0] * 2.0, np.eye(10)[1] * 2.0
 

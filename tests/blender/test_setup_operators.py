@@ -223,7 +223,7 @@ def test_a_machine_without_packages_is_told_what_to_do(online, monkeypatch):
 
 
 def test_set_up_is_refused_while_a_person_is_made(online, monkeypatch):
-    from blender_primdiffusion.ui.jobs.queue import Queue
+    from blender_primdiffusion.jobs.queue import Queue
 
     monkeypatch.setattr(Queue, "busy", property(lambda self: True))
     with pytest.raises(RuntimeError, match="The backend is at work"):

@@ -9,12 +9,12 @@ import bpy
 import pytest
 from jobs_driven import drive, error_of, shown, until_running
 
+from blender_primdiffusion.jobs.pictures import icons
+from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.jobs.variations import VariationsWork, sheet
 from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.scene.human import armature_of, humans
 from blender_primdiffusion.ui import variations_operators, variations_panel
-from blender_primdiffusion.ui.jobs.pictures import icons
-from blender_primdiffusion.ui.jobs.queue import queue
-from blender_primdiffusion.ui.jobs.variations import VariationsWork, sheet
 
 FAILS, TAKES_LONG = 2, 4
 """Seeds that the fake child takes as orders."""
@@ -216,7 +216,7 @@ def test_a_disk_that_is_full_keeps_the_former_sheet(addon, shown_people, monkeyp
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("blender_primdiffusion.ui.jobs.variations.shutil.move", full)
+    monkeypatch.setattr("blender_primdiffusion.jobs.variations.shutil.move", full)
     with pytest.raises(RuntimeError, match="No space left"):
         ops.variations(seed=40, count=2, steps=1)
     assert seeds() == [11, 12, 13, 14]

@@ -20,8 +20,7 @@ from ...worker.job import Job
 from ..attributes import Attributes, parsed
 from .asking import NoBackend, Stopped, ask, backend_of
 from .people import NPZ_FILE, PERSON_FILE, Movement, motion_name, movement_of, person_blend
-from .running import Clock, Say, begun, reason, run
-from .staging import publish, staging
+from .running import Clock, Say, begun, publish, reason, run, staging
 from .words import parse_generate
 
 SETTINGS = "settings.json"

@@ -78,7 +78,7 @@ def _begin(operator: bpy.types.Operator, make: Callable[[], Steps], *, replaces:
 def _release_environment() -> None:
     """End the children that run on the environment: their files could not be replaced. Raises ValueError."""
     from ...engine import studio
-    from ..jobs.queue import queue
+    from ...jobs.queue import queue
 
     if queue.busy:
         raise ValueError("The backend is at work; wait until it is done, or press Cancel")

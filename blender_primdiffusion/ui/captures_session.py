@@ -16,7 +16,7 @@ from pathlib import Path
 
 import bpy
 
-from ...worker.child_streams import Output
+from ..worker.child_streams import Output
 
 PATIENCE_S = 0.7
 """After this a child that was asked to stop is ended: its views are written whole or not at all."""
@@ -119,7 +119,7 @@ class CaptureSession:
             self._take(line.decode("utf-8", "replace"))
 
     def _take(self, line: str) -> None:
-        from ...capture.options import MARK
+        from ..capture.options import MARK
 
         if not line.startswith(MARK):
             return  # Blender's own
@@ -133,7 +133,7 @@ class CaptureSession:
             self.message = f"{progress['subject']}: view {progress['done']} of {progress['total']}"
 
     def _finish(self, code: int) -> None:
-        from ...console import CANCELLED, DONE
+        from ..console import CANCELLED, DONE
 
         self.exit_code, stopped = code, self._asked_to_stop_at is not None
         complaints = self._errors.log()
@@ -164,7 +164,7 @@ class CaptureSession:
 
 def child_command() -> list[str]:
     """What starts a Blender for captures; the extension's words follow."""
-    from ...capture import launch
+    from ..capture import launch
 
     script = str(Path(launch.__file__).resolve())
     if bpy.app.binary_path:

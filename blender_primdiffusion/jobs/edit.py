@@ -10,11 +10,11 @@ from typing import Any, ClassVar
 import bpy
 import numpy as np
 
-from ...scene.edit import edit_destination
-from ...scene.files import person_file
-from ...scene.overlap import overlap_warning_in
-from ...scene.writing import Destination
-from ...worker.sentence import sentence
+from ..scene.edit import edit_destination
+from ..scene.files import person_file
+from ..scene.overlap import overlap_warning_in
+from ..scene.writing import Destination
+from ..worker.sentence import sentence
 from .person import show_in_place
 from .target import Target
 from .work import Work, chosen_checkpoint

@@ -7,7 +7,7 @@ import dataclasses
 import bpy
 from bpy.app.handlers import persistent
 
-from ...scene.human import any_humans
+from ..scene.human import any_humans
 from .follow import redraw
 
 SOON_S = 0.5
@@ -36,7 +36,7 @@ def look() -> None:
 
 
 def _found() -> tuple[str, tuple[str, ...]]:
-    from ...scene.missing import find_person, missing_files
+    from ..scene.missing import find_person, missing_files
 
     lost = missing_files()
     alone = [one.person.name for one in lost if one.person_file and not one.linked and find_person(one) is None]
@@ -81,7 +81,7 @@ def _tick() -> float:
 def collect_before_saving(blend_path: str, *_: object) -> None:
     """Handler of save_pre; what collects is imported once there is somebody."""
     if any_humans():
-        from ...scene import collect
+        from ..scene import collect
 
         collect.collect_before_saving(blend_path)
 

@@ -11,16 +11,16 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...engine.people import posed
-from ...motion.skeleton import unchain
-from ...scene.armature import pose_from_joint_rotations
-from ...scene.export_model import FrameRange, check_ready, scene_with_only
-from ...scene.files import person_file
-from ...scene.human import armature_of
-from ...scene.human_file import HumanMotion, motion_in, read_tensors, reshaped, with_motion, write_tensors
-from ...scene.keyframes import keyframe_poses
-from ...scene.merged import MergedGrid, read_grid, write_grid
-from ...scene.shape import BODY_FILE, betas_of, generated_betas, has_custom_shape, shape_model_of
+from ..engine.people import posed
+from ..motion.skeleton import unchain
+from ..scene.armature import pose_from_joint_rotations
+from ..scene.export_model import FrameRange, check_ready, scene_with_only
+from ..scene.files import person_file
+from ..scene.human import armature_of
+from ..scene.human_file import HumanMotion, motion_in, read_tensors, reshaped, with_motion, write_tensors
+from ..scene.keyframes import keyframe_poses
+from ..scene.merged import MergedGrid, read_grid, write_grid
+from ..scene.shape import BODY_FILE, betas_of, generated_betas, has_custom_shape, shape_model_of
 from .person import build_person
 from .target import Target
 from .work import Work
@@ -69,8 +69,8 @@ def write_human(
 
 
 def _motion(context: bpy.types.Context, person: bpy.types.Collection, frames: FrameRange) -> HumanMotion:
-    from ...scene.convention import points_to_backend
-    from ...scene.human import armature_of
+    from ..scene.convention import points_to_backend
+    from ..scene.human import armature_of
 
     numbers = range(frames.first, frames.last + 1)
     joints = np.array([entry["joints"] for entry in posed_frames(context, person, numbers)], np.float64)

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.joints import JOINT_NAMES, PARENTS
+from ..formats.joints import JOINT_NAMES, PARENTS
 
 SIDE = 256
 """Pixels a side: what Blender makes of its own previews."""

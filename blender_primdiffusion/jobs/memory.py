@@ -6,7 +6,7 @@ import os
 
 import bpy
 
-from ...places import EXTENSION
+from ..places import EXTENSION
 from .queue import queue
 
 IDLE_MINUTES = 10.0
@@ -47,7 +47,7 @@ def release_when_idle(now: float) -> bool:
     if queue.release() is None:
         return False
     if not bpy.app.is_job_running("RENDER"):
-        from ...scene.grid_cache import free_unused_grids
+        from ..scene.grid_cache import free_unused_grids
 
         free_unused_grids()
     return True
@@ -58,9 +58,9 @@ def release() -> str:
 
     Raises RuntimeError while one of them is at work.
     """
-    from ...engine import studio
-    from ...scene.grid_cache import free_unused_grids
-    from ...worker.process_memory import resident_bytes
+    from ..engine import studio
+    from ..scene.grid_cache import free_unused_grids
+    from ..worker.process_memory import resident_bytes
 
     if queue.busy:
         raise RuntimeError("the backend is at work: wait for it, or cancel it first")

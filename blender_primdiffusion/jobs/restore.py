@@ -9,10 +9,10 @@ from typing import Any
 
 import bpy
 
-from ...scene.edit import edit_destination, restore_destination, restore_volumes
-from ...scene.human import MARK
-from ...scene.human_npz import read_human
-from ...scene.writing import Destination, write_now
+from ..scene.edit import edit_destination, restore_destination, restore_volumes
+from ..scene.human import MARK
+from ..scene.human_npz import read_human
+from ..scene.writing import Destination, write_now
 from .building import building
 from .person import show_in_place
 from .target import Target

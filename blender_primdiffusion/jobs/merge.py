@@ -9,14 +9,14 @@ from typing import Any, ClassVar
 import bpy
 import numpy as np
 
-from ...engine.people import posed
-from ...formats.joints import JOINT_NAMES
-from ...scene.attachment import set_attachment
-from ...scene.human import armature_of
-from ...scene.material import set_density_gain
-from ...scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
-from ..jobs.target import Target
-from ..jobs.work import Work
+from ..engine.people import posed
+from ..formats.joints import JOINT_NAMES
+from ..scene.attachment import set_attachment
+from ..scene.human import armature_of
+from ..scene.material import set_density_gain
+from ..scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
+from .target import Target
+from .work import Work
 
 
 @dataclasses.dataclass(frozen=True)

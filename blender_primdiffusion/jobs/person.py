@@ -8,12 +8,12 @@ from typing import Any
 
 import bpy
 
-from ...scene.build import build_written, next_folder, stand_beside_others
-from ...scene.edit import Replaced, edit_destination, replace_person
-from ...scene.grid_cache import free_unused_grids
-from ...scene.overlap import overlap_warning_in
-from ...scene.writing import Destination, write_now
-from ...worker.sentence import sentence
+from ..scene.build import build_written, next_folder, stand_beside_others
+from ..scene.edit import Replaced, edit_destination, replace_person
+from ..scene.grid_cache import free_unused_grids
+from ..scene.overlap import overlap_warning_in
+from ..scene.writing import Destination, write_now
+from ..worker.sentence import sentence
 from .building import building
 
 

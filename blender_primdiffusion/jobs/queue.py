@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ...places import new_backend, preference
+from ..places import new_backend, preference
 from .remedies import defect_in_the_scene, error_in_the_scene
 from .work import Work
 
 if TYPE_CHECKING:
-    from ...worker.backend import Backend
-    from ...worker.job import Job, JobError
+    from ..worker.backend import Backend
+    from ..worker.job import Job, JobError
 
 CANCELLED = "Cancelled"
 GONE = "The scene {!r} was deleted meanwhile: nothing was added. Undo the deletion and try again."
@@ -167,7 +167,7 @@ class Queue:
         """Between works: notice that the child has died or hangs; True when something visible changed. Never waits."""
         if self._backend is None or self.job is not None:
             return False
-        from ...worker.client import Died, Silent
+        from ..worker.client import Died, Silent
 
         for event in self._backend.listen():
             if isinstance(event, Died):
@@ -216,7 +216,7 @@ class Queue:
         return self._backend.log if self._backend is not None else ()
 
     def _begin(self, entry: Entry) -> None:
-        from ...worker.job import Job
+        from ..worker.job import Job
 
         self.current = entry
         try:

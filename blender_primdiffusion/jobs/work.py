@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import bpy
 
-from ...places import preference
+from ..places import preference
 
 if TYPE_CHECKING:
-    from ...scene.writing import Destination
+    from ..scene.writing import Destination
 
 
 class Work(abc.ABC):
@@ -54,8 +54,8 @@ class Work(abc.ABC):
         nobody. Asked for when the answer is there. ValueError and OSError are left to `finish` to tell."""
         if not self.new_person:
             return None
-        from ...scene.build import next_folder
-        from ...scene.writing import Destination
+        from ..scene.build import next_folder
+        from ..scene.writing import Destination
 
         return Destination(next_folder(self.new_person))
 

@@ -13,17 +13,17 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.joints import JOINT_NAMES
-from ...motion.pose_library import builtin_poses, current_pose
-from ...motion.poses import grounding
-from ...motion.rotation import from_axis_angle, to_axis_angle
-from ...motion.skeleton import REST_JOINTS, joint_positions
-from ...places import own_folder
-from ...scene.armature import build_armature
-from ...scene.convention import points_to_blender
-from ...scene.files import person_file
-from ...scene.human import MARK, armature_of
-from ...scene.keyframes import keyframe_poses
+from ..formats.joints import JOINT_NAMES
+from ..motion.pose_library import builtin_poses, current_pose
+from ..motion.poses import grounding
+from ..motion.rotation import from_axis_angle, to_axis_angle
+from ..motion.skeleton import REST_JOINTS, joint_positions
+from ..places import own_folder
+from ..scene.armature import build_armature
+from ..scene.convention import points_to_blender
+from ..scene.files import person_file
+from ..scene.human import MARK, armature_of
+from ..scene.keyframes import keyframe_poses
 from .target import Target
 from .thumbnails import SIDE, clay_figure, picture_of_file, show
 from .work import Work

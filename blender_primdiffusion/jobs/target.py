@@ -6,8 +6,8 @@ import dataclasses
 
 import bpy
 
-from ...scene.files import person_file, person_file_name
-from ...scene.human import human_of, humans
+from ..scene.files import person_file, person_file_name
+from ..scene.human import human_of, humans
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,14 +23,14 @@ class Target:
     @classmethod
     def of(cls, person: bpy.types.Collection) -> Target:
         """Raises ValueError for a person that cannot be edited."""
-        from ...scene.human import check_editable
+        from ..scene.human import check_editable
 
         check_editable(person)
         return cls(person.session_uid, person.name, person_file_name(person))
 
     def found(self) -> bpy.types.Collection:
         """The person, if still in a scene and the one it was; else ValueError with a sentence."""
-        from ...scene.human import check_editable
+        from ..scene.human import check_editable
 
         people = [person for scene in bpy.data.scenes for person in humans(scene)]
         person = next((person for person in people if person.session_uid == self.uid), None)

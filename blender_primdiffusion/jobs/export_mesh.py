@@ -9,20 +9,20 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...scene.attachment import attachment_of, set_attachment
-from ...scene.export_model import FrameRange, check_ready, write_model
-from ...scene.human import armature_of
-from ...scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy
-from ...scene.shape import BODY_FILE, betas_of
+from ..scene.attachment import attachment_of, set_attachment
+from ..scene.export_model import FrameRange, check_ready, write_model
+from ..scene.human import armature_of
+from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy
+from ..scene.shape import BODY_FILE, betas_of
 from .target import Target
 from .work import Work
 
 
 def show(person: bpy.types.Collection, what: str) -> None:
     """Switch to `what` of `settings.SHOWN`. Raises ValueError where there is no proxy; makes no undo step."""
-    from ...scene.merged import merged_of
-    from ...scene.proxy import proxy_of
-    from ...scene.surface import carrier_of, primitives_of
+    from ..scene.merged import merged_of
+    from ..scene.proxy import proxy_of
+    from ..scene.surface import carrier_of, primitives_of
 
     proxy = proxy_of(person)
     if proxy is None:
@@ -37,7 +37,7 @@ def show(person: bpy.types.Collection, what: str) -> None:
 
 def shown(person: bpy.types.Collection) -> str:
     """Which of `settings.SHOWN` holds now."""
-    from ...scene.proxy import proxy_of
+    from ..scene.proxy import proxy_of
 
     proxy = proxy_of(person)
     if proxy is None or proxy.hide_viewport:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ...worker.sentence import sentence
+from ..worker.sentence import sentence
 
 if TYPE_CHECKING:
-    from ...worker.job import JobError
+    from ..worker.job import JobError
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
 
@@ -59,7 +59,7 @@ def remedy_for(error: JobError) -> Remedy | None:
 
 def error_in_the_scene(error: Exception) -> JobError:
     """Why a result is not in the scene; an exception may name its kind itself, in an attribute `kind`."""
-    from ...worker.job import JobError
+    from ..worker.job import JobError
 
     kind = getattr(error, "kind", "scene")
     cause = error if isinstance(error, OSError) else error.__cause__
@@ -76,7 +76,7 @@ def defect_in_the_scene(error: Exception) -> JobError:
     """As `error_in_the_scene`, of an exception that is being handled and that nobody foresaw: with its traceback."""
     import traceback
 
-    from ...worker.job import JobError
+    from ..worker.job import JobError
 
     trace = tuple(traceback.format_exc().splitlines())
     return JobError(f"the result could not be put into the scene: {sentence(error)}", "", "scene", trace)
@@ -84,6 +84,6 @@ def defect_in_the_scene(error: Exception) -> JobError:
 
 def refusal_of_the_scene(message: str) -> JobError:
     """Why a result could not even begin to enter the scene."""
-    from ...worker.job import JobError
+    from ..worker.job import JobError
 
     return JobError(message, "", "scene")

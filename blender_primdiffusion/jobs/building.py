@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ...scene.writing import Destination, VolumeWriter, WrittenHuman
+    from ..scene.writing import Destination, VolumeWriter, WrittenHuman
     from .queue import Entry
     from .work import Work
 
@@ -61,7 +61,7 @@ class Building:
         self._entry = entry
         place = _place(entry.work) if "human" in result else None
         if place is not None:
-            from ...scene.writing import VolumeWriter
+            from ..scene.writing import VolumeWriter
 
             self._human = Path(result["human"])
             self._writing = VolumeWriter(self._human, place)
@@ -78,7 +78,7 @@ class Building:
         if written is None or self._read == len(written.files):
             return False  # where it failed, the operator tries again and reports why
         if may_work:
-            from ...scene.grid_cache import free_unused_grids, read_grids, read_headers
+            from ..scene.grid_cache import free_unused_grids, read_grids, read_headers
 
             if self._read == 0:
                 if not self._entry.work.new_person:  # those of before; freed later, the new ones would be read twice

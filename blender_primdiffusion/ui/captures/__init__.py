@@ -1,1 +1,0 @@
-"""Captures rendered by a Blender of their own."""

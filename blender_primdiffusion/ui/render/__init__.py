@@ -1,1 +1,0 @@
-"""Merged volumes and the density gain."""
