@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "blender_primdiffusion"))
 from worker.backend import Backend  # noqa: E402
 from worker.client import BackendClient, Died  # noqa: E402
-from worker.job import Job  # noqa: E402
+from worker.job import Request  # noqa: E402
 
 TICK_S = 0.1
 """Of Blender's timer."""
@@ -49,7 +49,7 @@ class Timer:
     def __init__(self) -> None:
         self.longest_s = 0.0
 
-    def until(self, job: Job, reached: Callable[[], bool]) -> float:
+    def until(self, job: Request, reached: Callable[[], bool]) -> float:
         """Seconds until `reached`; raises TimeoutError."""
         began = time.monotonic()
         while not reached():
@@ -84,7 +84,7 @@ def main() -> None:
     record.tell(figures, arguments.json)
 
 
-def cancel_seconds(timer: Timer, folder: Path, when: Callable[[Job], bool], send: int = 0) -> float:
+def cancel_seconds(timer: Timer, folder: Path, when: Callable[[Request], bool], send: int = 0) -> float:
     """From the cancel of a job for which `when` holds, the signal `send` having reached its child, to its end."""
     backend = Backend(this_python)
     job = generate(backend, folder)
@@ -149,8 +149,8 @@ def heartbeat_interval_s() -> float:
     return max(after - before for before, after in pairwise(times))
 
 
-def generate(backend: Backend, folder: Path) -> Job:
-    return Job(backend, "generate", {"seed": 1, "steps": STEPS, "size": 16, "out_dir": str(folder / "out")})
+def generate(backend: Backend, folder: Path) -> Request:
+    return Request(backend, "generate", {"seed": 1, "steps": STEPS, "size": 16, "out_dir": str(folder / "out")})
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from record import tell
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from blender_primdiffusion.jobs.building import READ_S
+from blender_primdiffusion.jobs.building import SLICE_S
 from blender_primdiffusion.scene.build import build_human, build_written, next_folder
 from blender_primdiffusion.scene.edit import edit_destination, replace_person
 from blender_primdiffusion.scene.grid_cache import free_unused_grids, read_grids
@@ -54,7 +54,7 @@ def prepare(human: Path, place: Destination) -> tuple[WrittenHuman, dict[str, fl
     parts, read = [], 0
     while read < len(written.files):
         began = time.perf_counter()
-        read += read_grids(written.files[read:], READ_S)
+        read += read_grids(written.files[read:], SLICE_S)
         parts.append(1000 * (time.perf_counter() - began))
     return written, figures | {"read_ms": sum(parts), "longest_read_ms": max(parts)}
 

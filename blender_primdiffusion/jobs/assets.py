@@ -24,9 +24,9 @@ from ..scene.convention import points_to_blender
 from ..scene.files import person_file
 from ..scene.human import MARK, armature_of
 from ..scene.keyframes import keyframe_poses
+from .job import Job
 from .target import Target
 from .thumbnails import SIDE, clay_figure, picture_of_file, show
-from .work import Work
 
 POSE_TAG, HUMAN_TAG = "pose", "human"
 
@@ -81,7 +81,7 @@ _ARMS_DOWN = 1.15
 
 
 @dataclasses.dataclass(frozen=True)
-class HumanAssetWork(Work):
+class HumanAssetJob(Job):
     """A person becomes an asset once the picture is there."""
 
     kind = "human_asset"
@@ -108,8 +108,8 @@ class HumanAssetWork(Work):
 
 
 @dataclasses.dataclass(frozen=True)
-class PoseAssetWork(Work):
-    """The pose somebody has when the work begins becomes an action and an asset."""
+class PoseAssetJob(Job):
+    """The pose that the person has when the job is queued becomes an action and an asset."""
 
     kind = "pose_asset"
     method = "render"
@@ -123,7 +123,7 @@ class PoseAssetWork(Work):
     """[3]."""
 
     @classmethod
-    def of(cls, person: bpy.types.Collection, name: str) -> PoseAssetWork:
+    def of(cls, person: bpy.types.Collection, name: str) -> PoseAssetJob:
         """Raises ValueError for somebody without the bones."""
         rotations, translation = current_pose(armature_of(person))
         frozen = tuple(tuple(map(tuple, rows)) for rows in rotations.tolist())

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ..scene.writing import Destination, VolumeWriter, WrittenHuman
+    from .job import Job
     from .queue import Entry
-    from .work import Work
 
 SLICE_S = 0.05
 """Of writing volumes or reading grids between two times that the window is drawn."""
@@ -59,7 +59,7 @@ class Building:
             return
         self.close()
         self._entry = entry
-        place = _place(entry.work) if "human" in result else None
+        place = _place(entry.job) if "human" in result else None
         if place is not None:
             from ..scene.writing import VolumeWriter
 
@@ -81,7 +81,7 @@ class Building:
             from ..scene.grid_cache import free_unused_grids, read_grids, read_headers
 
             if self._read == 0:
-                if not self._entry.work.new_person:  # those of before; freed later, the new ones would be read twice
+                if not self._entry.job.new_person:  # those of before; freed later, the new ones would be read twice
                     free_unused_grids()
                 read_headers(path for path in written.files if path.is_file())
             self._read += read_grids(written.files[self._read :], SLICE_S)
@@ -99,9 +99,9 @@ class Building:
         self._read = self._shown = 0
 
 
-def _place(work: Work) -> Destination | None:
+def _place(job: Job) -> Destination | None:
     try:
-        return work.place()
+        return job.place()
     except (ValueError, OSError):  # the operator tells what has become of the person
         return None
 

@@ -15,9 +15,9 @@ from ..scene.files import person_file
 from ..scene.overlap import overlap_warning_in
 from ..scene.writing import Destination
 from ..worker.sentence import sentence
+from .job import Job, chosen_checkpoint
 from .person import show_in_place
 from .target import Target
-from .work import Work, chosen_checkpoint
 
 _PICTURE_PX = 16
 """The child's pictures of the finished person are of no use here."""
@@ -26,7 +26,7 @@ _STEP_PICTURE_PX = 256
 
 
 @dataclasses.dataclass(frozen=True)
-class EditWork(Work):
+class EditJob(Job):
     """What the edits have in common."""
 
     made: ClassVar[str]
@@ -39,7 +39,7 @@ class EditWork(Work):
     checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
 
     @classmethod
-    def of(cls, person: bpy.types.Collection, steps: int, asked: Mapping[str, Any]) -> EditWork:
+    def of(cls, person: bpy.types.Collection, steps: int, asked: Mapping[str, Any]) -> EditJob:
         """Raises ValueError for a person that cannot be edited, FileNotFoundError for one whose file is missing."""
         person_file(person)
         return cls(Target.of(person), steps, asked)
@@ -74,28 +74,28 @@ class EditWork(Work):
         return " ".join([f"{news}{shape}.", *(sentence(text) for text in warnings if text)])
 
 
-class VaryWork(EditWork):
+class VaryJob(EditJob):
     """Vary."""
 
     kind = method = "vary"
     undo, made = "Vary Human", "Varied"
 
 
-class RedressWork(EditWork):
+class RedressJob(EditJob):
     """Re-dress Region."""
 
     kind = method = "inpaint"
     undo, made = "Re-dress Region", "Re-dressed"
 
 
-class TransferWork(EditWork):
+class TransferJob(EditJob):
     """Transfer Texture."""
 
     kind = method = "transfer"
     undo, made = "Transfer Texture", "Texture transferred"
 
 
-class BlendWork(EditWork):
+class BlendJob(EditJob):
     """Blend."""
 
     kind = method = "interpolate"

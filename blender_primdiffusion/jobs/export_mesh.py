@@ -14,8 +14,8 @@ from ..scene.export_model import FrameRange, check_ready, write_model
 from ..scene.human import armature_of
 from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy
 from ..scene.shape import BODY_FILE, betas_of
+from .job import Job
 from .target import Target
-from .work import Work
 
 
 def show(person: bpy.types.Collection, what: str) -> None:
@@ -46,7 +46,7 @@ def shown(person: bpy.types.Collection) -> str:
 
 
 @dataclasses.dataclass(frozen=True)
-class ProxyWork(Work):
+class ProxyJob(Job):
     """What works that need a proxy have in common."""
 
     target: Target
@@ -75,7 +75,7 @@ class ProxyWork(Work):
 
 
 @dataclasses.dataclass(frozen=True)
-class ExportMeshWork(ProxyWork):
+class ExportMeshJob(ProxyJob):
     """Armature and proxy as a file; nothing of it stays in the scene."""
 
     kind = "export_mesh"
@@ -105,7 +105,7 @@ class ExportMeshWork(ProxyWork):
 
 
 @dataclasses.dataclass(frozen=True)
-class AddProxyWork(ProxyWork):
+class AddProxyJob(ProxyJob):
     """The proxy as an object of the person, in the place of an earlier one."""
 
     kind = "add_proxy"

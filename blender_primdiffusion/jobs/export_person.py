@@ -21,9 +21,9 @@ from ..scene.human_file import HumanMotion, motion_in, read_tensors, reshaped, w
 from ..scene.keyframes import keyframe_poses
 from ..scene.merged import MergedGrid, read_grid, write_grid
 from ..scene.shape import BODY_FILE, betas_of, generated_betas, has_custom_shape, shape_model_of
+from .job import Job
 from .person import build_person
 from .target import Target
-from .work import Work
 
 
 def posed_now(context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
@@ -92,7 +92,7 @@ _PICTURE_PX = 16
 
 
 @dataclasses.dataclass(frozen=True)
-class ExportGaussiansWork(Work):
+class ExportGaussiansJob(Job):
     """A person in a pose as splats."""
 
     kind = "export_gaussians"
@@ -122,7 +122,7 @@ class ExportGaussiansWork(Work):
 
 
 @dataclasses.dataclass(frozen=True)
-class ExportVdbSequenceWork(Work):
+class ExportVdbSequenceJob(Job):
     """A person as one grid for each frame, in the world's place."""
 
     kind = "export_vdb_sequence"
@@ -163,7 +163,7 @@ class ExportVdbSequenceWork(Work):
 
 
 @dataclasses.dataclass(frozen=True)
-class ImportHumanWork(Work):
+class ImportHumanJob(Job):
     """The person of a .human file, with the motion that it may hold."""
 
     kind = "import_human"

@@ -10,11 +10,11 @@ from collections.abc import Iterator
 import bpy
 
 from .building import building
+from .job import Job
 from .memory import release_when_idle
 from .pictures import so_far
 from .queue import GONE, Entry, Outcome, queue
 from .remedies import refusal_of_the_scene
-from .work import Work
 
 _IN_THE_WAY = {"UNDO", "BLOCKING", "GRAB_CURSOR", "GRAB_CURSOR_X", "GRAB_CURSOR_Y"}
 """Options of modal operators that hold on to the scene or the mouse; others (screencasts) may run for ever."""
@@ -35,7 +35,7 @@ def enter() -> None:
     """Hand the answer to the operator that puts it into the scene it was asked for."""
     entry = queue.current
     scene = next((scene for scene in bpy.data.scenes if scene.session_uid == entry.scene_uid), None)
-    if scene is None and entry.work.undo:
+    if scene is None and entry.job.undo:
         queue.refuse(refusal_of_the_scene(GONE.format(entry.scene)))
         return
     try:
@@ -75,7 +75,7 @@ class PRIMDIFFUSION_OT_take_result(bpy.types.Operator):
 
     bl_idname = "primdiffusion.take_result"
     bl_label = "Take Result"
-    bl_options = {"INTERNAL"}  # noqa: RUF012  not UNDO: the step has the work's own name, and none is made on failure
+    bl_options = {"INTERNAL"}  # noqa: RUF012  not UNDO: the step has the job's own name, and none is made on failure
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -85,7 +85,7 @@ class PRIMDIFFUSION_OT_take_result(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Failures are the panel's to show, or of the operator that waits."""
-        undo = queue.current.work.undo
+        undo = queue.current.job.undo
         if undo:
             _leave_edit_mode(context)
         outcome = queue.finish(context)
@@ -109,13 +109,13 @@ _TOLD_S = 1.0
 """Between lines of progress on the console in background mode."""
 
 
-def submit(operator: bpy.types.Operator, context: bpy.types.Context, work: Work) -> set[str]:
-    """Queue `work` for the scene of `context`; with a window a timer follows it, in background mode this waits."""
+def submit(operator: bpy.types.Operator, context: bpy.types.Context, job: Job) -> set[str]:
+    """Queue `job` for the scene of `context`; with a window a timer follows it, in background mode this waits."""
     if not bpy.app.background:
-        queue.add(context, work)
+        queue.add(context, job)
         keep_following()
         return {"FINISHED"}
-    outcome = _wait_for(queue.add(context, work))
+    outcome = _wait_for(queue.add(context, job))
     if outcome.error is not None:
         operator.report({"ERROR"}, outcome.sentence)
         return {"CANCELLED"}
@@ -136,7 +136,7 @@ def follow() -> float | None:
         changed |= _nearer()
     if not queue.ready:
         building.close()
-    changed |= so_far.show(queue.job.picture if queue.job is not None else None)
+    changed |= so_far.show(queue.request.picture if queue.request is not None else None)
     if changed:
         redraw()
     if building.busy and not in_the_way():
@@ -160,7 +160,7 @@ def keep_watching() -> None:
 
 
 def redraw() -> None:
-    """Draw the sidebars of all windows anew: nothing else tells them that the work has moved on.
+    """Draw the sidebars of all windows anew: nothing else tells them that the job has moved on.
 
     Not the views beside them, which take long to draw.
     """
@@ -174,9 +174,9 @@ def redraw() -> None:
 def _wait_for(entry: Entry) -> Outcome:
     printed = 0.0
     while queue.last is None or queue.last.entry is not entry:
-        if queue.tick() and queue.job is not None and time.monotonic() - printed > _TOLD_S:
+        if queue.tick() and queue.request is not None and time.monotonic() - printed > _TOLD_S:
             printed = time.monotonic()
-            print(f"PrimDiffusion: {queue.job.message}", flush=True)
+            print(f"PrimDiffusion: {queue.request.message}", flush=True)
         if queue.ready:
             enter()
         else:
@@ -186,7 +186,7 @@ def _wait_for(entry: Entry) -> Outcome:
 
 def _nearer() -> bool:
     """Bring the answer nearer to the scene, and into it at last; True when something visible changed."""
-    building.begin(queue.current, queue.job.result or {})
+    building.begin(queue.current, queue.request.result or {})
     waits = bool(in_the_way())
     if building.goes_on(may_work=not waits):
         return building.moved()

@@ -9,9 +9,9 @@ from typing import Any
 
 import bpy
 
+from .job import Job, chosen_checkpoint
 from .person import build_person
 from .seeds import random_seed
-from .work import Work, chosen_checkpoint
 
 _PICTURE_PX = 16
 """The child's pictures of the finished person are of no use here."""
@@ -20,7 +20,7 @@ _STEP_PICTURE_PX = 256
 
 
 @dataclasses.dataclass(frozen=True)
-class GenerateWork(Work):
+class GenerateJob(Job):
     """Generate Human."""
 
     kind = method = "generate"

@@ -56,14 +56,14 @@ def release_when_idle(now: float) -> bool:
 def release() -> str:
     """End the children that generate and draw, and free grids that Blender can read again; what that gave back.
 
-    Raises RuntimeError while one of them is at work.
+    Raises RuntimeError while one of them is busy.
     """
     from ..engine import studio
     from ..scene.grid_cache import free_unused_grids
     from ..worker.process_memory import resident_bytes
 
     if queue.busy:
-        raise RuntimeError("the backend is at work: wait for it, or cancel it first")
+        raise RuntimeError("the backend is busy: wait for it, or cancel the job first")
     if bpy.app.is_job_running("RENDER"):
         raise RuntimeError("Blender is rendering: wait for it, or cancel it first")
     pids = [pid for pid in (queue.child_pid, studio.child_pid()) if pid is not None]

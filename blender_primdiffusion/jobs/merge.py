@@ -15,8 +15,8 @@ from ..scene.attachment import set_attachment
 from ..scene.human import armature_of
 from ..scene.material import set_density_gain
 from ..scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
+from .job import Job
 from .target import Target
-from .work import Work
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Moment:
 
 
 @dataclasses.dataclass(frozen=True)
-class MergeWork(Work):
+class MergeJob(Job):
     """A person in one pose as one volume."""
 
     kind = method = "merge"
@@ -77,7 +77,7 @@ class MergeWork(Work):
 
 
 @dataclasses.dataclass
-class MergeFramesWork(Work):
+class MergeFramesJob(Job):
     """A person as one volume, another one for each frame."""
 
     kind = method = "merge_frames"
@@ -133,7 +133,7 @@ class MergeFramesWork(Work):
 
 
 @dataclasses.dataclass(frozen=True)
-class FitGainWork(Work):
+class FitGainJob(Job):
     """The density gain of a person in one pose."""
 
     kind = method = "fit_gain"

@@ -57,7 +57,7 @@ class SoFar:
 
 
 so_far = SoFar()
-"""One work at a time: one picture."""
+"""One job at a time: one picture."""
 
 
 class Icons:

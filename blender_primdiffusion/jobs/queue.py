@@ -1,4 +1,4 @@
-"""Works in line for the child: one at a time, in the order in which they were asked for."""
+"""Jobs queued for the child: one at a time, in order."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..places import new_backend, preference
+from .job import Job
 from .remedies import defect_in_the_scene, error_in_the_scene
-from .work import Work
 
 if TYPE_CHECKING:
     from ..worker.backend import Backend
-    from ..worker.job import Job, JobError
+    from ..worker.job import JobError, Request
 
 CANCELLED = "Cancelled"
 GONE = "The scene {!r} was deleted meanwhile: nothing was added. Undo the deletion and try again."
@@ -29,11 +29,11 @@ _REMEMBERED = 5
 
 @dataclasses.dataclass
 class Entry:
-    """A work in line, and where it was asked for."""
+    """A queued job, and the scene it was queued for."""
 
     number: int
     """Its name for buttons."""
-    work: Work
+    job: Job
     scene: str
     scene_uid: int
     """For as long as the file is open."""
@@ -43,11 +43,11 @@ class Entry:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """How a work has ended."""
+    """How a job has ended."""
 
     entry: Entry
     notice: str = ""
-    """News, when it went well or was cancelled."""
+    """Message, when it succeeded or was cancelled."""
     error: JobError | None = None
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     """"work" from the click to the child's answer, "finish" in the scene."""
@@ -64,18 +64,18 @@ class Outcome:
 
 
 class Queue:
-    """Owns the child and the line. All methods are for Blender's main thread."""
+    """Owns the child and the queued jobs. All methods are for Blender's main thread."""
 
     def __init__(self) -> None:
         self.waiting: collections.deque[Entry] = collections.deque()
         self.current: Entry | None = None
-        """At work, None between works."""
-        self.job: Job | None = None
+        """The running one, None between jobs."""
+        self.request: Request | None = None
         """The request of `current`."""
         self.advancing = False
         """`current` has more to do before its answer may enter the scene."""
         self.outcomes: dict[str, Outcome] = {}
-        """The last of each kind of work, for the panels."""
+        """The last of each kind of job, for the panels."""
         self.last: Outcome | None = None
         self.ended: collections.deque[Outcome] = collections.deque(maxlen=_REMEMBERED)
         """The last of any kind, the latest first."""
@@ -91,43 +91,43 @@ class Queue:
 
     @property
     def busy(self) -> bool:
-        """Something is at work or waits for its turn."""
+        """A job is running or queued."""
         return self.current is not None or bool(self.waiting)
 
     @property
-    def in_line(self) -> list[Entry]:
-        """What is at work, and what waits for its turn."""
+    def queued(self) -> list[Entry]:
+        """The running job and the queued ones."""
         return [*([self.current] if self.current is not None else ()), *self.waiting]
 
     @property
     def ready(self) -> bool:
         """An answer waits to be put into the scene, by `finish`."""
-        return self.job is not None and self.job.state == "done"
+        return self.request is not None and self.request.state == "done"
 
-    def add(self, context: bpy.types.Context, work: Work) -> Entry:
-        """Queue `work` for the scene of `context`."""
+    def add(self, context: bpy.types.Context, job: Job) -> Entry:
+        """Queue `job` for the scene of `context`."""
         scene = context.scene
-        entry = Entry(next(self._numbers), work, scene.name, scene.session_uid, time.monotonic())
+        entry = Entry(next(self._numbers), job, scene.name, scene.session_uid, time.monotonic())
         self.waiting.append(entry)
-        self.outcomes.pop(work.kind, None)
+        self.outcomes.pop(job.kind, None)
         return entry
 
     def tick(self) -> bool:
-        """Take in news of the child, begin the next work; True when something visible changed. Never waits."""
+        """Take in news of the child, begin the next job; True when something visible changed. Never waits."""
         if self.current is None:
             if not self.waiting:
                 return False
             self._begin(self.waiting.popleft())
             return True
-        changed = self.job.tick()
-        if self.job.info:
-            self.info, self.child_news = self.job.info, ""
-        if self.job.state == "cancelled":
+        changed = self.request.tick()
+        if self.request.info:
+            self.info, self.child_news = self.request.info, ""
+        if self.request.state == "cancelled":
             self._end(Outcome(self.current, notice=CANCELLED))
-        elif self.job.state == "failed":
-            self._end(Outcome(self.current, error=self.job.error))
+        elif self.request.state == "failed":
+            self._end(Outcome(self.current, error=self.request.error))
         else:
-            self.advancing = self.current.work.advance(self._folder)
+            self.advancing = self.current.job.advance(self._folder)
         return changed
 
     def finish(self, context: bpy.types.Context) -> Outcome:
@@ -137,7 +137,7 @@ class Queue:
             raise RuntimeError("no answer waits: call tick until ready")
         notice, error = "", None
         try:
-            notice = entry.work.finish(context, self.job.result or {}, self._folder)
+            notice = entry.job.finish(context, self.request.result or {}, self._folder)
         except (ValueError, OSError, RuntimeError) as e:
             error = error_in_the_scene(e)
         except Exception as e:
@@ -147,16 +147,16 @@ class Queue:
         return self._end(Outcome(entry, notice, error, seconds))
 
     def refuse(self, error: JobError) -> Outcome:
-        """End the work at hand without looking at its answer."""
+        """End the running job without looking at its answer."""
         return self._end(Outcome(self.current, error=error))
 
     def cancel(self, number: int = 0) -> bool:
-        """Take a work out of the line, or ask the child to stop; 0: what is at work. Whether there was such a one."""
+        """Remove a queued job, or stop the running one (also number 0); whether there was such a job."""
         if self.current is not None and number in (0, self.current.number):
             if self.ready:  # and waits to enter the scene
                 self._end(Outcome(self.current, notice=CANCELLED))
             else:
-                self.job.cancel()
+                self.request.cancel()
             return True
         left = [entry for entry in self.waiting if entry.number != number]
         found = len(left) < len(self.waiting)
@@ -165,7 +165,7 @@ class Queue:
 
     def listen(self) -> bool:
         """Between works: notice that the child has died or hangs; True when something visible changed. Never waits."""
-        if self._backend is None or self.job is not None:
+        if self._backend is None or self.request is not None:
             return False
         from ..worker.client import Died, Silent
 
@@ -180,9 +180,9 @@ class Queue:
         return False
 
     def release(self) -> int | None:
-        """End the child that is kept warm; its process id, None where there was none or it is at work."""
+        """End the child that is idle; its process id, None where there was none or it is running a job."""
         pid = self.child_pid
-        if pid is None or self.job is not None:
+        if pid is None or self.request is not None:
             return None
         self._backend.release()
         return pid
@@ -190,7 +190,7 @@ class Queue:
     def drop(self) -> None:
         """Drop all jobs and end the child."""
         self.waiting.clear()
-        self.current = self.job = None
+        self.current = self.request = None
         self.child_news = ""
         self._clear_folder()
         if self._backend is not None:
@@ -216,21 +216,21 @@ class Queue:
         return self._backend.log if self._backend is not None else ()
 
     def _begin(self, entry: Entry) -> None:
-        from ..worker.job import Job
+        from ..worker.job import Request
 
         self.current = entry
         try:
-            self._folder = Path(tempfile.mkdtemp(prefix=f"{entry.work.kind}_", dir=bpy.app.tempdir or None))
-            params = entry.work.params(self._folder)
+            self._folder = Path(tempfile.mkdtemp(prefix=f"{entry.job.kind}_", dir=bpy.app.tempdir or None))
+            params = entry.job.params(self._folder)
         except (ValueError, OSError) as error:
             self._end(Outcome(entry, error=error_in_the_scene(error)))
             return
-        self.job = Job(self._backend_for(preference("backend_python")), entry.work.method, params)
+        self.request = Request(self._backend_for(preference("backend_python")), entry.job.method, params)
 
     def _end(self, outcome: Outcome) -> Outcome:
-        self.outcomes[outcome.entry.work.kind] = self.last = outcome
+        self.outcomes[outcome.entry.job.kind] = self.last = outcome
         self.ended.appendleft(outcome)
-        self.current = self.job = None
+        self.current = self.request = None
         self.idle_since = time.monotonic()
         self._clear_folder()
         return outcome
@@ -251,4 +251,4 @@ class Queue:
 
 
 queue = Queue()
-"""Blender has one main thread and one user: one line."""
+"""One for all windows."""

@@ -8,12 +8,12 @@ from typing import Any
 
 import bpy
 
+from .job import Job, chosen_checkpoint
 from .person import build_person
-from .work import Work, chosen_checkpoint
 
 
 @dataclasses.dataclass(frozen=True)
-class ReconstructWork(Work):
+class ReconstructJob(Job):
     """Human from Captures."""
 
     kind = method = "reconstruct"

@@ -14,16 +14,16 @@ from ..scene.human import MARK
 from ..scene.human_npz import read_human
 from ..scene.writing import Destination, write_now
 from .building import building
+from .job import Job, chosen_checkpoint
 from .person import show_in_place
 from .target import Target
-from .work import Work, chosen_checkpoint
 
 _PICTURE_PX = 16
 """The child's pictures of the person are of no use here."""
 
 
 @dataclasses.dataclass(frozen=True)
-class RestoreWork(Work):
+class RestoreJob(Job):
     """Volumes written again from the backend's file of a person: exactly those that were lost."""
 
     kind = "restore_volumes"
@@ -57,7 +57,7 @@ class RestoreWork(Work):
 
 
 @dataclasses.dataclass(frozen=True)
-class RegenerateWork(Work):
+class RegenerateJob(Job):
     """Somebody generated once more from their seed, in the place of one who has lost all files."""
 
     kind = "regenerate"

@@ -11,8 +11,8 @@ from typing import Any
 
 import bpy
 
+from .job import Job, chosen_checkpoint
 from .pictures import icons
-from .work import Work, chosen_checkpoint
 
 NAMES = {"human": "human.npz", "person": "person.human.safetensors", "picture": "picture.png"}
 """Files of a person, by the names that the child's answer has for them."""
@@ -99,7 +99,7 @@ PICTURE_PX = 256
 
 
 @dataclasses.dataclass(frozen=True)
-class VariationsWork(Work):
+class VariationsJob(Job):
     """Show Variations, and More Like This."""
 
     kind = method = "variations"

@@ -29,13 +29,13 @@ class PRIMDIFFUSION_OT_mark_human_as_asset(OnPerson, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """At once with a picture of the caller's."""
-        from ..jobs.assets import HumanAssetWork, mark_human
+        from ..jobs.assets import HumanAssetJob, mark_human
 
         target = Target.of(person)
         if not self.picture:
-            return submit(self, context, HumanAssetWork(target))
+            return submit(self, context, HumanAssetJob(target))
         self.report({"INFO"}, mark_human(person, Path(bpy.path.abspath(self.picture))))
-        bpy.ops.ed.undo_push(message=HumanAssetWork.undo)
+        bpy.ops.ed.undo_push(message=HumanAssetJob.undo)
         return {"FINISHED"}
 
 
@@ -51,13 +51,13 @@ class PRIMDIFFUSION_OT_mark_pose_as_asset(OnPerson, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """At once with a picture of the caller's."""
-        from ..jobs.assets import PoseAssetWork
+        from ..jobs.assets import PoseAssetJob
 
-        work = PoseAssetWork.of(person, self.name.strip() or "Pose")
+        job = PoseAssetJob.of(person, self.name.strip() or "Pose")
         if not self.picture:
-            return submit(self, context, work)
-        self.report({"INFO"}, work.marked(Path(bpy.path.abspath(self.picture))))
-        bpy.ops.ed.undo_push(message=PoseAssetWork.undo)
+            return submit(self, context, job)
+        self.report({"INFO"}, job.marked(Path(bpy.path.abspath(self.picture))))
+        bpy.ops.ed.undo_push(message=PoseAssetJob.undo)
         return {"FINISHED"}
 
 

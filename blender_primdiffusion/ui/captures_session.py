@@ -50,7 +50,7 @@ class CaptureSession:
 
     @property
     def busy(self) -> bool:
-        """A child is at work."""
+        """A child is running."""
         return self._process is not None
 
     def new_folder(self) -> Path:

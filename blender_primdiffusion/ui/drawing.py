@@ -52,12 +52,12 @@ def draw_job(
     button = layout.row()
     button.enabled = ready
     props = button.operator(operator_idname, icon=icon)
-    if queue.current is not None and queue.current.work.kind == kind:
+    if queue.current is not None and queue.current.job.kind == kind:
         if so_far.icon:
             layout.template_icon(icon_value=so_far.icon, scale=_PICTURE_SCALE)
         _draw_progress(layout)
-    if waiting := sum(entry.work.kind == kind for entry in queue.waiting):
-        layout.label(text=f"In Line: {waiting}", icon="SORTTIME", translate=False)
+    if waiting := sum(entry.job.kind == kind for entry in queue.waiting):
+        layout.label(text=f"Queued: {waiting}", icon="SORTTIME", translate=False)
     if (outcome := queue.outcomes.get(kind)) is not None:
         _draw_outcome(layout, outcome)
     return props
@@ -77,23 +77,23 @@ def _wrapped(text: str) -> list[str]:
 
 
 def _draw_progress(layout: bpy.types.UILayout) -> None:
-    """What is at work: how far it is, how long it will take, Cancel."""
+    """The running job: progress, time left, Cancel."""
     row = layout.row(align=True)
     row.progress(
-        factor=building.fraction if queue.ready else queue.job.fraction, text=_progress_text(), translate=False
+        factor=building.fraction if queue.ready else queue.request.fraction, text=_progress_text(), translate=False
     )
     row.operator("primdiffusion.cancel", text="", icon="CANCEL").number = 0
 
 
-def draw_in_line(layout: bpy.types.UILayout) -> None:
-    """What is at work and what waits for its turn, each removable."""
+def draw_queue(layout: bpy.types.UILayout) -> None:
+    """The running job and the queued ones, each with a button to remove it."""
     if not queue.busy:
         return  # an empty column would leave a gap
     column = layout.column(align=True)
-    for entry in queue.in_line:
+    for entry in queue.queued:
         row = column.row(align=True)
         icon = "PLAY" if entry is queue.current else "SORTTIME"
-        row.label(text=entry.work.label, icon=icon, translate=False)
+        row.label(text=entry.job.label, icon=icon, translate=False)
         row.operator("primdiffusion.cancel", text="", icon="X").number = entry.number
 
 
@@ -104,7 +104,7 @@ def draw_ended(layout: bpy.types.UILayout) -> None:
     column = layout.column(align=True)
     for outcome in queue.ended:
         icon = "ERROR" if outcome.error is not None else "CHECKMARK" if outcome.went_well else "CANCEL"
-        column.label(text=outcome.entry.work.label, icon=icon, translate=False)
+        column.label(text=outcome.entry.job.label, icon=icon, translate=False)
 
 
 def _draw_outcome(layout: bpy.types.UILayout, outcome: Outcome) -> None:
@@ -114,7 +114,7 @@ def _draw_outcome(layout: bpy.types.UILayout, outcome: Outcome) -> None:
         return
     draw_lines(layout, outcome.sentence, "ERROR")
     column = layout.column(align=True)  # beside each other their words would be cut
-    _draw_remedy(column, outcome.error, outcome.entry.work.kind)
+    _draw_remedy(column, outcome.error, outcome.entry.job.kind)
     column.operator("primdiffusion.copy_diagnostics", icon="COPYDOWN")
 
 
@@ -130,7 +130,7 @@ def _draw_remedy(layout: bpy.types.UILayout, error: JobError, kind: str) -> None
 
 
 def _progress_text() -> str:
-    job = queue.job
+    job = queue.request
     if queue.ready:
         waits_for = in_the_way()
         return f"Done: waits for {waits_for}" if waits_for else "Putting it into the scene"

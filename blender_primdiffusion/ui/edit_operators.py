@@ -162,7 +162,7 @@ class _Edit(OnPerson):
         return submit(self, context, getattr(edit, self.job).of(person, steps, self.params(context, person)))
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
-        """Of the child's method, with the edit's own ones only (see `EditWork.asked`)."""
+        """Of the child's method, with the edit's own ones only (see `EditJob.asked`)."""
         raise NotImplementedError
 
     def chosen(self, name: str, settings: bpy.types.PropertyGroup) -> Any:
@@ -201,7 +201,7 @@ class PRIMDIFFUSION_OT_vary(_Edit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.vary"
     bl_label = "Vary"
-    job = "VaryWork"
+    job = "VaryJob"
 
     amount: bpy.props.FloatProperty(name="Amount", min=0.0, max=1.0, description=PANELS, options=SKIP)
     attributes: bpy.props.StringProperty(
@@ -224,7 +224,7 @@ class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.redress"
     bl_label = "Re-dress Region"
-    job = "RedressWork"
+    job = "RedressJob"
 
     attributes: bpy.props.StringProperty(name="Attributes", description=f"Like outfit=suit. {PANELS}", options=SKIP)
     guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=PANELS, options=SKIP)
@@ -245,7 +245,7 @@ class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.transfer_texture"
     bl_label = "Transfer Texture"
-    job = "TransferWork"
+    job = "TransferJob"
 
     source: bpy.props.StringProperty(name="Source", description=f"Name of the other person. {PANELS}", options=SKIP)
     what: bpy.props.EnumProperty(name="Transfer", items=TRANSFER_ITEMS, description=PANELS, options=SKIP)
@@ -268,7 +268,7 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.blend"
     bl_label = "Blend"
-    job = "BlendWork"
+    job = "BlendJob"
 
     other: bpy.props.StringProperty(name="Other", description=f"Name of the other person. {PANELS}", options=SKIP)
     fraction: bpy.props.FloatProperty(

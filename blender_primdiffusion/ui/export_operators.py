@@ -162,7 +162,7 @@ class PRIMDIFFUSION_OT_export_mesh(_ToFile, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """A format that is not given follows the file's ending."""
-        from ..jobs.export_mesh import ExportMeshWork, scene_frames
+        from ..jobs.export_mesh import ExportMeshJob, scene_frames
         from ..scene.export_model import check_ready
 
         kind = self.chosen(context, "format")
@@ -173,7 +173,7 @@ class PRIMDIFFUSION_OT_export_mesh(_ToFile, bpy.types.Operator):
         target, frames = Target.of(person), scene_frames(context.scene, self.chosen(context, "animation"))
         check_ready(armature_of(person))
         px, triangles = int(self.chosen(context, "texture_px")), self.chosen(context, "triangles")
-        return submit(self, context, ExportMeshWork(target, px, triangles, path, kind, frames))
+        return submit(self, context, ExportMeshJob(target, px, triangles, path, kind, frames))
 
 
 class PRIMDIFFUSION_OT_add_proxy(_Export, bpy.types.Operator):
@@ -189,13 +189,13 @@ class PRIMDIFFUSION_OT_add_proxy(_Export, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """In line."""
-        from ..jobs.export_mesh import AddProxyWork
+        from ..jobs.export_mesh import AddProxyJob
         from ..scene.export_model import check_ready
 
         target = Target.of(person)
         check_ready(armature_of(person))
         px, triangles = int(self.chosen(context, "texture_px")), self.chosen(context, "triangles")
-        return submit(self, context, AddProxyWork(target, px, triangles))
+        return submit(self, context, AddProxyJob(target, px, triangles))
 
 
 class PRIMDIFFUSION_OT_show_proxy(_Export, bpy.types.Operator):
@@ -248,13 +248,11 @@ class PRIMDIFFUSION_OT_export_gaussians(_ToFile, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """In line, in the pose of now."""
-        from ..jobs.export_person import ExportGaussiansWork, posed_now
+        from ..jobs.export_person import ExportGaussiansJob, posed_now
 
         path = destination(self.filepath, self.endings(context))
-        work = ExportGaussiansWork(
-            Target.of(person), path, posed_now(context, person), self.chosen(context, "gaussians")
-        )
-        return submit(self, context, work)
+        job = ExportGaussiansJob(Target.of(person), path, posed_now(context, person), self.chosen(context, "gaussians"))
+        return submit(self, context, job)
 
 
 class PRIMDIFFUSION_OT_export_vdb_sequence(_Export, bpy.types.Operator):
@@ -276,7 +274,7 @@ class PRIMDIFFUSION_OT_export_vdb_sequence(_Export, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """In line, with the poses of now."""
-        from ..jobs.export_person import ExportVdbSequenceWork, posed_frames
+        from ..jobs.export_person import ExportVdbSequenceJob, posed_frames
 
         if not self.directory:
             raise ValueError("name a folder to export to")
@@ -289,8 +287,8 @@ class PRIMDIFFUSION_OT_export_vdb_sequence(_Export, bpy.types.Operator):
             raise ValueError(f"the last frame {last} is before the first, {first}: exchange them")
         target, stem = Target.of(person), bpy.path.clean_name(person.name)
         people = posed_frames(context, person, range(first, last + 1))
-        work = ExportVdbSequenceWork(target, folder, stem, people, first, self.chosen(context, "voxel"))
-        return submit(self, context, work)
+        job = ExportVdbSequenceJob(target, folder, stem, people, first, self.chosen(context, "voxel"))
+        return submit(self, context, job)
 
 
 class PRIMDIFFUSION_OT_export_human(_ToFile, bpy.types.Operator):
@@ -345,7 +343,7 @@ class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Look into the file, then put it in line; in background mode this waits for the person."""
-        from ..jobs.export_person import ImportHumanWork
+        from ..jobs.export_person import ImportHumanJob
         from ..scene.human_file import motion_in, read_tensors
 
         path = Path(bpy.path.abspath(self.filepath))
@@ -357,7 +355,7 @@ class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         at = tuple(self.location) if self.properties.is_property_set("location") else None
-        return submit(self, context, ImportHumanWork(str(path), at))
+        return submit(self, context, ImportHumanJob(str(path), at))
 
 
 CLASSES = (

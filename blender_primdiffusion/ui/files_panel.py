@@ -54,10 +54,10 @@ class _Find:
 
     def _restore(self, context: bpy.types.Context, directory: Path | None) -> tuple[int, list[str]]:
         """Works put in line for people whose files are nowhere, and sentences on those who cannot be helped."""
-        from ..jobs.restore import RestoreWork
+        from ..jobs.restore import RestoreJob
         from ..scene.missing import find_person, missing_files
 
-        works, left = [], []
+        jobs, left = [], []
         for one in missing_files():
             source = find_person(one, directory)
             if one.linked:
@@ -73,10 +73,10 @@ class _Find:
                 left.append(f"{one.summary()} cannot be found: press Merge again")
             else:
                 try:
-                    works.append(RestoreWork(Target.of(one.person), str(source)))
+                    jobs.append(RestoreJob(Target.of(one.person), str(source)))
                 except ValueError as error:
                     left.append(str(error))
-        done = [work for work in works if submit(self, context, work) == {"FINISHED"}]
+        done = [job for job in jobs if submit(self, context, job) == {"FINISHED"}]
         return len(done), left
 
 
@@ -109,13 +109,13 @@ class PRIMDIFFUSION_OT_generate_again(OnPerson, bpy.types.Operator):
     bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO (the result has one)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..jobs.restore import RegenerateWork, made_from_seed
+        from ..jobs.restore import RegenerateJob, made_from_seed
         from ..scene.files import person_file
 
         try:
             there = person_file(person)
         except FileNotFoundError:
-            return submit(self, context, RegenerateWork(Target.of(person), made_from_seed(person)))
+            return submit(self, context, RegenerateJob(Target.of(person), made_from_seed(person)))
         raise ValueError(f"the file of {person.name!r} is there, {there.name!r}: press Find Missing Volumes")
 
 

@@ -88,13 +88,13 @@ class PRIMDIFFUSION_OT_generate(Asking, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Put them in line; in background mode this waits for all."""
-        from ..jobs.generate import GenerateWork
+        from ..jobs.generate import GenerateJob
 
         settings = context.scene.primdiffusion
         from_panel = self.seed < 0
         # a script that names the seed means this one person, whatever the panel's number is
         count = self.count or (settings.count if from_panel else 1)
-        if from_panel and not settings.keep_seed and settings.seed in _seeds_in_line():
+        if from_panel and not settings.keep_seed and settings.seed in _queued_seeds():
             settings.seed = random_seed()
         seed = settings.seed if from_panel else self.seed
         try:
@@ -105,7 +105,7 @@ class PRIMDIFFUSION_OT_generate(Asking, bpy.types.Operator):
             return {"CANCELLED"}
         for each in range(seed, last + 1):
             renews = from_panel and not settings.keep_seed and each == last
-            if submit(self, context, GenerateWork(each, **sampling, renews_seed=renews)) == {"CANCELLED"}:
+            if submit(self, context, GenerateJob(each, **sampling, renews_seed=renews)) == {"CANCELLED"}:
                 return {"CANCELLED"}
         return {"FINISHED"}
 
@@ -123,9 +123,9 @@ class PRIMDIFFUSION_OT_random_seed(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def _seeds_in_line() -> set[int]:
+def _queued_seeds() -> set[int]:
     """Of people who are asked for already: a second press of the button means somebody else."""
-    return {entry.work.seed for entry in queue.in_line if entry.work.kind == "generate"}
+    return {entry.job.seed for entry in queue.queued if entry.job.kind == "generate"}
 
 
 class PRIMDIFFUSION_PT_generate(SidebarPanel, bpy.types.Panel):

@@ -121,7 +121,7 @@ class Asking:
         return self.properties.is_property_set(name)
 
     def sampling(self, settings: bpy.types.PropertyGroup) -> dict[str, Any]:
-        """Fields steps, sampler and asked of a work. Raises ValueError for attributes that are no name=value."""
+        """Fields steps, sampler and asked of a job. Raises ValueError for attributes that are not name=value."""
         wanted = parsed(self.attributes) if self.given("attributes") else asked(settings.attributes)
         guidance = self.guidance if self.given("guidance") else settings.guidance
         return {

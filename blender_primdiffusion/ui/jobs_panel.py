@@ -17,7 +17,7 @@ from ..jobs.memory import device_line
 from ..jobs.pictures import so_far
 from ..jobs.queue import queue
 from ..places import EXTENSION, backend_module_path, preference
-from .drawing import SidebarPanel, draw_ended, draw_in_line, draw_lines
+from .drawing import SidebarPanel, draw_ended, draw_lines, draw_queue
 
 TEXT = "PrimDiffusion Diagnostics"
 _LOG_LINES = 60
@@ -25,7 +25,7 @@ _PATHS = ("backend_python", "checkpoint", "encoder")
 
 
 def diagnostics() -> str:
-    """Versions, device, memory, the last work, its error and the end of the child's log; redacted."""
+    """Versions, device, memory, the last job, its error and the end of the child's log; redacted."""
     from ..worker.redact import redact
 
     return redact("\n".join(_lines()), _names())
@@ -42,12 +42,12 @@ def _lines() -> Iterator[str]:
     yield "Set in the preferences: " + (", ".join(filter(preference, _PATHS)) or "nothing")
     yield f"Device {device_line()}"
     yield f"Memory {info.get('memory_gb', '?')} GB, {info.get('memory_free_gb', '?')} GB free at the backend's start"
-    yield f"Running: {queue.child_pid is not None}; queued: {len(queue.waiting)}"
+    yield f"Child running: {queue.child_pid is not None}; queued: {len(queue.waiting)}"
     if queue.current is not None:
-        yield f"At work: {queue.current.work.label}: {queue.job.state}, {queue.job.message}"
+        yield f"Running: {queue.current.job.label}: {queue.request.state}, {queue.request.message}"
     if (outcome := queue.last) is not None:
         spent = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in outcome.seconds.items())
-        yield f"Last work: {outcome.entry.work.label} ({outcome.entry.work.method}) {spent}"
+        yield f"Last job: {outcome.entry.job.label} ({outcome.entry.job.method}) {spent}"
         yield f"Ended: {outcome.notice or 'with an error'}"
         if outcome.error is not None:
             yield f"Error ({outcome.error.kind}): {outcome.sentence}"
@@ -108,26 +108,26 @@ _SKIP = {"SKIP_SAVE"}
 
 
 class PRIMDIFFUSION_OT_cancel(bpy.types.Operator):
-    """Stop this work, or take it out of the line; nothing is added to the scene"""
+    """Stop this job, or remove it from the queue; nothing is added to the scene"""
 
     bl_idname = "primdiffusion.cancel"
     bl_label = "Cancel"
     bl_options: set[str] = set()  # noqa: RUF012
 
     number: bpy.props.IntProperty(
-        name="Number", description="Of the work in line; 0 is the one under way", min=0, options=_SKIP
+        name="Number", description="Number of the queued job; 0 is the running one", min=0, options=_SKIP
     )
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        """Only while something is in line."""
-        cls.poll_message_set("Nothing is in line")
+        """Only while a job is running or queued."""
+        cls.poll_message_set("No job is queued")
         return queue.busy
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
         """Ask; the timer sees it through."""
         if not queue.cancel(self.number):
-            which = f"work {self.number} is not in line any more" if self.number else "nothing is under way yet"
+            which = f"job {self.number} is no longer queued" if self.number else "no job is running yet"
             self.report({"ERROR"}, which)
             return {"CANCELLED"}
         redraw()
@@ -135,30 +135,30 @@ class PRIMDIFFUSION_OT_cancel(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_try_again(bpy.types.Operator):
-    """Ask for the same once more"""
+    """Queue the failed job again"""
 
     bl_idname = "primdiffusion.try_again"
     bl_label = "Try Again"
     bl_options: set[str] = set()  # noqa: RUF012
 
     kind: bpy.props.StringProperty(
-        name="Kind", description="Of work, like generate; empty: the last one that ended", options=_SKIP
+        name="Kind", description="Kind of job, such as generate; empty: the last one that ended", options=_SKIP
     )
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
         """Only after something has failed."""
-        cls.poll_message_set("Nothing has failed")
+        cls.poll_message_set("No job has failed")
         return any(outcome.error is not None for outcome in queue.outcomes.values())
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Put the failed work in line again, for the scene at hand."""
+        """Queue the failed job again, for the current scene."""
         outcome = queue.outcomes.get(self.kind) if self.kind else queue.last
         if outcome is None or outcome.error is None:
-            why = f"no work {self.kind!r} has failed" if self.kind else "the last work went well"
+            why = f"no job {self.kind!r} has failed" if self.kind else "the last job did not fail"
             self.report({"ERROR"}, why)
             return {"CANCELLED"}
-        return submit(self, context, outcome.entry.work)
+        return submit(self, context, outcome.entry.job)
 
 
 class PRIMDIFFUSION_OT_release_memory(bpy.types.Operator):
@@ -194,7 +194,7 @@ class PRIMDIFFUSION_PT_jobs(SidebarPanel, bpy.types.Panel):
     def draw(self, _context: bpy.types.Context) -> None:
         """Reads what is in line; starts nothing."""
         layout = self.layout
-        draw_in_line(layout)
+        draw_queue(layout)
         draw_ended(layout)
         draw_lines(layout, f"Device: {device_line()}", "MEMORY")
         column = layout.column(align=True)

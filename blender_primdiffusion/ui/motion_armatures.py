@@ -57,7 +57,7 @@ class OnArmature:
         return bool(humans(context.scene)) or (active is not None and active.type == "ARMATURE")
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Find the armature, do the work, or say in a sentence why not."""
+        """Find the armature and run; errors become reports."""
         try:
             return self.on(context, target_armature(context, self.person))
         except (ValueError, OSError) as error:
@@ -65,7 +65,7 @@ class OnArmature:
             return {"CANCELLED"}
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        """The work."""
+        """The operator's own part."""
         raise NotImplementedError
 
 

@@ -86,7 +86,7 @@ class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Put it in line; in background mode this waits for the person."""
-        from ..jobs.reconstruct import ReconstructWork
+        from ..jobs.reconstruct import ReconstructJob
 
         asked = context.scene.primdiffusion_reconstruct
         folder = bpy.path.abspath(self.directory or asked.capture)
@@ -95,7 +95,7 @@ class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
             self.report({"ERROR"}, "choose the folder of captures first")
             return {"CANCELLED"}
         frame, views = self.frame if self.frame >= 0 else asked.frame, self.views or asked.views
-        return submit(self, context, ReconstructWork(folder, subject, frame, views))
+        return submit(self, context, ReconstructJob(folder, subject, frame, views))
 
 
 class PRIMDIFFUSION_PT_human_from_captures(SidebarPanel, bpy.types.Panel):

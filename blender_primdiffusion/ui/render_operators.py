@@ -71,10 +71,10 @@ class PRIMDIFFUSION_OT_merge(_Merging, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """Put it in line; in background mode this waits for the merged volume."""
-        from ..jobs.merge import MergeWork
+        from ..jobs.merge import MergeJob
 
         moment = _moment(person, context.evaluated_depsgraph_get())
-        return submit(self, context, MergeWork(Target.of(person), moment, self.chosen_voxel(context)))
+        return submit(self, context, MergeJob(Target.of(person), moment, self.chosen_voxel(context)))
 
 
 class PRIMDIFFUSION_OT_merge_frames(_Merging, bpy.types.Operator):
@@ -88,7 +88,7 @@ class PRIMDIFFUSION_OT_merge_frames(_Merging, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """Put it in line; in background mode this waits for the merged volumes."""
-        from ..jobs.merge import MergeFramesWork
+        from ..jobs.merge import MergeFramesJob
 
         given = self.properties.is_property_set
         start, end = (getattr(self if given(name) else context.scene, name) for name in ("frame_start", "frame_end"))
@@ -97,7 +97,7 @@ class PRIMDIFFUSION_OT_merge_frames(_Merging, bpy.types.Operator):
                 f"frames {start} to {end} are no sequence: give a start and a later end, of at most {_MOST_FRAMES}"
             )
         moments = _moments(context, person, range(start, end + 1))
-        return submit(self, context, MergeFramesWork(Target.of(person), moments, start, self.chosen_voxel(context)))
+        return submit(self, context, MergeFramesJob(Target.of(person), moments, start, self.chosen_voxel(context)))
 
 
 class PRIMDIFFUSION_OT_unmerge(OnPerson, bpy.types.Operator):
@@ -128,10 +128,10 @@ class PRIMDIFFUSION_OT_fit_density_gain(OnPerson, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """Put it in line; in background mode this waits for the gain."""
-        from ..jobs.merge import FitGainWork
+        from ..jobs.merge import FitGainJob
 
         graph = context.evaluated_depsgraph_get()
-        return submit(self, context, FitGainWork(Target.of(person), _moment(person, graph)))
+        return submit(self, context, FitGainJob(Target.of(person), _moment(person, graph)))
 
 
 def _moment(person: bpy.types.Collection, graph: bpy.types.Depsgraph) -> Moment:

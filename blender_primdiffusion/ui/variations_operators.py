@@ -264,9 +264,9 @@ def _poll_sheet(cls: type[bpy.types.Operator]) -> bool:
 def _submit(
     operator: bpy.types.Operator, context: bpy.types.Context, seeds: tuple[int, ...], fields: dict[str, Any]
 ) -> set[str]:
-    from ..jobs.variations import VariationsWork
+    from ..jobs.variations import VariationsJob
 
-    return submit(operator, context, VariationsWork(seeds, **fields))
+    return submit(operator, context, VariationsJob(seeds, **fields))
 
 
 def _targets(index: int) -> list[Variation]:

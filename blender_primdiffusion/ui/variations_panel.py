@@ -16,7 +16,7 @@ from .drawing import SidebarPanel, draw_job, property_columns
 from .manual import draw_manual_button
 
 if TYPE_CHECKING:
-    from ..jobs.variations import VariationsWork
+    from ..jobs.variations import VariationsJob
 
 CELL_PX = 110
 """Width of a picture at which a sidebar of ordinary width holds two or three."""
@@ -46,9 +46,9 @@ class PRIMDIFFUSION_PT_variations(SidebarPanel, bpy.types.Panel):
         column.prop(settings, "seeds")
         column.prop(settings, "quality")
         draw_job(layout, "variations", "primdiffusion.variations", "LIGHTPROBE_VOLUME")
-        work = queue.current.work if queue.current is not None else None
-        if work is not None and work.kind == "variations":
-            _draw_coming(layout, _columns(context), work)
+        job = queue.current.job if queue.current is not None else None
+        if job is not None and job.kind == "variations":
+            _draw_coming(layout, _columns(context), job)
         elif sheet.variations:
             _draw_sheet(layout, _columns(context))
             _draw_choice(layout, settings)
@@ -66,12 +66,12 @@ def _grid(layout: bpy.types.UILayout, columns: int) -> bpy.types.UILayout:
     return layout.grid_flow(row_major=True, columns=columns, even_columns=True, even_rows=True, align=False)
 
 
-def _draw_coming(layout: bpy.types.UILayout, columns: tuple[int, float], work: VariationsWork) -> None:
+def _draw_coming(layout: bpy.types.UILayout, columns: tuple[int, float], job: VariationsJob) -> None:
     """Those who are being made, as far as they are."""
     grid = _grid(layout, columns[0])
-    for index, seed in enumerate(work.seeds):
+    for index, seed in enumerate(job.seeds):
         cell = grid.column(align=True)
-        _draw_picture(cell, queue.job.pictures.get(index), columns[1])
+        _draw_picture(cell, queue.request.pictures.get(index), columns[1])
         cell.label(text=str(seed))
 
 

@@ -49,7 +49,7 @@ class JobError:
         return " ".join(sentence(part) for part in (self.message, self.remedy) if part)
 
 
-class Job:
+class Request:
     """Asks the child for one thing. Call `tick` from a timer until `finished`; then read `result` or `error`.
 
     starting -> running -> done | failed;  cancel: -> cancelling -> cancelled.

@@ -104,7 +104,7 @@ def variations(module: str, python: str) -> Steps:
     yield "variations_empty"
     press("primdiffusion.variations")
     queue = queue_of(module)
-    yield from wait(lambda: queue.job is not None and bool(queue.job.pictures), 120)
+    yield from wait(lambda: queue.request is not None and bool(queue.request.pictures), 120)
     yield 0.5
     yield "variations_denoising"
     yield from wait(lambda: not queue.busy, 120)
@@ -265,7 +265,7 @@ def cancelled(module: str, python: str) -> Steps:
     queue = queue_of(module)
     for seed in (FIRST_SEED, SECOND_SEED, FIRST_SEED):
         press("primdiffusion.generate", seed=seed)
-        yield from wait(lambda: queue.job is not None and queue.job.step > 1, 120)
+        yield from wait(lambda: queue.request is not None and queue.request.step > 1, 120)
         asked = time.monotonic()
         press("primdiffusion.cancel")
         yield from wait(lambda: not queue.busy, 10)

@@ -21,7 +21,7 @@ def drive(seconds: float = 60.0) -> None:
 def until_running(seconds: float = 60.0) -> None:
     """Until the child has told of progress."""
     end = time.monotonic() + seconds
-    while queue.job is None or queue.job.state != "running":
+    while queue.request is None or queue.request.state != "running":
         assert time.monotonic() < end
         queue.tick()
         time.sleep(0.01)

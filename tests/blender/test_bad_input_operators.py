@@ -19,10 +19,10 @@ import synthetic_shape
 from jobs_driven import drive
 from test_missing_volumes import write_person
 
-from blender_primdiffusion.jobs.edit import VaryWork
-from blender_primdiffusion.jobs.generate import GenerateWork
+from blender_primdiffusion.jobs.edit import VaryJob
+from blender_primdiffusion.jobs.generate import GenerateJob
+from blender_primdiffusion.jobs.job import Job
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.jobs.work import Work
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of, body_of, humans
 
@@ -252,7 +252,7 @@ def _asked(monkeypatch, folder: Path) -> None:
     def wait_for(entry):
         queue.waiting.remove(entry)
         try:
-            entry.work.params(folder)
+            entry.job.params(folder)
         except (ValueError, OSError) as error:
             return Outcome(entry, error=error_in_the_scene(error))
         return Outcome(entry, "done")
@@ -282,12 +282,12 @@ def test_every_operator_works_or_says_what_is_wrong(anna, situation, monkeypatch
     assert not faults, "\n".join(faults)
 
 
-def _generated(_person) -> Work:
-    return GenerateWork(11, 1)
+def _generated(_person) -> Job:
+    return GenerateJob(11, 1)
 
 
-def _varied(person) -> Work:
-    return VaryWork.of(person, 1, {"amount": 0.5, "seed": 3})
+def _varied(person) -> Job:
+    return VaryJob.of(person, 1, {"amount": 0.5, "seed": 3})
 
 
 @pytest.mark.parametrize("ask", [_generated, _varied], ids=["generated", "varied"])

@@ -14,7 +14,7 @@ import blender_primdiffusion
 from blender_primdiffusion.jobs import follow as follow_module
 from blender_primdiffusion.jobs.building import building
 from blender_primdiffusion.jobs.follow import follow
-from blender_primdiffusion.jobs.generate import GenerateWork
+from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.files import folder_of, person_file, volume_path
@@ -33,7 +33,7 @@ def on_their_way(addon, tmp_path, monkeypatch):
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared.npz", COUNT)))
     monkeypatch.setattr("blender_primdiffusion.jobs.building.SLICE_S", 0.0)
     bpy.ops.ed.undo_push(message="before")
-    queue.add(addon, GenerateWork(7, 1))
+    queue.add(addon, GenerateJob(7, 1))
     until(lambda: 0.6 < building.fraction < 1.0)
     return addon
 
@@ -63,7 +63,7 @@ def test_no_tick_writes_more_than_its_slice(addon, monkeypatch):
     monkeypatch.setattr("blender_primdiffusion.jobs.building.SLICE_S", 0.0)
     written, write_file, ticks = [], volumes._write_file, [0]
     monkeypatch.setattr(volumes, "_write_file", lambda *args: written.append(ticks[0]) or write_file(*args))
-    queue.add(addon, GenerateWork(7, 1))
+    queue.add(addon, GenerateJob(7, 1))
     while follow() is not None:
         ticks[0] += 1
     assert len(written) == len(set(written)) == 8
@@ -72,7 +72,7 @@ def test_no_tick_writes_more_than_its_slice(addon, monkeypatch):
 
 def test_the_bar_goes_on_while_volumes_are_written_and_read(addon, monkeypatch):
     monkeypatch.setattr("blender_primdiffusion.jobs.building.SLICE_S", 0.0)
-    queue.add(addon, GenerateWork(7, 1))
+    queue.add(addon, GenerateJob(7, 1))
     seen = []
     while follow() is not None:
         if queue.ready:
@@ -134,7 +134,7 @@ def test_files_removed_meanwhile_are_written_again(on_their_way):
 
 
 def test_a_script_that_does_not_wait_for_the_volumes_gets_the_whole_person(addon):
-    queue.add(addon, GenerateWork(7, 1))
+    queue.add(addon, GenerateJob(7, 1))
     until(lambda: queue.ready)
     bpy.ops.primdiffusion.take_result()
     assert follow() is None
@@ -185,7 +185,7 @@ def test_grids_are_not_read_while_the_user_holds_something(on_their_way, monkeyp
 
 
 def test_a_damaged_answer_is_told_and_leaves_no_files(addon, tmp_path):
-    queue.add(addon, GenerateWork(GIVES_GARBAGE, 1))
+    queue.add(addon, GenerateJob(GIVES_GARBAGE, 1))
     drive()
     assert "is damaged" in error_of("generate")
     assert not (tmp_path / "shot_humans").exists()
@@ -193,7 +193,7 @@ def test_a_damaged_answer_is_told_and_leaves_no_files(addon, tmp_path):
 
 def test_a_folder_that_cannot_be_written_is_told(addon, tmp_path):
     (tmp_path / "shot_humans").write_text("in the way")
-    queue.add(addon, GenerateWork(7, 1))
+    queue.add(addon, GenerateJob(7, 1))
     drive()
     assert "could not be written" in error_of("generate")
     assert not bpy.data.volumes
@@ -201,7 +201,7 @@ def test_a_folder_that_cannot_be_written_is_told(addon, tmp_path):
 
 def test_people_in_line_do_not_get_in_each_others_way(addon):
     for seed in (11, 12, 13):
-        queue.add(addon, GenerateWork(seed, 1))
+        queue.add(addon, GenerateJob(seed, 1))
     drive()
     people = humans(bpy.context.scene)
     assert len({folder_of(person) for person in people}) == 3

@@ -14,10 +14,10 @@ from jobs_driven import drive, error_of, notice_of
 
 import blender_primdiffusion
 from blender_primdiffusion.jobs.building import building
-from blender_primdiffusion.jobs.edit import RedressWork, VaryWork
+from blender_primdiffusion.jobs.edit import RedressJob, VaryJob
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.jobs.restore import RegenerateWork, RestoreWork, made_from_seed
+from blender_primdiffusion.jobs.restore import RegenerateJob, RestoreJob, made_from_seed
 from blender_primdiffusion.jobs.target import Target
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.files import folder_of, person_file, volume_path
@@ -51,7 +51,7 @@ def varied(person, monkeypatch):
 
 
 def vary(person, seed: int = FINE) -> None:
-    queue.add(bpy.context, VaryWork.of(person, 2, {"amount": 0.5, "seed": seed}))
+    queue.add(bpy.context, VaryJob.of(person, 2, {"amount": 0.5, "seed": seed}))
 
 
 def until_read(seconds: float = 30.0) -> None:
@@ -101,7 +101,7 @@ def test_an_edit_writes_its_volumes_in_slices(person, monkeypatch):
 def test_only_what_the_edit_changes_is_written_and_read(person, monkeypatch):
     monkeypatch.setattr(MEANWHILE, 0.0)
     before = set(shown(person).values())
-    queue.add(bpy.context, RedressWork.of(person, 2, {"region": ["top"], "seed": FINE}))
+    queue.add(bpy.context, RedressJob.of(person, 2, {"region": ["top"], "seed": FINE}))
     until_read()
     assert len(building._writing.result.files) == OF_THE_REGION
     drive()
@@ -318,7 +318,7 @@ def lost(person, monkeypatch):
     (person,) = humans(bpy.context.scene)
     bpy.context.view_layer.update()
     assert not all(thing.data.grids.load() for thing in person.all_objects if thing.type == "VOLUME")  # seen by Blender
-    queue.add(bpy.context, RestoreWork(Target.of(person), str(person_file(person))))
+    queue.add(bpy.context, RestoreJob(Target.of(person), str(person_file(person))))
     until_read()
     return person
 
@@ -356,7 +356,7 @@ def test_a_person_generated_again_is_written_in_the_thread(person, monkeypatch):
     (person,) = humans(bpy.context.scene)
     bpy.context.view_layer.update()
     assert not any(thing.data.grids.load() for thing in person.all_objects if thing.type == "VOLUME")
-    queue.add(bpy.context, RegenerateWork(Target.of(person), made))
+    queue.add(bpy.context, RegenerateJob(Target.of(person), made))
     until_read()
     drive()
     assert error_of("regenerate") == ""

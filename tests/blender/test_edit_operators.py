@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
-from blender_primdiffusion.jobs.edit import VaryWork
+from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.files import person_file
@@ -47,7 +47,7 @@ def sent(person) -> dict:
 
 
 def start(person, seed: int = FINE, **params) -> None:
-    queue.add(bpy.context, VaryWork.of(person, 2, {"amount": 0.5, "seed": seed, **params}))
+    queue.add(bpy.context, VaryJob.of(person, 2, {"amount": 0.5, "seed": seed, **params}))
 
 
 def texts(panel, context) -> str:

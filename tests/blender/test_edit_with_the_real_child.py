@@ -13,7 +13,7 @@ from backend_python import found
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 
 import blender_primdiffusion
-from blender_primdiffusion.jobs import work
+from blender_primdiffusion.jobs import job
 from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.scene.human import MARK, armature_of, body_of, humans
 from blender_primdiffusion.worker.client import BackendClient
@@ -31,7 +31,7 @@ def people(saved_scene, tmp_path, monkeypatch):
     checkpoint = save_tiny_checkpoint(tmp_path / "tiny.safetensors")
     python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
     monkeypatch.setattr("blender_primdiffusion.worker.environment.search", found(python))
-    monkeypatch.setattr(work, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
+    monkeypatch.setattr(job, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
     # With a cache in Blender's temporary folder the child would compile its marcher anew for each test.
     monkeypatch.setattr(
         "blender_primdiffusion.worker.client.BackendClient",

@@ -15,7 +15,7 @@ from jobs_driven import drive, error_of, notice_of, shown, until_running
 import blender_primdiffusion
 from blender_primdiffusion.jobs import queue as queue_module
 from blender_primdiffusion.jobs.follow import follow
-from blender_primdiffusion.jobs.generate import GenerateWork
+from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.files import folder_of
 from blender_primdiffusion.scene.human import humans
@@ -27,7 +27,7 @@ FAKE = Path(__file__).parent / "fake_backend"
 
 
 def ask(context, seed: int, steps: int) -> None:
-    queue.add(context, GenerateWork(seed, steps))
+    queue.add(context, GenerateJob(seed, steps))
 
 
 def panel_texts(context) -> list[str]:

@@ -34,7 +34,7 @@ def panel_settings(addon):
 def in_line(monkeypatch):
     """Works as with a window: submit returns at once, and `drive` is the timer."""
     monkeypatch.setattr(
-        generate_panel, "submit", lambda _operator, context, work: queue.add(context, work) and {"FINISHED"}
+        generate_panel, "submit", lambda _operator, context, job: queue.add(context, job) and {"FINISHED"}
     )
 
 
@@ -85,7 +85,7 @@ def test_pressing_twice_asks_for_two_different_people(addon, panel_settings, in_
 def test_a_count_is_as_many_works_in_line_of_seeds_that_follow_on_each_other(addon, panel_settings, in_line):
     panel_settings.count = 3
     bpy.ops.primdiffusion.generate(steps=1)
-    assert [entry.work.label for entry in queue.waiting] == [f"Human, seed {seed}" for seed in (7, 8, 9)]
+    assert [entry.job.label for entry in queue.waiting] == [f"Human, seed {seed}" for seed in (7, 8, 9)]
     drive()
     assert seeds(addon) == [7, 8, 9]
     assert panel_settings.seed not in (7, 8, 9)

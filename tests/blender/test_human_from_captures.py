@@ -14,7 +14,7 @@ from backend_python import found
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 import blender_primdiffusion
-from blender_primdiffusion.jobs import reconstruct, work
+from blender_primdiffusion.jobs import job, reconstruct
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.files import folder_of
 from blender_primdiffusion.scene.human import humans
@@ -119,7 +119,7 @@ def test_a_warning_of_the_backend_is_shown(addon, captures):
 
 def test_the_panel_shows_progress_and_cancel_ends_the_job_without_a_person(addon, captures):
     assert "primdiffusion.human_from_captures" in shown(PRIMDIFFUSION_PT_human_from_captures, addon)
-    queue.add(addon, reconstruct.ReconstructWork(str(order(captures, "take long")), "", 0, 8))
+    queue.add(addon, reconstruct.ReconstructJob(str(order(captures, "take long")), "", 0, 8))
     until_running()
     texts = shown(PRIMDIFFUSION_PT_human_from_captures, addon)
     assert texts == ["primdiffusion.human_from_captures", "Reconstructing", "primdiffusion.cancel"]
@@ -130,7 +130,7 @@ def test_the_panel_shows_progress_and_cancel_ends_the_job_without_a_person(addon
 
 
 def test_the_timer_builds_the_person(addon, captures):
-    queue.add(addon, reconstruct.ReconstructWork(str(captures), "", 0, 8))
+    queue.add(addon, reconstruct.ReconstructJob(str(captures), "", 0, 8))
     drive()
     assert len(humans(addon.scene)) == 1
 
@@ -162,7 +162,7 @@ def test_the_real_child_makes_a_person_of_real_captures(saved_scene, tmp_path, m
     folder = captured(tmp_path / "made", people=2, frames=1, passes=("img", "mask"))
     python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
     monkeypatch.setattr("blender_primdiffusion.worker.environment.search", found(python))
-    monkeypatch.setattr(work, "preference", lambda name: str(encoder) if name == "encoder" else "")
+    monkeypatch.setattr(job, "preference", lambda name: str(encoder) if name == "encoder" else "")
     blender_primdiffusion.register()
     try:
         with pytest.raises(RuntimeError, match=r"holds several subjects: name one of them \(person_000000"):

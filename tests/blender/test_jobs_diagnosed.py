@@ -16,7 +16,7 @@ from jobs_driven import drive, shown, until_running
 
 from blender_primdiffusion.jobs import memory, remedies
 from blender_primdiffusion.jobs.follow import follow
-from blender_primdiffusion.jobs.generate import GenerateWork
+from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.pictures import SoFar, so_far
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import humans
@@ -46,7 +46,7 @@ def write_png(path: Path, colour: tuple[int, int, int], side: int = 8) -> Path:
 
 def started_and_idle() -> int:
     """The process id of a child that has made a person."""
-    queue.add(bpy.context, GenerateWork(7, 1))
+    queue.add(bpy.context, GenerateJob(7, 1))
     drive()
     return queue.child_pid
 
@@ -88,7 +88,7 @@ def test_a_picture_that_is_gone_or_none_is_no_error(tmp_path):
 
 
 def test_the_childs_picture_is_shown_while_it_works_and_then_no_more(addon):
-    queue.add(bpy.context, GenerateWork(TAKES_LONG, 5))
+    queue.add(bpy.context, GenerateJob(TAKES_LONG, 5))
     until_running()
     follow()
     assert so_far.shown.name == "picture.png"
@@ -179,7 +179,7 @@ def test_release_ends_the_child_says_what_was_freed_and_the_next_person_starts_a
 
 
 def test_release_is_refused_while_the_child_works(addon):
-    queue.add(bpy.context, GenerateWork(TAKES_LONG, 50))
+    queue.add(bpy.context, GenerateJob(TAKES_LONG, 50))
     until_running()
     with pytest.raises(RuntimeError, match="the backend is at work: wait for it, or cancel it first"):
         ops.release_memory()
@@ -211,7 +211,7 @@ def test_grids_are_given_back_with_an_idle_child_but_not_under_a_render(addon, m
 
 
 def test_a_child_that_works_is_never_idle(addon):
-    queue.add(bpy.context, GenerateWork(TAKES_LONG, 50))
+    queue.add(bpy.context, GenerateJob(TAKES_LONG, 50))
     until_running()
     assert not memory.release_when_idle(time.monotonic() + 10_000)
 

@@ -9,13 +9,13 @@ import bpy
 import pytest
 import synthetic_shape
 
-from blender_primdiffusion.jobs.assets import HumanAssetWork, PoseAssetWork
-from blender_primdiffusion.jobs.edit import BlendWork, RedressWork, TransferWork, VaryWork
-from blender_primdiffusion.jobs.export_mesh import AddProxyWork, ExportMeshWork
-from blender_primdiffusion.jobs.export_person import ExportGaussiansWork, ExportVdbSequenceWork, posed_frames, posed_now
-from blender_primdiffusion.jobs.merge import FitGainWork, MergeWork, Moment
+from blender_primdiffusion.jobs.assets import HumanAssetJob, PoseAssetJob
+from blender_primdiffusion.jobs.edit import BlendJob, RedressJob, TransferJob, VaryJob
+from blender_primdiffusion.jobs.export_mesh import AddProxyJob, ExportMeshJob
+from blender_primdiffusion.jobs.export_person import ExportGaussiansJob, ExportVdbSequenceJob, posed_frames, posed_now
+from blender_primdiffusion.jobs.job import Job
+from blender_primdiffusion.jobs.merge import FitGainJob, MergeJob, Moment
 from blender_primdiffusion.jobs.target import Target
-from blender_primdiffusion.jobs.work import Work
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.export_model import FrameRange
 from blender_primdiffusion.scene.files import person_file
@@ -28,21 +28,21 @@ def person(addon, tmp_path):
     return build_human(addon, synthetic_shape.write(tmp_path / "human.npz", 6), "Änne", [file])
 
 
-def jobs_about(person: bpy.types.Collection, folder: Path) -> list[Work]:
+def jobs_about(person: bpy.types.Collection, folder: Path) -> list[Job]:
     target, moment, context = Target.of(person), Moment.now(person), bpy.context
     return [
-        VaryWork.of(person, 3, {"amount": 0.5, "seed": 3}),
-        RedressWork.of(person, 3, {"region": {"painted": [0.0, 1.0]}, "seed": 3}),
-        TransferWork.of(person, 3, {"other": "/a/b"}),
-        BlendWork.of(person, 3, {"other": "/a/b", "fraction": 0.5}),
-        MergeWork(target, moment, 0.006),
-        FitGainWork(target, moment),
-        ExportMeshWork(target, 512, 9000, folder / "ä.glb", "GLB", FrameRange(1, 3)),
-        AddProxyWork(target, 512, 9000),
-        ExportGaussiansWork(target, folder / "ä.ply", posed_now(context, person), 500),
-        ExportVdbSequenceWork(target, folder, "ä", posed_frames(context, person, range(1, 4)), 1, 0.01),
-        HumanAssetWork(target),
-        PoseAssetWork.of(person, "Lehnt"),
+        VaryJob.of(person, 3, {"amount": 0.5, "seed": 3}),
+        RedressJob.of(person, 3, {"region": {"painted": [0.0, 1.0]}, "seed": 3}),
+        TransferJob.of(person, 3, {"other": "/a/b"}),
+        BlendJob.of(person, 3, {"other": "/a/b", "fraction": 0.5}),
+        MergeJob(target, moment, 0.006),
+        FitGainJob(target, moment),
+        ExportMeshJob(target, 512, 9000, folder / "ä.glb", "GLB", FrameRange(1, 3)),
+        AddProxyJob(target, 512, 9000),
+        ExportGaussiansJob(target, folder / "ä.ply", posed_now(context, person), 500),
+        ExportVdbSequenceJob(target, folder, "ä", posed_frames(context, person, range(1, 4)), 1, 0.01),
+        HumanAssetJob(target),
+        PoseAssetJob.of(person, "Lehnt"),
     ]
 
 

@@ -14,7 +14,7 @@ from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 from blender_primdiffusion.jobs import follow as follow_module
 from blender_primdiffusion.jobs.follow import follow, watch
-from blender_primdiffusion.jobs.generate import GenerateWork
+from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.scene.human import humans
@@ -29,7 +29,7 @@ ops = bpy.ops.primdiffusion
 
 
 def ask(seed: int, steps: int = 1) -> int:
-    return queue.add(bpy.context, GenerateWork(seed, steps)).number
+    return queue.add(bpy.context, GenerateJob(seed, steps)).number
 
 
 def seeds() -> list[int]:
@@ -55,7 +55,7 @@ def test_one_that_waits_can_be_taken_out_and_the_others_are_done(addon):
     until_running()
     assert shown(PRIMDIFFUSION_PT_jobs, addon)[:2] == ["Human, seed 11", "primdiffusion.cancel"]
     assert "Human, seed 12" in shown(PRIMDIFFUSION_PT_jobs, addon)
-    assert "In Line: 2" in shown(PRIMDIFFUSION_PT_generate, addon)
+    assert "Queued: 2" in shown(PRIMDIFFUSION_PT_generate, addon)
     assert ops.cancel(number=second) == {"FINISHED"}
     drive()
     assert seeds() == [11, 13]
@@ -64,9 +64,9 @@ def test_one_that_waits_can_be_taken_out_and_the_others_are_done(addon):
 
 def test_a_work_that_is_not_in_line_cannot_be_cancelled(addon):
     number = ask(11)
-    with pytest.raises(RuntimeError, match="nothing is under way yet"):
+    with pytest.raises(RuntimeError, match="no job is running"):
         ops.cancel()
-    with pytest.raises(RuntimeError, match="is not in line any more"):
+    with pytest.raises(RuntimeError, match="is no longer queued"):
         ops.cancel(number=number + 1)
 
 
@@ -237,7 +237,7 @@ def test_progress_is_shown_once_beside_the_button_and_the_jobs_panel_tells_what_
     assert shown(PRIMDIFFUSION_PT_generate, addon).count("step 1") == 1
     ops.cancel()
     drive()
-    assert [(outcome.entry.work.seed, outcome.went_well) for outcome in queue.ended] == [
+    assert [(outcome.entry.job.seed, outcome.went_well) for outcome in queue.ended] == [
         (TAKES_LONG, False), (11, True), (FAILS, False)
     ]  # fmt: skip
     texts = shown(PRIMDIFFUSION_PT_jobs, addon)
@@ -250,5 +250,5 @@ def test_try_again_asks_for_the_same(addon):
     drive()
     with pytest.raises(RuntimeError, match="ended by itself"):
         ops.try_again(kind="generate")
-    with pytest.raises(RuntimeError, match="no work 'vary' has failed"):
+    with pytest.raises(RuntimeError, match="no job 'vary' has failed"):
         ops.try_again(kind="vary")

@@ -14,9 +14,9 @@ from blender_primdiffusion.formats.requests import DENSITY_GAIN
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 from blender_primdiffusion import places
-from blender_primdiffusion.jobs import merge as merge_work
+from blender_primdiffusion.jobs import merge
 from blender_primdiffusion.jobs.follow import follow
-from blender_primdiffusion.jobs.merge import MergeFramesWork, MergeWork, Moment
+from blender_primdiffusion.jobs.merge import MergeFramesJob, MergeJob, Moment
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.jobs.target import Target
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
@@ -143,7 +143,7 @@ def test_a_cancelled_sequence_leaves_nothing(person, monkeypatch):
     monkeypatch.setenv("FAKE_MERGE", "takes long")
     moment = Moment.now(person)
     before = sorted(folder_of(person).iterdir())
-    queue.add(bpy.context, MergeFramesWork(Target.of(person), [moment, moment], 1, 0.02))
+    queue.add(bpy.context, MergeFramesJob(Target.of(person), [moment, moment], 1, 0.02))
     until_running()
     queue.cancel()
     drive()
@@ -153,10 +153,10 @@ def test_a_cancelled_sequence_leaves_nothing(person, monkeypatch):
 
 def test_the_frames_of_a_sequence_are_written_one_at_a_tick(person, monkeypatch):
     written, ticks = [], [0]
-    write_grid = merge_work.write_grid
-    monkeypatch.setattr(merge_work, "write_grid", lambda *args: written.append(ticks[0]) or write_grid(*args))
+    write_grid = merge.write_grid
+    monkeypatch.setattr(merge, "write_grid", lambda *args: written.append(ticks[0]) or write_grid(*args))
     moment = Moment.now(person)
-    queue.add(bpy.context, MergeFramesWork(Target.of(person), [moment] * 5, 1, 0.02))
+    queue.add(bpy.context, MergeFramesJob(Target.of(person), [moment] * 5, 1, 0.02))
     while follow() is not None:
         ticks[0] += 1
     assert len(written) == len(set(written)) == 5
@@ -177,7 +177,7 @@ def test_a_child_that_misbehaves_leaves_the_person_as_they_were(person, monkeypa
 
 
 def test_somebody_removed_meanwhile_is_not_merged(person):
-    queue.add(bpy.context, MergeWork(Target.of(person), Moment.now(person), 0.02))
+    queue.add(bpy.context, MergeJob(Target.of(person), Moment.now(person), 0.02))
     remove_human(person)
     drive()
     assert "was removed" in error_of("merge")

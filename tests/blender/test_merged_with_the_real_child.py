@@ -11,7 +11,7 @@ import pytest
 from backend_python import found
 
 import blender_primdiffusion
-from blender_primdiffusion.jobs import work
+from blender_primdiffusion.jobs import job
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import attachment_of, set_attachment
 from blender_primdiffusion.scene.files import sequence_files, volume_path
@@ -32,7 +32,7 @@ def person(saved_scene, tmp_path, monkeypatch):
     checkpoint = save_tiny_checkpoint(tmp_path / "tiny.safetensors")
     python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
     monkeypatch.setattr("blender_primdiffusion.worker.environment.search", found(python))
-    monkeypatch.setattr(work, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
+    monkeypatch.setattr(job, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
     # With a cache in Blender's temporary folder the child would compile its marcher anew for each test.
     monkeypatch.setattr(
         "blender_primdiffusion.worker.client.BackendClient",

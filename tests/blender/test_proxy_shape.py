@@ -9,7 +9,7 @@ import pytest
 import synthetic_shape
 from scene_stage import replace
 
-from blender_primdiffusion.jobs.export_mesh import AddProxyWork
+from blender_primdiffusion.jobs.export_mesh import AddProxyJob
 from blender_primdiffusion.jobs.target import Target
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
@@ -101,6 +101,6 @@ def test_who_is_reshaped_while_the_child_works_gets_a_proxy_of_the_body_of_now(p
     followed = proxy_of(person)
     reshape(person, before + TALLER)
     result = {"proxy": str(tmp_path / "proxy.npz"), "texture": str(tmp_path / "proxy.png"), "betas": before.tolist()}
-    made = AddProxyWork(Target.of(person), 64, 500).built(person, result)
+    made = AddProxyJob(Target.of(person), 64, 500).built(person, result)
     np.testing.assert_allclose(places(made), places(followed), atol=1e-5)
     assert not is_outdated(person, made, betas_of(person))

@@ -11,7 +11,7 @@ from jobs_driven import drive, error_of, shown, until_running
 
 from blender_primdiffusion.jobs.pictures import icons
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.jobs.variations import VariationsWork, sheet
+from blender_primdiffusion.jobs.variations import VariationsJob, sheet
 from blender_primdiffusion.scene.files import person_file
 from blender_primdiffusion.scene.human import armature_of, humans
 from blender_primdiffusion.ui import variations_operators, variations_panel
@@ -147,9 +147,9 @@ def test_pictures_appear_one_by_one_while_they_are_made_and_cancelling_keeps_the
 ):
     drawn = []
     monkeypatch.setattr(variations_panel, "_draw_picture", lambda _cell, path, _units: drawn.append(path))
-    queue.add(addon, VariationsWork((31, TAKES_LONG, 33), 3, "ddim"))
+    queue.add(addon, VariationsJob((31, TAKES_LONG, 33), 3, "ddim"))
     until_running()
-    while len(queue.job.pictures) < 2:
+    while len(queue.request.pictures) < 2:
         queue.tick()
     texts = shown(variations_panel.PRIMDIFFUSION_PT_variations, addon)
     assert [path is not None for path in drawn] == [True, True, False]
@@ -206,7 +206,7 @@ def test_files_and_pictures_go_when_it_is_cleared_another_file_is_loaded_or_the_
 
 
 def test_a_person_cleared_before_its_turn_is_named(addon, shown_people):
-    queue.add(addon, VariationsWork((1,), 1, "ddim", person=str(sheet.variations[0].person)))
+    queue.add(addon, VariationsJob((1,), 1, "ddim", person=str(sheet.variations[0].person)))
     ops.clear_variations()
     drive()
     assert "the person to vary was cleared meanwhile" in error_of("variations").lower()

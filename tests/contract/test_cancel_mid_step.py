@@ -8,7 +8,7 @@ import time
 
 import pytest
 from child_jobs import generate_job, this_pythons_backend
-from worker.job import Job
+from worker.job import Request
 
 TICK_S = 0.1
 """Of Blender's timer."""
@@ -40,7 +40,7 @@ sys.meta_path.insert(0, LongSteps())
 """
 
 
-def tick(job: Job, until, timeout_s: float = 90.0) -> None:
+def tick(job: Request, until, timeout_s: float = 90.0) -> None:
     """As Blender's timer does."""
     end = time.monotonic() + timeout_s
     while not until():

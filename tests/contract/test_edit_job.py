@@ -7,7 +7,7 @@ import pytest
 from child_jobs import edit_job, generate_job, this_pythons_backend
 from conversation import BUSY_STEPS
 from primdiffusion.human_file import load_human
-from worker.job import Job
+from worker.job import Request
 
 PART = {"region": ["hair"], "seed": 2}
 PARAMS = {
@@ -18,7 +18,7 @@ PARAMS = {
 }
 
 
-def follow(job: Job, until=lambda job: job.finished, timeout_s: float = 120) -> Job:
+def follow(job: Request, until=lambda job: job.finished, timeout_s: float = 120) -> Request:
     """Ticks as Blender's timer does."""
     end = time.monotonic() + timeout_s
     while not until(job):
@@ -44,7 +44,7 @@ def people(backend, checkpoint, tmp_path_factory) -> list[Path]:
     return [folder / "person.human.safetensors" for folder in folders]
 
 
-def edit(backend, people, checkpoint, method, out, steps=3, **changes) -> Job:
+def edit(backend, people, checkpoint, method, out, steps=3, **changes) -> Request:
     others = {"transfer": {"source": str(people[1])}, "interpolate": {"other": str(people[1])}}
     asked = {**PARAMS[method], **others.get(method, {}), **changes}
     return edit_job(backend, method, people[0], **asked, out_dir=out, steps=steps, checkpoint=checkpoint)

@@ -12,12 +12,12 @@ from conversation import BUSY_STEPS
 from worker.backend import Backend
 from worker.client import BackendClient
 from worker.environment import BackendNotFound
-from worker.job import Job
+from worker.job import Request
 
 PYTHON = Path(sys.executable)
 
 
-def follow(job: Job, until=lambda job: job.finished, timeout_s: float = 60) -> list[str]:
+def follow(job: Request, until=lambda job: job.finished, timeout_s: float = 60) -> list[str]:
     """Ticks as Blender's timer does; returns the states passed through."""
     states = [job.state]
     end = time.monotonic() + timeout_s
@@ -39,7 +39,7 @@ def backend():
 
 @pytest.fixture
 def start(backend, checkpoint, tmp_path):
-    def start(steps: int, name: str = "out", **settings) -> Job:
+    def start(steps: int, name: str = "out", **settings) -> Request:
         return generate_job(
             backend, seed=4, steps=steps, out_dir=tmp_path / name, **{"checkpoint": checkpoint, **settings}
         )

@@ -11,7 +11,7 @@ from capture_scenes import captured
 from child_jobs import reconstruct_job, this_pythons_backend
 from conversation import Conversation
 from tiny_encoder import save_tiny_encoder
-from worker.job import Job
+from worker.job import Request
 
 CANCELLED, DOMAIN_ERROR, INVALID_PARAMS = -32001, -32002, -32602
 FIRST = "person_000000"
@@ -86,7 +86,7 @@ def test_a_cancel_ends_the_job_and_leaves_nothing(child, asked):
     assert not Path(asked["out_dir"]).parent.exists()
 
 
-def follow(job: Job, timeout_s: float = 60) -> list[str]:
+def follow(job: Request, timeout_s: float = 60) -> list[str]:
     """Ticks as Blender's timer does; returns the messages passed through."""
     messages, end = [job.message], time.monotonic() + timeout_s
     while not job.finished:
@@ -107,7 +107,7 @@ def backend():
 
 @pytest.fixture
 def start(backend, captures, encoder, tmp_path):
-    def start(**more) -> Job:
+    def start(**more) -> Request:
         settings = {"capture": captures, "subject": FIRST, "checkpoint": encoder, "out_dir": tmp_path / "out", **more}
         return reconstruct_job(backend, **settings)
 

@@ -15,7 +15,7 @@ from ...console import Stop
 from ...places import EXTENSION, new_backend, preference
 from ...worker.backend import Backend
 from ...worker.environment import VARIABLE
-from ...worker.job import Job
+from ...worker.job import Request
 
 _TICK_S = 0.03
 
@@ -78,13 +78,13 @@ def ask(
     method: str,
     params: Mapping[str, Any],
     stop: Stop,
-    tell: Callable[[Job], None] = lambda _job: None,
+    tell: Callable[[Request], None] = lambda _job: None,
 ) -> dict[str, Any]:
     """The child's answer; `tell` hears of the job's progress.
 
     Raises NoBackend, ChildFailed, and Stopped once `stop` is set, within a second; then no file is left.
     """
-    job = Job(backend, method, params)
+    job = Request(backend, method, params)
     while not job.finished:
         if stop.is_set():
             job.cancel()

@@ -16,7 +16,7 @@ from ...capture.report import Report
 from ...console import Stop, duration
 from ...places import preference
 from ...worker.backend import Backend
-from ...worker.job import Job
+from ...worker.job import Request
 from ..attributes import Attributes, parsed
 from .asking import NoBackend, Stopped, ask, backend_of
 from .people import NPZ_FILE, PERSON_FILE, Movement, motion_name, movement_of, person_blend
@@ -94,7 +94,7 @@ class _Person:
                 person_blend(source / NPZ_FILE, source / PERSON_FILE, made / self._blend, self.name, self._movement)
             publish(made, self._folder, last=self._blend or PERSON_FILE)
 
-    def _tell(self, job: Job) -> None:
+    def _tell(self, job: Request) -> None:
         if not job.finished and time.monotonic() - self._told > _TOLD_S:
             self._told = time.monotonic()
             left = f" ({duration(job.eta_s)} left)" if job.eta_s else ""

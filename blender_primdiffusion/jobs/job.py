@@ -1,4 +1,4 @@
-"""What the child can be asked for, and what becomes of the answer: rooms subclass `Work` for what they offer."""
+"""What the child can be asked for, and what becomes of the answer: rooms subclass `Job` for what they offer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ..scene.writing import Destination
 
 
-class Work(abc.ABC):
+class Job(abc.ABC):
     """One thing the child is asked for. Plain data alone: undo and loading replace Blender's objects meanwhile."""
 
     kind: ClassVar[str]
@@ -46,7 +46,7 @@ class Work(abc.ABC):
 
     def advance(self, folder: Path) -> bool:
         """Do a little with the files that the child has written so far, in the time of a timer's tick; whether there is
-        more to do at once. Called while the child is at work, and then until there is no more, before `finish`."""
+        more to do at once. Called while the child is running, and then until there is no more, before `finish`."""
         return False
 
     def place(self) -> Destination | None:
