@@ -25,7 +25,7 @@ from typing import Any, Literal
 from .backend import Backend
 from .client import BackendClient
 from .environment import MARK, BackendPython, python_of_environment, search
-from .job import Job
+from .job import Request
 from .setup_packages import Lock
 from .setup_pip import SetUpFailed, clean_environment, followed, what_went_wrong
 
@@ -193,17 +193,17 @@ def _trial(python: Path, module_path: Path, cache: Path, temporary: Path) -> Gen
     backend, began = Backend(make_client), time.monotonic()
     person = temporary / "person"
     try:
-        job = Job(backend, "generate", {**_TRIAL, "out_dir": str(person)})
-        while not job.finished:
-            yield Step(f"Testing the backend: {job.message}", _INSTALLED)
-            job.tick()
-        if job.error is not None:
-            last = f" ({job.error.log[-1]})" if job.error.kind == "died" and job.error.log else ""
-            raise SetUpFailed(f"the self-test failed: {job.error.message}{last}")
-        if not Path((job.result or {}).get("human", "")).is_file():
+        request = Request(backend, "generate", {**_TRIAL, "out_dir": str(person)})
+        while not request.finished:
+            yield Step(f"Testing the backend: {request.message}", _INSTALLED)
+            request.tick()
+        if request.error is not None:
+            last = f" ({request.error.log[-1]})" if request.error.kind == "died" and request.error.log else ""
+            raise SetUpFailed(f"the self-test failed: {request.error.message}{last}")
+        if not Path((request.result or {}).get("human", "")).is_file():
             raise SetUpFailed("the self-test failed: the backend made no person and did not say why")
         return {
-            "device": job.info.get("device_name") or "",
+            "device": request.info.get("device_name") or "",
             "seconds": round(time.monotonic() - began, 1),
             "torch": found[0].torch,
             "python": found[0].python,
