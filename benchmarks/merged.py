@@ -20,13 +20,13 @@ import psutil
 import torch
 from primdiffusion.body.model import BodyPose
 from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.commands.frame import PosedPerson
+from primdiffusion.commands.merge import FitGainRequest, MergeRequest
+from primdiffusion.commands.session import Session
 from primdiffusion.formats.requests import DENSITY_GAIN
 from primdiffusion.human import body_of, generate, pose_body
 from primdiffusion.human_file import export_for_blender, load_human, save_human
 from primdiffusion.primitives.anchors import attach
-from primdiffusion.serve.draw_params import PersonParams
-from primdiffusion.serve.merge_params import FitGainParams, MergeParams
-from primdiffusion.serve.merging import fit_gain_of, merge_people
 from record import tell
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -145,9 +145,10 @@ def main() -> None:
     armature.animation_data_clear()
     pose_from_joint_rotations(armature, stepping())
     joints = pose_body(human.betas, BodyPose(torch.from_numpy(stepping()).float(), torch.zeros(3))).skinning
-    params = PersonParams(str(folder / "person.human.safetensors"), torch.eye(3, 4).tolist(), joints[:, :3].tolist())
+    posed = PosedPerson(folder / "person.human.safetensors", torch.eye(3, 4).tolist(), joints[:, :3].tolist())
+    session = Session()
     began = time.perf_counter()
-    merge_people(MergeParams([params], str(folder / "grid.npz")), lambda *_, **__: None)
+    MergeRequest(people=[posed], out=folder / "grid.npz").run(session, lambda *_, **__: None)
     figures["seconds_merge"] = time.perf_counter() - began
     grid = merging.read_grid(folder / "grid.npz")
     began = time.perf_counter()
@@ -155,7 +156,7 @@ def main() -> None:
     files = merging.publish([folder / "grid.vdb"], [digest], merging.merged_folder(person))
     figures |= {"seconds_write_merged": time.perf_counter() - began, "merged_mb": files[0].stat().st_size / 1e6}
     merging.show_merged(person, files, merging.MergedState(("",), grid.voxel))
-    fit = fit_gain_of(FitGainParams([params]), lambda *_, **__: None)
+    fit = FitGainRequest(people=[posed]).run(session, lambda *_, **__: None)
     figures |= {f"gain_{name}": fit[name] for name in ("gain", "error", "error_before")}
 
     setup_cycles_preview(bpy.context.scene, size=SIZE, samples=1, yaw=0.5, world=GREY)

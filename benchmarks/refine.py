@@ -24,6 +24,7 @@ from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import open_captures
+from primdiffusion.commands.refine import dealt_cameras
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, place
@@ -31,7 +32,6 @@ from primdiffusion.machine import best_device
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
-from primdiffusion.refine_command import dealt_cameras
 from primdiffusion.render.march import march
 from primdiffusion.training.refine import RefineSettings, refine
 from primdiffusion.training.refine_start import bare_body, meshed_person

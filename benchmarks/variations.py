@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from PIL import Image
-from primdiffusion.serve.jobs import Jobs
-from primdiffusion.serve.params import GenerateParams
-from primdiffusion.serve.variation_params import VariationsParams
+from primdiffusion.commands.generate import GenerateRequest
+from primdiffusion.commands.session import Session
+from primdiffusion.commands.variations import VariationsRequest
 from record import tell
 
 PICTURE_PX = 256
@@ -38,14 +38,14 @@ class Counter:
         self.pictures += "picture" in more
 
 
-def timed_generate(jobs: Jobs, folder: Path, steps: int, repeats: int) -> dict[str, float | int]:
+def timed_generate(session: Session, folder: Path, steps: int, repeats: int) -> dict[str, float | int]:
     """Seconds of sampling with and without pictures, medians; how many pictures there were."""
     seconds: dict[int, list[float]] = {0: [], PICTURE_PX: []}
     counter = Counter()
     for seed in range(repeats):
         for px, taken in seconds.items():
-            params = GenerateParams(seed, str(folder / "person"), steps, size=16, picture_px=px)
-            taken.append(jobs.generate(params, counter)["seconds_sampling"])
+            request = GenerateRequest(seed=seed, out_dir=folder / "person", steps=steps, size=16, picture_px=px)
+            taken.append(request.run(session, counter)["seconds_sampling"])
     without, with_pictures = (statistics.median(taken) for taken in seconds.values())
     return {
         "generate_seconds": round(without, 3),
@@ -55,10 +55,10 @@ def timed_generate(jobs: Jobs, folder: Path, steps: int, repeats: int) -> dict[s
     }
 
 
-def timed_variations(jobs: Jobs, folder: Path, count: int, **how: Any) -> float:
+def timed_variations(session: Session, folder: Path, count: int, **how: Any) -> float:
     """Seconds until all are written."""
     began = time.perf_counter()
-    jobs.variations(VariationsParams(list(range(7, 7 + count)), str(folder), **how), Counter())
+    VariationsRequest(seeds=list(range(7, 7 + count)), out_dir=folder, **how).run(session, Counter())
     return round(time.perf_counter() - began, 3)
 
 
@@ -80,16 +80,18 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     asked = parser.parse_args()
     steps, repeats = (6, 1) if asked.quick else (30, 5)
-    jobs, figures = Jobs(), {}
+    session, figures = Session(), {}
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        jobs.generate(GenerateParams(0, str(folder / "warm"), 2, size=64), Counter())
-        figures |= timed_generate(jobs, folder, steps, repeats)
+        GenerateRequest(seed=0, out_dir=folder / "warm", steps=2, size=64).run(session, Counter())
+        figures |= timed_generate(session, folder, steps, repeats)
         for count in (4, 8, 16):
-            figures[f"variations_{count}_seconds"] = timed_variations(jobs, folder / str(count), count, steps=steps)
-        figures["variations_8_draft_seconds"] = timed_variations(jobs, folder / "draft", 8, **DRAFT)
+            figures[f"variations_{count}_seconds"] = timed_variations(session, folder / str(count), count, steps=steps)
+        figures["variations_8_draft_seconds"] = timed_variations(session, folder / "draft", 8, **DRAFT)
         person = folder / "8" / "7.human.safetensors"
-        figures["variants_8_seconds"] = timed_variations(jobs, folder / "variants", 8, steps=steps, person=str(person))
+        figures["variants_8_seconds"] = timed_variations(
+            session, folder / "variants", 8, steps=steps, person=str(person)
+        )
         if asked.out is not None:
             contact_sheet(folder / "8", asked.out)
     tell(figures, asked.json)

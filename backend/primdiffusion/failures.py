@@ -1,4 +1,4 @@
-"""Which exceptions are news for the user, and what to tell: one sentence, a kind for programs, a remedy.
+"""Which exceptions are errors of input, files or memory, and how users read them: a sentence, a kind, a remedy.
 
 Domain errors of this package subclass builtins, so builtin types decide; everything else is a defect of ours and keeps
 its traceback. Imports no torch: the child answers `hello` before torch is there.

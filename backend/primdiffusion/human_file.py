@@ -1,4 +1,4 @@
-"""People as files: `.human.safetensors` to keep and share, `human.npz` to hand them to Blender. No pickle in either.
+"""People as files: `.human.safetensors` to keep and share, `human.npz` for Blender. No pickle in either.
 
 A `.human.safetensors` file holds rgb, density, delta_scale and betas as they are in memory, and in its metadata
 `format`, `format_version` and `provenance`: a JSON object that says where the person comes from. Of it are known
@@ -8,7 +8,7 @@ A `.human.safetensors` file holds rgb, density, delta_scale and betas as they ar
     version                                         by which PrimDiffusion
     edits                                           what was done to it since, oldest first: objects with a name "edit"
 
-and every other entry is kept as it is. A person who stands on a body of the user's files has format version 2, the
+and every other entry is saved as it is. A person on a body of the user's files has format version 2, the
 boxes' rest_half_extent, and in the metadata `body`: paths and fingerprints of these files, never what is in them.
 """
 
@@ -37,7 +37,7 @@ FORMAT = "primdiffusion.human"
 FORMAT_VERSION = 1
 """Of people who stand on the default body."""
 FORMAT_VERSION_ON_FILES = 2
-"""Of people who stand on a body of the user's files; readers refuse a higher one."""
+"""Of people who stand on a body of the user's files; readers reject a higher one."""
 BLENDER_FORMAT_VERSION = 2
 """Of human.npz."""
 LARGEST_BETA = 5.0
@@ -172,23 +172,23 @@ def _check_provenance(provenance: Any) -> None:
         raise ValueError(f"its provenance is no JSON object but {provenance!r:.60}: generate the person again")
     for name, (wanted, kind) in _KINDS.items():
         if name in provenance and not _is(provenance[name], kind):
-            _refuse(name, provenance[name], wanted)
+            _reject(name, provenance[name], wanted)
     _check_attributes("attributes", provenance.get("attributes", {}))
     edits = provenance.get("edits", [])
     if not isinstance(edits, list):
-        _refuse("edits", edits, "a list of objects")
+        _reject("edits", edits, "a list of objects")
     for edit in edits:
         if not isinstance(edit, Mapping) or not _is(edit.get("edit"), str):
-            _refuse("edits", edit, 'objects with a name "edit"')
+            _reject("edits", edit, 'objects with a name "edit"')
 
 
 def _check_attributes(name: str, attributes: Any) -> None:
     wanted = "an object of texts and numbers"
     if not isinstance(attributes, Mapping):
-        _refuse(name, attributes, wanted)
+        _reject(name, attributes, wanted)
     for value in attributes.values():
         if not _is(value, (str, int, float)):
-            _refuse(name, value, wanted)
+            _reject(name, value, wanted)
 
 
 def _is(value: Any, kind: Any) -> bool:
@@ -197,7 +197,7 @@ def _is(value: Any, kind: Any) -> bool:
     return isinstance(value, kind)
 
 
-def _refuse(name: str, value: Any, wanted: str) -> NoReturn:
+def _reject(name: str, value: Any, wanted: str) -> NoReturn:
     raise ValueError(f"{name!r} of its provenance is {value!r:.60}, not {wanted}: generate the person again")
 
 

@@ -1,4 +1,4 @@
-"""What this machine offers: memory at once, the torch device when torch is there."""
+"""The memory of this machine, and its torch device."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def peak_memory_gb() -> float:
     """The most memory this process has held at once so far, GB (1e9 bytes)."""
     if sys.platform == "win32":
         return psutil.Process().memory_info().peak_wset / GB
-    import resource
+    import resource  # Windows has none
 
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / GB
@@ -41,14 +41,14 @@ def peak_memory_gb() -> float:
 
 def best_device() -> torch.device:
     """CUDA where torch sees one, otherwise the CPU."""
-    import torch
+    import torch  # late: `memory` needs none
 
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def device_info(device: torch.device) -> dict[str, Any]:
     """The device as `hello` and the panel state it: its name, and its own memory where it has some."""
-    import torch
+    import torch  # late: `memory` needs none
 
     if device.type == "cuda":
         free, total = torch.cuda.mem_get_info(device)

@@ -1,4 +1,4 @@
-"""What a generated person leaves behind in a folder; the same for the command line and for Blender's child."""
+"""The files of a generated person in a folder, the same from the command line and from Blender's child."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class PersonFiles:
     depth: str = "depth.png"
 
     def in_folder(self, folder: Path) -> dict[str, str]:
-        """Their paths, by the names that results of jobs have for them."""
+        """Their paths, by their names in results of requests."""
         names = {"human": self.blender, "person": self.human, "preview": self.front, "side": self.side}
         return {name: str(folder / file) for name, file in {**names, "depth": self.depth}.items()}
 
@@ -34,7 +34,7 @@ FILES = PersonFiles()
 def write_person(folder: Path, human: Human, size: int) -> None:
     """Writes all of FILES: the person for Blender, the person to keep, and pictures in the T pose.
 
-    The first picture on a machine takes some seconds longer: the marcher is compiled and kept.
+    The first picture on a machine takes some seconds longer: the marcher is compiled, and cached.
     """
     export_for_blender(folder / FILES.blender, human)
     save_human(folder / FILES.human, human)

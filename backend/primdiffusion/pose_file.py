@@ -1,4 +1,4 @@
-"""Poses as people keep them: 72 axis-angle numbers (24 joints x 3, radians, SMPL's order, the pelvis first)."""
+"""Pose files: 72 axis-angle numbers (24 joints x 3, radians, SMPL's order, the pelvis first)."""
 
 from __future__ import annotations
 

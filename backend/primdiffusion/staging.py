@@ -1,4 +1,4 @@
-"""All files of a job or none: they are written aside and renamed into place together."""
+"""All files of a request or none: they are written to a folder of their own and renamed into place together."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from pathlib import Path
 import psutil
 
 STAGING_PREFIX = ".primdiffusion-partial-"
-"""Followed by the writing process' id; what a killed process leaves is removed by the next job in the same folder."""
+"""Followed by the writing process' id; what a killed process leaves goes with the next one in the same folder."""
 
 
 @contextlib.contextmanager
 def staged(folder: str | Path) -> Iterator[Path]:
     """A folder to write into; on a good end its files move to `folder`, on an error all of it goes, a new `folder` too.
 
-    Yields a new folder inside `folder`, so that a folder that cannot be written to fails here, before any work is done.
+    Yields a new folder inside `folder`, so that a folder that cannot be written to fails here, before any work.
     Files of the same names in `folder` are replaced. Raises OSError.
     """
     target = Path(folder)
@@ -53,7 +53,7 @@ def _make(folder: Path) -> list[Path]:
 
 
 def _unmake(created: list[Path]) -> None:
-    """Removes folders this job created, as far as nobody else has put something into them."""
+    """Removes folders this process created, unless something else was put into them."""
     for path in created:
         try:
             path.rmdir()

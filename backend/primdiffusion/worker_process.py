@@ -1,4 +1,4 @@
-"""How a process of a pool begins: alone on its core, and never outliving the process that gives it work."""
+"""How a process of a pool starts: with one thread, and never outliving its parent."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import threading
 
 
 def begin_worker() -> None:
-    """One thread for torch, which does not heed all of the environment; no life after the process that gives the work.
+    """One thread for torch, which ignores part of the environment; the process ends with its parent.
 
-    A pool's workers outlive a parent that is killed, and keep its place on the processors. Ctrl-C is the parent's to
-    heed: it lets workers finish what they are at.
+    A pool's workers would outlive a parent that is killed, and stay on the processors. Ctrl-C is left to the parent,
+    which lets workers finish what they are doing.
     """
-    import torch
+    import torch  # only in the worker
 
     torch.set_num_threads(1)
     end_with_parent()

@@ -14,11 +14,11 @@ import psutil
 import pytest
 from capture_scenes import box_person, captured, save_person, small_job
 from primdiffusion import cli
-from primdiffusion.capture.command import parse_shard
 from primdiffusion.capture.glb import GlbError, read_glb
 from primdiffusion.capture.people_files import find_people, read_person
 from primdiffusion.capture.rasterised import render
 from primdiffusion.capture.verify import verify
+from primdiffusion.commands.captures import parse_shard
 from primdiffusion.formats import capture_layout
 
 NAMES = ["person_000000", "person_000001"]

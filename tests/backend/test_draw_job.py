@@ -3,11 +3,15 @@
 import dataclasses
 import os
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose
+from primdiffusion.commands import frame_drawer
+from primdiffusion.commands.frame import Frame, PosedPerson
+from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Look, Scene
 from primdiffusion.failures import describe
@@ -16,9 +20,6 @@ from primdiffusion.human_file import save_human
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.reshaping import reshaped
-from primdiffusion.serve import drawing
-from primdiffusion.serve.draw_params import DrawParams, PersonParams
-from primdiffusion.serve.drawing import FrameDrawer, map_frame
 from tiny_model import tiny_model
 
 WIDTH, HEIGHT = 40, 56
@@ -36,26 +37,26 @@ def pose():
 
 
 @pytest.fixture
-def params(human, pose, tmp_path) -> DrawParams:
+def params(human, pose, tmp_path) -> Frame:
     save_human(tmp_path / "a.human.safetensors", human)
     camera = framing(place(human, pose), 0.4, WIDTH, HEIGHT)
     joints = pose_body(human.betas, pose).skinning[:, :3].tolist()
-    return DrawParams(
+    return Frame(
         frame=new_frame(tmp_path / "frame", WIDTH, HEIGHT),
         width=WIDTH,
         height=HEIGHT,
         intrinsics=camera.intrinsics.tolist(),
         world_to_camera=camera.world_to_camera.tolist(),
-        people=[PersonParams(str(tmp_path / "a.human.safetensors"), STILL, joints)],
+        people=[PosedPerson(tmp_path / "a.human.safetensors", STILL, joints)],
     )
 
 
-def new_frame(path, width: int, height: int) -> str:
+def new_frame(path, width: int, height: int) -> Path:
     np.full(width * height * 5, np.nan, np.float32).tofile(path)
-    return str(path)
+    return path
 
 
-def drawn(params: DrawParams, drawer: FrameDrawer | None = None, reports: list | None = None):
+def drawn(params: Frame, drawer: FrameDrawer | None = None, reports: list | None = None):
     drawer = drawer or FrameDrawer(torch.device("cpu"))
     drawer.draw(params, lambda *report: reports is None or reports.append(report))
     return map_frame(params.frame, *params.size)
@@ -125,8 +126,8 @@ def test_the_first_band_is_small_where_samples_or_people_are_many(params):
 def test_people_are_loaded_once_and_placed_once_a_pose(params, monkeypatch, tmp_path):
     calls = []
     for name in ("load_human", "place_skinned"):
-        original = getattr(drawing, name)
-        monkeypatch.setattr(drawing, name, lambda *a, o=original, n=name: calls.append(n) or o(*a))
+        original = getattr(frame_drawer, name)
+        monkeypatch.setattr(frame_drawer, name, lambda *a, o=original, n=name: calls.append(n) or o(*a))
     drawer = FrameDrawer(torch.device("cpu"))
     moved_camera = [[*row[:3], row[3] + 0.01] for row in params.world_to_camera]
     drawn(params, drawer)
@@ -202,7 +203,7 @@ def test_out_of_memory_names_the_resolution(params, monkeypatch):
     def no_room(*_):
         torch.empty(10**15)
 
-    monkeypatch.setattr(drawing, "draw_in_bands", no_room)
+    monkeypatch.setattr(frame_drawer, "draw_in_bands", no_room)
     with pytest.raises(MemoryError, match=f"{WIDTH} x {HEIGHT} pixels") as error:
         drawn(params)
     failure = describe(error.value)
@@ -239,10 +240,10 @@ def test_samples_are_those_of_the_default_for_people_of_about_natural_size():
         return [(scale * np.eye(3, 4)).tolist() for scale in scales]
 
     for scales in ((), (1.0,), (0.8, 1.3), (-1.0,)):
-        assert drawing.settings_for(0.004, objects(*scales)) == MarchSettings()
-    both = drawing.settings_for(0.004, objects(1.0, 0.25))
+        assert frame_drawer.settings_for(0.004, objects(*scales)) == MarchSettings()
+    both = frame_drawer.settings_for(0.004, objects(1.0, 0.25))
     assert (both.strides, both.spacing) == ((16, 8, 4, 2, 1), 0.00025)
-    assert drawing.settings_for(0.004, objects(1e-6, 1e6)).strides[0] == 4 * 2**drawing.MOST_DOUBLINGS
+    assert frame_drawer.settings_for(0.004, objects(1e-6, 1e6)).strides[0] == 4 * 2**frame_drawer.MOST_DOUBLINGS
 
 
 def test_a_camera_that_scales_is_refused_before_anything_is_drawn(params):

@@ -2,10 +2,12 @@
 
 import copy
 import math
+from pathlib import Path
 
 import pytest
-from primdiffusion.serve.draw_params import DrawParams, PersonParams
-from primdiffusion.serve.rpc import INVALID_PARAMS, RpcError, read_params
+from primdiffusion.commands.draw import DrawRequest
+from primdiffusion.commands.frame import PosedPerson
+from primdiffusion.commands.request import read_request
 
 STILL = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
 GOOD = {
@@ -18,8 +20,8 @@ GOOD = {
 }
 
 
-def read(**changes) -> DrawParams:
-    return read_params(DrawParams, {**copy.deepcopy(GOOD), **changes}, "draw")
+def read(**changes) -> DrawRequest:
+    return read_request(DrawRequest, {**copy.deepcopy(GOOD), **changes}, "draw")
 
 
 def person(**changes) -> list:
@@ -30,7 +32,7 @@ def test_defaults_are_the_whole_picture_in_colour():
     params = read()
     assert (params.size, params.corner) == ((64, 48), (0, 0))
     assert (params.view, params.step, params.background, params.solids) == ("colour", 0.004, None, None)
-    assert params.people == [PersonParams("h", STILL, [STILL] * 24, None)]
+    assert params.people == [PosedPerson(Path("h"), STILL, [STILL] * 24, None)]
 
 
 def test_a_regions_corner_is_counted_from_the_top():
@@ -51,7 +53,7 @@ BROKEN = [[1.0, 0.0, 0.0, 0.0], [0.0, math.nan, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
         ({"region": [-1, 0, 10, 10]}, "region"),
         ({"region": [0, 0, 10]}, "region"),
         ({"region": [0, 0, 10.5, 10]}, "region"),
-        ({"view": "x-ray"}, "colour, depth, alpha, boxes"),
+        ({"view": "x-ray"}, "'colour', 'depth', 'alpha', 'boxes'"),
         ({"clip": [1.0, 0.5]}, "clip"),
         ({"clip": [math.nan, 5.0]}, "clip holds nan"),
         ({"clip": [0.1]}, "clip holds 1 entries"),
@@ -79,9 +81,8 @@ BROKEN = [[1.0, 0.0, 0.0, 0.0], [0.0, math.nan, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
     ],
 )
 def test_wrong_values_are_named_in_one_sentence(changes, said):
-    with pytest.raises(RpcError) as error:
+    with pytest.raises(ValueError) as error:
         read(**changes)
-    assert error.value.code == INVALID_PARAMS
     assert said in str(error.value)
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 300

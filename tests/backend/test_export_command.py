@@ -7,10 +7,11 @@ import torch
 import trimesh
 from export_people import person
 from primdiffusion import cli
+from primdiffusion.commands.export import GaussiansRequest, HumanNpzRequest, ProxyRequest
+from primdiffusion.commands.request import read_request
+from primdiffusion.commands.session import Session
 from primdiffusion.human import place, pose_body
 from primdiffusion.human_file import save_human
-from primdiffusion.serve import exporting
-from primdiffusion.serve.export_params import GaussiansParams, HumanNpzParams, ProxyParams
 
 COARSE = ["--triangles", "800", "--texture", "64"]
 
@@ -58,9 +59,9 @@ def test_what_cannot_be_exported_is_refused_before_any_work(saved, monkeypatch, 
 
 
 def test_the_childs_proxy_follows_other_betas(saved, tmp_path):
-    params = {"person": str(saved), "triangles": 800, "texture_px": 64, "spacing": 0.02}
-    own = exporting.proxy(ProxyParams(out_dir=str(tmp_path / "own"), **params), silent)
-    tall = exporting.proxy(ProxyParams(out_dir=str(tmp_path / "tall"), betas=[3.0] + [0.0] * 9, **params), silent)
+    params = {"person": saved, "triangles": 800, "texture_px": 64, "spacing": 0.02}
+    own = ProxyRequest(out_dir=tmp_path / "own", **params).run(Session(), silent)
+    tall = ProxyRequest(out_dir=tmp_path / "tall", betas=[3.0] + [0.0] * 9, **params).run(Session(), silent)
     heights = []
     for result in (own, tall):
         with np.load(result["proxy"]) as arrays:
@@ -72,13 +73,13 @@ def test_the_childs_proxy_follows_other_betas(saved, tmp_path):
 def test_the_childs_gaussians_stand_where_the_armature_does(saved, tmp_path):
     skinning = pose_body(person().betas).skinning[:, :3].tolist()
     moved = [[1.0, 0, 0, 2.0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]]
-    params = GaussiansParams(person=str(saved), out=str(tmp_path / "p.ply"), object=moved, joints=skinning, limit=2000)
-    assert exporting.gaussians(params, silent)["gaussians"] == 2000
+    request = GaussiansRequest(person=saved, out=tmp_path / "p.ply", object=moved, joints=skinning, limit=2000)
+    assert request.run(Session(), silent)["gaussians"] == 2000
     assert splatter.read_ply(tmp_path / "p.ply")["x"].mean() == pytest.approx(2.0, abs=0.1)
 
 
 def test_a_person_who_exists_gets_the_files_of_generate(saved, tmp_path):
-    result = exporting.human_npz(HumanNpzParams(person=str(saved), out_dir=str(tmp_path / "out"), size=32), silent)
+    result = HumanNpzRequest(person=saved, out_dir=tmp_path / "out", size=32).run(Session(), silent)
     with np.load(result["human"]) as arrays:
         assert torch.equal(torch.from_numpy(arrays["betas"]), person().betas)
     assert {"human", "person", "preview", "side", "depth"} <= set(result)
@@ -89,28 +90,28 @@ def test_a_cancelled_proxy_leaves_nothing(saved, tmp_path):
         if stage == "write":
             raise InterruptedError
 
-    params = ProxyParams(person=str(saved), out_dir=str(tmp_path / "new"), triangles=800, texture_px=64, spacing=0.03)
+    request = ProxyRequest(person=saved, out_dir=tmp_path / "new", triangles=800, texture_px=64, spacing=0.03)
     with pytest.raises(InterruptedError):
-        exporting.proxy(params, cancel)
+        request.run(Session(), cancel)
     assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(
     ("kind", "wrong"),
     [
-        (ProxyParams, {"person": "", "out_dir": "x"}),
-        (ProxyParams, {"person": "p", "out_dir": "x", "betas": ["tall"]}),
-        (GaussiansParams, {"person": "p", "out": "x", "object": [[1, 0, 0, 0]] * 3}),
-        (GaussiansParams, {"person": "p", "out": "x", "limit": 0}),
-        (HumanNpzParams, {"person": "p", "out_dir": "x", "size": 0}),
+        (ProxyRequest, {"person": "", "out_dir": "x"}),
+        (ProxyRequest, {"person": "p", "out_dir": "x", "betas": ["tall"]}),
+        (GaussiansRequest, {"person": "p", "out": "x", "object": [[1, 0, 0, 0]] * 3}),
+        (GaussiansRequest, {"person": "p", "out": "x", "limit": 0}),
+        (HumanNpzRequest, {"person": "p", "out_dir": "x", "size": 0}),
     ],
 )
 def test_impossible_parameters_are_refused(kind, wrong):
     with pytest.raises(ValueError):
-        kind(**wrong)
+        read_request(kind, wrong, "export")
 
 
 def test_betas_of_another_body_are_refused(saved, tmp_path):
-    params = ProxyParams(person=str(saved), out_dir=str(tmp_path / "out"), betas=[0.0] * 3)
+    request = ProxyRequest(person=saved, out_dir=tmp_path / "out", betas=[0.0] * 3)
     with pytest.raises(ValueError, match="3 betas"):
-        exporting.proxy(params, silent)
+        request.run(Session(), silent)

@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose
+from primdiffusion.commands.frame import PosedPerson
+from primdiffusion.commands.merge import FitGainRequest, MergeFramesRequest, MergeRequest
+from primdiffusion.commands.request import Request, read_request
+from primdiffusion.commands.session import Session
 from primdiffusion.export.merged_file import upright_grid
 from primdiffusion.formats.requests import DENSITY_GAIN
 from primdiffusion.human import generate, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.render.merge import merge
 from primdiffusion.reshaping import reshaped
-from primdiffusion.serve.draw_params import PersonParams
-from primdiffusion.serve.merge_params import FitGainParams, MergeFramesParams, MergeParams
-from primdiffusion.serve.merging import fit_gain_of, merge_frames, merge_people
-from primdiffusion.serve.server import JOBS, Cancelled
+from primdiffusion.serve.server import REQUESTS, Cancelled
 from tiny_model import tiny_model
 
 VOXEL = 0.03
@@ -34,18 +35,23 @@ def human():
 
 
 @pytest.fixture
-def person(human, tmp_path) -> PersonParams:
+def person(human, tmp_path) -> PosedPerson:
     save_human(tmp_path / "a.human.safetensors", human)
     joints = pose_body(human.betas, pose(2)).skinning[:, :3].tolist()
-    return PersonParams(str(tmp_path / "a.human.safetensors"), STILL, joints)
+    return PosedPerson((tmp_path / "a.human.safetensors"), STILL, joints)
 
 
 def quiet(*_: object, **__: object) -> None:
     """Hears no report."""
 
 
+def done(request: Request, report=quiet) -> dict:
+    request.check()
+    return request.run(Session(), report)
+
+
 def test_a_grid_is_the_posed_person_turned_z_up(human, person, tmp_path):
-    result = merge_people(MergeParams([person], str(tmp_path / "grid.npz"), VOXEL), quiet)
+    result = done(MergeRequest(people=[person], out=tmp_path / "grid.npz", voxel=VOXEL))
     with np.load(result["out"], allow_pickle=False) as grid:
         density, colour, origin = grid["density"], grid["colour"], grid["origin"]
         assert density.dtype == colour.dtype == np.float16
@@ -66,7 +72,7 @@ def test_other_betas_merge_the_reshaped_person_whose_boxes_have_grown(human, per
     betas = human.betas + torch.tensor([0.0, 3.0, 1.0, 2.0, 0.0, 4.0, 0.0, 0.0, 0.0, 0.0])
     joints = pose_body(betas, pose(2)).skinning[:, :3].tolist()
     wider = dataclasses.replace(person, joints=joints, betas=betas.tolist())
-    result = merge_people(MergeParams([wider], str(tmp_path / "grid.npz"), VOXEL), quiet)
+    result = done(MergeRequest(people=[wider], out=tmp_path / "grid.npz", voxel=VOXEL))
     with np.load(result["out"], allow_pickle=False) as grid:
         got = grid["density"].sum(dtype=np.float64)
     grown, ungrown = (
@@ -79,12 +85,12 @@ def test_other_betas_merge_the_reshaped_person_whose_boxes_have_grown(human, per
 
 def test_frames_are_the_person_s_single_grids(human, person, tmp_path):
     other = dataclasses.replace(person, joints=pose_body(human.betas, pose(5)).skinning[:, :3].tolist())
-    told = []
-    params = MergeFramesParams([person, other], str(tmp_path / "new" / "grids"), VOXEL)
-    result = merge_frames(params, lambda *news: told.append(news))
-    assert [news[:3] for news in told] == [("merge", 0, 2), ("merge", 1, 2), ("merge", 2, 2)]
+    reports = []
+    request = MergeFramesRequest(people=[person, other], out_dir=tmp_path / "new" / "grids", voxel=VOXEL)
+    result = done(request, lambda *report: reports.append(report))
+    assert [report[:3] for report in reports] == [("merge", 0, 2), ("merge", 1, 2), ("merge", 2, 2)]
     for file, one in zip(result["files"], (person, other), strict=True):
-        alone = merge_people(MergeParams([one], str(tmp_path / "one.npz"), VOXEL), quiet)["out"]
+        alone = done(MergeRequest(people=[one], out=tmp_path / "one.npz", voxel=VOXEL))["out"]
         with np.load(file) as grid, np.load(alone) as expected:
             for name in ("density", "colour", "origin", "voxel"):
                 np.testing.assert_array_equal(grid[name], expected[name])
@@ -96,12 +102,12 @@ def test_a_cancelled_merge_leaves_no_file(person, tmp_path):
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        merge_people(MergeParams([person], str(tmp_path / "grid.npz"), VOXEL), cancelled)
+        done(MergeRequest(people=[person], out=tmp_path / "grid.npz", voxel=VOXEL), cancelled)
     assert not list(tmp_path.glob("*grid*"))
 
 
 def test_a_fitted_gain_is_at_least_as_good_as_the_usual_one(person):
-    fit = fit_gain_of(FitGainParams([person]), quiet)
+    fit = done(FitGainRequest(people=[person]))
     assert fit["error"] <= fit["error_before"] < 0.2
     assert fit["gain_before"] == DENSITY_GAIN
     assert 0.1 <= fit["gain"] <= 20
@@ -109,21 +115,22 @@ def test_a_fitted_gain_is_at_least_as_good_as_the_usual_one(person):
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("record", "wrong", "name"),
     [
-        (lambda person: MergeParams([], "grid.npz"), "people is empty"),
-        (lambda person: MergeParams([person], ""), "out is empty"),
-        (lambda person: MergeParams([person], "grid.npz", 0.0), "voxel is 0"),
-        (lambda person: MergeFramesParams([], "folder"), "people is empty"),
-        (lambda person: MergeFramesParams([person], ""), "out_dir is empty"),
-        (lambda person: MergeFramesParams([person], "folder", float("inf")), "voxel is inf"),
-        (lambda person: FitGainParams([]), "people is empty"),
+        (MergeRequest, {"people": [], "out": "grid.npz"}, "people"),
+        (MergeRequest, {"out": ""}, "out"),
+        (MergeRequest, {"out": "grid.npz", "voxel": 0.0}, "voxel"),
+        (MergeFramesRequest, {"people": [], "out_dir": "folder"}, "people"),
+        (MergeFramesRequest, {"out_dir": ""}, "out_dir"),
+        (MergeFramesRequest, {"out_dir": "folder", "voxel": float("inf")}, "voxel"),
+        (FitGainRequest, {"people": []}, "people"),
     ],
 )
-def test_parameters_that_cannot_be_are_refused(person, make, message):
-    with pytest.raises(ValueError, match=message):
-        make(person)
+def test_a_wrong_parameter_is_named(record, wrong, name):
+    person = {"human": "h", "object": STILL, "joints": [STILL] * 24}
+    with pytest.raises(ValueError, match=name):
+        read_request(record, {"people": [person], **wrong}, "merge")
 
 
 def test_the_child_knows_the_methods():
-    assert {"merge", "merge_frames", "fit_gain"} <= set(JOBS)
+    assert {"merge", "merge_frames", "fit_gain"} <= set(REQUESTS)

@@ -11,9 +11,13 @@ import pytest
 import torch
 from capture_scenes import box, captured, save_person, small_job
 from PIL import Image
-from primdiffusion import cli
+from primdiffusion import cli, person_folder
 from primdiffusion.capture.conditioning import captured_person, choose_subject, conditioning_views
 from primdiffusion.capture.rasterised import render
+from primdiffusion.commands.reconstruct import ReconstructRequest
+from primdiffusion.commands.request import read_request
+from primdiffusion.commands.session import Session
+from primdiffusion.encoder import checkpoint as encoder_checkpoint
 from primdiffusion.encoder.checkpoint import load_encoder
 from primdiffusion.encoder.encode import EncoderModel
 from primdiffusion.encoder.network import Encoder
@@ -22,9 +26,6 @@ from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.human import place
 from primdiffusion.human_file import load_human
 from primdiffusion.reconstruction import reconstruct
-from primdiffusion.serve import reconstruction
-from primdiffusion.serve.jobs import Jobs
-from primdiffusion.serve.params import ReconstructParams
 from tiny_encoder import TINY, save_tiny_encoder, tiny_encoder
 from tiny_model import save_tiny_checkpoint
 
@@ -188,24 +189,25 @@ def test_a_missing_damaged_or_foreign_checkpoint_is_named(dataset, checkpoint, t
 def test_the_encoder_stays_loaded_until_another_is_asked_for(dataset, checkpoint, tmp_path, monkeypatch):
     loaded = []
     load = load_encoder
-    monkeypatch.setattr(reconstruction, "write_person", lambda *_: None)
-    monkeypatch.setattr(reconstruction, "load_encoder", lambda path, device: loaded.append(path) or load(path, device))
+    monkeypatch.setattr(person_folder, "write_person", lambda *_: None)
+    counted = lambda path, device: loaded.append(path) or load(path, device)  # noqa: E731
+    monkeypatch.setattr(encoder_checkpoint, "load_encoder", counted)
     other = save_tiny_encoder(tmp_path / "other.safetensors")
-    jobs = Jobs()
+    session = Session()
     for path in (checkpoint, checkpoint, other):
-        params = ReconstructParams(str(dataset / FIRST), str(tmp_path / "out"), views=2, checkpoint=str(path))
-        jobs.reconstruct(params, lambda *report: None)
+        request = ReconstructRequest(capture=dataset / FIRST, out_dir=tmp_path / "out", views=2, checkpoint=path)
+        request.run(session, lambda *report: None)
     assert loaded == [checkpoint, other]
 
 
-def test_the_job_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypatch):
+def test_the_request_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypatch):
     class Stop(Exception):
         pass
 
     folder = captured(tmp_path, people=1, frames=1, passes=("img", "mask"))
-    params = ReconstructParams(str(folder), str(tmp_path / "out"), checkpoint=str(checkpoint), size=32)
-    jobs, reports = Jobs(), []
-    result = jobs.reconstruct(params, lambda *report: reports.append(report))
+    request = ReconstructRequest(capture=folder, out_dir=tmp_path / "out", checkpoint=checkpoint, size=32)
+    session, reports = Session(), []
+    result = request.run(session, lambda *report: reports.append(report))
     stages = [("read", 0), ("load", 1), ("encode", 2), ("write", 3), ("write", 4)]
     assert [report[:2] for report in reports] == stages
     assert result["subject"] == FIRST
@@ -220,11 +222,11 @@ def test_the_job_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypatch)
                 raise Stop
 
         with pytest.raises(Stop):
-            jobs.reconstruct(params, stop)
+            request.run(session, stop)
         assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("wrong", [{"frame": -1}, {"views": 0}, {"size": 0}, {"capture": ""}, {"out_dir": ""}])
-def test_impossible_parameters_of_the_job_are_refused(wrong):
+def test_impossible_parameters_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong)) if wrong != {"size": 0} else "pixels a side"):
-        ReconstructParams(**{"capture": "captures", "out_dir": "out", **wrong})
+        read_request(ReconstructRequest, {"capture": "captures", "out_dir": "out", **wrong}, "reconstruct")

@@ -14,13 +14,13 @@ from primdiffusion.capture.dataset import Views, stack
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import open_captures
+from primdiffusion.commands.refine import dealt_cameras
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import load_human, save_human
 from primdiffusion.primitives.primitives import K, Payload, S
-from primdiffusion.refine_command import dealt_cameras
 from primdiffusion.render.march import march
 from primdiffusion.staging import STAGING_PREFIX
 from primdiffusion.training.refine import RefineSettings, refine

@@ -13,6 +13,8 @@ import torch
 from primdiffusion import cli
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.commands.frame import Frame, PosedPerson
+from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
 from primdiffusion.diffusion.checkpoint import CheckpointError, read_card
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Look, Scene
@@ -22,8 +24,6 @@ from primdiffusion.primitives.anchors import build_anchors
 from primdiffusion.primitives.body_setup import BodySetupError, body_setup_from_files
 from primdiffusion.primitives.primitives import K, Payload
 from primdiffusion.released.conventions import ReleasedSlab, released_steps
-from primdiffusion.serve.draw_params import DrawParams, PersonParams
-from primdiffusion.serve.drawing import FrameDrawer, map_frame
 from released_files import TINY, body_arrays, random_network, save_body, save_released, stage_one, state, template
 
 
@@ -114,10 +114,10 @@ def test_the_engines_frames_and_boxes_show_people_on_the_users_body(person, tmp_
     camera = framing(primitives, 0.4, 40, 56)
     for view, chart in (("colour", None), ("boxes", human.body_setup.anchors.chart)):
         np.full(40 * 56 * 5, np.nan, np.float32).tofile(tmp_path / "frame")
-        params = DrawParams(
-            frame=str(tmp_path / "frame"), width=40, height=56, view=view, intrinsics=camera.intrinsics.tolist(),
+        params = Frame(
+            frame=tmp_path / "frame", width=40, height=56, view=view, intrinsics=camera.intrinsics.tolist(),
             world_to_camera=camera.world_to_camera.tolist(),
-            people=[PersonParams(str(tmp_path / "a.human.safetensors"), still, [still] * 24)],
+            people=[PosedPerson(tmp_path / "a.human.safetensors", still, [still] * 24)],
         )  # fmt: skip
         FrameDrawer(torch.device("cpu")).draw(params, lambda *_: None)
         want = draw(Scene(primitives, chart=chart), camera, Look(view, clip=(0.0, 1e10)))

@@ -1,6 +1,5 @@
-"""Lines of JSON-RPC, and parameters with types."""
+"""Lines of JSON-RPC."""
 
-import dataclasses
 import io
 import json
 import math
@@ -10,13 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from primdiffusion.serve.rpc import (
-    INVALID_PARAMS,
     MalformedRequest,
-    Request,
-    RpcError,
+    RpcRequest,
     Wire,
     parse_request,
-    read_params,
 )
 
 scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text()
@@ -38,49 +34,10 @@ def test_any_line_is_a_request_or_an_error_that_can_be_sent(line):
     except MalformedRequest as e:
         Wire(stream).fail(e.id, e)
     else:
-        assert isinstance(request, Request)
+        assert isinstance(request, RpcRequest)
         Wire(stream).respond(request.id, request.method)
     assert stream.getvalue().count(b"\n") == 1
     assert "id" in json.loads(stream.getvalue())
-
-
-@dataclasses.dataclass(frozen=True)
-class Params:
-    count: int
-    scale: float = 1.0
-    name: str | None = None
-    pose: str | list | None = None
-
-    def __post_init__(self) -> None:
-        if self.count < 0:
-            raise ValueError(f"count {self.count} is negative")
-
-
-def test_parameters_get_their_defaults_and_whole_numbers_pass_for_floats():
-    assert read_params(Params, {"count": 2, "scale": 3}, "m") == Params(2, 3)
-    assert read_params(Params, {"count": 2, "pose": [1]}, "m").pose == [1]
-
-
-@pytest.mark.parametrize(
-    ("params", "named"),
-    [
-        ({}, "count"),
-        ({"count": 1, "colour": 2}, "colour"),
-        ({"count": "1"}, "count"),
-        ({"count": 1.0}, "count"),
-        ({"count": True}, "count"),
-        ({"count": None}, "count"),
-        ({"count": 1, "scale": "2"}, "scale"),
-        ({"count": 1, "scale": False}, "scale"),
-        ({"count": 1, "name": 2}, "name"),
-        ({"count": 1, "pose": {}}, "pose"),
-        ({"count": -1}, "count -1 is negative"),
-    ],
-)
-def test_a_wrong_parameter_is_named(params, named):
-    with pytest.raises(RpcError, match=named) as error:
-        read_params(Params, params, "m")
-    assert error.value.code == INVALID_PARAMS
 
 
 def test_lines_of_many_threads_do_not_mix_and_nan_is_not_sent():

@@ -1,30 +1,33 @@
-"""The work of the child, without the child."""
+"""Generating for a child, without the child."""
 
 import itertools
+from pathlib import Path
 
 import pytest
-from primdiffusion.serve import jobs
-from primdiffusion.serve.jobs import Jobs
-from primdiffusion.serve.params import GenerateParams
+from primdiffusion import person_folder
+from primdiffusion.commands import progress, session
+from primdiffusion.commands.generate import GenerateRequest
+from primdiffusion.commands.session import Session
 from tiny_model import save_tiny_checkpoint
 
 
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory) -> str:
-    return str(save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "tiny.safetensors"))
+def checkpoint(tmp_path_factory) -> Path:
+    return save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "tiny.safetensors")
 
 
 @pytest.fixture
 def only_sampling(monkeypatch):
     """Leaves out files and pictures."""
-    monkeypatch.setattr(jobs, "write_person", lambda *_: None)
+    monkeypatch.setattr(person_folder, "write_person", lambda *_: None)
 
 
 def test_time_left_is_the_mean_of_the_warm_steps_times_the_steps_left(checkpoint, tmp_path, monkeypatch, only_sampling):
     clock = itertools.chain([0.0, 10.0, 12.0, 14.0, 20.0], itertools.count(30.0))  # start, 4 steps, the rest
-    monkeypatch.setattr(jobs.time, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: next(clock))
     reports = []
-    Jobs().generate(GenerateParams(1, str(tmp_path), 4, checkpoint=checkpoint), lambda *report: reports.append(report))
+    request = GenerateRequest(seed=1, out_dir=tmp_path, steps=4, checkpoint=checkpoint)
+    request.run(Session(), lambda *report: reports.append(report))
     assert [report for report in reports if report[0] == "sample"] == [
         ("sample", 0, 4, None),
         ("sample", 1, 4, None),
@@ -36,22 +39,23 @@ def test_time_left_is_the_mean_of_the_warm_steps_times_the_steps_left(checkpoint
 
 def test_the_model_stays_loaded_until_another_is_asked_for(checkpoint, tmp_path, monkeypatch, only_sampling):
     loaded = []
-    load = jobs.load_checkpoint
-    monkeypatch.setattr(jobs, "load_checkpoint", lambda path, device: loaded.append(path) or load(path, device))
-    other = str(save_tiny_checkpoint(tmp_path / "other.safetensors"))
-    worker = Jobs()
+    load = session.load_checkpoint
+    monkeypatch.setattr(session, "load_checkpoint", lambda path, device: loaded.append(path) or load(path, device))
+    other = save_tiny_checkpoint(tmp_path / "other.safetensors")
+    one = Session()
     for path in (checkpoint, checkpoint, other, checkpoint):
-        worker.generate(GenerateParams(1, str(tmp_path / "out"), 1, checkpoint=path), lambda *report: None)
+        request = GenerateRequest(seed=1, out_dir=tmp_path / "out", steps=1, checkpoint=path)
+        request.run(one, lambda *report: None)
     assert loaded == [checkpoint, other, checkpoint]
 
 
-def test_a_job_can_be_ended_at_every_report(checkpoint, tmp_path):
+def test_a_request_can_be_ended_at_every_report(checkpoint, tmp_path):
     class Stop(Exception):
         pass
 
-    params = GenerateParams(1, str(tmp_path / "out"), 2, checkpoint=checkpoint, size=32)
+    request = GenerateRequest(seed=1, out_dir=tmp_path / "out", steps=2, checkpoint=checkpoint, size=32)
     reports = []
-    Jobs().generate(params, lambda *report: reports.append(report))
+    request.run(Session(), lambda *report: reports.append(report))
     assert [report[0] for report in reports] == ["load", "sample", "sample", "sample", "write", "write"]
     for path in (tmp_path / "out").iterdir():
         path.unlink()
@@ -64,5 +68,5 @@ def test_a_job_can_be_ended_at_every_report(checkpoint, tmp_path):
                 raise Stop
 
         with pytest.raises(Stop):
-            Jobs().generate(params, stop)
+            request.run(Session(), stop)
         assert not (tmp_path / "out").exists()

@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from primdiffusion.commands import step_pictures as pictures
+from primdiffusion.commands.edit import Region
+from primdiffusion.commands.generate import GenerateRequest
+from primdiffusion.commands.inpaint import InpaintRequest
+from primdiffusion.commands.interpolate import InterpolateRequest
+from primdiffusion.commands.session import Session
+from primdiffusion.commands.step_pictures import Allowance, PassingPictures, draw_front_and_back, step_pictures
+from primdiffusion.commands.transfer import TransferRequest
+from primdiffusion.commands.vary import VaryRequest
 from primdiffusion.diffusion.samplers import Step
-from primdiffusion.serve import step_pictures as pictures
-from primdiffusion.serve.edit_params import InpaintParams, InterpolateParams, TransferParams, VaryParams
-from primdiffusion.serve.jobs import Jobs
-from primdiffusion.serve.params import GenerateParams
-from primdiffusion.serve.step_pictures import Allowance, PassingPictures, draw_front_and_back, step_pictures
 from tiny_model import save_tiny_checkpoint
 
 FILES = ["depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"]
@@ -107,9 +111,10 @@ def test_the_last_step_has_no_picture_for_the_result_follows(tmp_path, always):
 
 def test_generate_shows_what_the_person_will_look_like_and_leaves_no_pictures_behind(checkpoint, tmp_path, always):
     plain, shown = tmp_path / "plain", tmp_path / "shown"
-    Jobs().generate(GenerateParams(5, str(plain), 4, checkpoint=checkpoint, size=32), lambda *_: None)
+    same = {"seed": 5, "steps": 4, "checkpoint": checkpoint, "size": 32}
+    GenerateRequest(out_dir=plain, **same).run(Session(), lambda *_: None)
     listener = Listener()
-    Jobs().generate(GenerateParams(5, str(shown), 4, checkpoint=checkpoint, size=32, picture_px=24), listener)
+    GenerateRequest(out_dir=shown, picture_px=24, **same).run(Session(), listener)
     assert [step for step, _ in listener.pictures] == [1, 2, 3]
     assert {(picture.size, picture.mode) for _, picture in listener.pictures} == {((24, 24), "RGBA")}
     assert all(picture.getchannel("A").getextrema() == (0, 255) for _, picture in listener.pictures)
@@ -126,30 +131,32 @@ def test_a_cancelled_job_leaves_no_picture(checkpoint, tmp_path, always):
         if "picture" in more:
             raise Stop
 
+    request = GenerateRequest(seed=5, out_dir=tmp_path / "out", steps=4, checkpoint=checkpoint, picture_px=16)
     with pytest.raises(Stop):
-        Jobs().generate(GenerateParams(5, str(tmp_path / "out"), 4, checkpoint=checkpoint, picture_px=16), stop)
+        request.run(Session(), stop)
     assert not (tmp_path / "out").exists()
 
 
 def test_every_edit_shows_its_guesses(checkpoint, tmp_path, always):
-    worker, people = Jobs(), []
+    session, people = Session(), []
     for seed in (1, 2):
-        worker.generate(GenerateParams(seed, str(tmp_path / str(seed)), 2, checkpoint=checkpoint, size=8), lambda *_: 0)
-        people.append(str(tmp_path / str(seed) / "person.human.safetensors"))
+        request = GenerateRequest(seed=seed, out_dir=tmp_path / str(seed), steps=2, checkpoint=checkpoint, size=8)
+        request.run(session, lambda *_: None)
+        people.append(tmp_path / str(seed) / "person.human.safetensors")
     same = {"person": people[0], "checkpoint": checkpoint, "size": 8, "steps": 4, "picture_px": 16}
     edits = {
-        "vary": VaryParams(out_dir=str(tmp_path / "v"), **same),
-        "interpolate": InterpolateParams(out_dir=str(tmp_path / "i"), other=people[1], **same),
-        "inpaint": InpaintParams(out_dir=str(tmp_path / "p"), region=["top"], **same),
-        "transfer": TransferParams(
-            out_dir=str(tmp_path / "t"), source=people[1], region=["top"], harmonise=0.5, **same
+        "vary": VaryRequest(out_dir=tmp_path / "v", **same),
+        "interpolate": InterpolateRequest(out_dir=tmp_path / "i", other=people[1], **same),
+        "inpaint": InpaintRequest(out_dir=tmp_path / "p", region=Region(("top",)), **same),
+        "transfer": TransferRequest(
+            out_dir=tmp_path / "t", source=people[1], region=Region(("top",)), harmonise=0.5, **same
         ),
     }
-    for method, params in edits.items():
+    for method, request in edits.items():
         listener = Listener()
-        getattr(worker, method)(params, listener)
+        request.run(session, listener)
         assert len(listener.pictures) >= 2, method
-        assert sorted(path.name for path in tmp_path.joinpath(params.out_dir).iterdir()) == FILES, method
+        assert sorted(path.name for path in tmp_path.joinpath(request.out_dir).iterdir()) == FILES, method
 
 
 def test_a_person_is_drawn_from_both_sides_in_halves_of_a_square(checkpoint, tmp_path):
@@ -169,6 +176,6 @@ def test_a_person_is_drawn_from_both_sides_in_halves_of_a_square(checkpoint, tmp
 @pytest.mark.parametrize("px", [-1, 1025])
 def test_sizes_out_of_range_are_refused(tmp_path, px):
     with pytest.raises(ValueError, match=f"picture_px is {px}: choose 0, for no pictures, to 1024"):
-        GenerateParams(1, str(tmp_path), picture_px=px)
+        GenerateRequest(seed=1, out_dir=tmp_path, picture_px=px).check()
     with pytest.raises(ValueError, match=f"picture_px is {px}"):
-        VaryParams(person="p", out_dir="o", picture_px=px)
+        VaryRequest(person=tmp_path, out_dir=tmp_path, picture_px=px).check()

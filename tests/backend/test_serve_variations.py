@@ -8,12 +8,13 @@ import pytest
 import torch
 from PIL import Image
 from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.commands.request import read_request
+from primdiffusion.commands.session import Session
+from primdiffusion.commands.step_pictures import Allowance
+from primdiffusion.commands.variations import VariationsRequest
 from primdiffusion.editing.vary import vary
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
-from primdiffusion.serve.jobs import Jobs
-from primdiffusion.serve.step_pictures import Allowance
-from primdiffusion.serve.variation_params import VariationsParams
 from tiny_model import save_tiny_checkpoint
 
 
@@ -41,8 +42,8 @@ class Listener:
 def test_each_person_is_the_one_that_generate_makes_of_the_seed(checkpoint, model, tmp_path):
     listener = Listener()
     asked = {"attributes": {"outfit": "suit", "height": 1.7}, "guidance": 2.0}
-    params = VariationsParams([5, 2**63 - 1, 6], str(tmp_path / "out"), 3, "dpmpp_2m", checkpoint, 32, **asked)
-    result = Jobs().variations(params, listener)
+    how = {"steps": 3, "sampler": "dpmpp_2m", "checkpoint": checkpoint, "size": 32, **asked}
+    result = VariationsRequest(seeds=[5, 2**63 - 1, 6], out_dir=tmp_path / "out", **how).run(Session(), listener)
     assert [person["seed"] for person in result["people"]] == [5, 2**63 - 1, 6]
     assert len(list((tmp_path / "out").iterdir())) == 9
     for person in result["people"]:
@@ -62,11 +63,12 @@ def test_each_person_is_the_one_that_generate_makes_of_the_seed(checkpoint, mode
 def test_while_they_are_sampled_each_gets_its_picture_in_turn(checkpoint, model, tmp_path, monkeypatch, around):
     person = tmp_path / "person.human.safetensors"
     save_human(person, generate(model, 3, 2))
-    of_whom, out = {"person": str(person)} if around else {}, tmp_path / "out"
+    of_whom, out = {"person": person} if around else {}, tmp_path / "out"
     grants = itertools.cycle([True, True, False])
     monkeypatch.setattr(Allowance, "granted", lambda _: next(grants))
     listener = Listener()
-    Jobs().variations(VariationsParams([1, 2, 3], str(out), 4, checkpoint=checkpoint, size=16, **of_whom), listener)
+    how = {"steps": 4, "checkpoint": checkpoint, "size": 16, **of_whom}
+    VariationsRequest(seeds=[1, 2, 3], out_dir=out, **how).run(Session(), listener)
     shown = [(step, more["index"]) for stage, step, _, more in listener.reports if stage == "sample" and more]
     assert shown == [(1, 0), (1, 1), (2, 2), (2, 0), (3, 1), (3, 2)]
     assert sorted({path.suffix for path in out.iterdir()}) == [".npz", ".png", ".safetensors"]
@@ -76,10 +78,8 @@ def test_while_they_are_sampled_each_gets_its_picture_in_turn(checkpoint, model,
 def test_variants_of_a_person_are_those_that_vary_makes(checkpoint, model, tmp_path):
     person = tmp_path / "person.human.safetensors"
     save_human(person, generate(model, 3, 2))
-    params = VariationsParams(
-        [8, 9], str(tmp_path / "out"), 5, checkpoint=checkpoint, size=16, person=str(person), amount=0.8
-    )
-    result = Jobs().variations(params, Listener())
+    how = {"steps": 5, "checkpoint": checkpoint, "size": 16, "person": person, "amount": 0.8}
+    result = VariationsRequest(seeds=[8, 9], out_dir=tmp_path / "out", **how).run(Session(), Listener())
     for made in result["people"]:
         kept, alone = load_human(made["person"]), vary(model, load_human(person), 0.8, made["seed"], 5)
         assert torch.allclose(kept.payload.rgb, alone.payload.rgb, atol=1e-4)
@@ -94,9 +94,9 @@ def test_it_can_be_ended_at_every_report_and_then_leaves_nothing(checkpoint, tmp
     class Stop(Exception):
         pass
 
-    params = VariationsParams([1, 2], str(tmp_path / "out"), 2, checkpoint=checkpoint, size=16)
+    request = VariationsRequest(seeds=[1, 2], out_dir=tmp_path / "out", steps=2, checkpoint=checkpoint, size=16)
     listener = Listener()
-    Jobs().variations(params, listener)
+    request.run(Session(), listener)
     for path in (tmp_path / "out").iterdir():
         path.unlink()
     (tmp_path / "out").rmdir()
@@ -108,14 +108,15 @@ def test_it_can_be_ended_at_every_report_and_then_leaves_nothing(checkpoint, tmp
                 raise Stop
 
         with pytest.raises(Stop):
-            Jobs().variations(params, stop)
+            request.run(Session(), stop)
         assert not (tmp_path / "out").exists()
 
 
 def test_a_person_that_is_not_there_is_named(checkpoint, tmp_path):
-    params = VariationsParams([1], str(tmp_path / "out"), 2, checkpoint=checkpoint, person=str(tmp_path / "nobody"))
+    how = {"steps": 2, "checkpoint": checkpoint, "person": tmp_path / "nobody"}
+    request = VariationsRequest(seeds=[1], out_dir=tmp_path / "out", **how)
     with pytest.raises(FileNotFoundError, match=r"there is no person in .*nobody"):
-        Jobs().variations(params, lambda *_, **more: None)
+        request.run(Session(), lambda *_, **more: None)
     assert not (tmp_path / "out").exists()
 
 
@@ -124,19 +125,19 @@ def test_a_person_that_is_not_there_is_named(checkpoint, tmp_path):
     [
         ({"seeds": []}, "0 seeds were given: choose 1 to 64"),
         ({"seeds": list(range(65))}, "65 seeds were given"),
-        ({"seeds": [1, "2"]}, "the seed '2' is no whole number"),
-        ({"seeds": [True]}, "the seed True is no whole number"),
+        ({"seeds": [1, "2"]}, "seeds"),
+        ({"seeds": [True]}, "seeds"),
         ({"seeds": [-1]}, "seed -1 is outside"),
         ({"seeds": [4, 5, 4]}, "two of the seeds are alike"),
         ({"steps": 0}, "0 steps"),
         ({"size": 1}, "pictures of 1 pixels a side: choose 2 or more"),
         ({"size": 5000}, "picture_px is 5000"),
-        ({"out_dir": ""}, "out_dir is empty"),
-        ({"person": ""}, "person is empty"),
+        ({"out_dir": ""}, "out_dir"),
+        ({"person": ""}, "person"),
         ({"amount": 1.5}, "amount is 1.5"),
         ({"guidance": float("nan")}, "guidance is nan"),
     ],
 )
 def test_what_cannot_be_is_refused_before_any_work(changes, sentence):
     with pytest.raises(ValueError, match=sentence):
-        VariationsParams(**{"seeds": [1], "out_dir": "out", **changes})
+        read_request(VariationsRequest, {"seeds": [1], "out_dir": "out", **changes}, "variations")

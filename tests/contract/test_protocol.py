@@ -292,14 +292,14 @@ def test_a_broken_environment_still_says_hello_and_names_the_problem(tmp_path):
 
 FAILING = """
 import torch
-import primdiffusion.serve.jobs as jobs, primdiffusion.serve.server as server
+import primdiffusion.human as human, primdiffusion.serve.server as server
 
-def fail(model, seed, *_):
-    if seed == 1:
+def fail(model, seeds, *_):
+    if seeds == [1]:
         torch.empty(10**15)
     raise KeyError("a defect")
 
-jobs.generate = fail
+human.generate_batch = fail
 server.main()
 """
 

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float32, Int
 from numpy import ndarray
 from torch import Tensor
 
+from primdiffusion.formats.requests import VIEWS, View
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.render.solids import Solids
 
-View = Literal["colour", "depth", "alpha", "boxes"]
-"""What is drawn of people: their colours, their distance in colours, their coverage in grey, their boxes."""
 NOTHING = 1e10
 """Depth where there is nothing, metres: what Blender's Depth pass holds there."""
 
@@ -36,7 +34,7 @@ class Scene:
 class Look:
     """How a scene is drawn."""
 
-    view: View = "colour"
+    view: View = VIEWS[0]
     background: tuple[float, float, float] | None = None
     """Linear RGB behind everything; None leaves the picture transparent there."""
     clip: tuple[float, float] = (0.0, math.inf)
@@ -45,8 +43,8 @@ class Look:
 
     def __post_init__(self) -> None:
         """ValueError for an unknown view and planes in the wrong order."""
-        if self.view not in get_args(View):
-            raise ValueError(f"there is no view {self.view!r}; choose from {', '.join(get_args(View))}")
+        if self.view not in VIEWS:
+            raise ValueError(f"there is no view {self.view!r}; choose from {', '.join(VIEWS)}")
         start, end = self.clip
         if not 0 <= start < end:
             raise ValueError(

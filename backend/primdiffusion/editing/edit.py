@@ -14,7 +14,7 @@ from torch import Tensor
 from primdiffusion.diffusion.model import DiffusionModel, seeded
 from primdiffusion.diffusion.samplers import Denoise, Step
 from primdiffusion.diffusion.schedule import Schedule, trailing_steps
-from primdiffusion.editing.shares import check_share
+from primdiffusion.editing.unit_interval import check_unit_interval
 from primdiffusion.human import Human
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import Payload
@@ -81,7 +81,7 @@ def chain_down(schedule: Schedule, amount: float, steps: int) -> list[int]:
     or all there are below that level where these are fewer. Raises ValueError for an amount outside 0 ... 1 and a
     number of steps outside 1 ... T.
     """
-    check_share("amount", amount)
+    check_unit_interval("amount", amount)
     trailing_steps(schedule.length, steps)
     levels = round(amount**EVENNESS * schedule.length)
     return trailing_steps(levels, min(steps, levels)) if levels else []

@@ -24,7 +24,7 @@ from primdiffusion.editing.edit import (
     last,
     with_edit,
 )
-from primdiffusion.editing.shares import check_share
+from primdiffusion.editing.unit_interval import check_unit_interval
 from primdiffusion.formats import requests
 from primdiffusion.human import Human, made_by
 from primdiffusion.primitives.primitives import Payload
@@ -46,7 +46,7 @@ def interpolate(
     Deterministic, without a seed. Provenance is that of the nearer person. Raises ValueError for a fraction outside
     0 ... 1 and steps outside 1 ... T.
     """
-    check_share("fraction", fraction)
+    check_unit_interval("fraction", fraction)
     chain = inversion_steps(model.schedule, steps)
     models = fitted(model, a), fitted(model, b)
     if models[0].full_density != models[1].full_density:

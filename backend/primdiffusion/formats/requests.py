@@ -1,11 +1,18 @@
 """What requests may say, and their defaults: on the command line, in JSON-RPC and in the extension's panels."""
 
-SAMPLERS = ("ddim", "dpmpp_2m", "ddpm")
+from typing import Literal, get_args
+
+Sampler = Literal["ddim", "dpmpp_2m", "ddpm"]
+SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
 """The first is the default."""
-TRANSFERS = ("texture", "garment")
-"""What one person can get from another; the first is the default."""
-VIEWS = ("colour", "depth", "alpha", "boxes")
-"""What pictures can show; the first is the default."""
+Transfer = Literal["texture", "garment"]
+"""What one person can get from another: colours alone, or shape too."""
+TRANSFERS: tuple[Transfer, ...] = get_args(Transfer)
+"""The first is the default."""
+View = Literal["colour", "depth", "alpha", "boxes"]
+"""What is drawn of people: their colours, their distance in colours, their coverage in grey, their boxes."""
+VIEWS: tuple[View, ...] = get_args(View)
+"""The first is the default."""
 WHOLE_PARTS = (
     "face", "hair", "neck", "torso", "upper_arms", "forearms", "hands", "thighs", "shins", "feet", "hips",
     "head", "arms", "legs", "top", "bottom", "shoes", "clothes", "skin",

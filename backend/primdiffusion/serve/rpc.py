@@ -1,4 +1,4 @@
-"""JSON-RPC 2.0, one message a line: framing, errors and typed parameters. Knows pipes and JSON, nothing of people.
+"""JSON-RPC 2.0, one message a line: framing and errors. Knows pipes and JSON, nothing of people.
 
 A line is UTF-8 JSON without line breaks inside (json escapes them), ended by a newline. There are no batches.
 """
@@ -9,9 +9,7 @@ import dataclasses
 import json
 import math
 import threading
-import types
-import typing
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO
 
 PARSE_ERROR = -32700
 INVALID_REQUEST = -32600
@@ -22,7 +20,6 @@ CANCELLED = -32001
 DOMAIN_ERROR = -32002
 """An error of the subject, not of the protocol; `data.kind` names it, `data.remedy` says what to do next."""
 
-T = TypeVar("T")
 JsonId = str | int | float | None
 
 
@@ -41,7 +38,7 @@ class RpcError(Exception):
 
 
 @dataclasses.dataclass(frozen=True)
-class Request:
+class RpcRequest:
     """One parsed message from the other side."""
 
     method: str
@@ -59,7 +56,7 @@ class MalformedRequest(RpcError):
         self.id = id
 
 
-def parse_request(line: bytes) -> Request:
+def parse_request(line: bytes) -> RpcRequest:
     """The request in one line. Raises MalformedRequest for anything that is not one JSON-RPC 2.0 request object."""
     try:
         message = json.loads(line.decode("utf-8"))
@@ -81,60 +78,7 @@ def parse_request(line: bytes) -> Request:
         raise MalformedRequest(INVALID_REQUEST, "a request needs a method name", id)
     if not isinstance(params, dict):
         raise MalformedRequest(INVALID_PARAMS, f"params of {method!r} must be a JSON object with names", id)
-    return Request(method, params, id, "id" in message)
-
-
-def _json_type_fits(value: Any, annotation: Any) -> bool:
-    if typing.get_origin(annotation) in (types.UnionType, typing.Union):
-        return any(_json_type_fits(value, option) for option in typing.get_args(annotation))
-    if annotation is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    if annotation is int:
-        return isinstance(value, int) and not isinstance(value, bool)
-    return isinstance(value, typing.get_origin(annotation) or annotation)
-
-
-def _record_of_entries(annotation: Any) -> type | None:
-    """The dataclass R of an annotation list[R], otherwise None."""
-    entries = typing.get_args(annotation)
-    is_list = typing.get_origin(annotation) is list and len(entries) == 1
-    return entries[0] if is_list and isinstance(entries[0], type) and dataclasses.is_dataclass(entries[0]) else None
-
-
-def _read_entries(record: type[T], values: list[Any], name: str) -> list[T]:
-    for value in values:
-        if not isinstance(value, dict):
-            raise RpcError(INVALID_PARAMS, f"every entry of {name} must be a JSON object: {value!r:.80} was given")
-    return [read_params(record, value, f"{name}[{i}]") for i, value in enumerate(values)]
-
-
-def read_params(record: type[T], params: dict[str, Any], method: str) -> T:
-    """`params` as a frozen dataclass `record`: unknown, missing or wrongly typed names raise RpcError(INVALID_PARAMS).
-
-    A field list[R] of a dataclass R takes a list of JSON objects, each read in the same way. A ValueError of the
-    record's own `__post_init__` (ranges) becomes the same error.
-    """
-    fields = {field.name: field for field in dataclasses.fields(record)}  # type: ignore[arg-type]
-    hints = typing.get_type_hints(record)
-    if unknown := sorted(set(params) - set(fields)):
-        known = ", ".join(fields) or "none"
-        raise RpcError(
-            INVALID_PARAMS, f"{method!r} does not know the parameter {unknown[0]!r}: its parameters are {known}"
-        )
-    for name, field in fields.items():
-        if name not in params:
-            if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-                raise RpcError(INVALID_PARAMS, f"{method!r} needs the parameter {name!r}: it was not given")
-        elif not _json_type_fits(params[name], hints[name]):
-            wanted = getattr(hints[name], "__name__", str(hints[name]))
-            given = f"{params[name]!r:.80}"
-            raise RpcError(INVALID_PARAMS, f"parameter {name!r} of {method!r} must be {wanted}: {given} was given")
-    lists = {name: _record_of_entries(hints[name]) for name in params}
-    read = {name: _read_entries(entry, params[name], f"{method}.{name}") for name, entry in lists.items() if entry}
-    try:
-        return record(**{**params, **read})
-    except ValueError as e:
-        raise RpcError(INVALID_PARAMS, f"{method!r}: {e}") from e
+    return RpcRequest(method, params, id, "id" in message)
 
 
 class Wire:
@@ -151,13 +95,13 @@ class Wire:
             self._stream.flush()
 
     def respond(self, id: JsonId, result: Any) -> None:
-        """The good end of a request."""
+        """The result of a request."""
         self._send({"id": id, "result": result})
 
     def fail(self, id: JsonId, error: RpcError) -> None:
-        """The bad end of a request."""
+        """The error of a request."""
         self._send({"id": id, "error": error.as_object()})
 
     def notify(self, method: str, **params: Any) -> None:
-        """A message nobody answers."""
+        """A message without an answer."""
         self._send({"method": method, "params": params})

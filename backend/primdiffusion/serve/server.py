@@ -1,11 +1,11 @@
 """The child's side of the conversation: JSON-RPC 2.0 on stdin and stdout, a message a line (docs/design/protocol.md).
 
-    reader thread     parses lines; answers hello, cancel and shutdown itself, so they work while a person is sampled
-    main thread       loads torch, then runs one job at a time (generate, edits, reconstruct, render, draw)
+    reader thread     parses lines; answers hello, cancel and shutdown itself, so they work while a request runs
+    main thread       loads torch, then runs one request at a time of REQUESTS
     heartbeat thread  a notification every 0.5 s, so that the other side can tell busy from hung
 
 `hello` answers before torch is loaded: `device` is null until a `ready` notification brings it (or `problem`, a
-sentence, where the environment is broken). A second job while one runs fails with kind "busy". The child ends when its
+sentence, where the environment is broken). A second request meanwhile fails with kind "busy". The child ends when its
 stdin does, because then its parent is gone. Stray prints go to stderr: file descriptor 1 is moved away first of all.
 """
 
@@ -19,56 +19,64 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
+from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn, TypeVar
 
 from primdiffusion import __version__
+from primdiffusion.commands.attributes import AttributesRequest
+from primdiffusion.commands.draw import DrawRequest
+from primdiffusion.commands.export import GaussiansRequest, HumanNpzRequest, ProxyRequest
+from primdiffusion.commands.generate import GenerateRequest
+from primdiffusion.commands.inpaint import InpaintRequest
+from primdiffusion.commands.interpolate import InterpolateRequest
+from primdiffusion.commands.merge import FitGainRequest, MergeFramesRequest, MergeRequest
+from primdiffusion.commands.reconstruct import ReconstructRequest
+from primdiffusion.commands.render import RenderRequest
+from primdiffusion.commands.request import Request, RequestError, read_record, read_request
+from primdiffusion.commands.transfer import TransferRequest
+from primdiffusion.commands.variations import VariationsRequest
+from primdiffusion.commands.vary import VaryRequest
 from primdiffusion.failures import Failure, describe
 from primdiffusion.machine import memory, share_processors
-from primdiffusion.serve.draw_params import DrawParams
-from primdiffusion.serve.edit_params import InpaintParams, InterpolateParams, TransferParams, VaryParams
-from primdiffusion.serve.export_params import GaussiansParams, HumanNpzParams, ProxyParams
-from primdiffusion.serve.merge_params import FitGainParams, MergeFramesParams, MergeParams
-from primdiffusion.serve.params import AttributesParams, GenerateParams, ReconstructParams, RenderParams
 from primdiffusion.serve.rpc import (
     CANCELLED,
     DOMAIN_ERROR,
     INTERNAL_ERROR,
+    INVALID_PARAMS,
     METHOD_NOT_FOUND,
     MalformedRequest,
-    Request,
     RpcError,
+    RpcRequest,
     Wire,
     parse_request,
-    read_params,
 )
-from primdiffusion.serve.variation_params import VariationsParams
 
 if TYPE_CHECKING:
-    from primdiffusion.serve.jobs import Jobs
+    from primdiffusion.commands.session import Session
 
+R = TypeVar("R")
 PROTOCOL = 1
 HEARTBEAT_S = 0.5
-JOBS = {
-    "generate": GenerateParams,
-    "variations": VariationsParams,
-    "attributes": AttributesParams,
-    "vary": VaryParams,
-    "interpolate": InterpolateParams,
-    "inpaint": InpaintParams,
-    "transfer": TransferParams,
-    "reconstruct": ReconstructParams,
-    "render": RenderParams,
-    "draw": DrawParams,
-    "merge": MergeParams,
-    "merge_frames": MergeFramesParams,
-    "fit_gain": FitGainParams,
-    "proxy": ProxyParams,
-    "gaussians": GaussiansParams,
-    "human_npz": HumanNpzParams,
+REQUESTS: dict[str, type[Request]] = {
+    "generate": GenerateRequest,
+    "variations": VariationsRequest,
+    "attributes": AttributesRequest,
+    "vary": VaryRequest,
+    "interpolate": InterpolateRequest,
+    "inpaint": InpaintRequest,
+    "transfer": TransferRequest,
+    "reconstruct": ReconstructRequest,
+    "render": RenderRequest,
+    "draw": DrawRequest,
+    "merge": MergeRequest,
+    "merge_frames": MergeFramesRequest,
+    "fit_gain": FitGainRequest,
+    "proxy": ProxyRequest,
+    "gaussians": GaussiansRequest,
+    "human_npz": HumanNpzRequest,
 }
-"""Methods of `Jobs`, which run on the main thread one at a time, and their parameters."""
+"""By method; they run on the main thread, one at a time."""
 GRACE_S = 3.0
-"""After the parent is gone a job has this long to reach its next step and tidy up; then the process ends anyway."""
+"""After the parent is gone a request has this long to reach its next step and tidy up; then the process ends anyway."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,43 +92,43 @@ class CancelParams:
 
 
 class Cancelled(Exception):
-    """Raised inside a job at its next step after a cancel."""
+    """Raised in a request at work at its next step after a cancel."""
 
 
 @dataclasses.dataclass
-class Job:
+class Running:
     """The request at work."""
 
+    message: RpcRequest
     request: Request
-    params: Any
     cancelled: threading.Event = dataclasses.field(default_factory=threading.Event)
 
 
 class Server:
-    """One conversation: lines from `source`, messages to `wire`, one job at a time."""
+    """One conversation: lines from `source`, messages to `wire`."""
 
     def __init__(self, source: BinaryIO, wire: Wire):
         self._source = source
         self._wire = wire
-        self._queue: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[Running | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
-        self._job: Job | None = None
+        self._running: Running | None = None
         self._ended = threading.Event()
         self._state: dict[str, Any] = {"ready": False, "problem": None, "device": None, "device_name": None}
-        self._methods: dict[str, Callable[[Request], None]] = {
+        self._methods: dict[str, Callable[[RpcRequest], None]] = {
             "hello": self._hello,
             "cancel": self._cancel,
             "shutdown": self._shutdown,
-            **dict.fromkeys(JOBS, self._accept),
+            **dict.fromkeys(REQUESTS, self._accept),
         }
 
     def run(self) -> None:
         """Serves until shutdown, or the end of the input or of the output. Call from the main thread."""
         threading.Thread(target=self._read, name="reader", daemon=True).start()
         threading.Thread(target=self._beat, name="heartbeat", daemon=True).start()
-        jobs = self._warm_up()
-        while (job := self._queue.get()) is not None:
-            self._run_job(jobs, job)
+        session = self._warm_up()
+        while (running := self._queue.get()) is not None:
+            self._work(session, running)
 
     # reader thread
 
@@ -136,56 +144,56 @@ class Server:
 
     def _dispatch(self, line: bytes) -> None:
         try:
-            request = parse_request(line)
+            message = parse_request(line)
         except MalformedRequest as e:
             self._wire.fail(e.id, e)
             return
         try:
-            method = self._methods.get(request.method)
+            method = self._methods.get(message.method)
             if method is None:
                 known = ", ".join(self._methods)
-                raise RpcError(METHOD_NOT_FOUND, f"there is no method {request.method!r}: the methods are {known}")
-            method(request)
+                raise RpcError(METHOD_NOT_FOUND, f"there is no method {message.method!r}: the methods are {known}")
+            method(message)
         except OSError:
             raise
         except Exception as e:
-            self._fail(request, _as_rpc_error(e))
+            self._fail(message, _as_rpc_error(e))
 
-    def _hello(self, request: Request) -> None:
-        read_params(NoParams, request.params, "hello")
+    def _hello(self, message: RpcRequest) -> None:
+        _parameters(read_record, NoParams, message)
         about = {"name": "primdiffusion", "version": __version__, "protocol": PROTOCOL, "pid": os.getpid()}
         python = {"python": platform.python_version(), "executable": sys.executable}
-        self._respond(request, {**about, **python, **memory(), **self._state})
+        self._respond(message, {**about, **python, **memory(), **self._state})
 
-    def _cancel(self, request: Request) -> None:
-        params = read_params(CancelParams, request.params, "cancel")
-        with self._lock:  # also while answering, so that the answer comes before the end of the job
-            found = self._job is not None and self._job.request.id == params.id
-            if found and self._job is not None:
-                self._job.cancelled.set()
-            self._respond(request, {"cancelled": found})
+    def _cancel(self, message: RpcRequest) -> None:
+        params = _parameters(read_record, CancelParams, message)
+        with self._lock:  # also while answering, so that the answer comes before the end of the request
+            found = self._running is not None and self._running.message.id == params.id
+            if found and self._running is not None:
+                self._running.cancelled.set()
+            self._respond(message, {"cancelled": found})
 
-    def _shutdown(self, request: Request) -> None:
-        read_params(NoParams, request.params, "shutdown")
-        self._respond(request, {})
+    def _shutdown(self, message: RpcRequest) -> None:
+        _parameters(read_record, NoParams, message)
+        self._respond(message, {})
         self._end()
 
-    def _accept(self, request: Request) -> None:
-        job = Job(request, read_params(JOBS[request.method], request.params, request.method))
+    def _accept(self, message: RpcRequest) -> None:
+        running = Running(message, _parameters(read_request, REQUESTS[message.method], message))
         with self._lock:
-            if self._job is not None:
-                sentence = f"the backend is at work on request {self._job.request.id!r}: one job at a time"
+            if self._running is not None:
+                sentence = f"the backend is at work on request {self._running.message.id!r}: one at a time"
                 raise RpcError(DOMAIN_ERROR, sentence, {"kind": "busy", "remedy": "wait for it, or cancel it first"})
-            self._job = job
-        self._queue.put(job)
+            self._running = running
+        self._queue.put(running)
 
     def _end(self) -> None:
-        """A job at work may tidy up first; with none there is nothing to wait for, not even torch being loaded."""
+        """A request at work may tidy up first; with none there is nothing to wait for, not even torch being loaded."""
         self._ended.set()
         with self._lock:
-            if self._job is None:
+            if self._running is None:
                 _leave(0)
-            self._job.cancelled.set()
+            self._running.cancelled.set()
         self._queue.put(None)
         threading.Timer(GRACE_S, _leave, [0]).start()
 
@@ -200,31 +208,31 @@ class Server:
 
     # main thread
 
-    def _warm_up(self) -> Jobs | RpcError:
-        """Imports torch and all that needs it; a broken environment becomes the error of every later job."""
+    def _warm_up(self) -> Session | RpcError:
+        """Imports torch and all that needs it; a broken environment becomes the error of every later request."""
         try:
-            from primdiffusion.serve.jobs import Jobs
+            from primdiffusion.commands.session import Session  # after `hello` can be answered
 
-            jobs = Jobs()
+            session = Session()
         except Exception as e:
             error = _as_rpc_error(e)
             self._state = {**self._state, "problem": str(error)}
             self._notify("ready", **self._state)
             return error
-        self._state = {**self._state, "ready": True, **jobs.device_info()}
+        self._state = {**self._state, "ready": True, **session.device_info()}
         self._notify("ready", **self._state)
-        return jobs
+        return session
 
-    def _run_job(self, jobs: Jobs | RpcError, job: Job) -> None:
+    def _work(self, session: Session | RpcError, running: Running) -> None:
         def report(stage: str, step: int, total: int, eta_s: float | None, /, **more: Any) -> None:
-            if job.cancelled.is_set():
+            if running.cancelled.is_set():
                 raise Cancelled
-            self._notify("progress", id=job.request.id, stage=stage, step=step, total=total, eta_s=eta_s, **more)
+            self._notify("progress", id=running.message.id, stage=stage, step=step, total=total, eta_s=eta_s, **more)
 
         try:
-            if isinstance(jobs, RpcError):
-                raise jobs
-            result = getattr(jobs, job.request.method)(job.params, report)
+            if isinstance(session, RpcError):
+                raise session
+            result = running.request.run(session, report)
         except Cancelled:
             outcome: Any = RpcError(CANCELLED, "cancelled")
         except Exception as e:
@@ -232,28 +240,38 @@ class Server:
         else:
             outcome = result
         with self._lock:
-            self._job = None
+            self._running = None
         if isinstance(outcome, RpcError):
-            self._fail(job.request, outcome)
+            self._fail(running.message, outcome)
         else:
-            self._respond(job.request, outcome)
+            self._respond(running.message, outcome)
 
     # any thread
 
-    def _respond(self, request: Request, result: Any) -> None:
-        if request.wants_response:
-            self._wire.respond(request.id, result)
+    def _respond(self, message: RpcRequest, result: Any) -> None:
+        if message.wants_response:
+            self._wire.respond(message.id, result)
 
-    def _fail(self, request: Request, error: RpcError) -> None:
-        if request.wants_response:
-            self._wire.fail(request.id, error)
+    def _fail(self, message: RpcRequest, error: RpcError) -> None:
+        if message.wants_response:
+            self._wire.fail(message.id, error)
 
     def _notify(self, method: str, **params: Any) -> None:
         self._wire.notify(method, **params)
 
 
+def _parameters(read: Callable[[type[R], dict[str, Any], str], R], record: type[R], message: RpcRequest) -> R:
+    """The parameters of a message; ValueErrors of reading become RpcError(INVALID_PARAMS)."""
+    try:
+        return read(record, message.params, message.method)
+    except RequestError as e:
+        raise RpcError(INVALID_PARAMS, str(e)) from e
+    except ValueError as e:
+        raise RpcError(INVALID_PARAMS, f"{message.method!r}: {e}") from e
+
+
 def _as_rpc_error(error: Exception) -> RpcError:
-    """What the other side is told; the traceback goes to stderr, where the client keeps the last lines."""
+    """The error as a response carries it; the traceback goes to stderr, where the client keeps the last lines."""
     if isinstance(error, RpcError):
         return error
     traceback.print_exception(error, file=sys.stderr)

@@ -1,16 +1,20 @@
-"""What a job tells while it is at work: steps, the time that is left, pictures of what is there so far."""
+"""What a request at work reports: steps, the time that is left, pictures of the result so far."""
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, Protocol
 
-from primdiffusion.diffusion.samplers import Step
+from tqdm import tqdm
+
+if TYPE_CHECKING:
+    from primdiffusion.diffusion.samplers import Step
 
 
 class Report(Protocol):
-    """The listener of a job."""
+    """The listener of a request at work."""
 
     def __call__(self, stage: str, step: int, total: int, eta_s: float | None, /, **more: Any) -> None:
         """`eta_s` are seconds; `more` may be `picture`, a PNG's path, and `index`, whose it is. Raises to end it."""
@@ -24,7 +28,7 @@ class Pace:
         self._times: list[float] = []
 
     def left(self, done: int, total: int) -> float | None:
-        """Seconds until `total`, told each time a step is done; None after the first one."""
+        """Seconds until `total`; call it each time a step is done. None after the first one."""
         self._times.append(time.perf_counter())
         if len(self._times) < 2:
             return None
@@ -32,12 +36,12 @@ class Pace:
 
 
 def no_picture(_step: Step) -> str | None:
-    """What a job without pictures shows after a step."""
+    """The picture after a step of a request without pictures."""
     return None
 
 
 def step_reporter(report: Report, picture: Callable[[Step], str | None] = no_picture) -> Callable[[Step], None]:
-    """Reports each step with the seconds left, and the picture that there may be of it."""
+    """Reports each step with the seconds left, and its picture where there is one."""
     pace = Pace()
 
     def on_step(step: Step) -> None:
@@ -47,3 +51,16 @@ def step_reporter(report: Report, picture: Callable[[Step], str | None] = no_pic
         report("sample", done, step.total, pace.left(done, step.total), **more)
 
     return on_step
+
+
+@contextlib.contextmanager
+def progress_bar(label: str | None = None) -> Iterator[Report]:
+    """Shows the sampler's steps on stderr where that is a terminal."""
+    with tqdm(desc=label, unit="step", disable=None) as bar:
+
+        def report(stage: str, step: int, total: int, _eta_s: float | None, /, **_more: Any) -> None:
+            if stage == "sample":
+                bar.total = total
+                bar.update(step - bar.n)
+
+        yield report

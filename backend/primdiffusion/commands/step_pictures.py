@@ -12,19 +12,19 @@ import torch
 from torch import Tensor
 
 from primdiffusion.body.model import BodyPose
+from primdiffusion.commands.progress import no_picture
 from primdiffusion.diffusion.samplers import Step
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.human import Human, framing, place
 from primdiffusion.render.image import rgba_to_png, to_png
 from primdiffusion.render.march import march
-from primdiffusion.serve.progress import no_picture
 
 INTERVAL_S = 0.4
 """Of work between two pictures."""
 TIME_SHARE = 0.25
 """Of all time may go into pictures."""
 KEPT = 2
-"""Pictures: whoever has just been told of one may still be reading it when the next one appears."""
+"""Pictures: the reader of one may still be at it when the next one appears."""
 THREE_QUARTERS = math.radians(20)
 ARMS_DOWN = math.radians(62)
 
@@ -87,7 +87,7 @@ class PassingPictures(contextlib.AbstractContextManager):
 
 @contextlib.contextmanager
 def step_pictures(folder: Path, px: int, show: Show) -> Iterator[Callable[[Step], str | None]]:
-    """A function that is told of each step and may draw a picture of `px` x `px` pixels in `folder`; returns its path.
+    """A function to call after each step, which may draw a picture of `px` x `px` pixels in `folder`; returns its path.
 
     None where there is no picture; px = 0 draws none. Those of the steps before vanish.
     """
@@ -122,7 +122,7 @@ def draw_front_and_back(path: Path, human: Human, px: int) -> None:
 
     A standing person is half as wide as high: two of them fill a square.
     """
-    primitives = place(human, at_ease())
+    primitives = place(human, a_pose())
     views = []
     for yaw in (THREE_QUARTERS, THREE_QUARTERS + math.pi):
         view = march(primitives, framing(primitives, yaw, px // 2, px))
@@ -130,7 +130,7 @@ def draw_front_and_back(path: Path, human: Human, px: int) -> None:
     rgba_to_png(path, torch.cat(views, dim=1), None)
 
 
-def at_ease() -> BodyPose:
+def a_pose() -> BodyPose:
     """Arms lowered to the sides, away from the body."""
     theta = torch.zeros(len(JOINT_NAMES), 3)
     theta[JOINT_NAMES.index("left_shoulder"), 2] = -ARMS_DOWN

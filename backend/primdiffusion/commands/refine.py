@@ -1,4 +1,4 @@
-"""The command `primdiffusion refine`: a captured person's pictures in, the person in all their detail out."""
+"""A captured person in all their detail: `primdiffusion refine`."""
 
 from __future__ import annotations
 
@@ -62,6 +62,7 @@ class Refine:
         Raises:
             ValueError, FileNotFoundError: captures, start or settings are missing, damaged or do not fit; OSError.
         """
+        # torch is loaded late
         from primdiffusion.capture.conditioning import choose_subject, conditioning_views, default_betas
         from primdiffusion.machine import best_device
         from primdiffusion.person_folder import write_person
@@ -103,6 +104,7 @@ class Refine:
 
     def _start(self, captures: Captures, name: str, betas: Tensor, given: Sequence[int]) -> Human:
         """The person to begin with, on the captured body, whoever's they were."""
+        # torch is loaded late
         from primdiffusion.human_file import load_human
         from primdiffusion.training.refine_start import bare_body, meshed_person
 
@@ -122,6 +124,7 @@ class Refine:
         return dataclasses.replace(human, betas=betas, provenance={**human.provenance, "refined_from": name})
 
     def _encoded(self, captures: Captures, name: str, betas: Tensor, given: Sequence[int]) -> Human:
+        # torch is loaded late
         from primdiffusion.capture.conditioning import CapturedPerson, conditioning_views
         from primdiffusion.encoder.checkpoint import load_encoder
         from primdiffusion.machine import best_device

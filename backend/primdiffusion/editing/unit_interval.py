@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 
-def check_share(name: str, value: float) -> None:
+def check_unit_interval(name: str, value: float) -> None:
     """ValueError unless `value` lies in 0 ... 1."""
     if not 0 <= value <= 1:
         raise ValueError(f"{name} is {value}: choose a number from 0 to 1")

@@ -1,24 +1,21 @@
-"""Parameters of draw, checked before any work starts. Imports no torch."""
+"""A frame to draw: people in their poses, and the camera that sees them. Imports no torch."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from pathlib import Path
 
+from primdiffusion.commands.checks import check_betas, check_numbers, check_sides
 from primdiffusion.drawing.steps import check_step
-
-VIEWS = ("colour", "depth", "alpha", "boxes")
-JOINTS = 24
-LARGEST_NUMBER = 1e30
-"""Products of larger ones do not fit into float32."""
-Matrix = tuple[tuple[float, ...], ...]
+from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.formats.requests import RAY_STEP, VIEWS, View
 
 
 @dataclasses.dataclass(frozen=True)
-class PersonParams:
-    """One of the people in a picture."""
+class PosedPerson:
+    """A person as an armature poses them."""
 
-    human: str
+    human: Path
     """A person.human.safetensors file."""
     object: list
     """[3][4] world matrix of the armature object; y up, metres."""
@@ -27,18 +24,18 @@ class PersonParams:
     betas: list | None = None
     """Shape coefficients; None for the file's."""
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """ValueError for arrays of another shape, and numbers that are not finite."""
         check_numbers("object", self.object, (3, 4))
-        check_numbers("joints", self.joints, (JOINTS, 3, 4))
-        if self.betas is not None:
-            check_numbers("betas", self.betas, (len(self.betas),))
+        check_numbers("joints", self.joints, (len(JOINT_NAMES), 3, 4))
+        check_betas(self.betas)
 
 
 @dataclasses.dataclass(frozen=True)
-class DrawParams:
-    """Parameters of draw."""
+class Frame:
+    """What to draw, and into which file."""
 
-    frame: str
+    frame: Path
     """A file of (4 + 1) w h float32 that is mapped and filled: premultiplied linear RGBA, then depth; bottom row first.
     w and h are the region's."""
     width: int
@@ -48,22 +45,24 @@ class DrawParams:
     """[3][3] of the whole picture, pixels from its top left corner, pixel centres at +0.5."""
     world_to_camera: list
     """[3][4], OpenCV; y up, metres."""
-    people: list[PersonParams]
+    people: list[PosedPerson]
     region: list | None = None
     """[x, y, w, h], pixels from the left and from the bottom; None for the whole picture."""
     clip: list = dataclasses.field(default_factory=lambda: [0.0, 1e10])
     """[start, end], metres along the optical axis."""
-    solids: str | None = None
+    solids: Path | None = None
     """An npz of corners [F, 3, 3], colour [F, 3] and holdout [F]."""
     background: list | None = None
     """[r, g, b], linear; None leaves the picture transparent."""
-    view: str = "colour"
-    step: float = 0.004
+    view: View = VIEWS[0]
+    step: float = RAY_STEP
     """Metres between samples of a ray through people of natural size; others are sampled in proportion to theirs."""
 
-    def __post_init__(self) -> None:
-        if min(self.width, self.height) < 1:
-            raise ValueError(f"a picture of {self.width} x {self.height} pixels: choose sides of 1 or more")
+    def check(self) -> None:
+        """ValueError, which names the field, for values that are out of range."""
+        for person in self.people:
+            person.check()
+        check_sides(self.width, self.height)
         check_numbers("intrinsics", self.intrinsics, (3, 3))
         if not (self.intrinsics[0][0] > 0 and self.intrinsics[1][1] > 0):
             raise ValueError(f"the focal lengths of intrinsics {self.intrinsics} are not positive")
@@ -75,8 +74,6 @@ class DrawParams:
             raise ValueError(f"clip is {self.clip}: give [start, end] in metres with 0 <= start < end")
         if self.background is not None:
             check_numbers("background", self.background, (3,))
-        if self.view not in VIEWS:
-            raise ValueError(f"there is no view {self.view!r}: choose from {', '.join(VIEWS)}")
         check_step(self.step)
         if self.region is not None:
             self._check_region(self.region)
@@ -99,19 +96,3 @@ class DrawParams:
     def corner(self) -> tuple[int, int]:
         """The pixel of the whole picture, from its left and top, that is the region's top left one."""
         return (0, 0) if self.region is None else (self.region[0], self.height - self.region[1] - self.region[3])
-
-
-def check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> None:
-    """ValueError that names `name` unless `value` is nested lists of this shape, of numbers that float32 can hold."""
-    wanted = " x ".join(map(str, shape))
-    if not shape:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ValueError(f"{name} holds {value!r:.40} where a number should be")
-        if not -LARGEST_NUMBER <= value <= LARGEST_NUMBER:
-            raise ValueError(f"{name} holds {value!r:.40}: give finite numbers, of at most {LARGEST_NUMBER:g}")
-        return
-    if not isinstance(value, list) or len(value) != shape[0]:
-        given = f"{len(value)} entries" if isinstance(value, list) else f"{value!r:.40}"
-        raise ValueError(f"{name} holds {given} where {wanted} numbers should be")
-    for entry in value:
-        check_numbers(name, entry, shape[1:])

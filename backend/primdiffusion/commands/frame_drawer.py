@@ -1,4 +1,4 @@
-"""The child's job `draw`: from parameters to a filled frame, keeping what the next picture is likely to need again."""
+"""Draws frames, and keeps what the next one is likely to need again."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import functools
 import math
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,8 @@ import numpy as np
 import torch
 
 from primdiffusion.body.model import BodyModel, default_body
+from primdiffusion.commands.frame import Frame
+from primdiffusion.commands.progress import Report
 from primdiffusion.drawing.bands import BAND_SECONDS, FIRST_PIXELS, draw_in_bands
 from primdiffusion.drawing.scene import Look, Picture, Scene
 from primdiffusion.failures import PictureOutOfMemory, out_of_memory
@@ -27,10 +28,7 @@ from primdiffusion.render import cuda
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.render.solids import Solids
 from primdiffusion.reshaping import reshaped
-from primdiffusion.serve.draw_params import DrawParams
 
-Report = Callable[[str, int, int, float | None], None]
-"""Told (stage, step, total, seconds left); raises to end the job."""
 CHANNELS = 5
 """Of a frame: combined and depth."""
 PEOPLE_KEPT = 64
@@ -39,7 +37,7 @@ SOLIDS_KEPT = 2
 MOST_DOUBLINGS = 16
 """From the smallest person of a picture to the largest."""
 
-Stamp = tuple[str, int, int]
+Stamp = tuple[Path, int, int]
 """A file as it is now: path, time of change, size."""
 Numbers = tuple[Any, ...]
 """Nested tuples of floats."""
@@ -60,21 +58,21 @@ class FrameDrawer:
         self._speed: dict[tuple[str, float, int], float] = {}
         """Pixels a second of the last picture, by view, step and number of people."""
 
-    def draw(self, params: DrawParams, report: Report) -> dict[str, Any]:
+    def draw(self, frame: Frame, report: Report) -> dict[str, Any]:
         """Fills the frame band by band from the top, with a report after each; returns what it took.
 
         Raises what load_human and place_skinned do, ValueError for a frame of the wrong size or solids that are none,
         OSError for files that cannot be read or written, PictureOutOfMemory.
         """
         began = time.perf_counter()
-        width, height = params.size
-        picture = map_frame(params.frame, width, height)
+        width, height = frame.size
+        picture = map_frame(frame.frame, width, height)
         report("draw", 0, height, None)
-        people = tuple((_stamp(p.human), _frozen(p.object), _frozen(p.joints), _frozen(p.betas)) for p in params.people)
+        people = tuple((_stamp(p.human), _frozen(p.object), _frozen(p.joints), _frozen(p.betas)) for p in frame.people)
         try:
-            scene = self._scene(people, params)
+            scene = self._scene(people, frame)
             placed = time.perf_counter()
-            seconds = self._fill(picture, scene, params, report)
+            seconds = self._fill(picture, scene, frame, report)
         except Exception as e:
             if out_of_memory(e):
                 raise PictureOutOfMemory(width, height) from e
@@ -85,13 +83,13 @@ class FrameDrawer:
             "seconds_march": round(seconds, 6),
         }
 
-    def _scene(self, people: tuple[Numbers, ...], params: DrawParams) -> Scene:
-        solids = None if params.solids is None else self._solids(_stamp(params.solids))
+    def _scene(self, people: tuple[Numbers, ...], frame: Frame) -> Scene:
+        solids = None if frame.solids is None else self._solids(_stamp(frame.solids))
         if not people:
             return Scene(None, solids)
         chart = (
             torch.cat([self._body_and_anchors(person[0])[1].chart for person in people])
-            if params.view == "boxes"
+            if frame.view == "boxes"
             else None
         )
         return Scene(self._everybody(people), solids, None if chart is None else chart.cpu())
@@ -120,30 +118,30 @@ class FrameDrawer:
     def _load(self, file: Stamp) -> Human:
         return load_human(file[0]).to(self._device)
 
-    def _fill(self, picture: Picture, scene: Scene, params: DrawParams, report: Report) -> float:
+    def _fill(self, picture: Picture, scene: Scene, frame: Frame, report: Report) -> float:
         """Draws into the frame; returns the seconds of the marcher."""
         look = Look(
-            params.view,  # type: ignore[arg-type]  checked by Look itself
-            None if params.background is None else tuple(params.background),
-            (params.clip[0], params.clip[1]),
-            settings_for(params.step, [person.object for person in params.people]),
+            frame.view,
+            None if frame.background is None else tuple(frame.background),
+            (frame.clip[0], frame.clip[1]),
+            settings_for(frame.step, [person.object for person in frame.people]),
         )
         began, seconds, height = time.perf_counter(), 0.0, len(picture.depth)
-        kind = (params.view, params.step, len(params.people))
-        speed = self._speed.get(kind) or _first_guess(params)
-        for done in draw_in_bands(picture, scene, self._camera(params), look, speed):
+        kind = (frame.view, frame.step, len(frame.people))
+        speed = self._speed.get(kind) or _first_guess(frame)
+        for done in draw_in_bands(picture, scene, self._camera(frame), look, speed):
             self._speed[kind], seconds = done.pixels_a_second, done.seconds_march
             left = (time.perf_counter() - began) / done.rows * (height - done.rows)
             report("draw", done.rows, height, round(left, 3))
         return seconds
 
-    def _camera(self, params: DrawParams) -> Camera:
-        intrinsics, view = torch.tensor(params.intrinsics), torch.tensor(params.world_to_camera)
-        whole = Camera(intrinsics.float(), view.float(), params.width, params.height).to(self._device)
-        return whole if params.region is None else whole.crop(*params.corner, *params.size)
+    def _camera(self, frame: Frame) -> Camera:
+        intrinsics, view = torch.tensor(frame.intrinsics), torch.tensor(frame.world_to_camera)
+        whole = Camera(intrinsics.float(), view.float(), frame.width, frame.height).to(self._device)
+        return whole if frame.region is None else whole.crop(*frame.corner, *frame.size)
 
 
-def map_frame(path: str, width: int, height: int) -> Picture:
+def map_frame(path: Path, width: int, height: int) -> Picture:
     """The picture in a frame file; writing to it writes to the file.
 
     Raises FileNotFoundError, ValueError for a file of another size, OSError.
@@ -160,10 +158,10 @@ def map_frame(path: str, width: int, height: int) -> Picture:
     return Picture(combined.reshape(height, width, 4)[::-1], depth.reshape(height, width)[::-1])
 
 
-def _first_guess(params: DrawParams) -> float:
-    """Pixels a second of a machine that nobody knows, on the safe side: work grows with samples and with people."""
+def _first_guess(frame: Frame) -> float:
+    """Pixels a second of an unknown machine, on the safe side: work grows with samples and with people."""
     plain = FIRST_PIXELS / BAND_SECONDS
-    return plain * min(1.0, params.step / MarchSettings().step) / max(1, len(params.people))
+    return plain * min(1.0, frame.step / MarchSettings().step) / max(1, len(frame.people))
 
 
 def settings_for(step: float, objects: list[Any]) -> MarchSettings:
@@ -180,7 +178,7 @@ def settings_for(step: float, objects: list[Any]) -> MarchSettings:
     return MarchSettings(step=step * 2.0 ** max(powers), strides=(*coarser, *plain.strides))
 
 
-def _stamp(path: str) -> Stamp:
+def _stamp(path: Path) -> Stamp:
     try:
         found = os.stat(path)
     except (FileNotFoundError, ValueError):  # ValueError: a path with a null character
@@ -197,7 +195,7 @@ def _frozen(value: Any) -> Any:
 
 def _load_solids(file: Stamp) -> Solids:
     """Raises ValueError, naming the file, where it holds no solids."""
-    path = Path(file[0])
+    path = file[0]
     try:
         arrays = read_arrays(path, ("corners", "colour", "holdout"))
         return Solids(

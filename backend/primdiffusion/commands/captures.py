@@ -138,6 +138,7 @@ class VerifyCaptures:
         Raises:
             ValueError: something is wrong.
         """
+        # of this subcommand alone
         from primdiffusion.capture.verify import repair, subject_folders, verify
 
         findings = verify(self.root, checksums=not self.quick)
@@ -162,6 +163,7 @@ class InfoOfCaptures:
 
     def run(self) -> None:
         """Prints one JSON object."""
+        # of this subcommand alone
         from primdiffusion.capture.pack import open_pack
         from primdiffusion.capture.reader import open_captures
 
@@ -190,6 +192,7 @@ class PackCaptures:
 
     def run(self) -> None:
         """Packs, and prints a line for each subject."""
+        # of this subcommand alone
         from primdiffusion.capture.pack import pack
         from primdiffusion.capture.reader import open_captures
 
@@ -215,6 +218,7 @@ class SheetOfCaptures:
 
     def run(self) -> None:
         """Draws, and prints the sheet's path and the largest error of the joints' pixels."""
+        # of this subcommand alone
         from primdiffusion.capture.reader import open_captures
         from primdiffusion.capture.sheet import draw_sheet
 
@@ -249,6 +253,7 @@ class FarmCaptures:
         Raises:
             FarmError: the farm cannot begin, or somebody is not finished.
         """
+        # of this subcommand alone
         from primdiffusion.capture.farm import Farm, FarmError, Outcome, render_on
 
         def tell(outcome: Outcome, done: int, total: int) -> None:

@@ -1,0 +1,238 @@
+"""People for other programs: `primdiffusion export`, and `proxy`, `gaussians` and `human_npz` of JSON-RPC."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import tyro
+
+from primdiffusion.commands.checks import check_betas, check_numbers, check_size
+from primdiffusion.commands.progress import Report
+from primdiffusion.commands.request import parse
+from primdiffusion.formats import requests
+from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.staging import staged
+
+if TYPE_CHECKING:
+    from primdiffusion.commands.session import Session
+    from primdiffusion.human import Human
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ProxyRequest:
+    """Write the textured mesh of a person at rest."""
+
+    person: Path
+    """A .human.safetensors file."""
+    out_dir: Path
+    """Folder for proxy.npz and proxy.png; made if missing."""
+    betas: list | None = None
+    """Shape coefficients; None for the file's."""
+    triangles: int = requests.TRIANGLES
+    """At most."""
+    texture_px: int = requests.TEXTURE_SIZE
+    """Pixels a side of proxy.png."""
+    spacing: float = requests.VOXEL
+    """Of the grid that the surface is found on, metres."""
+
+    def check(self) -> None:
+        """See `Request`."""
+        check_betas(self.betas)
+
+    def run(self, session: Session, report: Report) -> dict[str, Any]:
+        """Writes both files or none.
+
+        Raises OSError before any work if the folder cannot be written to; what load_human and mesh_proxy raise.
+        """
+        # torch is loaded late
+        from primdiffusion.export.proxy import ProxySettings, mesh_proxy
+        from primdiffusion.export.proxy_files import ARRAYS, TEXTURE, write_proxy_arrays
+
+        began = time.perf_counter()
+        settings = ProxySettings(self.spacing, self.triangles, self.texture_px)
+        with staged(self.out_dir) as folder:
+            report("load", 0, 4, None)
+            human = _shaped(self.person, self.betas)
+            made = mesh_proxy(human, settings, lambda stage, done, total: report(stage, done, total + 1, None))
+            report("write", 3, 4, 0.0)
+            write_proxy_arrays(folder, made)
+            report("write", 4, 4, 0.0)  # the last chance to cancel
+        return {
+            "proxy": str(self.out_dir / ARRAYS),
+            "texture": str(self.out_dir / TEXTURE),
+            "triangles": len(made.faces),
+            "betas": human.betas.tolist(),
+            "seconds": round(time.perf_counter() - began, 3),
+        }
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GaussiansRequest:
+    """Write a person as 3D Gaussians, posed as an armature poses them."""
+
+    person: Path
+    """A .human.safetensors file."""
+    out: Path
+    """The .ply to write."""
+    object: list | None = None
+    """[3][4] world matrix of the armature object; y up, metres. None, as `joints`: the T pose at the origin."""
+    joints: list | None = None
+    """[24][3][4] from rest to posed in the object's space, SMPL's joint order."""
+    betas: list | None = None
+    """Shape coefficients; None for the file's."""
+    limit: int = requests.GAUSSIANS
+    """Gaussians at most."""
+
+    def check(self) -> None:
+        """See `Request`."""
+        check_betas(self.betas)
+        if (self.object is None) != (self.joints is None):
+            raise ValueError("object and joints go together: give both, or neither for the T pose")
+        if self.object is not None:
+            check_numbers("object", self.object, (3, 4))
+            check_numbers("joints", self.joints, (len(JOINT_NAMES), 3, 4))
+        if self.limit < 1:
+            raise ValueError(f"{self.limit} Gaussians were asked for: choose 1 or more")
+
+    def run(self, session: Session, report: Report) -> dict[str, Any]:
+        """Raises OSError and what load_human does."""
+        import torch  # late
+
+        # torch is loaded late
+        from primdiffusion.export.gaussian_file import write_gaussians
+        from primdiffusion.export.gaussians import gaussians_of
+        from primdiffusion.human import place, place_skinned
+
+        began = time.perf_counter()
+        report("load", 0, 2, None)
+        human = _shaped(self.person, self.betas)
+        if self.object is None or self.joints is None:
+            primitives = place(human)
+        else:
+            primitives = place_skinned(human, torch.tensor(self.joints), torch.tensor(self.object))
+        report("gaussians", 1, 2, None)
+        splats = gaussians_of(primitives, self.limit)
+        report("write", 2, 2, 0.0)
+        write_gaussians(self.out, splats)
+        seconds = round(time.perf_counter() - began, 3)
+        return {"out": str(self.out), "gaussians": len(splats.opacity), "seconds": seconds}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HumanNpzRequest:
+    """Write the files of `generate` for a person who exists."""
+
+    person: Path
+    """A .human.safetensors file."""
+    out_dir: Path
+    """Folder for them; made if missing."""
+    size: int = requests.PICTURE_SIZE
+    """Pixels a side of the pictures."""
+
+    def check(self) -> None:
+        """See `Request`."""
+        check_size(self.size)
+
+    def run(self, session: Session, report: Report) -> dict[str, Any]:
+        """Writes all files or none. Raises OSError and what load_human does."""
+        # torch is loaded late
+        from primdiffusion.human_file import load_human
+        from primdiffusion.person_folder import FILES, write_person
+
+        began = time.perf_counter()
+        with staged(self.out_dir) as folder:
+            report("load", 0, 1, None)
+            human = load_human(self.person)
+            report("write", 0, 1, None)
+            write_person(folder, human, self.size)
+            report("write", 1, 1, 0.0)  # the last chance to cancel
+        return {**FILES.in_folder(self.out_dir), "seconds": round(time.perf_counter() - began, 3)}
+
+
+def _shaped(person: Path, betas: list | None) -> Human:
+    """The person with other betas. Raises ValueError for another number of them, and what load_human does."""
+    import torch  # late
+
+    # torch is loaded late
+    from primdiffusion.human_file import load_human
+    from primdiffusion.reshaping import reshaped
+
+    human = load_human(person)
+    return human if betas is None else reshaped(human, torch.tensor(betas))
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportCommand:
+    """Write a person for other programs; the ending of --out says what: .glb, .obj or .ply."""
+
+    human: tyro.conf.Positional[Path]
+    """A .human file (or .human.safetensors)."""
+    out: Path
+    """.glb: textured mesh with a skeleton; .obj: the mesh alone, with .mtl and .png beside it; .ply: 3D Gaussians."""
+    triangles: int = requests.TRIANGLES
+    """Of the mesh, at most."""
+    texture: int = requests.TEXTURE_SIZE
+    """Pixels a side of the mesh's texture."""
+    gaussians: int = requests.GAUSSIANS
+    """Gaussians, at most."""
+    pose: Path | None = None
+    """.json or .npz with 72 axis-angle numbers (24 joints x 3, radians), for Gaussians; without it the T pose. Meshes
+    are in the T pose."""
+    frame: int = 0
+    """Which frame of a pose file that holds several."""
+
+    def check(self) -> None:
+        """See `Request`."""
+        write = _writer(self.out)
+        if self.pose is not None and write is not _write_gaussians:
+            raise ValueError(f"{self.out.name} cannot hold a pose: leave --pose out, or write Gaussians to a .ply")
+        if self.frame and self.pose is None:
+            raise ValueError(f"frame {self.frame} was asked for without a pose file: name one with --pose")
+        if not self.out.parent.is_dir():
+            raise FileNotFoundError(f"there is no folder {self.out.parent}: make it first, or choose another")
+
+    def export(self) -> None:
+        """Exports, and prints the file's path."""
+        from primdiffusion.human_file import load_human  # torch is loaded late
+
+        _writer(self.out)(self, load_human(self.human))
+        print(self.out)
+
+
+def _writer(out: Path) -> Callable[[ExportCommand, Human], None]:
+    writers = {".glb": _write_mesh, ".obj": _write_mesh, ".ply": _write_gaussians}
+    if out.suffix.lower() not in writers:
+        raise ValueError(f"{out.name!r} has none of the endings {', '.join(writers)}: choose one")
+    return writers[out.suffix.lower()]
+
+
+def _write_mesh(asked: ExportCommand, human: Human) -> None:
+    # torch is loaded late
+    from primdiffusion.export.proxy import ProxySettings, mesh_proxy
+    from primdiffusion.export.proxy_files import write_proxy_glb, write_proxy_obj
+
+    proxy = mesh_proxy(human, ProxySettings(triangles=asked.triangles, texture_px=asked.texture))
+    if asked.out.suffix.lower() == ".glb":
+        write_proxy_glb(asked.out, proxy, human.provenance)
+    else:
+        write_proxy_obj(asked.out, proxy)
+
+
+def _write_gaussians(asked: ExportCommand, human: Human) -> None:
+    # torch is loaded late
+    from primdiffusion.export.gaussian_file import write_gaussians
+    from primdiffusion.export.gaussians import gaussians_of
+    from primdiffusion.human import place
+    from primdiffusion.pose_file import read_pose
+
+    pose = None if asked.pose is None else read_pose(asked.pose, asked.frame)
+    write_gaussians(asked.out, gaussians_of(place(human, pose), asked.gaussians))
+
+
+def run(arguments: Sequence[str]) -> None:
+    """One command line, errors as exceptions."""
+    parse(ExportCommand, arguments, "export").export()

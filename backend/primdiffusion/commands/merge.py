@@ -1,0 +1,225 @@
+"""People as grids of voxels, for renderers that are not ours: `primdiffusion merge`, and `merge`, `merge_frames` and
+`fit_gain` of JSON-RPC."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import tyro
+
+from primdiffusion.commands.checks import check_voxel
+from primdiffusion.commands.frame import PosedPerson
+from primdiffusion.commands.progress import Pace, Report
+from primdiffusion.commands.request import parse
+from primdiffusion.formats.requests import DENSITY_GAIN, VOXEL
+from primdiffusion.staging import written_whole
+
+if TYPE_CHECKING:
+    from primdiffusion.commands.session import Session
+    from primdiffusion.human import Human
+    from primdiffusion.primitives.primitives import Primitives
+
+GAIN_VIEWS = 4
+"""Around the person."""
+GAIN_PIXELS = 128
+"""A side of each view; 4 x 128 x 128 rays meet a standing person about ten thousand times."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MergeRequest:
+    """Write one grid of several people, z up. Needs no checkpoint."""
+
+    people: list[PosedPerson]
+    out: Path
+    """The .npz to write."""
+    voxel: float = VOXEL
+    """Metres a side."""
+
+    def check(self) -> None:
+        """See `Request`."""
+        check_voxel(self.voxel)
+        _check_people(self.people)
+
+    def run(self, session: Session, report: Report) -> dict[str, Any]:
+        """Returns the grid's path and shape. Raises what load_human, place_skinned and merge do."""
+        began = time.perf_counter()
+        report("merge", 0, 1, None)
+        primitives = _together(self.people)
+        with written_whole(self.out) as path:
+            shape = _write(path, primitives, self.voxel)
+            report("merge", 1, 1, 0.0)  # the last chance to cancel
+        return {"out": str(self.out), "shape": shape, "seconds": round(time.perf_counter() - began, 3)}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MergeFramesRequest:
+    """Write a grid for each frame of a person. Needs no checkpoint."""
+
+    people: list[PosedPerson]
+    """One person, once for each frame."""
+    out_dir: Path
+    """Folder for 0000.npz, 0001.npz, ...; made if missing."""
+    voxel: float = VOXEL
+    """Metres a side."""
+
+    def check(self) -> None:
+        """See `Request`."""
+        check_voxel(self.voxel)
+        _check_people(self.people)
+
+    def run(self, session: Session, report: Report) -> dict[str, Any]:
+        """Writes the grids one by one, each of them whole, so that a program may take them in meanwhile.
+
+        Returns their paths. Raises as `MergeRequest`; what is there by then stays.
+        """
+        from primdiffusion.human_file import load_human  # torch is loaded late
+
+        began, pace, count = time.perf_counter(), Pace(), len(self.people)
+        self.out_dir.mkdir(parents=True, exist_ok=True)
+        load = functools.lru_cache(maxsize=1)(load_human)
+        report("merge", 0, count, None)
+        files = []
+        for index, person in enumerate(self.people):
+            file = self.out_dir / f"{index:04d}.npz"
+            with written_whole(file) as path:
+                _write(path, _placed(load(person.human), person), self.voxel)
+            files.append(str(file))
+            report("merge", index + 1, count, pace.left(index + 1, count))
+        return {"files": files, "seconds": round(time.perf_counter() - began, 3)}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FitGainRequest:
+    """Fit the density gain of renderers with exponential absorption. Needs no checkpoint."""
+
+    people: list[PosedPerson]
+    """In the pose to fit in."""
+
+    def check(self) -> None:
+        """See `Request`."""
+        _check_people(self.people)
+
+    def run(self, session: Session, report: Report) -> dict[str, Any]:
+        """The gain, from views around the person (see `fit_gain`); also raises as it."""
+        import numpy as np  # late
+
+        # torch is loaded late
+        from primdiffusion.human import framing
+        from primdiffusion.render.gain import fit_gain, unclamped_alpha
+
+        primitives = _together(self.people)
+        reached = []
+        for view in range(GAIN_VIEWS):
+            report("fit", view, GAIN_VIEWS, None)
+            camera = framing(primitives, 2 * math.pi * view / GAIN_VIEWS, GAIN_PIXELS, GAIN_PIXELS)
+            reached.append(unclamped_alpha(primitives, camera).numpy())
+        fit = fit_gain(np.stack(reached))
+        return {
+            "gain": round(fit.gain, 3),
+            "error": round(fit.error, 5),
+            "gain_before": DENSITY_GAIN,
+            "error_before": round(fit.error_before, 5),
+            "rays": fit.rays,
+        }
+
+
+def _check_people(people: list[PosedPerson]) -> None:
+    if not people:
+        raise ValueError("people is empty: name at least one person")
+    for person in people:
+        person.check()
+
+
+def _together(people: list[PosedPerson]) -> Primitives:
+    # torch is loaded late
+    from primdiffusion.human_file import load_human
+    from primdiffusion.primitives.primitives import Primitives
+
+    return Primitives.together([_placed(load_human(person.human), person) for person in people])
+
+
+def _placed(human: Human, person: PosedPerson) -> Primitives:
+    import torch  # late
+
+    # torch is loaded late
+    from primdiffusion.human import place_skinned
+    from primdiffusion.reshaping import reshaped
+
+    if person.betas is not None:
+        human = reshaped(human, torch.tensor(person.betas))
+    return place_skinned(human, torch.tensor(person.joints), torch.tensor(person.object))
+
+
+def _write(path: Path, primitives: Primitives, voxel: float) -> list[int]:
+    from primdiffusion.export.merged_file import upright_grid, write_grid_npz  # torch is loaded late
+
+    grid = upright_grid(primitives, voxel)
+    write_grid_npz(path, grid)
+    return list(grid.density.shape)
+
+
+@dataclasses.dataclass(frozen=True)
+class MergeCommand:
+    """Write people as one grid of voxels; the ending of --out says how: .vdb or .npz."""
+
+    humans: tyro.conf.Positional[tuple[Path, ...]]
+    """.human files (or .human.safetensors)."""
+    out: Path
+    """.vdb: grids density and Cd (needs Python's module openvdb); .npz: density, colour, origin, voxel. z up."""
+    voxel: float = VOXEL
+    """Metres a side; finer shows more detail, at eight times the memory for half."""
+    pose: Path | None = None
+    """.json or .npz with 72 axis-angle numbers (24 joints x 3, radians), for all of them; without it the T pose."""
+    frame: int = 0
+    """Which frame of a pose file that holds several."""
+    apart: float = 1.0
+    """Metres between neighbours, side by side, where there are several people."""
+
+    def merge(self) -> None:
+        """Merges, and prints the file's path."""
+        import torch  # late
+
+        # torch is loaded late
+        from primdiffusion.export.merged_file import check_openvdb, upright_grid, write_grid_npz, write_grid_vdb
+        from primdiffusion.human import place
+        from primdiffusion.human_file import load_human
+        from primdiffusion.pose_file import read_pose
+        from primdiffusion.primitives.primitives import Primitives
+
+        if self.out.suffix.lower() == ".vdb":
+            check_openvdb()
+        pose = None if self.pose is None else read_pose(self.pose, self.frame)
+        people = []
+        for number, path in enumerate(self.humans):
+            placed = place(load_human(path), pose)
+            aside = torch.tensor([(number - (len(self.humans) - 1) / 2) * self.apart, 0.0, 0.0])
+            people.append(dataclasses.replace(placed, position=placed.position + aside))
+        grid = upright_grid(Primitives.together(people), self.voxel)
+        with written_whole(self.out) as path:
+            (write_grid_vdb if self.out.suffix.lower() == ".vdb" else write_grid_npz)(path, grid)
+        print(self.out)
+
+    def check(self) -> None:
+        """See `Request`."""
+        if not self.humans:
+            raise ValueError("no person was named: give at least one .human file")
+        if self.out.suffix.lower() not in (".vdb", ".npz"):
+            raise ValueError(f"{self.out.name!r} has none of the endings .vdb, .npz: choose one")
+        if not self.out.parent.is_dir():
+            raise FileNotFoundError(f"there is no folder {self.out.parent}: make it first, or choose another")
+        check_voxel(self.voxel)
+        if not math.isfinite(self.apart):
+            raise ValueError(f"apart is {self.apart}: give metres between neighbours")
+        if self.frame and self.pose is None:
+            raise ValueError(f"frame {self.frame} was asked for without a pose file: name one with --pose")
+
+
+def run(arguments: Sequence[str]) -> None:
+    """One command line, errors as exceptions."""
+    parse(MergeCommand, arguments, "merge").merge()

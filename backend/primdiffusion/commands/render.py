@@ -1,0 +1,149 @@
+"""Draw a person: `primdiffusion render`, and `render` of JSON-RPC."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from primdiffusion.commands.checks import check_angle, check_sides
+from primdiffusion.commands.progress import Report
+from primdiffusion.commands.request import parse
+from primdiffusion.drawing.steps import check_step
+from primdiffusion.formats.requests import PICTURE_SIZE, RAY_STEP, VIEWS, View
+from primdiffusion.staging import written_whole
+
+if TYPE_CHECKING:
+    from primdiffusion.commands.session import Session
+
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RenderRequest:
+    """Draw a saved person on black."""
+
+    human: Path
+    """A .human.safetensors file."""
+    out: Path
+    """The PNG to write."""
+    width: int = PICTURE_SIZE
+    height: int = PICTURE_SIZE
+    yaw: float = 0.0
+    """Where the camera stands around the person: 0 in front, pi/2 at the person's left; radians."""
+    pose: Path | list | None = None
+    """72 axis-angle values (24 x 3, radians), or a pose file (.json, .npz); None for the T pose."""
+    depth: Path | None = None
+    """A second PNG, of depth."""
+
+    def check(self) -> None:
+        """See `Request`."""
+        check_sides(self.width, self.height)
+        check_angle("yaw", self.yaw, "radians")
+
+    def run(self, session: Session, report: Report) -> dict[str, Any]:
+        """Returns the picture's path. Raises what load_human and read_pose do, and OSError."""
+        # torch is loaded late
+        from primdiffusion.human import framing, place
+        from primdiffusion.human_file import load_human
+        from primdiffusion.pose_file import pose_from_numbers, read_pose
+        from primdiffusion.render.image import depth_to_png, to_png
+        from primdiffusion.render.march import march
+
+        began = time.perf_counter()
+        report("load", 0, 1, None)
+        human = load_human(self.human)
+        pose = None
+        if self.pose is not None:
+            given = self.pose
+            pose = read_pose(given) if isinstance(given, Path) else pose_from_numbers(given, "the parameter pose")
+        primitives = place(human, pose)
+        report("render", 0, 1, None)
+        rendering = march(primitives, framing(primitives, self.yaw, self.width, self.height))
+        report("write", 1, 1, 0.0)
+        with contextlib.ExitStack() as files:  # both pictures or none
+            to_png(files.enter_context(written_whole(self.out)), rendering)
+            if self.depth is not None:
+                depth_to_png(files.enter_context(written_whole(self.depth)), rendering)
+        depth = None if self.depth is None else str(self.depth)
+        return {"out": str(self.out), "depth": depth, "seconds": round(time.perf_counter() - began, 3)}
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderCommand:
+    """Draw a person in a pose."""
+
+    human: tyro.conf.Positional[Path]
+    """A .human.safetensors file."""
+    out: Path
+    """PNG to write."""
+    yaw: float = 0.0
+    """Degrees around the person: 0 the face, 90 their left side."""
+    pose: Path | None = None
+    """.json or .npz with 72 axis-angle numbers (24 joints x 3, radians); without it the T pose."""
+    frame: int = 0
+    """Which frame of a pose file that holds several."""
+    size: int = PICTURE_SIZE
+    """Width and height, pixels."""
+    width: int | None = None
+    """Pixels; without it the size."""
+    height: int | None = None
+    """Pixels; without it the size."""
+    view: View = VIEWS[0]
+    """colour; depth in colours, bright where near; alpha: what the person covers, in grey; boxes: the primitives."""
+    step: float = RAY_STEP
+    """Metres between samples of a ray; finer is slower and closer to the truth."""
+    background: Literal["black", "white", "transparent"] = "black"
+    """What is behind the person."""
+    depth: Path | None = None
+    """A second PNG: depth in colours, bright where near."""
+
+    def draw(self) -> None:
+        """Draws, and prints the picture's path."""
+        import torch  # late
+
+        # torch is loaded late
+        from primdiffusion.drawing.draw import draw
+        from primdiffusion.drawing.scene import Look, Scene
+        from primdiffusion.human import body_of, framing, place
+        from primdiffusion.human_file import load_human
+        from primdiffusion.pose_file import read_pose
+        from primdiffusion.render.image import depth_to_png, rgba_to_png
+        from primdiffusion.render.march import MarchSettings, march
+
+        look = Look(self.view, settings=MarchSettings(step=self.step))
+        human = load_human(self.human)
+        primitives = place(human, None if self.pose is None else read_pose(self.pose, self.frame))
+        width, height = (self.size if side is None else side for side in (self.width, self.height))
+        camera = framing(primitives, math.radians(self.yaw), width, height)
+        picture = draw(Scene(primitives, chart=body_of(human)[1].chart), camera, look)
+        with contextlib.ExitStack() as files:  # both pictures or none
+            rgba_to_png(
+                files.enter_context(written_whole(self.out)),
+                torch.from_numpy(picture.combined),
+                BACKGROUNDS[self.background],
+            )
+            if self.depth is not None:
+                rendering = march(primitives, camera, look.settings)
+                depth_to_png(files.enter_context(written_whole(self.depth)), rendering)
+        print(self.out)
+
+    def check(self) -> None:
+        """See `Request`."""
+        check_angle("yaw", self.yaw, "degrees")
+        check_step(self.step)
+        if self.depth is not None and self.depth.resolve() == self.out.resolve():
+            raise ValueError(f"out and depth are both {self.out}: name two files")
+        if self.frame and self.pose is None:
+            raise ValueError(f"frame {self.frame} was asked for without a pose file: name one with --pose")
+
+
+def run(arguments: Sequence[str]) -> None:
+    """One command line, errors as exceptions."""
+    parse(RenderCommand, arguments, "render").draw()
