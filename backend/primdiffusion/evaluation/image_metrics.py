@@ -1,4 +1,4 @@
-"""How alike two pictures are: PSNR, SSIM, LPIPS, overlap of masks. Pictures are sRGB-encoded RGB in [0, 1].
+"""How alike two pictures are: PSNR, SSIM, LPIPS, fine detail, overlap of masks. Pictures are sRGB-encoded, in [0, 1].
 
 Written here rather than called from torchmetrics, which only the extra `training` installs: whoever has a checkpoint
 can evaluate it. The tests hold these against torchmetrics and scikit-image.
@@ -10,8 +10,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy import ndimage
 from torch import Tensor, nn
 
 from primdiffusion.picture_features import (
@@ -28,6 +30,13 @@ WINDOW, SIGMA = 11, 1.5
 """Of SSIM's gaussian, pixels."""
 K1, K2 = 0.01, 0.03
 """SSIM's constants, for a data range of 1."""
+FIGURE_MARGIN = 8
+"""Pixels around a figure that count in `figure_psnr`: what sticks out of its outline is an error too."""
+FINE_SIGMA = 3.0
+"""Pixels: fine detail is what a Gaussian blur of this standard deviation removes."""
+OUTLINE = 4
+"""Pixels within the outline that `detail_energy` and `compare_detail` leave out: edges there are not detail."""
+LUMA = (0.299, 0.587, 0.114)
 LARGEST_PSNR = 100.0
 """dB, of pictures that are equal: a mean over pictures stays finite."""
 LPIPS_LAYERS = {
@@ -90,6 +99,60 @@ def _blurred(pictures: Float[Tensor, "n H W"]) -> Float[Tensor, "n h w"]:
     # As channels of one picture: as pictures of one channel it is nine times slower on the CPU.
     columns = torch.nn.functional.conv2d(pictures[None], weight.mT, groups=count)
     return torch.nn.functional.conv2d(columns, weight, groups=count)[0]
+
+
+def figure_psnr(
+    image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], figure: Bool[Tensor, "H W"]
+) -> Float[Tensor, ""]:
+    """PSNR over the target's figure and FIGURE_MARGIN pixels around it, dB. Raises ValueError for an empty figure."""
+    _check_pair(image, target)
+    if not figure.any():
+        raise ValueError("the target shows no figure: there is nothing to compare")
+    near = torch.from_numpy(ndimage.binary_dilation(figure.numpy(), iterations=FIGURE_MARGIN))
+    return psnr(image[near][None], target[near][None])
+
+
+class Detail(NamedTuple):
+    """Fine detail of a picture beside that of the true one."""
+
+    energy: float
+    """Over the true one's; above 1 is noise or aliasing, unless the correlation is high too."""
+    correlation: float
+    """From -1 to 1."""
+
+
+def compare_detail(
+    image: Float[Tensor, "H W 3"],
+    figure: Bool[Tensor, "H W"],
+    target: Float[Tensor, "H W 3"],
+    target_figure: Bool[Tensor, "H W"],
+) -> Detail | None:
+    """Detail finer than FINE_SIGMA inside both figures; None where these have no inside in common."""
+    _check_pair(image, target)
+    inside = _inside(figure & target_figure)
+    if not inside.any():
+        return None
+    ours, true = (_fine(one, mask)[inside] for one, mask in ((image, figure), (target, target_figure)))
+    ours_energy, true_energy = float((ours**2).mean()), float((true**2).mean())
+    product = float((ours * true).mean())
+    return Detail(ours_energy / max(true_energy, 1e-9), product / max((ours_energy * true_energy) ** 0.5, 1e-9))
+
+
+def detail_energy(image: Float[Tensor, "H W 3"], figure: Bool[Tensor, "H W"]) -> float | None:
+    """Mean square of the detail finer than FINE_SIGMA inside the figure; None where it has no inside."""
+    inside = _inside(figure)
+    return float((_fine(image, figure)[inside] ** 2).mean()) if inside.any() else None
+
+
+def _inside(figure: Bool[Tensor, "H W"]) -> Bool[np.ndarray, "H W"]:
+    return ndimage.binary_erosion(figure.numpy(), iterations=OUTLINE)
+
+
+def _fine(image: Float[Tensor, "H W 3"], figure: Bool[Tensor, "H W"]) -> Float[np.ndarray, "H W"]:
+    """Brightness less its blur, which sees the figure alone: the background is no detail."""
+    brightness, weight = image.double().numpy() @ np.array(LUMA), figure.double().numpy()
+    seen = np.maximum(ndimage.gaussian_filter(weight, FINE_SIGMA), 1e-3)
+    return brightness - ndimage.gaussian_filter(brightness * weight, FINE_SIGMA) / seen
 
 
 def overlap(first: Bool[Tensor, "H W"], second: Bool[Tensor, "H W"]) -> float:

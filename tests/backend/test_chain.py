@@ -1,0 +1,129 @@
+"""Measures of the chain from mesh to sample: on pictures, payloads and colours whose answers are known."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from primdiffusion.evaluation.image_metrics import compare_detail, detail_energy, figure_psnr, overlap
+from primdiffusion.primitives.primitives import K, Payload
+from scipy import ndimage
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+import chain_measures
+
+
+def figure(side=64):
+    """A noisy square on grey, and its mask."""
+    picture = torch.full((side, side, 3), 0.5)
+    mask = torch.zeros(side, side, dtype=torch.bool)
+    mask[8:-8, 8:-8] = True
+    picture[mask] = torch.rand(int(mask.sum()), 3, generator=torch.Generator().manual_seed(0))
+    return picture, mask
+
+
+def blurred(picture, sigma):
+    return torch.from_numpy(ndimage.gaussian_filter(picture.numpy(), (sigma, sigma, 0)))
+
+
+def test_a_picture_has_all_of_its_own_detail():
+    picture, mask = figure()
+    assert compare_detail(picture, mask, picture, mask) == pytest.approx((1, 1))
+
+
+def test_a_blur_takes_detail_energy_away_and_noise_correlation():
+    picture, mask = figure()
+    soft = compare_detail(blurred(picture, 1.0), mask, picture, mask)
+    softer = compare_detail(blurred(picture, 2.0), mask, picture, mask)
+    assert softer.energy < soft.energy < 1
+    noise = torch.rand(picture.shape, generator=torch.Generator().manual_seed(1))
+    unlike = compare_detail(noise, mask, picture, mask)
+    assert unlike.energy == pytest.approx(1, abs=0.3)
+    assert abs(unlike.correlation) < 0.1
+
+
+def test_scaling_contrast_scales_detail_energy_by_its_square_and_leaves_the_correlation():
+    picture, mask = figure()
+    detail = compare_detail(0.5 * picture, mask, picture, mask)
+    assert detail == pytest.approx((0.25, 1), rel=1e-5)
+    assert detail_energy(0.5 * picture, mask) == pytest.approx(0.25 * detail_energy(picture, mask))
+
+
+def test_the_outline_of_a_plain_figure_is_no_detail():
+    picture, mask = figure()
+    picture[mask] = 1.0
+    assert detail_energy(picture, mask) == pytest.approx(0, abs=1e-9)
+
+
+def test_a_figure_thinner_than_its_outline_has_no_detail_to_compare():
+    picture, mask = figure()
+    mask[:] = False
+    mask[30:33] = True
+    assert compare_detail(picture, mask, picture, mask) is None
+    assert detail_energy(picture, mask) is None
+
+
+def test_errors_far_from_the_figure_do_not_count_in_its_psnr():
+    picture, mask = figure()
+    far, near = picture.clone(), picture.clone()
+    far[0, 0] += 0.5
+    near[7, 30] += 0.5
+    assert float(figure_psnr(far, picture, mask)) == float(figure_psnr(picture, picture, mask))
+    assert float(figure_psnr(near, picture, mask)) < float(figure_psnr(picture, picture, mask))
+    whole = picture + 0.1
+    assert float(figure_psnr(whole, picture, mask)) == pytest.approx(20, abs=1e-3)
+    with pytest.raises(ValueError):
+        figure_psnr(picture, picture, torch.zeros_like(mask))
+
+
+def test_compare_of_shifted_squares_gives_the_overlap_by_hand():
+    true, drawn = torch.zeros(32, 32, 4), torch.zeros(32, 32, 4)
+    true[8:24, 8:24] = 1
+    drawn[8:24, 12:28] = 1
+    measured = chain_measures.compare(drawn, true)
+    assert measured["iou"] == pytest.approx(12 / 20)
+    assert overlap(true[..., 3] > 0.5, drawn[..., 3] > 0.5) == pytest.approx(12 / 20)
+
+
+def test_the_windows_weight_is_one_inside_and_small_at_the_faces():
+    weight = chain_measures.window_weight()
+    assert weight[3:5, 3:5, 3:5].min() > 0.99
+    assert weight[0].max() < 0.1
+    torch.testing.assert_close(weight, weight.flip(0))
+
+
+def test_change_cosine_of_equal_opposite_and_invisible_changes():
+    def payload(grey, density):
+        return Payload(torch.full((K, 3, 8, 8, 8), grey), torch.full((K, 8, 8, 8), density), torch.ones(K, 3))
+
+    start, up, down = payload(0.3, 50.0), payload(0.3, 60.0), payload(0.3, 40.0)
+    assert chain_measures.change_cosine(up, up, start, 100.0) == pytest.approx(1)
+    assert chain_measures.change_cosine(up, down, start, 100.0) == pytest.approx(-1)
+    edge = up.map(torch.clone)
+    edge.density[..., 0, 0, 0] = 0.0
+    assert chain_measures.change_cosine(up, edge, start, 100.0) == pytest.approx(1, abs=1e-3)
+
+
+def test_lab_of_known_colours():
+    lab = chain_measures.lab_of_linear(np.array([[1.0, 1, 1], [0, 0, 0], [1, 0, 0]]))
+    np.testing.assert_allclose(lab, [[100, 0, 0], [0, 0, 0], [53.24, 80.09, 67.20]], atol=0.03)
+
+
+def test_rest_std_is_measured_region_by_region():
+    chart = chain_measures.default_anchors().chart
+    rest = torch.ones(2, 5, K)
+    rest[..., chart == chain_measures.CHARTS.index("head")] = -3.0
+    spread = chain_measures.rest_std(rest.unflatten(-1, (32, 32)))
+    assert spread["head"] == pytest.approx(3)
+    assert spread["torso"] == pytest.approx(1)
+
+
+def test_a_sleeve_is_no_skin():
+    face, near, sleeve = np.array([60.0, 15, 20]), np.array([57.0, 15, 16]), np.array([20.0, 0, -30])
+    bare = {"face": face, "hands": near, "forearms": near}
+    dressed = {"face": face, "hands": near, "forearms": sleeve}
+    masked = {"hands": near}
+    differences = chain_measures.skin_differences([bare, dressed, masked])
+    assert differences["hands"] == pytest.approx([5, 5])
+    assert differences["forearm"] == pytest.approx([5])
