@@ -66,6 +66,7 @@ from chain_sets import (
     stored,
     stored_fit,
 )
+from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.image_metrics import detail_energy
 from primdiffusion.people.assets import Assets, open_assets
@@ -73,7 +74,6 @@ from primdiffusion.people.fitted import head_centre
 from primdiffusion.people.payloads import make_payloads, rest_frames
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
-from primdiffusion.training.checkpoint import load_checkpoint
 from record import tell
 from torch import Tensor
 
@@ -213,11 +213,11 @@ def payload_figures(assets: Assets, held: Path, count: int) -> Figures:
 
 def sample_figures(model: DiffusionModel, assets: Assets, chain: Chain, count: int, skins: int) -> Figures:
     """How sharp, how varied and how even in skin generated people are beside held-out ones."""
-    real = []
+    skins_held = []
     for number in range(skins):
         person = held_out(assets, number)
         scene = rest_scene(person)
-        real.append(skin_colours(scene.true("front", 1), scene.cameras["front"], torch.from_numpy(person.betas)))
+        skins_held.append(skin_colours(scene.true("front", 1), scene.cameras["front"], torch.from_numpy(person.betas)))
         progress("skins")(number + 1, skins)
     energies, samples, made = [], [], []
     for x0, human in generated(model, count):
@@ -233,7 +233,7 @@ def sample_figures(model: DiffusionModel, assets: Assets, chain: Chain, count: i
     if rest is not None and rest_held is not None:
         real = rest_std(rest_held)
         figures |= {f"sample_rest_std_{name}": value / real[name] for name, value in rest_std(rest).items()}
-    return figures | skin_figures(skin_differences(made), skin_differences(real))
+    return figures | skin_figures(skin_differences(made), skin_differences(skins_held))
 
 
 def progress(what: str) -> Callable[[int, int], None]:

@@ -11,13 +11,13 @@ from jaxtyping import Float
 from numpy import ndarray
 from PIL import Image
 from primdiffusion.body.model import default_body
+from primdiffusion.diffusion.codec import window_weight
 from primdiffusion.editing.regions import region_of
 from primdiffusion.evaluation.image_metrics import compare_detail, figure_psnr, overlap, ssim
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.primitives.anchors import CHARTS, attach, default_anchors
 from primdiffusion.primitives.primitives import Payload, S
-from primdiffusion.render.lattice import WINDOW_POWER, WINDOW_SHARPNESS
 from torch import Tensor
 
 SHEET_SIDE = 256
@@ -62,22 +62,12 @@ def means(rows: Sequence[Measures]) -> dict[str, float]:
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
-def window_weight() -> Float[Tensor, "8 8 8"]:
-    """How much of each voxel the marcher's window lets through: near 1 inside a box, near 0 at its faces."""
-    place = torch.linspace(-1, 1, 100 * (S - 1) + 1)
-    centre = torch.linspace(-1, 1, S)[:, None]
-    hat = (1 - (place - centre).abs() * (S - 1) / 2).clamp_min(0)
-    through = torch.exp(-WINDOW_SHARPNESS * place**WINDOW_POWER)
-    one = (hat * through).sum(1) / hat.sum(1)
-    return one[:, None, None] * one[:, None] * one
-
-
 def change_cosine(first: Payload, second: Payload, start: Payload, full_density: float) -> float:
     """Cosine of the changes of two fits from their start: encoded colour and relative density, weighted by the window.
 
     1: both found the same; 0: what they changed is chance.
     """
-    root = window_weight().sqrt()
+    root = window_weight()[: S**3].unflatten(0, (S, S, S))
 
     def values(payload: Payload) -> Tensor:
         colour = encode_srgb(payload.rgb.clamp(0, 1)) * root

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, ShapedBody, default_body
 from primdiffusion.capture.poses import BUILT_IN, built_in_poses
-from primdiffusion.capture.rasterise import rasterise
 from primdiffusion.diffusion.codec import cells_from_voxels
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import CellCodec, DiffusionModel, sample, seeded
@@ -29,6 +28,7 @@ from primdiffusion.people.person import Person, make_person, recolour
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.raster.rasterise import rasterise
 from primdiffusion.render.march import march
 from primdiffusion.training.stored_people import StoredPerson, read_person
 from torch import Tensor

@@ -86,13 +86,6 @@ def test_compare_of_shifted_squares_gives_the_overlap_by_hand():
     assert overlap(true[..., 3] > 0.5, drawn[..., 3] > 0.5) == pytest.approx(12 / 20)
 
 
-def test_the_windows_weight_is_one_inside_and_small_at_the_faces():
-    weight = chain_measures.window_weight()
-    assert weight[3:5, 3:5, 3:5].min() > 0.99
-    assert weight[0].max() < 0.1
-    torch.testing.assert_close(weight, weight.flip(0))
-
-
 def test_change_cosine_of_equal_opposite_and_invisible_changes():
     def payload(grey, density):
         return Payload(torch.full((K, 3, 8, 8, 8), grey), torch.full((K, 8, 8, 8), density), torch.ones(K, 3))
@@ -102,7 +95,7 @@ def test_change_cosine_of_equal_opposite_and_invisible_changes():
     assert chain_measures.change_cosine(up, down, start, 100.0) == pytest.approx(-1)
     edge = up.map(torch.clone)
     edge.density[..., 0, 0, 0] = 0.0
-    assert chain_measures.change_cosine(up, edge, start, 100.0) == pytest.approx(1, abs=1e-3)
+    assert chain_measures.change_cosine(up, edge, start, 100.0) == pytest.approx(1, abs=1e-2)
 
 
 def test_lab_of_known_colours():
