@@ -67,7 +67,7 @@ def test_reconstruct_reports_its_stages_and_leaves_whole_files(child, asked):
         ({"capture": "/nowhere"}, DOMAIN_ERROR, "missing_file", "no folder of captures /nowhere"),
         ({"checkpoint": "/nowhere.safetensors"}, DOMAIN_ERROR, "missing_file", "no encoder at /nowhere.safetensors"),
         ({"views": 0}, INVALID_PARAMS, None, "0 views"),
-        ({"views": "all"}, INVALID_PARAMS, None, "'views' of 'reconstruct' must be int"),
+        ({"views": "all"}, INVALID_PARAMS, None, "reconstruct.views"),
     ],
 )
 def test_a_refusal_names_what_was_wrong_and_leaves_nothing(child, asked, wrong, code, kind, told):
