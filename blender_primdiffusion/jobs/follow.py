@@ -80,7 +80,7 @@ class PRIMDIFFUSION_OT_take_result(bpy.types.Operator):
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
         """Only while a result waits."""
-        cls.poll_message_set("No result waits to enter the scene")
+        cls.poll_message_set("No result is ready")
         return queue.ready
 
     def execute(self, context: bpy.types.Context) -> set[str]:

@@ -18,7 +18,7 @@ _WORTH_TELLING = 50e6
 def device_line() -> str:
     """What panels say of the device: its name, and its memory in all and free where the child has told."""
     if queue.child_news:
-        return f"{queue.child_news}; starts anew with the next person"
+        return f"{queue.child_news}; restarts with the next person"
     info = queue.info
     if not info.get("device_name"):
         return "starts with the first person"
@@ -77,7 +77,7 @@ def release() -> str:
         f"Blender gave back {grids / 1e9:.1f} GB of volumes, read again when needed" if grids > _WORTH_TELLING else ""
     )
     if not pids:
-        return freed or "nothing was held: no backend runs"
+        return freed or "nothing to release: the backend is not running"
     card = f", and what they held of {queue.info['device_name']}" if queue.info.get("device_memory_gb") else ""
     size = f", {sum(held) / 1e9:.1f} GB of memory" if held else ""
     ended = f"{len(pids)} {'process' if len(pids) == 1 else 'processes'} ended{size}{card}"

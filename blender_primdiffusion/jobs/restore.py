@@ -92,7 +92,8 @@ class RegenerateJob(Job):
             if name in before and made.get(name) != before[name]:
                 raise ValueError(
                     f"{person.name!r} was made by the checkpoint {before.get('checkpoint')!r}, and this one is "
-                    f"{made.get('checkpoint')!r}: choose that one in the preferences, or it would be somebody else"
+                    f"{made.get('checkpoint')!r}: choose that one in the preferences, "
+                    "otherwise the result would be another person"
                 )
         show_in_place(context, person, result)
         _look()
@@ -104,10 +105,10 @@ def made_from_seed(person: bpy.types.Collection) -> dict[str, Any]:
     made = json.loads(person[MARK])
     if made.get("edits"):
         raise ValueError(
-            f"{person.name!r} was edited after they were generated, so no seed makes them again: put their files back"
+            f"{person.name!r} was edited after they were generated, so no seed reproduces them: restore their files"
         )
     if not isinstance(made.get("seed"), int) or "steps" not in made:
-        raise ValueError(f"{person.name!r} was not generated from a seed: put their files back")
+        raise ValueError(f"{person.name!r} was not generated from a seed: restore their files")
     return made
 
 

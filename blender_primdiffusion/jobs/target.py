@@ -36,13 +36,12 @@ class Target:
         person = next((person for person in people if person.session_uid == self.uid), None)
         if person is None or not any(thing.type == "ARMATURE" for thing in person.objects):
             raise ValueError(
-                f"the person {self.name!r} was removed while the edit was under way; nothing was changed. Undo the "
+                f"the person {self.name!r} was removed during the edit; nothing was changed. Undo the "
                 "removal and edit again"
             )
         if person_file_name(person) != self.file:
             raise ValueError(
-                f"the person {person.name!r} became another while the edit was under way (by undo or redo); nothing "
-                "was changed. Edit again"
+                f"the person {person.name!r} changed during the edit (by undo or redo); nothing was changed. Edit again"
             )
         check_editable(person)
         return person

@@ -88,7 +88,7 @@ class Sheet:
         """Those that are selected. Raises ValueError for none."""
         found = [variation for variation in self.variations if variation.chosen]
         if not found:
-            raise ValueError("no variation is selected: click the seeds of those you want")
+            raise ValueError("no variation is selected: click the seeds below the pictures")
         return found
 
 
@@ -125,7 +125,7 @@ class VariationsJob(Job):
         params: dict[str, Any] = {"seeds": list(self.seeds), "steps": self.steps, "sampler": self.sampler, **self.asked}
         if self.person:
             if not Path(self.person).is_file():
-                raise FileNotFoundError("the person to vary was cleared meanwhile: show variations again")
+                raise FileNotFoundError("the person to vary was cleared: show variations again")
             params |= {"person": self.person, "amount": self.amount}
         if self.checkpoint:
             params["checkpoint"] = self.checkpoint

@@ -15,7 +15,7 @@ from .manual import draw_manual_button
 from .on_person import SKIP, OnPerson
 from .translations import CONTEXT
 
-_PICTURE = "A picture file for it; empty: one is drawn"
+_PICTURE = "Picture file for the asset; empty: one is drawn"
 
 
 class PRIMDIFFUSION_OT_mark_human_as_asset(OnPerson, bpy.types.Operator):
@@ -40,7 +40,7 @@ class PRIMDIFFUSION_OT_mark_human_as_asset(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_mark_pose_as_asset(OnPerson, bpy.types.Operator):
-    """Make the pose the selected person is in an asset, to be applied to anybody from the pose library"""
+    """Make the selected person's pose an asset that can be applied to any person from the pose library"""
 
     bl_idname = "primdiffusion.mark_pose_as_asset"
     bl_label = "Mark Pose as Asset"
@@ -73,7 +73,7 @@ class PRIMDIFFUSION_OT_unmark_human_asset(OnPerson, bpy.types.Operator):
         if person.library is not None:
             raise ValueError(f"{person.name!r} is linked from {person.library.filepath!r}: unmark it there")
         if person.asset_data is None:
-            raise ValueError(f"{person.name!r} is no asset: there is nothing to unmark")
+            raise ValueError(f"{person.name!r} is not an asset: there is nothing to unmark")
         person.asset_clear()
         return {"FINISHED"}
 

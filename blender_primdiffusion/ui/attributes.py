@@ -76,7 +76,7 @@ def title(name: str) -> str:
 def _menu_property(name: str):
     items: Callable = lambda _self, _context: menu(name)  # noqa: E731  bpy wants a function of its own for each
     return bpy.props.EnumProperty(
-        name=title(name), description="What the person is asked to be", items=items, translation_context=CONTEXT
+        name=title(name), description="Attribute of the generated person", items=items, translation_context=CONTEXT
     )
 
 
@@ -89,11 +89,11 @@ class PRIMDIFFUSION_PG_attributes(bpy.types.PropertyGroup):
     shoes: _menu_property("shoes")
     hair: _menu_property("hair")
     hat: _menu_property("hat")
-    use_height: bpy.props.BoolProperty(name="Ask for a Height", description="The body is of this height")
+    use_height: bpy.props.BoolProperty(name="Ask for a Height", description="Ask for a body of this height")
     height: bpy.props.FloatProperty(
         name="Height", description="Metres", default=1.7, min=0.5, max=2.5, step=1, translation_context=CONTEXT
     )
-    use_weight: bpy.props.BoolProperty(name="Ask for a Weight", description="The body is of this weight")
+    use_weight: bpy.props.BoolProperty(name="Ask for a Weight", description="Ask for a body of this weight")
     weight: bpy.props.FloatProperty(
         name="Weight", description="Kilograms", default=70.0, min=10.0, max=300.0, step=100, translation_context=CONTEXT
     )
@@ -118,7 +118,7 @@ def parsed(text: str) -> Attributes:
     for part in filter(None, re.split(r"[,;]\s*", text.strip())):
         name, equals, value = (piece.strip() for piece in part.partition("="))
         if not (equals and name and value):
-            raise ValueError(f"the attribute {part!r} is no name=value: write them like sex=female, height=1.7")
+            raise ValueError(f"the attribute {part!r} is not name=value: write for example sex=female, height=1.7")
         try:
             found[name] = float(value)
         except ValueError:

@@ -29,7 +29,7 @@ _PERSON_M = 1.1
 
 
 class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
-    """Render everybody in the folder of people from all sides, into the folder of captures"""
+    """Render all people in the folder from all sides, into the folder of captures"""
 
     bl_idname = "primdiffusion.render_captures"
     bl_label = "Render Captures"
@@ -86,7 +86,7 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_cancel_captures(bpy.types.Operator):
-    """Stop rendering; what is there stays, and the next run goes on from it"""
+    """Stop rendering; finished pictures stay, and the next run resumes from them"""
 
     bl_idname = "primdiffusion.cancel_captures"
     bl_label = "Cancel"
@@ -105,7 +105,7 @@ class PRIMDIFFUSION_OT_cancel_captures(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_verify_captures(bpy.types.Operator):
-    """Read every file of the captures and name what is missing, cut short or altered"""
+    """Read every file of the captures and report what is missing, truncated or altered"""
 
     bl_idname = "primdiffusion.verify_captures"
     bl_label = "Verify"
@@ -113,7 +113,7 @@ class PRIMDIFFUSION_OT_verify_captures(bpy.types.Operator):
 
     out: bpy.props.StringProperty(name="Captures", description="Empty: the panel's")
     repair: bpy.props.BoolProperty(
-        name="Repair", description="Take away what is damaged, so that the next run renders just that anew"
+        name="Repair", description="Remove damaged files, so that the next run renders only those again"
     )
 
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -144,7 +144,7 @@ class PRIMDIFFUSION_OT_verify_captures(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_preview_rig(bpy.types.Operator):
-    """Show the cameras around the active object, or take them away again"""
+    """Show the cameras around the active object, or hide them again"""
 
     bl_idname = "primdiffusion.preview_rig"
     bl_label = "Preview Cameras"

@@ -144,7 +144,7 @@ class CaptureSession:
         self._clear_folder()
         last = self.lines[-1] if self.lines else ""
         if stopped or code == CANCELLED:
-            self.notice = "Cancelled; the same settings go on from here."
+            self.notice = "Cancelled; the same settings resume from here."
         elif code == DONE:
             self.notice, self.fraction = last, 1.0
         else:

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 _PASS_NAMES = {
     "img": ("Colour", "What the camera sees, over black"),
-    "mask": ("Mask", "Share of each pixel that the person covers"),
+    "mask": ("Mask", "Coverage of each pixel by the person"),
     "depth": ("Depth", "Metres along the optical axis, 16 bits"),
-    "normal": ("Normal", "Of the surface, in the world"),
+    "normal": ("Normal", "Surface normal in world space"),
     "part": ("Part", "Which of the 24 joints moves the surface"),
 }
 _LAYOUT_NAMES = {"nerf": "NeRF", "opencv": "OpenCV", "colmap": "COLMAP"}
@@ -34,14 +34,16 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         name="People", description="Folder of scans (.glb, .fbx, .obj) or of generated people", subtype="DIR_PATH"
     )
     out: bpy.props.StringProperty(
-        name="Captures", description="Folder of the dataset; one begun before is gone on with", subtype="DIR_PATH"
+        name="Captures", description="Folder of the dataset; an unfinished one is resumed", subtype="DIR_PATH"
     )
-    seed: bpy.props.IntProperty(name="Seed", description="Of the choice of poses and of the noise", min=0)
+    seed: bpy.props.IntProperty(name="Seed", description="Seed of the choice of poses and of the render noise", min=0)
     body: bpy.props.StringProperty(
         name="Body", description="Your SMPL body as .npz of plain arrays; empty: the default body", subtype="FILE_PATH"
     )
     shard: bpy.props.IntProperty(name="Shard", description="Which part of the people this machine renders", min=0)
-    shards: bpy.props.IntProperty(name="of", description="Into how many parts the people are dealt", min=1, default=1)
+    shards: bpy.props.IntProperty(
+        name="of", description="Number of parts the people are divided into", min=1, default=1
+    )
 
     poses: bpy.props.StringProperty(
         name="Poses",
@@ -59,16 +61,18 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
             ("rings", "Rings", "Rings at several heights"),
             ("sphere", "Sphere", "Evenly all round (Fibonacci)"),
             ("hemisphere", "Hemisphere", "Evenly from above and the sides"),
-            ("custom", "Cameras of the Scene", "The cameras of a collection; they stand still while people change"),
+            ("custom", "Cameras of the Scene", "The cameras of a collection; they stay fixed for all people"),
         ],
     )
     camera_count: bpy.props.IntProperty(
         name="Cameras", description="Views of each pose", default=36, min=1, soft_max=200
     )
-    rings: bpy.props.IntProperty(name="Rings", description="Over which the cameras are dealt", default=3, min=1, max=50)
+    rings: bpy.props.IntProperty(
+        name="Rings", description="Number of rings the cameras are distributed over", default=3, min=1, max=50
+    )
     lowest: bpy.props.FloatProperty(
         name="Lowest",
-        description="Ring, above the horizon",
+        description="Angle above the horizon",
         default=math.radians(-10),
         min=math.radians(-89),
         max=math.radians(89),
@@ -76,7 +80,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     )
     highest: bpy.props.FloatProperty(
         name="Highest",
-        description="Ring, above the horizon",
+        description="Angle above the horizon",
         default=math.radians(40),
         min=math.radians(-89),
         max=math.radians(89),
@@ -88,30 +92,28 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     )  # fmt: skip
     margin: bpy.props.FloatProperty(name="Margin", description="Room around people", default=1.05, min=0.1, max=100)
     cameras: bpy.props.PointerProperty(
-        name="Collection", description="Whose cameras take the pictures", type=bpy.types.Collection
+        name="Collection", description="Collection with the cameras", type=bpy.types.Collection
     )
 
     samples: bpy.props.IntProperty(name="Samples", description="Of a pixel", default=16, min=1, soft_max=1024)
     light: bpy.props.EnumProperty(
         name="Light",
         translation_context=CONTEXT,
-        description="What the people are seen in",
+        description="Lighting of the people",
         items=[
             ("uniform", "Uniform", "Every surface shows its own colour"),
             ("dome", "Dome", "A white sky, soft shadows"),
-            ("hdri", "HDRI", "A picture of the surroundings"),
+            ("hdri", "HDRI", "An environment picture"),
         ],
     )
-    hdri: bpy.props.StringProperty(
-        name="HDRI", description="Picture of the surroundings, .exr or .hdr", subtype="FILE_PATH"
-    )
+    hdri: bpy.props.StringProperty(name="HDRI", description="Environment picture, .exr or .hdr", subtype="FILE_PATH")
     denoise: bpy.props.BoolProperty(
         name="Denoise", description="Colours under a dome or HDRI light; never masks, depth, normals or parts"
     )
     device: bpy.props.EnumProperty(
         name="Device",
         description="What Cycles renders on",
-        items=[("auto", "Automatic", "A GPU where there is one"), ("cpu", "CPU", ""), ("gpu", "GPU", "")],
+        items=[("auto", "Automatic", "A GPU if there is one"), ("cpu", "CPU", ""), ("gpu", "GPU", "")],
     )
 
     width: bpy.props.IntProperty(
@@ -123,7 +125,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     background: bpy.props.EnumProperty(
         name="Background",
         description="Behind the people",
-        items=[("black", "Black", ""), ("transparent", "Transparent", "One pass more: PNG with straight alpha")],
+        items=[("black", "Black", ""), ("transparent", "Transparent", "One more pass: PNG with straight alpha")],
     )
     passes: bpy.props.EnumProperty(
         name="Passes",
@@ -134,13 +136,13 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     )
     layouts: bpy.props.EnumProperty(
         name="Also for",
-        description="Camera files of other projects beside the same pictures",
+        description="Also write camera files in the layouts of other projects",
         options={"ENUM_FLAG"},
         items=_LAYOUT_ITEMS,
         default=set(LAYOUTS),
     )
     released_reference: bpy.props.BoolProperty(
-        name="Released Reference", description="One subject also under the name that the released code looks for"
+        name="Released Reference", description="Also store one subject under the name that the released code expects"
     )
 
     def elevations(self) -> list[float]:
@@ -155,7 +157,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         from ..formats.camera_rig import Rig
 
         if self.arrangement == "custom":
-            raise ValueError("the scene's cameras are no rig: they stand where they stand")
+            raise ValueError("the scene's own cameras need no preview: choose another arrangement")
         return Rig(
             arrangement=self.arrangement,
             count=self.camera_count,

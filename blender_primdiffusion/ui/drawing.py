@@ -133,7 +133,7 @@ def _progress_text() -> str:
     job = queue.request
     if queue.ready:
         waits_for = in_the_way()
-        return f"Done: waits for {waits_for}" if waits_for else "Putting it into the scene"
+        return f"Done; waiting for {waits_for}" if waits_for else "Adding it to the scene"
     if not job.eta_s:
         return job.message
     left = f"{job.eta_s:.0f} s" if job.eta_s < _MINUTES_FROM_S else f"{job.eta_s / 60:.0f} min"

@@ -22,7 +22,7 @@ PAINTED_GROUP = "PrimDiffusion Region"
 """Vertex group of the body mesh that Paint Region makes."""
 
 _TRANSFERS = {
-    "texture": ("Texture", "Colours alone, on the person's own shape"),
+    "texture": ("Texture", "Colours only, on the person's own shape"),
     "garment": ("Garment", "Colours and shape: what the other person wears there"),
 }
 TRANSFER_ITEMS = [(name, *_TRANSFERS[name]) for name in TRANSFERS]
@@ -48,11 +48,14 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
     """`scene.primdiffusion_edit`."""
 
     seed: bpy.props.IntProperty(
-        name="Seed", description="Another seed is another result; the same seed is the same", default=1, min=0
+        name="Seed",
+        description="Another seed gives another result; the same seed gives the same result",
+        default=1,
+        min=0,
     )
     amount: bpy.props.FloatProperty(
         name="Amount",
-        description="How far the new person may be from this one: 0 is the same, 1 anybody",
+        description="How much the new person may differ from this one: 0 not at all, 1 completely",
         default=AMOUNT,
         min=0.0,
         max=1.0,
@@ -68,16 +71,16 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
     )
     parts: parts_property()
     vertex_group: bpy.props.StringProperty(
-        name="Vertex Group", description="Of the body mesh of the person", default=PAINTED_GROUP
+        name="Vertex Group", description="Vertex group of the person's body mesh", default=PAINTED_GROUP
     )
     attributes: bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_attributes)
     other: bpy.props.PointerProperty(
-        name="Other Person", description="From whom", type=bpy.types.Collection, poll=_may_be_other
+        name="Other Person", description="The other person", type=bpy.types.Collection, poll=_may_be_other
     )
     what: bpy.props.EnumProperty(name="Transfer", description="What the person gets", items=TRANSFER_ITEMS)
     harmonise: bpy.props.FloatProperty(
         name="Harmonise",
-        description="How much the region is denoised once more to fit the rest of the person: 0 copies it exactly",
+        description="How much the region is denoised again to match the rest of the person: 0 copies it exactly",
         default=0.0,
         min=0.0,
         max=1.0,
@@ -86,7 +89,7 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
     fraction: bpy.props.FloatProperty(
         name="Fraction",
         translation_context=CONTEXT,
-        description="How much of the other person: 0 is this one, 1 the other",
+        description="Share of the other person: 0 is this person, 1 the other",
         default=FRACTION,
         min=0.0,
         max=1.0,
@@ -95,7 +98,7 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
 
 
 class PRIMDIFFUSION_OT_paint_region(bpy.types.Operator):
-    """Show the body mesh of the selected person and paint on it where to change them"""
+    """Show the body mesh of the selected person and paint the region to change"""
 
     bl_idname = "primdiffusion.paint_region"
     bl_label = "Paint Region"
@@ -175,7 +178,7 @@ class _Region:
 
     parts: parts_property()
     vertex_group: bpy.props.StringProperty(
-        name="Vertex Group", description="A painted region instead of parts", options=SKIP
+        name="Vertex Group", description="Vertex group with a painted region, instead of parts", options=SKIP
     )
 
     def region(
@@ -197,7 +200,7 @@ class _Region:
 
 
 class PRIMDIFFUSION_OT_vary(_Edit, bpy.types.Operator):
-    """Turn the selected person into a neighbour: similar, more so the smaller the amount"""
+    """Turn the selected person into a similar one; the smaller the amount, the more similar"""
 
     bl_idname = "primdiffusion.vary"
     bl_label = "Vary"
@@ -205,7 +208,7 @@ class PRIMDIFFUSION_OT_vary(_Edit, bpy.types.Operator):
 
     amount: bpy.props.FloatProperty(name="Amount", min=0.0, max=1.0, description=PANELS, options=SKIP)
     attributes: bpy.props.StringProperty(
-        name="Attributes", description="Like sex=female, height=1.7; empty: whatever comes", options=SKIP
+        name="Attributes", description="For example sex=female, height=1.7; empty: no restriction", options=SKIP
     )
     guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=PANELS, options=SKIP)
 
@@ -220,13 +223,15 @@ class PRIMDIFFUSION_OT_vary(_Edit, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
-    """Generate a region of the selected person anew; everything else stays exactly as it is"""
+    """Generate a region of the selected person again; everything else stays exactly as it is"""
 
     bl_idname = "primdiffusion.redress"
     bl_label = "Re-dress Region"
     job = "RedressJob"
 
-    attributes: bpy.props.StringProperty(name="Attributes", description=f"Like outfit=suit. {PANELS}", options=SKIP)
+    attributes: bpy.props.StringProperty(
+        name="Attributes", description=f"For example outfit=suit. {PANELS}", options=SKIP
+    )
     guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=PANELS, options=SKIP)
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
@@ -241,7 +246,7 @@ class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
-    """Give a region of the selected person the texture of another one, or the garment"""
+    """Transfer the texture, or the garment, of another person to a region of the selected person"""
 
     bl_idname = "primdiffusion.transfer_texture"
     bl_label = "Transfer Texture"
@@ -264,7 +269,7 @@ class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
-    """Move the selected person towards another one, who stays as they are"""
+    """Change the selected person towards another one, who stays unchanged"""
 
     bl_idname = "primdiffusion.blend"
     bl_label = "Blend"
@@ -289,7 +294,7 @@ def _other(context: bpy.types.Context, person: bpy.types.Collection, name: str) 
         raise ValueError("choose the other person in the panel first")
     other = named_person(context, name or picked.name)
     if other == person:
-        raise ValueError(f"{person.name!r} cannot be the other person too: choose somebody else")
+        raise ValueError(f"{person.name!r} cannot be the other person too: choose another one")
     return str(person_file(other))
 
 

@@ -22,7 +22,9 @@ def destination(filepath: str, endings: Sequence[str]) -> Path:
         raise ValueError("name a file to export to")
     path = Path(bpy.path.abspath(filepath))
     if not path.is_absolute():
-        raise ValueError(f"{filepath!r} is beside a .blend that was never saved: save it first, or give the whole path")
+        raise ValueError(
+            f"{filepath!r} is relative to a .blend that was never saved: save it first, or give an absolute path"
+        )
     if not path.suffix:
         path = path.with_suffix(endings[0])
     if path.suffix.lower() not in endings:
@@ -31,7 +33,7 @@ def destination(filepath: str, endings: Sequence[str]) -> Path:
         raise ValueError(f"{str(path)!r} is a folder: name a file in it")
     check_writable(path.parent)
     if path.exists() and not os.access(path, os.W_OK):
-        raise PermissionError(f"{str(path)!r} may not be written to: choose another file")
+        raise PermissionError(f"{str(path)!r} is not writable: choose another file")
     return path
 
 
@@ -40,7 +42,7 @@ def check_writable(folder: Path) -> None:
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no folder {str(folder)!r}: make it first, or choose another")
     if not os.access(folder, os.W_OK):
-        raise PermissionError(f"the folder {str(folder)!r} may not be written to: choose another")
+        raise PermissionError(f"the folder {str(folder)!r} is not writable: choose another")
 
 
 FORMATS = (
@@ -76,21 +78,21 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
     triangles: bpy.props.IntProperty(
         name="Triangles",
         translation_context=CONTEXT,
-        description="Of the mesh proxy, at most",
+        description="Largest number of triangles of the mesh proxy",
         default=requests.TRIANGLES,
         min=500,
         max=1_000_000,
     )
     gaussians: bpy.props.IntProperty(
         name="Gaussians",
-        description="At most; a person has some 130 thousand that can be seen",
+        description="Largest number of Gaussians; a person has about 130,000 that can be seen",
         default=requests.GAUSSIANS,
         min=1000,
         max=1_000_000,
     )
     voxel: bpy.props.FloatProperty(
         name="Voxel Size",
-        description="Side of the voxels of a VDB sequence: half of it, eight times the memory",
+        description="Voxel size of the VDB sequence: half the size takes eight times the memory",
         default=requests.VOXEL,
         min=0.002,
         max=0.05,
@@ -100,7 +102,7 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
     )
     motion: bpy.props.BoolProperty(
         name="With Motion",
-        description="Keep the scene's frames of the person in the .human file; otherwise the person alone",
+        description="Include the motion of the scene's frame range in the .human file; otherwise only the person",
         default=False,
     )
 
@@ -199,7 +201,7 @@ class PRIMDIFFUSION_OT_add_proxy(_Export, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_show_proxy(_Export, bpy.types.Operator):
-    """Choose what is seen of the selected person: the volumes, or the mesh proxy"""
+    """Choose how the selected person is shown: as volumes or as the mesh proxy"""
 
     bl_idname = "primdiffusion.show_proxy"
     bl_label = "Show Volumes or Mesh"
@@ -284,7 +286,7 @@ class PRIMDIFFUSION_OT_export_vdb_sequence(_Export, bpy.types.Operator):
         first = self.first if given("first") else scene.frame_start
         last = self.last if given("last") else scene.frame_end
         if last < first:
-            raise ValueError(f"the last frame {last} is before the first, {first}: exchange them")
+            raise ValueError(f"the last frame {last} is before the first, {first}: swap them")
         target, stem = Target.of(person), bpy.path.clean_name(person.name)
         people = posed_frames(context, person, range(first, last + 1))
         job = ExportVdbSequenceJob(target, folder, stem, people, first, self.chosen(context, "voxel"))
@@ -292,7 +294,7 @@ class PRIMDIFFUSION_OT_export_vdb_sequence(_Export, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_export_human(_ToFile, bpy.types.Operator):
-    """Export the selected person as a .human file, to be dropped into another scene or given to somebody else"""
+    """Export the selected person as a .human file that can be dropped into another scene"""
 
     bl_idname = "primdiffusion.export_human"
     bl_label = "Export Human File"

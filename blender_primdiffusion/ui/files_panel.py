@@ -62,7 +62,7 @@ class _Find:
             source = find_person(one, directory)
             if one.linked:
                 left.append(
-                    f"{one.summary()}, linked from {one.linked!r}, cannot be found: open that file and look there"
+                    f"{one.summary()}, linked from {one.linked!r}, cannot be found: open that file and search there"
                 )
             elif source is None:
                 left.append(
@@ -81,14 +81,14 @@ class _Find:
 
 
 class PRIMDIFFUSION_OT_find_missing_volumes(_Find, bpy.types.Operator):
-    """Look for files of people that are missing, and make those again that cannot be found"""
+    """Find missing files of people, and restore those that cannot be found"""
 
     bl_idname = "primdiffusion.find_missing_volumes"
     bl_label = "Find Missing Volumes"
 
 
 class PRIMDIFFUSION_OT_find_volumes_in_folder(_Find, bpy.types.Operator):
-    """Choose a folder to look in for files of people that are missing"""
+    """Choose a folder to search for missing files of people"""
 
     bl_idname = "primdiffusion.find_volumes_in_folder"
     bl_label = "Find Volumes in Folder"
@@ -102,7 +102,7 @@ class PRIMDIFFUSION_OT_find_volumes_in_folder(_Find, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_generate_again(OnPerson, bpy.types.Operator):
-    """Generate this person once more from their seed, where all of their files are lost"""
+    """Generate this person again from their seed, when all of their files are lost"""
 
     bl_idname = "primdiffusion.generate_again"
     bl_label = "Generate Again"
@@ -120,7 +120,7 @@ class PRIMDIFFUSION_OT_generate_again(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_collect_files(bpy.types.Operator):
-    """Copy all files of this file's people beside it, so that it can be moved or sent with one folder"""
+    """Copy the files of all people next to this .blend, so that it can be moved or sent with one folder"""
 
     bl_idname = "primdiffusion.collect_files"
     bl_label = "Collect Files"

@@ -52,7 +52,7 @@ class PRIMDIFFUSION_OT_add_generate_preset(AddPresetBase, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_use_generate_preset(bpy.types.Operator):
-    """Take over the settings of this preset"""
+    """Use the settings of this preset"""
 
     bl_idname = "primdiffusion.use_generate_preset"
     bl_label = "Use Generate Preset"
@@ -70,14 +70,14 @@ class PRIMDIFFUSION_OT_use_generate_preset(bpy.types.Operator):
             return {"CANCELLED"}
         except (TypeError, AttributeError, SyntaxError) as error:
             name = bpy.path.display_name(path.name)
-            self.report({"ERROR"}, f"The preset {name!r} does not suit this checkpoint or version: {error}. Remove it")
+            self.report({"ERROR"}, f"The preset {name!r} does not match this checkpoint or version: {error}. Remove it")
             return {"CANCELLED"}
         PRIMDIFFUSION_PT_generate_presets.bl_label = bpy.path.display_name(path.name)
         return {"FINISHED"}
 
 
 class PRIMDIFFUSION_OT_generate(Asking, bpy.types.Operator):
-    """Generate people from the seed, and add them to the scene with armatures, side by side"""
+    """Generate people from the seed and add them to the scene with armatures, side by side"""
 
     bl_idname = "primdiffusion.generate"
     bl_label = "Generate Human"
@@ -111,7 +111,7 @@ class PRIMDIFFUSION_OT_generate(Asking, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_random_seed(bpy.types.Operator):
-    """Put a random seed into the panel"""
+    """Set a random seed"""
 
     bl_idname = "primdiffusion.random_seed"
     bl_label = "Random Seed"

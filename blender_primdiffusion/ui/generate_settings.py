@@ -13,7 +13,7 @@ from .attributes import PRIMDIFFUSION_PG_attributes, asked, parsed
 STEPS_AND_SAMPLER = {"DRAFT": (8, "dpmpp_2m"), "STANDARD": (30, "ddim"), "HIGH": (60, "ddim")}
 CUSTOM = "CUSTOM"
 ITEMS = [
-    ("DRAFT", "Draft", "8 steps of DPM-Solver++: quick, softer, and of the same seed now and then another person"),
+    ("DRAFT", "Draft", "8 steps of DPM-Solver++: quick and softer; the same seed sometimes gives another person"),
     ("STANDARD", "Standard", "30 steps of DDIM"),
     ("HIGH", "High", "60 steps of DDIM: twice the time of Standard for a little more detail"),
     (CUSTOM, "Custom", "Steps and sampler as chosen below"),
@@ -39,9 +39,9 @@ def quality_of(settings: bpy.types.PropertyGroup) -> str:
 
 
 _SAMPLERS = {
-    "ddim": ("DDIM", "The noise of the seed alone: as the paper samples"),
-    "dpmpp_2m": ("DPM-Solver++(2M)", "Two steps are looked at together: does well with few"),
-    "ddpm": ("DDPM", "New noise at each step: wants many"),
+    "ddim": ("DDIM", "No noise but that of the seed: the paper's sampler"),
+    "dpmpp_2m": ("DPM-Solver++(2M)", "Second-order multistep: good with few steps"),
+    "ddpm": ("DDPM", "New noise at each step; needs many steps"),
 }
 SAMPLER_ITEMS = [(name, *_SAMPLERS[name]) for name in requests.SAMPLERS]
 
@@ -50,14 +50,17 @@ class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
     """`scene.primdiffusion`."""
 
     seed: bpy.props.IntProperty(
-        name="Seed", description="Another seed is another person; the same seed is the same person", default=7, min=0
+        name="Seed",
+        description="Another seed gives another person; the same seed gives the same person",
+        default=7,
+        min=0,
     )
     keep_seed: bpy.props.BoolProperty(
-        name="Lock Seed", description="Keep the seed; otherwise each new person leaves a new random one"
+        name="Lock Seed", description="Keep the seed; otherwise it is set to a new random one after each person"
     )
     count: bpy.props.IntProperty(
         name="Count",
-        description="How many people, of this seed and those that follow on it, one after the other and side by side",
+        description="How many people: from this seed and the following ones, placed side by side",
         default=1,
         min=1,
         max=1000,
@@ -65,7 +68,7 @@ class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
     )
     quality: bpy.props.EnumProperty(
         name="Quality",
-        description="How carefully the noise is taken away",
+        description="Steps and sampler of the denoising",
         items=ITEMS,
         default="STANDARD",
         update=apply_quality,
@@ -80,11 +83,11 @@ class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
         update=name_quality,
     )
     sampler: bpy.props.EnumProperty(
-        name="Sampler", description="How the noise is taken away", items=SAMPLER_ITEMS, update=name_quality
+        name="Sampler", description="How the noise is removed", items=SAMPLER_ITEMS, update=name_quality
     )
     guidance: bpy.props.FloatProperty(
         name="Guidance",
-        description="How strongly the attributes are followed: 1 as people are, more exaggerates; "
+        description="How strongly the attributes are followed: 1 as in the training data, more exaggerates; "
         "without attributes it does nothing",
         default=requests.GUIDANCE,
         min=0.0,
@@ -112,7 +115,7 @@ class Asking:
     guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=_PANELS, options=_SKIP)
     attributes: bpy.props.StringProperty(
         name="Attributes",
-        description="Like sex=female, height=1.7; empty: whatever comes. Not given: the panel's",
+        description="For example sex=female, height=1.7; empty: no restriction. Not given: the panel's",
         options=_SKIP,
     )
 

@@ -36,7 +36,7 @@ class PRIMDIFFUSION_OT_frame_human(OnPerson, bpy.types.Operator):
         """In the 3D viewport that this was pressed in, else in the first."""
         place = _viewport(context)
         if place is None:
-            raise ValueError("no 3D viewport is open to show the person in: open one")
+            raise ValueError("no 3D viewport is open: open one")
         select(context, person)
         with context.temp_override(**place):
             bpy.ops.view3d.view_selected()
@@ -44,7 +44,7 @@ class PRIMDIFFUSION_OT_frame_human(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_duplicate_human(OnPerson, bpy.types.Operator):
-    """Put another person like this one beside them: bones and body of their own, the same files"""
+    """Duplicate this person, with an armature and body of their own and the same files"""
 
     bl_idname = "primdiffusion.duplicate_human"
     bl_label = "Duplicate Human"
@@ -88,7 +88,7 @@ class PRIMDIFFUSION_OT_delete_human(OnPerson, bpy.types.Operator):
         from ..scene.painting import leave_mode
 
         if person.library is not None:
-            raise ValueError(f"the person {person.name!r} is linked: remove them in the Outliner, by Unlink")
+            raise ValueError(f"the person {person.name!r} is linked: remove them in the Outliner with Unlink")
         leave_mode(context)
         remove_human(person)
         context.view_layer.update()  # what is evaluated holds grids too

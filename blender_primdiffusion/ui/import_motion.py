@@ -62,7 +62,7 @@ def nearest_to(mouse: tuple[float, float], seen: dict[str, NDArray]) -> str:
 
 SUFFIXES = (".npz", ".npy", ".json", ".bvh")
 _UP_ITEMS = [
-    ("AUTO", "Found in the File", "From how the pelvis stands"),
+    ("AUTO", "Found in the File", "Detected from the orientation of the pelvis"),
     *[
         (axis.upper().replace("-", "MINUS_"), axis.upper(), f"{axis} points up")
         for axis in ("x", "y", "z", "-x", "-y", "-z")
@@ -132,7 +132,7 @@ class _BoneMap:
 
 
 class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper, bpy.types.Operator):
-    """Put the motion of an AMASS .npz, a pose file or a .bvh onto the person"""
+    """Apply the motion of an AMASS .npz, a pose file or a .bvh to the person"""
 
     bl_idname = "primdiffusion.import_motion"
     bl_label = "Import Motion"
@@ -145,38 +145,46 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
     filter_glob: bpy.props.StringProperty(default=";".join(f"*{s}" for s in SUFFIXES), options={"HIDDEN"})
     up: bpy.props.EnumProperty(name="Up Axis", description="Which axis of the file points up", items=_UP_ITEMS)
     fps: bpy.props.FloatProperty(
-        name="Source Rate", description="Frames a second of the file; 0: as the file tells", default=0, min=0, max=10000
+        name="Source Rate",
+        description="Frames per second of the file; 0: as stated in the file",
+        default=0,
+        min=0,
+        max=10000,
     )
     timing: bpy.props.EnumProperty(
         name="Keys",
         description="Where keys are set",
         items=[
             ("SCENE", "Scene Rate", "A key on every frame of the scene; the motion keeps its speed"),
-            ("SOURCE", "Every Source Frame", "A key for every frame of the file, between the scene's if need be"),
+            ("SOURCE", "Every Source Frame", "A key for every frame of the file, on subframes where needed"),
         ],
     )
     first: bpy.props.IntProperty(name="From", description="First frame of the file, counted from 1", default=1, min=1)
     last: bpy.props.IntProperty(name="To", description="Last frame of the file; 0: all there are", default=0, min=0)
     stride: bpy.props.IntProperty(name="Step", description="Take every n-th frame of the file", default=1, min=1)
     scale: bpy.props.FloatProperty(
-        name="Scale Path", description="How much longer the way becomes; turns stay", default=1.0, min=0.0, soft_max=10
+        name="Scale Path",
+        description="Factor on the length of the path; rotations stay",
+        default=1.0,
+        min=0.0,
+        soft_max=10,
     )
     fit_stride: bpy.props.BoolProperty(
         name="Fit Stride",
-        description="Make the way as long as this person's legs go, so that feet stay where they are put down",
+        description="Scale the path to the length of this person's legs, so that the feet do not slide",
         default=True,
     )
     ground: bpy.props.BoolProperty(
         name="Feet on the Floor",
-        description="Raise or lower the whole motion until its lowest feet stand",
+        description="Move the whole motion up or down until the feet stand on the floor",
         default=True,
     )
     bones: bpy.props.EnumProperty(
         name="Bones",
-        description="How the bones of a .bvh are told apart",
+        description="How the bones of a .bvh are identified",
         items=[
-            ("AUTO", "By Name", "Rigs whose names are known: SMPL, Mixamo, CMU, Unreal, Rigify, Daz and others"),
-            ("CHOSEN", "Chosen", "The map below, which can be kept as a preset"),
+            ("AUTO", "By Name", "Known rigs: SMPL, Mixamo, CMU, Unreal, Rigify, Daz and others"),
+            ("CHOSEN", "Chosen", "The map below, which can be saved as a preset"),
         ],
     )
 

@@ -85,7 +85,7 @@ def _names() -> set[str]:
 
 
 class PRIMDIFFUSION_OT_copy_diagnostics(bpy.types.Operator):
-    """Copy what a bug report needs: versions, device, the last error and the log, without names and folders"""
+    """Copy what a bug report needs: versions, device, last error and log, without user names or folder names"""
 
     bl_idname = "primdiffusion.copy_diagnostics"
     bl_label = "Copy Diagnostics"
@@ -100,7 +100,7 @@ class PRIMDIFFUSION_OT_copy_diagnostics(bpy.types.Operator):
             self.report({"INFO"}, f"the text {TEXT!r} holds them")
         else:
             context.window_manager.clipboard = text
-            self.report({"INFO"}, "copied: paste it into the report, and read it first")
+            self.report({"INFO"}, "copied: read it before you paste it into a report")
         return {"FINISHED"}
 
 
@@ -162,7 +162,7 @@ class PRIMDIFFUSION_OT_try_again(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_release_memory(bpy.types.Operator):
-    """End the processes that generate and draw, and so give back what they hold; the next person starts them anew"""
+    """End the processes that generate and draw to release their memory; they start again with the next person"""
 
     bl_idname = "primdiffusion.release_memory"
     bl_label = "Release Memory"

@@ -18,7 +18,7 @@ class PRIMDIFFUSION_OT_open_manual(bpy.types.Operator):
     bl_label = "Open Manual"
     bl_options: set[str] = set()  # noqa: RUF012
 
-    page: bpy.props.StringProperty(name="Page", description="Name of the page, like first_human", default="index")
+    page: bpy.props.StringProperty(name="Page", description="Name of the page, such as first_human", default="index")
     anchor: bpy.props.StringProperty(name="Section", description="Heading on the page; empty: its beginning")
 
     def execute(self, _context: bpy.types.Context) -> set[str]:

@@ -45,7 +45,7 @@ class OnArmature:
 
     person: bpy.props.StringProperty(
         name="Person",
-        description="Name of the person (of their collection); empty: the active armature or the selected person",
+        description="Name of the person's collection; empty: the active armature or the selected person",
         options={"SKIP_SAVE"},
     )
 
@@ -72,10 +72,10 @@ class OnArmature:
 class WhereTo:
     """Properties of operators that key a motion; their values are those of `placing.Placement`."""
 
-    start: bpy.props.IntProperty(name="Start Frame", description="Frame of the scene with the first pose", default=1)
+    start: bpy.props.IntProperty(name="Start Frame", description="Scene frame of the first pose", default=1)
     root: bpy.props.EnumProperty(
         name="Root Motion",
-        description="What becomes of the way through space",
+        description="What happens to the path through space",
         items=[
             ("ORIGIN", "From the Person", "The path begins where the person is"),
             ("KEEP", "As It Is", "The path keeps its place, which may be metres away"),
@@ -86,8 +86,8 @@ class WhereTo:
         name="Into",
         description="Where the keys go",
         items=[
-            ("NEW", "New Action", "A new action; the one before stays in the file"),
-            ("APPEND", "Append", "After the last key of the action the person has"),
+            ("NEW", "New Action", "A new action; the previous one stays in the file"),
+            ("APPEND", "Append", "After the last key of the person's current action"),
             ("STRIP", "NLA Strip", "A strip on a new track of the nonlinear animation"),
         ],
     )

@@ -24,7 +24,7 @@ _BUILT_IN = [
 
 
 class PRIMDIFFUSION_OT_use_action(bpy.types.Operator):
-    """Let the person move by another action of this file"""
+    """Use another action of this file for the person"""
 
     bl_idname = "primdiffusion.use_action"
     bl_label = "Use Motion"
@@ -43,7 +43,7 @@ class PRIMDIFFUSION_OT_use_action(bpy.types.Operator):
             if action is None:
                 raise ValueError(f"there is no action {self.action!r} in this file")
             if not moves_bones(action):
-                raise ValueError(f"the action {self.action!r} moves no bones of a person")
+                raise ValueError(f"the action {self.action!r} does not animate the bones of a person")
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -66,7 +66,7 @@ def moves_bones(action: bpy.types.Action) -> bool:
 
 
 class PRIMDIFFUSION_OT_add_motion(OnArmature, WhereTo, bpy.types.Operator):
-    """Put a built-in motion onto the person"""
+    """Apply a built-in motion to the person"""
 
     bl_idname = "primdiffusion.add_motion"
     bl_label = "Add Motion"
@@ -95,7 +95,7 @@ class PRIMDIFFUSION_OT_add_motion(OnArmature, WhereTo, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_clear_motion(OnArmature, bpy.types.Operator):
-    """Take the motion off the person; the action stays in the file, the person goes back to the rest pose"""
+    """Remove the motion from the person; the action stays in the file, the person returns to the rest pose"""
 
     bl_idname = "primdiffusion.clear_motion"
     bl_label = "Clear Motion"
@@ -120,7 +120,7 @@ class PRIMDIFFUSION_OT_clear_motion(OnArmature, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_loop_motion(OnArmature, bpy.types.Operator):
-    """Let the motion go on for ever, or end that again; a walk goes on from where it has got to"""
+    """Loop the motion, or stop looping; a walk continues from where it has arrived"""
 
     bl_idname = "primdiffusion.loop_motion"
     bl_label = "Loop"
@@ -137,7 +137,7 @@ class PRIMDIFFUSION_OT_loop_motion(OnArmature, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operator):
-    """Write the person's motion as the .npz files of AMASS: axis-angles, places and shape, z up"""
+    """Write the person's motion as an AMASS .npz file: axis angles, translations and shape, z up"""
 
     bl_idname = "primdiffusion.export_motion"
     bl_label = "Export Motion"
@@ -145,7 +145,9 @@ class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operato
 
     filename_ext = ".npz"
     filter_glob: bpy.props.StringProperty(default="*.npz", options={"HIDDEN"})
-    first: bpy.props.IntProperty(name="From", description="First frame; 0 with To 0: the scene's range", default=0)
+    first: bpy.props.IntProperty(
+        name="From", description="First frame; if From and To are 0, the scene's range", default=0
+    )
     last: bpy.props.IntProperty(name="To", description="Last frame", default=0)
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:

@@ -20,6 +20,7 @@ class OnPerson:
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
+        """There is a person in the scene."""
         cls.poll_message_set("There is no person in the scene: generate one first")
         return bool(humans(context.scene))
 

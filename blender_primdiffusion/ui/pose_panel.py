@@ -24,17 +24,17 @@ class PRIMDIFFUSION_PG_motion(bpy.types.PropertyGroup):
     pose: bpy.props.EnumProperty(name="Pose", description="The pose to apply", items=pose_items)
     amount: bpy.props.FloatProperty(
         name="Amount",
-        description="How much of the pose: 0 none, 1 all",
+        description="Strength of the pose: 0 none, 1 full",
         default=1.0,
         min=0.0,
         max=1.0,
         subtype="FACTOR",
     )
-    mirror: bpy.props.BoolProperty(name="Mirror", description="Left and right change places", default=False)
+    mirror: bpy.props.BoolProperty(name="Mirror", description="Swap left and right", default=False)
     only_selected: bpy.props.BoolProperty(
         name="Only Selected Bones",
         translation_context=CONTEXT,
-        description="Leave bones alone that are not selected",
+        description="Change only the selected bones",
         default=False,
     )
 
@@ -47,7 +47,7 @@ class _Posing(OnArmature):
 
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
     only_selected: bpy.props.BoolProperty(
-        name="Only Selected Bones", description="Leave bones alone that are not selected", default=False
+        name="Only Selected Bones", description="Change only the selected bones", default=False
     )
 
     def joints(self, armature: bpy.types.Object) -> list[str]:
@@ -78,29 +78,31 @@ class _Posing(OnArmature):
             key_pose(armature, context.scene.frame_current, changed)
         locked = len(joints) - len(changed)
         if locked:
-            self.report({"WARNING"}, f"{locked} locked bones of {armature.name!r} stayed as they were")
+            self.report({"WARNING"}, f"{locked} locked bones of {armature.name!r} were not changed")
         warn_of_rest(self, armature)
         return {"FINISHED"}
 
 
 class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
-    """Give the person the chosen pose of the library"""
+    """Apply the chosen pose of the library to the person"""
 
     bl_idname = "primdiffusion.apply_pose"
     bl_label = "Apply Pose"
 
-    pose_name: bpy.props.StringProperty(name="Pose", description="Of the library; empty: the panel's", options=_SKIP)
+    pose_name: bpy.props.StringProperty(
+        name="Pose", description="Name of the pose in the library; empty: the panel's", options=_SKIP
+    )
     amount: bpy.props.FloatProperty(
         name="Amount",
-        description="How much of the pose: 0 none, 1 all",
+        description="Strength of the pose: 0 none, 1 full",
         default=1.0,
         min=0.0,
         max=1.0,
         subtype="FACTOR",
     )
-    mirror: bpy.props.BoolProperty(name="Mirror", description="Left and right change places", default=False)
+    mirror: bpy.props.BoolProperty(name="Mirror", description="Swap left and right", default=False)
     ground: bpy.props.BoolProperty(
-        name="Feet on the Floor", description="Lower the body as far as the pose needs", default=True
+        name="Feet on the Floor", description="Move the body down until the feet are on the floor", default=True
     )
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
@@ -134,7 +136,7 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_mirror_pose(_Posing, bpy.types.Operator):
-    """Let left and right of the person's pose change places"""
+    """Swap left and right of the person's pose"""
 
     bl_idname = "primdiffusion.mirror_pose"
     bl_label = "Mirror Pose"
@@ -149,7 +151,7 @@ class PRIMDIFFUSION_OT_mirror_pose(_Posing, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_reset_pose(_Posing, bpy.types.Operator):
-    """Bring the person back to the rest pose"""
+    """Reset the person to the rest pose"""
 
     bl_idname = "primdiffusion.reset_pose"
     bl_label = "Reset to Rest"
@@ -177,7 +179,7 @@ class PRIMDIFFUSION_OT_key_pose(OnArmature, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
-    """Keep the person's pose in the library, for this and other files"""
+    """Save the person's pose in the library, for this and other files"""
 
     bl_idname = "primdiffusion.save_pose"
     bl_label = "Save Pose"
@@ -210,7 +212,7 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_delete_pose(bpy.types.Operator):
-    """Delete the chosen pose of your own from the library, for all files"""
+    """Delete the chosen pose from your own poses in the library, for all .blend files"""
 
     bl_idname = "primdiffusion.delete_pose"
     bl_label = "Delete Pose"
@@ -228,7 +230,7 @@ class PRIMDIFFUSION_OT_delete_pose(bpy.types.Operator):
         name = self.pose_name or settings.pose
         own = own_poses(poses_folder())
         if name not in own:
-            self.report({"ERROR"}, f"{name!r} is no pose of your own: only those can be deleted")
+            self.report({"ERROR"}, f"{name!r} is not one of your own poses: only those can be deleted")
             return {"CANCELLED"}
         try:
             delete_pose(own[name])

@@ -45,17 +45,17 @@ class PRIMDIFFUSION_PG_reconstruct(bpy.types.PropertyGroup):
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     subject: bpy.props.StringProperty(
-        name="Subject", description="Whom of the dataset; empty where there is only one", search=_search
+        name="Subject", description="Subject of the dataset; empty if there is only one", search=_search
     )
     frame: bpy.props.IntProperty(
         name="Frame",
-        description="Which captured pose to look at; 0 is near the T-pose, where most of a person is seen",
+        description="Which captured pose to use; 0 is near the T-pose, which shows most of a person",
         default=0,
         min=0,
     )
     views: bpy.props.IntProperty(
         name="Views",
-        description="How many cameras, spread around the person; all where there are fewer",
+        description="How many cameras, spread around the person; all if there are fewer",
         default=CAPTURE_VIEWS,
         min=1,
         soft_max=36,
@@ -63,7 +63,7 @@ class PRIMDIFFUSION_PG_reconstruct(bpy.types.PropertyGroup):
 
 
 class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
-    """Make a person of pictures from several sides, and add it to the scene with an armature"""
+    """Reconstruct a person from pictures taken from several sides, and add it to the scene with an armature"""
 
     bl_idname = "primdiffusion.human_from_captures"
     bl_label = "Human from Captures"

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from ..jobs.merge import Moment
 
 ATTACHMENT_ITEMS = (
-    ("ARMATURE", "Armature", "Each volume is an object that follows the bones; quick, and the default"),
-    ("SURFACE", "Surface", "Volumes lie on the posed skin, anew in each pose, as the exact engine has them"),
+    ("ARMATURE", "Armature", "Each volume is an object that follows the bones; fast, and the default"),
+    ("SURFACE", "Surface", "Volumes are placed on the posed skin in each pose, as in the PrimDiffusion engine"),
     ("MERGED", "Merged", "The merged volume, in the pose it was merged in; far faster in Cycles"),
 )
 _MOST_FRAMES = 10_000
@@ -64,7 +64,7 @@ class _Merging(OnPerson):
 
 
 class PRIMDIFFUSION_OT_merge(_Merging, bpy.types.Operator):
-    """Make one volume of the selected person's, as posed now, which Cycles draws far faster"""
+    """Merge the selected person's volumes, in the current pose, into one that Cycles renders much faster"""
 
     bl_idname = "primdiffusion.merge"
     bl_label = "Merge Pose"
@@ -78,7 +78,7 @@ class PRIMDIFFUSION_OT_merge(_Merging, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_merge_frames(_Merging, bpy.types.Operator):
-    """Make one volume for each frame of the scene's range; you can work on meanwhile"""
+    """Merge the person's volumes into one volume for each frame of the scene's range, in the background"""
 
     bl_idname = "primdiffusion.merge_frames"
     bl_label = "Merge Frame Range"
@@ -120,7 +120,7 @@ class PRIMDIFFUSION_OT_unmerge(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_fit_density_gain(OnPerson, bpy.types.Operator):
-    """Find the density gain by which Cycles shows the selected person as opaque as the exact engine does"""
+    """Find the density gain with which Cycles shows the selected person as opaque as the PrimDiffusion engine does"""
 
     bl_idname = "primdiffusion.fit_density_gain"
     bl_label = "Fit Density Gain"

@@ -24,7 +24,7 @@ class PRIMDIFFUSION_PG_merging(bpy.types.PropertyGroup):
 
     voxel: bpy.props.FloatProperty(
         name="Voxel Size",
-        description="Side of the merged volume's voxels: half the size shows more and takes eight times the memory",
+        description="Voxel size of the merged volume: half the size shows more detail and takes eight times the memory",
         subtype="DISTANCE",
         unit="LENGTH",
         default=VOXEL,
@@ -53,7 +53,8 @@ def gain_property() -> bpy.props.FloatProperty:
     """`collection.primdiffusion_density_gain` of a person's collection."""
     return bpy.props.FloatProperty(
         name="Density Gain",
-        description="How much denser Cycles takes this person for: it absorbs exponentially, the exact engine adds up",
+        description="Factor on the density in Cycles, which absorbs exponentially while the PrimDiffusion "
+        "engine adds opacity up",
         min=0.01,
         max=100.0,
         soft_min=0.5,
@@ -69,7 +70,7 @@ _YAW = math.radians(20)
 
 
 class PRIMDIFFUSION_OT_set_up_engine(bpy.types.Operator):
-    """Render with PrimDiffusion: exact, seconds a picture; other objects are shaded simply"""
+    """Render with PrimDiffusion: exact, a few seconds per picture; other objects get simple shading"""
 
     bl_idname = "primdiffusion.set_up_engine"
     bl_label = "PrimDiffusion (Exact)"
@@ -83,7 +84,7 @@ class PRIMDIFFUSION_OT_set_up_engine(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_set_up_cycles(bpy.types.Operator):
-    """Render with Cycles: people are approximated, shadows and lights on other objects are right"""
+    """Render with Cycles: people are approximate; shadows and light on other objects are correct"""
 
     bl_idname = "primdiffusion.set_up_cycles"
     bl_label = "Cycles (Approximate)"
@@ -95,7 +96,7 @@ class PRIMDIFFUSION_OT_set_up_cycles(bpy.types.Operator):
 
         scene = context.scene
         if not hasattr(scene, "cycles"):
-            self.report({"ERROR"}, "Cycles is switched off: enable the add-on Cycles Render Engine in the preferences")
+            self.report({"ERROR"}, "Cycles is disabled: enable the add-on Cycles Render Engine in the preferences")
             return {"CANCELLED"}
         scene.render.engine = "CYCLES"
         bounces = scene.cycles.max_bounces
@@ -106,7 +107,7 @@ class PRIMDIFFUSION_OT_set_up_cycles(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_add_camera(bpy.types.Operator):
-    """Add a camera that frames the selected person, or everybody, and a sun for other objects"""
+    """Add a camera that frames the selected person, or all people, and a sun for other objects"""
 
     bl_idname = "primdiffusion.add_camera"
     bl_label = "Add Camera and Light"

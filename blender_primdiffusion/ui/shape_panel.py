@@ -41,13 +41,16 @@ class _Shape(OnPerson):
 
 
 class PRIMDIFFUSION_OT_reshape(_Shape, bpy.types.Operator):
-    """Give the selected person a shape: numbers, or a height and a weight to reach from there"""
+    """Set the body shape of the selected person: shape parameters, or a height and a weight"""
 
     bl_idname = "primdiffusion.reshape"
     bl_label = "Reshape Human"
 
     betas: bpy.props.FloatVectorProperty(
-        name="Shape", size=BETA_COUNT, description="Standard deviations. Not given: as it is", options=SKIP
+        name="Shape",
+        size=BETA_COUNT,
+        description="Shape parameters in standard deviations. Not given: unchanged",
+        options=SKIP,
     )
     height: bpy.props.FloatProperty(name="Height (m)", description="Not given: any", options=SKIP)
     weight: bpy.props.FloatProperty(name="Weight (kg)", description="Not given: any", options=SKIP)
@@ -66,7 +69,7 @@ class PRIMDIFFUSION_OT_reshape(_Shape, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_reset_shape(_Shape, bpy.types.Operator):
-    """Give the selected person the shape they were generated with, or got from their last edit"""
+    """Reset the selected person to the shape they were generated with, or to that of their last edit"""
 
     bl_idname = "primdiffusion.reset_shape"
     bl_label = "Reset Shape"
@@ -79,16 +82,16 @@ class PRIMDIFFUSION_OT_reset_shape(_Shape, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_random_shape(_Shape, bpy.types.Operator):
-    """Give the selected person a body at random; the same seed is the same body"""
+    """Give the selected person a random body shape; the same seed gives the same shape"""
 
     bl_idname = "primdiffusion.random_shape"
     bl_label = "Random Shape"
 
-    seed: bpy.props.IntProperty(name="Seed", description="Another seed is another body", min=0)
+    seed: bpy.props.IntProperty(name="Seed", description="Another seed gives another body", min=0)
     spread: bpy.props.FloatProperty(
         name="Spread",
         translation_context=CONTEXT,
-        description="How far bodies are from the mean one: 1 as people are",
+        description="How far bodies differ from the mean body: 1 as real people do",
         default=1.0,
         min=0.0,
         max=2.0,
@@ -108,7 +111,7 @@ class PRIMDIFFUSION_OT_random_shape(_Shape, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_copy_shape(_Shape, bpy.types.Operator):
-    """Give the selected person the shape of the other person, who stays as they are"""
+    """Copy the body shape of the other person to the selected person"""
 
     bl_idname = "primdiffusion.copy_shape"
     bl_label = "Copy Shape"
@@ -126,9 +129,11 @@ class PRIMDIFFUSION_OT_copy_shape(_Shape, bpy.types.Operator):
             raise ValueError("choose the other person in the panel first")
         other = named_person(context, self.source or picked.name)
         if other == person:
-            raise ValueError(f"{person.name!r} cannot be the other person too: choose somebody else")
+            raise ValueError(f"{person.name!r} cannot be the other person too: choose another one")
         if len(shape_model_of(other).template) != len(shape_model_of(person).template):
-            raise ValueError(f"{other.name!r} stands on another body than {person.name!r}: shapes mean something else")
+            raise ValueError(
+                f"{other.name!r} stands on another body than {person.name!r}: their shape parameters are not comparable"
+            )
         return betas_of(other)
 
 

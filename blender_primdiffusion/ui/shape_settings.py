@@ -22,7 +22,7 @@ def person_of(armature: bpy.types.Object) -> bpy.types.Collection:
     for collection in armature.users_collection:
         if MARK in collection:
             return collection
-    raise ValueError(f"the object {armature.name!r} is no person's armature: select one")
+    raise ValueError(f"the object {armature.name!r} is not the armature of a person: select one")
 
 
 def measures_of(armature: bpy.types.Object) -> Measures:
@@ -113,11 +113,11 @@ class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
     """`armature.primdiffusion_human`."""
 
     person: bpy.props.StringProperty(
-        name="Name", description="What the person is called: the collection and its parts", get=_name, set=_rename
+        name="Name", description="Name of the person's collection and its objects", get=_name, set=_rename
     )
     betas: bpy.props.FloatVectorProperty(
         name="Shape",
-        description="How the body differs from the mean one, in standard deviations of people",
+        description="Difference from the mean body, in standard deviations",
         size=BETA_COUNT,
         min=-LARGEST_BETA,
         max=LARGEST_BETA,

@@ -36,7 +36,7 @@ class PRIMDIFFUSION_PG_variations(bpy.types.PropertyGroup):
     )
     quality: bpy.props.EnumProperty(
         name="Quality",
-        description="Whoever is built is exactly the one seen here, in this quality",
+        description="People are built exactly as shown here, in this quality",
         items=[
             ("PANEL", "As Generate", "The steps and sampler of the panel Generate: what is built needs no refining"),
             (
@@ -49,7 +49,7 @@ class PRIMDIFFUSION_PG_variations(bpy.types.PropertyGroup):
     )
     amount: bpy.props.FloatProperty(
         name="Difference",
-        description="How far More Like This goes from the chosen person: 0 is the person, 1 anybody",
+        description="How much More Like This differs from the chosen person: 0 not at all, 1 completely",
         default=AMOUNT,
         min=0.05,
         max=1.0,
@@ -86,7 +86,7 @@ class _Variations(Asking):
 
 
 class PRIMDIFFUSION_OT_variations(_Variations, bpy.types.Operator):
-    """Show many people to choose from, before any is built"""
+    """Show several people to choose from before building them"""
 
     bl_idname = "primdiffusion.variations"
     bl_label = "Show Variations"
@@ -125,7 +125,7 @@ class PRIMDIFFUSION_OT_more_like_variation(_Variations, bpy.types.Operator):
         try:
             around = _targets(self.index)
             if len(around) > 1:
-                raise ValueError(f"{len(around)} variations are selected: select the one to go on from")
+                raise ValueError(f"{len(around)} variations are selected: select only the one to vary")
             seeds = self.seeds(context, self.seed)
             sampling = self.sheet_sampling(context)
         except ValueError as error:
@@ -164,7 +164,7 @@ class PRIMDIFFUSION_OT_select_variation(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_build_variation(bpy.types.Operator):
-    """Add the selected people to the scene, exactly as seen, side by side"""
+    """Add the selected people to the scene, exactly as shown, side by side"""
 
     bl_idname = "primdiffusion.build_variation"
     bl_label = "Build Selected"
@@ -207,7 +207,7 @@ class PRIMDIFFUSION_OT_build_variation(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_use_variation_seed(bpy.types.Operator):
-    """Put the seed of the selected person into the panel Generate and lock it there"""
+    """Set the seed of the panel Generate to that of the selected person and lock it"""
 
     bl_idname = "primdiffusion.use_variation_seed"
     bl_label = "Use Seed"
@@ -227,7 +227,7 @@ class PRIMDIFFUSION_OT_use_variation_seed(bpy.types.Operator):
             if len(wanted) > 1:
                 raise ValueError(f"{len(wanted)} variations are selected: select one")
             if sheet.around:
-                raise ValueError("these are variants of a person, whom no seed alone makes again: build what you want")
+                raise ValueError("variants of a person cannot be generated from a seed alone: build them instead")
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -237,7 +237,7 @@ class PRIMDIFFUSION_OT_use_variation_seed(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_clear_variations(bpy.types.Operator):
-    """Forget these people and remove their files; those in the scene stay"""
+    """Clear the sheet and delete its files; people in the scene stay"""
 
     bl_idname = "primdiffusion.clear_variations"
     bl_label = "Clear Variations"

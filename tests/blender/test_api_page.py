@@ -33,4 +33,4 @@ def test_every_operator_and_setting_has_its_place(addon):
 
 def test_what_poll_wants_is_told(addon):
     vary = page.page().split("\n### vary\n")[1].split("\n### ")[0]
-    assert "Needs: there is somebody" in vary
+    assert "Needs: there is a person in the scene" in vary

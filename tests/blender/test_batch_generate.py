@@ -124,7 +124,7 @@ def test_a_blend_that_is_asked_for_later_is_made_without_another_generation(out)
 def test_ctrl_c_ends_the_batch_and_leaves_nothing_half_made(out, capfd):
     threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGINT)).start()
     assert generate(out, "--seed", TAKES_LONG, "--count", 2, "--steps", 50) == CANCELLED
-    assert "goes on from here" in capfd.readouterr().out
+    assert "resumes from here" in capfd.readouterr().out
     assert not list(out.glob("person*"))
     assert not list(out.glob(".*"))
     assert report(out)["done"] == []
@@ -176,7 +176,7 @@ def test_a_folder_that_cannot_be_is_a_sentence(addon, tmp_path, capfd):
     ("words", "sentence"),
     [
         (["--count", "0"], "invalid whole number from 1 value: '0'"),
-        (["--attributes", "tall"], "'tall' is no name=value"),
+        (["--attributes", "tall"], "'tall' is not name=value"),
         (["--sampler", "euler"], "invalid choice: 'euler'"),
         (["--checkpoint", "/nowhere.safetensors"], "--checkpoint /nowhere.safetensors is no file"),
         (["--motion", "/nowhere.bvh", "--blend"], "--motion /nowhere.bvh is no file"),

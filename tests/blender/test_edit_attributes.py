@@ -72,7 +72,7 @@ def test_a_script_asks_past_the_panel(addon, known):
     assert (asked["guidance"], asked["sampler"]) == (3.0, "ddpm")
     bpy.ops.primdiffusion.generate(seed=7, steps=1, attributes="")
     assert "attributes" not in sent(addon)
-    with pytest.raises(RuntimeError, match="'tall' is no name=value"):
+    with pytest.raises(RuntimeError, match="'tall' is not name=value"):
         bpy.ops.primdiffusion.generate(seed=7, steps=1, attributes="tall")
 
 

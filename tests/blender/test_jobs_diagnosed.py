@@ -171,7 +171,7 @@ def test_release_ends_the_child_says_what_was_freed_and_the_next_person_starts_a
     assert said.startswith("1 process ended, 0.")
     assert "GB of memory" in said  # of the process; then what Blender gave back, where tests before left grids
     assert ended(pid)
-    assert memory.release() == "nothing was held: no backend runs"
+    assert memory.release() == "nothing to release: the backend is not running"
     assert ops.release_memory() == {"FINISHED"}
     assert started_and_idle() not in (pid, None)
     assert len(humans(bpy.context.scene)) == 2

@@ -197,7 +197,7 @@ def test_a_result_waits_for_the_user_to_let_go_of_what_is_being_moved(addon, mon
     for _ in range(5):
         follow()
     assert not humans(bpy.context.scene)
-    assert "Done: waits for Move" in shown(PRIMDIFFUSION_PT_generate, addon)
+    assert "Done; waiting for Move" in shown(PRIMDIFFUSION_PT_generate, addon)
     assert ops.cancel() == {"FINISHED"}
     drive()
     assert not humans(bpy.context.scene)

@@ -160,7 +160,7 @@ def test_a_person_of_whom_nothing_is_left_is_generated_again(person, tmp_path):
     [
         ({"edits": [{"edit": "vary"}]}, "was edited"),
         ({"seed": None}, "not generated from a seed"),
-        ({"checkpoint": "another"}, "somebody else"),
+        ({"checkpoint": "another"}, "another person"),
     ],
 )
 def test_people_whom_no_seed_makes_again_are_refused(person, tmp_path, changes, sentence):

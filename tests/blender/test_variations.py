@@ -125,7 +125,7 @@ def test_more_like_this_asks_for_variants_of_the_kept_person(addon, shown_people
     assert (asked["person"], asked["amount"], asked["steps"]) == (str(kept), 0.25, 4)
     assert seeds() == [20, 21, 22]
     assert sheet.title == "Like seed 12"
-    with pytest.raises(RuntimeError, match="no seed alone makes again"):
+    with pytest.raises(RuntimeError, match="cannot be generated from a seed alone"):
         ops.use_variation_seed(index=0)
 
 
@@ -209,7 +209,7 @@ def test_a_person_cleared_before_its_turn_is_named(addon, shown_people):
     queue.add(addon, VariationsJob((1,), 1, "ddim", person=str(sheet.variations[0].person)))
     ops.clear_variations()
     drive()
-    assert "the person to vary was cleared meanwhile" in error_of("variations").lower()
+    assert "the person to vary was cleared" in error_of("variations").lower()
 
 
 def test_a_disk_that_is_full_keeps_the_former_sheet(addon, shown_people, monkeypatch):

@@ -15,7 +15,7 @@ blender -c primdiffusion generate --count 50 --seed 7 --out PEOPLE     people in
 blender -c primdiffusion render PEOPLE --out PICTURES                  pictures of them, or of a .blend
 blender -c primdiffusion capture --people SCANS --out CAPTURES         captures from all sides, to train on
 Each tells more with --help.
-Exit codes: 0 all is done, 1 some failed, 2 wrong words, 3 no Python runs the backend, 130 stopped by Ctrl-C."""
+Exit codes: 0 all is done, 1 some failed, 2 usage error, 3 no Python runs the backend, 130 stopped by Ctrl-C."""
 
 
 def execute(argv: Sequence[str]) -> int:

@@ -69,7 +69,7 @@ def sources(path: Path) -> list[Source]:
     if path.is_dir():
         found = sorted(_in_folder(path), key=lambda source: source.name)
         if not found:
-            raise ValueError(f"{path} holds no people: name a folder that `generate` wrote, or of .human files")
+            raise ValueError(f"{path} contains no people: name a folder that `generate` wrote, or of .human files")
         return found
     if path.suffix == ".blend":
         return [Source(path.stem, path)]
@@ -280,4 +280,4 @@ def _draw(scene: bpy.types.Scene, path: Path) -> None:
             unfinished.unlink(missing_ok=True)
             raise
         if not unfinished.is_file():
-            raise OSError(f"{path} was not drawn: is there room on the disk?")
+            raise OSError(f"{path} was not written: is the disk full?")

@@ -112,7 +112,7 @@ def run(
         try:
             report = work(options, say, stop)
         except Stopped:
-            say("Stopped; the same command goes on from here.")
+            say("Stopped; the same command resumes from here.")
             return CANCELLED
         except NoBackend as error:
             return _refused(name, str(error), NO_BACKEND)

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 ENGINES = {"primdiffusion": "PRIMDIFFUSION", "cycles": "CYCLES"}
 """What the command line calls render engines, and what Blender does."""
 _ENDS = (
-    "exit codes: 0 all is done, 1 somebody failed (report.json tells who and why), 2 wrong words, 3 no Python runs the "
-    "backend, 130 stopped by Ctrl-C; the same command goes on from there"
+    "exit codes: 0 all is done, 1 some failed (report.json says which and why), 2 usage error, 3 no Python runs the "
+    "backend, 130 stopped by Ctrl-C; the same command resumes"
 )
 
 
@@ -28,7 +28,7 @@ def parse_generate(argv: Sequence[str]) -> argparse.Namespace:
     """The options of `generate`. Raises UsageError; SystemExit after --help."""
     made = _parser("generate", "Generate people, a folder each: the person, the person for Blender, pictures.")
     add = made.add_argument
-    add("--out", type=Path, required=True, help="folder for all of them; one begun before is gone on with")
+    add("--out", type=Path, required=True, help="folder for all of them; an unfinished one is resumed")
     add("--count", type=_whole(1), default=1, help="how many (default %(default)s)")
     add("--seed", type=_whole(0), default=0, help="of the first; the next ones follow (default %(default)s)")
     add("--steps", type=_whole(1), default=STEPS, help="denoising steps (default %(default)s)")
