@@ -1,4 +1,4 @@
-"""A person on one page: generate, pose, look.
+"""The whole pipeline on one page: generate a human, pose it, render it.
 
     model = load_checkpoint()                          # diffusion: noise -> payload and betas
     human = generate(model, seed=7)
@@ -39,36 +39,36 @@ from primdiffusion.render.march import MarchSettings, Rendering, march
 DEFAULT_SETTINGS = MarchSettings()
 VERTICAL_FOV = math.radians(30)
 LARGEST_PICTURE = 8192
-"""Pixels a side; beyond, a slip of the finger takes all memory."""
+"""Pixels per side; a limit that keeps a mistyped size from exhausting memory."""
 SMALLEST_SCALE = 1e-6
-"""Of an object: below, a person is smaller than what float32 tells apart."""
+"""Smallest accepted scale of an object; below it, float32 cannot resolve the human."""
 FRAMING_MARGIN = 1.04
-"""How much farther than just filling the picture the camera stands."""
+"""Camera distance relative to the distance at which the human just fills the image."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Human(TensorRecord):
-    """One person, independent of pose: what fills the primitives, and the body they sit on."""
+    """One human, independent of pose: the payload of the primitives and the shape of the body they are attached to."""
 
     payload: Payload
     """Unbatched."""
     betas: Float[Tensor, "n"]
-    """Shape coefficients of the body they stand on."""
+    """Shape coefficients of the body."""
     provenance: Mapping[str, Any]
-    """Where the person comes from; JSON values. Of a generated one: seed, steps, sampler, attributes if any were asked
-    for, checkpoint, checkpoint_sha256, full_density, version."""
+    """Where the human comes from; JSON values. For a generated one: seed, steps, sampler, attributes and guidance if
+    requested, checkpoint, checkpoint_sha256, full_density, version."""
     body_setup: BodySetup | None = None
-    """Body and anchors that they stand on; None is the default body."""
+    """Body and anchors; None is the default body."""
 
     def validate(self) -> Human:
-        """Itself, if it is one whole person with finite values; otherwise ValueError that names what is wrong."""
+        """Return self if this is one complete human with finite values; otherwise raise ValueError."""
         self.payload.validate()
         if self.payload.density.ndim != 4:
             raise ValueError(
-                f"a human holds one person, not a batch {tuple(self.payload.density.shape[:-4])}: pick one"
+                f"expected one human, got a batch of shape {tuple(self.payload.density.shape[:-4])}: select one sample"
             )
         if self.betas.ndim != 1 or not torch.isfinite(self.betas).all():
-            raise ValueError(f"betas must be one row of finite numbers, not {self.betas!r}: generate the person again")
+            raise ValueError(f"betas must be one row of finite numbers, got {self.betas!r}: generate the human again")
         return self
 
 
@@ -81,10 +81,10 @@ def generate(
     attributes: Attributes = MappingProxyType({}),
     guidance: float = requests.GUIDANCE,
 ) -> Human:
-    """A new person, on the CPU; the same for the same model, seed, steps, sampler, attributes, guidance and device.
+    """A new human, on the CPU; deterministic in model, seed, steps, sampler, attributes, guidance and device.
 
-    `attributes` are what the person is asked to be, of what `model.vocabulary` knows; by default anybody (the paper).
-    `on_step` sees each step after it is done; an exception it raises ends the work (that is how cancelling works).
+    `attributes` condition the sample on attributes in `model.vocabulary`; empty means unconditional, as in the paper.
+    `on_step` is called after each step; raise an exception from it to cancel.
     Raises ValueError for an unknown sampler or attribute, a number of steps outside 1 ... T, or a seed outside
     0 ... 2^63-1.
     """
@@ -100,10 +100,10 @@ def generate_batch(
     attributes: Attributes = MappingProxyType({}),
     guidance: float = requests.GUIDANCE,
 ) -> list[Human]:
-    """People of several seeds, who share the work; each as `generate` makes them, but for rounding. Errors likewise."""
+    """One human per seed, sampled as a batch; equal to `generate` up to rounding. Raises the same errors."""
     condition = model.condition(attributes)
     if not math.isfinite(guidance):
-        raise ValueError(f"guidance is {guidance}: give a number, 1 for none")
+        raise ValueError(f"guidance is {guidance}: give a finite number, 1 for none")
     final = None
     for step in sample(model, seeds, steps, sampler, condition, guidance):
         if on_step is not None:
@@ -126,7 +126,7 @@ def people_of(
     seeds: Sequence[int],
     attributes: Attributes = MappingProxyType({}),
 ) -> list[Human]:
-    """The people whom clean samples of these seeds stand for, on the CPU; without provenance, and unchecked."""
+    """Decode denoised samples x0 into humans on the CPU, without provenance or validation."""
     body = default_body() if model.body_setup is None else model.body_setup.body
     people = []
     for sample_of_one, betas in zip(x0, model.betas(x0, seeds), strict=True):
@@ -136,7 +136,7 @@ def people_of(
 
 
 def made_by(model: DiffusionModel) -> dict[str, Any]:
-    """What a person's provenance says of the model and program that made them."""
+    """The provenance entries that describe the model and the program version."""
     of_file = {"checkpoint_sha256": model.card["sha256"]} if "sha256" in model.card else {}
     return {
         "checkpoint": model.card.get("name", "unnamed"),
@@ -147,13 +147,15 @@ def made_by(model: DiffusionModel) -> dict[str, Any]:
 
 
 def measures_of(attributes: Attributes) -> tuple[float | None, float | None]:
-    """Height (m) and weight (kg) that are asked for; None where they are not."""
-    height, weight = (attributes.get(name) for name in ("height", "weight"))  # numbers: the vocabulary has read them
+    """The requested height (m) and weight (kg), each None if not requested."""
+    height, weight = (
+        attributes.get(name) for name in ("height", "weight")
+    )  # already parsed to numbers by the vocabulary
     return None if height is None else float(height), None if weight is None else float(weight)
 
 
 def pose_body(betas: Float[Tensor, "n"], pose: BodyPose | None = None, body: BodyModel | None = None) -> PosedBody:
-    """The body with this shape in this pose; None stands for the T pose and the default body."""
+    """The body with this shape in this pose; None is the T pose and the default body."""
     body = default_body() if body is None else body
     return body.shape(betas).pose(BodyPose.rest() if pose is None else pose)
 
@@ -161,7 +163,7 @@ def pose_body(betas: Float[Tensor, "n"], pose: BodyPose | None = None, body: Bod
 def place(
     human: Human, pose: BodyPose | None = None, body: BodyModel | None = None, anchors: Anchors | None = None
 ) -> Primitives:
-    """The person's primitives in the world; None stands for the T pose, the body they stand on and its anchors.
+    """The human's primitives in the world; None is the T pose, and the human's own body and anchors.
 
     Anchors belong to a body: give both or neither. Differentiable in the pose and the human.
     """
@@ -177,14 +179,14 @@ def place_skinned(
     body: BodyModel | None = None,
     anchors: Anchors | None = None,
 ) -> Primitives:
-    """The person's primitives as an armature moves them: affine matrices (r = 3 or 4 rows), joints' and the object's.
+    """The human's primitives posed by an armature: affine matrices (r = 3 or 4 rows) of the joints and the object.
 
-    `skinning` takes rest to posed in the object's space (posed x rest^-1, SMPL's joint order). The object's 3x3 part
-    is split into Q P (`polar`): the stretch P moves the posed vertices, on which the frames sit, and with
-    s = cbrt(det P) boxes are s times as large and 1/s as dense, so a person is as opaque at any size; Q and the
-    translation move the frames. Where the object mirrors, so do the frames (det -1).
+    `skinning` maps rest to posed points in object space (posed x rest^-1, SMPL's joint order). The object's 3x3 part is
+    split into Q P (`polar`): the stretch P deforms the posed vertices that carry the frames, and with s = cbrt(det P)
+    boxes are scaled by s and densities by 1/s, so that opacity does not depend on size; Q and the translation move the
+    frames. If the object mirrors, so do the frames (det -1).
 
-    Raises ValueError for matrices with NaN or infinite values, and for a flat object or joint (scaled to zero).
+    Raises ValueError for matrices with NaN or infinite values, and for an object or joint scaled to zero.
     """
     body, anchors = body_of(human, body, anchors)
     for name, matrix in (("skinning", skinning), ("object_to_world", object_to_world)):
@@ -193,11 +195,11 @@ def place_skinned(
     flat = torch.linalg.det(skinning[:, :3, :3].double()).abs() < SMALLEST_SCALE**3
     if flat.any():
         name = JOINT_NAMES[int(flat.int().argmax())]
-        raise ValueError(f"skinning flattens the joint {name!r}: give its bone a scale other than zero")
+        raise ValueError(f"the bone of joint {name!r} is scaled to zero: give it a nonzero scale")
     orthogonal, stretch = polar(object_to_world[:3, :3].double())
     scale = float(torch.linalg.det(stretch)) ** (1 / 3)
     if not scale > SMALLEST_SCALE:
-        raise ValueError(f"the object is scaled to {scale:.3g} of its size: give it a scale other than zero")
+        raise ValueError(f"the object's mean scale is {scale:.3g}: give it a nonzero scale along every axis")
     orthogonal, unit_stretch = orthogonal.to(skinning), (stretch / scale).to(skinning)
     vertices = body.shape(human.betas).follow(skinning) @ unit_stretch.T
     frames = attach(anchors, vertices, body.faces)
@@ -206,7 +208,7 @@ def place_skinned(
         rotation=orthogonal @ frames.rotation,
         half_extent=frames.half_extent * scale,
     )
-    unscaled = abs(scale - 1) < 1e-6  # as after a rotation in float32; the payload then stays the same tensor
+    unscaled = abs(scale - 1) < 1e-6  # up to float32 rounding of a rotation; avoids copying the payload
     payload = human.payload
     return Primitives.place(
         frames, payload if unscaled else dataclasses.replace(payload, density=payload.density / scale)
@@ -214,26 +216,24 @@ def place_skinned(
 
 
 def body_of(human: Human, body: BodyModel | None = None, anchors: Anchors | None = None) -> tuple[BodyModel, Anchors]:
-    """The body and anchors that are given, or those that the person stands on; ValueError for one without the other."""
+    """The given body and anchors, or else the human's own; ValueError if only one of the two is given."""
     if body is None and anchors is None:
         if human.body_setup is None:
             return default_body(), default_anchors()
         return human.body_setup.body, human.body_setup.anchors
     if body is None or anchors is None:
-        raise ValueError("a body and its anchors go together: give both, or neither for the person's own")
+        raise ValueError("body and anchors must be given together: give both, or neither to use the human's own")
     return body, anchors
 
 
 def framing(primitives: Primitives, yaw: float = 0.0, width: int = 512, height: int = 512) -> Camera:
-    """A level camera that just sees all of `primitives`; it stands at the height of their middle.
+    """A level camera that frames all of `primitives`, at the height of their centre.
 
-    `yaw` in radians: 0 looks at the person's face, pi/2 at their left side. 30 degrees of view from top to bottom.
-    Raises ValueError for sides outside 1 ... LARGEST_PICTURE pixels.
+    `yaw` in radians: 0 shows the front of the human, pi/2 the left side. The vertical field of view is 30 degrees.
+    Raises ValueError for an image side outside 1 ... LARGEST_PICTURE pixels.
     """
     if not 1 <= min(width, height) <= max(width, height) <= LARGEST_PICTURE:
-        raise ValueError(
-            f"a picture of {width} x {height} pixels was asked for: choose sides of 1 to {LARGEST_PICTURE}"
-        )
+        raise ValueError(f"the image size is {width} x {height} pixels: choose sides from 1 to {LARGEST_PICTURE}")
     signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3).to(primitives.position)
     local = primitives.half_extent[:, None] * signs
     corners = primitives.position[:, None] + (primitives.rotation[:, None] @ local[..., None])[..., 0]
@@ -251,5 +251,5 @@ def framing(primitives: Primitives, yaw: float = 0.0, width: int = 512, height: 
 def render(
     human: Human, camera: Camera, pose: BodyPose | None = None, settings: MarchSettings = DEFAULT_SETTINGS
 ) -> Rendering:
-    """The person in a pose (None: T pose) as the camera sees them."""
+    """Render the human in a pose (None: T pose)."""
     return march(place(human, pose), camera, settings)

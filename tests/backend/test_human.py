@@ -128,7 +128,7 @@ def test_moving_the_body_moves_the_primitives_rigidly(human):
 
 
 def test_a_body_without_its_anchors_is_refused(human):
-    with pytest.raises(ValueError, match="go together"):
+    with pytest.raises(ValueError, match="anchors"):
         place(human, body=default_body())
 
 

@@ -1,4 +1,4 @@
-"""What a body measures, and bodies of given measures."""
+"""Measure bodies, and find bodies with given measures."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from torch import Tensor
 from primdiffusion.body.model import BodyModel, ShapedBody
 
 DENSITY = 985.0
-"""kg/m^3 of a living person with air in the lungs."""
+"""kg/m^3 of a living human with air in the lungs."""
 MOST_CORRECTIONS = 20
 LARGEST_BETA = 5.0
-"""Beyond, bodies of linear shape models fall apart."""
+"""Linear shape models produce broken bodies beyond this value."""
 
 
 class Measures(NamedTuple):
-    """Of a bare body."""
+    """Measures of a body without clothes."""
 
     height: float
     """Metres."""
     weight: float
-    """Kilograms: the volume within the skin, as heavy as a person."""
+    """Kilograms, from the volume and DENSITY."""
 
 
 def measure(shape: ShapedBody) -> Measures:
@@ -31,7 +31,7 @@ def measure(shape: ShapedBody) -> Measures:
     vertices = shape.vertices.detach().double()
     height = float(vertices[:, 1].amax() - vertices[:, 1].amin())
     a, b, c = (vertices[shape.model.faces[:, i].long()] for i in range(3))
-    volume = float((a * torch.linalg.cross(b, c)).sum()) / 6  # signed tetrahedra to the origin
+    volume = float((a * torch.linalg.cross(b, c)).sum()) / 6  # sum of signed tetrahedra to the origin
     return Measures(height, abs(volume) * DENSITY)
 
 
@@ -42,11 +42,12 @@ def betas_of_measures(
     height: float | None = None,
     weight: float | None = None,
 ) -> Float[Tensor, "n"]:
-    """The betas, moved as little as possible until the body has the given height (m) and weight (kg).
+    """Change betas as little as possible so that the body has the given height (m) and weight (kg).
 
-    Distances are those of N(., scale scale^T), the distribution that `betas` are a draw of; so the result is a draw of
-    that distribution given the measures, as far as these are linear in betas (Matheron's rule), which Newton steps
-    correct. Exact to 0.1 mm and 10 g. Raises ValueError where no body within LARGEST_BETA has these measures.
+    Distance is the Mahalanobis distance of N(., scale scale^T), the distribution that `betas` were sampled from. As far
+    as measures are linear in betas, the result is a sample of that distribution conditioned on the measures (Matheron's
+    rule); Newton steps correct the rest. Accurate to 0.1 mm and 10 g. Raises ValueError if no body within LARGEST_BETA
+    has these measures.
     """
     wanted = [(number, value) for number, value in enumerate((height, weight)) if value is not None]
     if not wanted:
@@ -68,7 +69,7 @@ def betas_of_measures(
     if not moved.abs().amax() <= LARGEST_BETA:
         names = (("a height of {:.2f} m", height), ("a weight of {:.0f} kg", weight))
         asked = " with ".join(text.format(value) for text, value in names if value is not None)
-        raise ValueError(f"no body of this model has {asked}: ask for something more usual")
+        raise ValueError(f"no body of this model has {asked}: choose less extreme values")
     return moved.to(betas)
 
 
@@ -77,6 +78,6 @@ def _measured(betas: Float[Tensor, "n"], body: BodyModel) -> Float[Tensor, "2"]:
 
 
 def _slope(betas: Float[Tensor, "n"], body: BodyModel, step: float = 0.05) -> Float[Tensor, "2 n"]:
-    """Central differences of the measures by each beta."""
+    """Central differences of the measures with respect to each beta."""
     moves = step * torch.eye(len(betas), dtype=torch.float64)
     return torch.stack([(_measured(betas + m, body) - _measured(betas - m, body)) / (2 * step) for m in moves], dim=1)

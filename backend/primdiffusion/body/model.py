@@ -22,18 +22,18 @@ J = len(JOINT_NAMES)
 
 @dataclasses.dataclass(frozen=True)
 class BodyPose(TensorRecord):
-    """What the joints do: pure numbers, valid for any body of the same skeleton."""
+    """Joint rotations and translation, independent of the body's shape."""
 
     joint_rotation: Float[Tensor, "*b J 3 3"]
-    """Each joint relative to its parent; the first is the whole body's turn about its pelvis."""
+    """Rotation of each joint relative to its parent; the first rotates the whole body about the pelvis."""
     translation: Float[Tensor, "*b 3"]
-    """Of the whole body, metres, after the rotations."""
+    """Translation of the whole body, metres, applied after the rotations."""
 
     @classmethod
     def rest(
         cls, *batch: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
     ) -> BodyPose:
-        """The T pose the template is made in, for a batch of any shape."""
+        """The T pose of the template, with the given batch shape."""
         return cls(
             torch.eye(3, dtype=dtype, device=device).expand(*batch, J, 3, 3),
             torch.zeros(*batch, 3, dtype=dtype, device=device),
@@ -60,18 +60,18 @@ class BodyPose(TensorRecord):
 
 @dataclasses.dataclass(frozen=True)
 class BodyModel(TensorRecord):
-    """A body before it has a shape; metres, y up, facing +z, its left at +x."""
+    """A body model without shape or pose; metres, y up, facing +z, left side at +x."""
 
     template: Float[Tensor, "V 3"]
     """The mean body in the rest pose."""
     shape_basis: Float[Tensor, "V 3 B"]
-    """What a unit of each shape coefficient adds, metres."""
+    """Vertex offsets per unit of each shape coefficient, metres."""
     pose_basis: Float[Tensor, "V 3 P"]
-    """What each entry of (R - I) of the 23 joints below the pelvis adds, row-major; zero where a body has none."""
+    """Vertex offsets per entry of (R - I) of the 23 joints below the pelvis, row-major; P may be 0."""
     joint_regressor: Float[Tensor, "J V"]
     """Joints as weighted sums of the shaped vertices."""
     skin_weights: Float[Tensor, "V J"]
-    """How much each joint moves a vertex; rows sum to 1."""
+    """Skinning weights of the joints; rows sum to 1."""
     parents: Int[Tensor, "J"]
     """Each joint's parent, -1 for the root; a parent comes before its children."""
     faces: Int[Tensor, "F 3"]
@@ -79,10 +79,10 @@ class BodyModel(TensorRecord):
     uv: Float[Tensor, "T 2"]
     """Texture coordinates in [0, 1], v up as in OBJ files."""
     uv_faces: Int[Tensor, "F 3"]
-    """The texture coordinate of each face's corners."""
+    """Indices into `uv` of each face's corners."""
 
     def shape(self, betas: Float[Tensor, "*b N"]) -> ShapedBody:
-        """The body of a person (SMPL eqs. 8 and 10). Betas may be fewer than the basis holds; the rest count as zero.
+        """Apply shape coefficients (SMPL eqs. 8 and 10). Fewer betas than the basis has are padded with zeros.
 
         Raises:
             ValueError: there are more betas than the basis has components.
@@ -99,7 +99,7 @@ class BodyModel(TensorRecord):
 
 @dataclasses.dataclass(frozen=True)
 class ShapedBody(TensorRecord):
-    """A person's body in the rest pose."""
+    """A body with shape, in the rest pose."""
 
     model: BodyModel
     vertices: Float[Tensor, "*b V 3"]
@@ -108,7 +108,7 @@ class ShapedBody(TensorRecord):
     """Metres."""
 
     def pose(self, pose: BodyPose) -> PosedBody:
-        """The person in a pose (SMPL eqs. 2-4, 7 and 9); batches of bodies and poses broadcast."""
+        """Pose the body (SMPL eqs. 2-4, 7 and 9); batches of bodies and poses broadcast."""
         joints = self.joints
         world_from_joint = world_from_joints(pose.joint_rotation, joints, self.model.parents.tolist())
         identity = torch.eye(3, dtype=joints.dtype, device=joints.device)
@@ -118,10 +118,10 @@ class ShapedBody(TensorRecord):
         return PosedBody(vertices, world_from_joint, skinning)
 
     def follow(self, skinning: Float[Tensor, "*#b J r 4"]) -> Float[Tensor, "... V 3"]:
-        """The vertices moved by any 24 affine matrices (r = 3 or 4 rows), such as those of an animator's armature.
+        """Skin the vertices with 24 arbitrary affine matrices (r = 3 or 4 rows), such as those of an armature.
 
-        `skinning` takes points of the rest pose to where they go, as `PosedBody.skinning` does. The pose-dependent
-        correctives (SMPL eq. 9) follow the joints' rotations relative to their parents, without scale and shear.
+        `skinning` maps rest points to posed points, as `PosedBody.skinning` does. The pose-dependent correctives (SMPL
+        eq. 9) use the joints' rotations relative to their parents, without scale and shear.
         """
         if self.model.pose_basis.numel() == 0:
             return skin(self.vertices, self.model.skin_weights, skinning)
@@ -139,14 +139,14 @@ class ShapedBody(TensorRecord):
 
 @dataclasses.dataclass(frozen=True)
 class PosedBody(TensorRecord):
-    """A person's body in the world."""
+    """A posed body in world space."""
 
     vertices: Float[Tensor, "*b V 3"]
     """Metres."""
     joints: Float[Tensor, "*b J 4 4"]
-    """World from joint: rotation and place of every joint's axes."""
+    """World from joint: orientation and position of every joint."""
     skinning: Float[Tensor, "*b J 4 4"]
-    """World from rest: what each joint does to a point of the rest pose."""
+    """World from rest: the transform of each joint for points of the rest pose."""
 
 
 @functools.cache

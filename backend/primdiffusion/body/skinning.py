@@ -22,9 +22,9 @@ def rigid_matrix(rotation: Float[Tensor, "*#b 3 3"], translation: Float[Tensor, 
 def world_from_joints(
     joint_rotation: Float[Tensor, "*#b J 3 3"], rest_joints: Float[Tensor, "*#b J 3"], parents: Sequence[int]
 ) -> Float[Tensor, "... J 4 4"]:
-    """Chain each joint's rotation, relative to its parent, down the skeleton; a parent comes before its children.
+    """Forward kinematics: chain the joints' rotations relative to their parents; parents precede their children.
 
-    In the rest pose a joint's axes are the world's, so its matrix is a pure translation.
+    In the rest pose joint axes are the world axes, so each matrix is a pure translation.
     """
     bones = torch.stack(
         [rest_joints[..., j, :] - (rest_joints[..., p, :] if p >= 0 else 0) for j, p in enumerate(parents)], dim=-2
@@ -40,16 +40,17 @@ def world_from_joints(
 def world_from_rest(
     world_from_joint: Float[Tensor, "*#b J 4 4"], rest_joints: Float[Tensor, "*#b J 3"]
 ) -> Float[Tensor, "... J 4 4"]:
-    """What each joint does to points given in the rest pose: move the joint to the origin first."""
+    """Transforms of the joints for rest points: move the joint to the origin, then apply its world matrix."""
     rotation = world_from_joint[..., :3, :3]
     moved_rest = (rotation @ rest_joints[..., None])[..., 0]
     return rigid_matrix(rotation, world_from_joint[..., :3, 3] - moved_rest)
 
 
 def relative_rotations(skinning: Float[Tensor, "*b J r 4"], parents: Sequence[int]) -> Float[Tensor, "*b J 3 3"]:
-    """The joints' rotations relative to their parents, out of any affine matrices world <- rest.
+    """Joint rotations relative to their parents, from arbitrary affine matrices world <- rest.
 
-    Each matrix counts as its nearest orthogonal one (`polar`); a rest pose has no rotations, so these are the joints'.
+    Each matrix is replaced by the nearest orthogonal one (`polar`). Joints are not rotated in the rest pose, so that is
+    the joint's world rotation.
     """
     world, _ = polar(skinning[..., :3, :3])
     parent = [world[..., max(p, 0), :, :] for p in parents]
@@ -61,6 +62,6 @@ def relative_rotations(skinning: Float[Tensor, "*b J r 4"], parents: Sequence[in
 def skin(
     points: Float[Tensor, "*#b V 3"], weights: Float[Tensor, "V J"], skinning: Float[Tensor, "*#b J r 4"]
 ) -> Float[Tensor, "... V 3"]:
-    """Points moved by the weighted mean of the joints' matrices (linear blend skinning)."""
+    """Linear blend skinning: transform points by the weighted mean of the joints' matrices."""
     blended = torch.einsum("vj,...jrc->...vrc", weights, skinning[..., :3, :])
     return (blended[..., :3] @ points[..., None])[..., 0] + blended[..., 3]

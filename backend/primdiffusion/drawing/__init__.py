@@ -1,1 +1,1 @@
-"""Whole pictures: people among opaque things, before a background, in one of several views."""
+"""Complete images: humans and opaque meshes over a background, in one of several views."""

@@ -1,4 +1,4 @@
-"""A picture in bands from the top, so that something shows early and each band leaves a chance to stop."""
+"""Draw an image in bands from the top, so that results show early and drawing can be cancelled between bands."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ from primdiffusion.drawing.scene import Look, Picture, Scene
 from primdiffusion.geometry.camera import Camera
 
 BAND_SECONDS = 0.3
-"""What a band should take at most: a cancelled picture stops that soon."""
+"""Target duration of a band, and so the latency of a cancel."""
 FIRST_PIXELS = 2**15
-"""Of the first band while nobody knows how fast drawing is."""
+"""Pixels in the first band when the drawing speed is unknown."""
 MOST_PIXELS = 2**19
-"""Of any band: bounds the memory, some 100 bytes a pixel."""
+"""Pixels in any band; bounds memory, about 100 bytes per pixel."""
 GROWTH = 4
-"""A band has at most this many times the last one's rows: the top of a picture is often empty and quickly done."""
+"""Largest ratio of rows between consecutive bands: the top of an image is often empty and misleadingly fast."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """How far a picture has come."""
+    """Progress of an image."""
 
     rows: int
-    """Finished, from the top."""
+    """Finished rows, from the top."""
     seconds_march: float
-    """Of the marcher alone, so far."""
+    """Time spent in the marcher so far."""
     pixels_a_second: float
-    """The least seen in this picture, but for its first band, which may have loaded compiled code; what the next
-    picture of the kind may reckon with."""
+    """Slowest band of this image, an estimate for the next one; the first band is skipped unless it is the only one,
+    because it may include loading compiled code."""
 
 
 def draw_in_bands(
     picture: Picture, scene: Scene, camera: Camera, look: Look, pixels_a_second: float | None = None
 ) -> Iterator[Progress]:
-    """Fills `picture` with what `draw` gives, in bands from the top; `pixels_a_second` of one before, where known."""
+    """As `draw`, but fill `picture` in bands from the top; `pixels_a_second` is the measured speed, if known."""
     top, rows, seconds = 0, camera.height, 0.0
     speeds: list[float] = []
     while top < camera.height:

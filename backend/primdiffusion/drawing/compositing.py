@@ -1,9 +1,9 @@
-"""People over solids over a background, pixel by pixel.
+"""Composite humans over solids over a background, pixel by pixel.
 
-Solids are seen through FINER x FINER points of each pixel, so that their outlines are smooth; people through its
-centre. Where one surface fills the pixel the marcher's ray has ended at it and what people leave shows the surface. At
-an outline the ray has passed on: each of the points then shows its solid alone where that is nearer than the people's
-expected depth, and the people over it where it is not.
+Solids are antialiased with FINER x FINER samples per pixel; humans are sampled once, at the pixel's centre. If one
+surface covers the pixel, the marcher's ray ends at that surface and the remaining transmittance shows it. At an outline
+the ray does not end: each sample then shows its solid alone if that is nearer than the humans' expected depth, and the
+humans over the solid otherwise.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from primdiffusion.raster.nearest_triangle import nearest_triangles
 from primdiffusion.render.solids import Layer, Solids, shade_solids
 
 FINER = 2
-"""Points of a pixel along each side at which solids are looked for."""
+"""Samples per pixel along each axis for solids."""
 STEEPEST = 6.0
-"""A pixel shows one surface where depths within it differ by less than this many times the pixel's width there (a slope
-of 80 degrees), or all belong to one triangle. Measured in pixels, so that it holds for far and narrow views as well."""
+"""A pixel shows a single surface if its samples hit one triangle, or if their depths differ by less than this many
+pixel widths at that depth (a slope of 80 degrees). In pixels, so that it also holds for distant and narrow views."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Backdrop:
-    """What stands among people."""
+    """The rasterised solids of an image."""
 
     solids: Layer
-    """At FINER times the picture's size."""
+    """At FINER times the image resolution."""
     hole: Bool[ndarray, "fh fw"]
-    """Where a holdout is seen, at that size."""
+    """Samples that hit a holdout, at the same resolution."""
     end: Float32[ndarray, "h w"]
-    """Depth along the optical axis at which a pixel's ray ends; inf where a part of it goes on."""
+    """Depth along the optical axis at which the pixel's ray ends; inf if any sample misses the solids."""
     outline: Bool[ndarray, "h w"]
-    """Whether a pixel shows more than one surface, or one in a part of it only."""
+    """Pixels that show more than one surface, or are partly covered."""
 
 
 def backdrop(solids: Solids, camera: Camera, clip: tuple[float, float]) -> Backdrop:
-    """The solids as `camera` sees them between the depths `clip`."""
+    """Rasterise the solids as seen by `camera` between the depths `clip`."""
     intrinsics = camera.intrinsics.clone()
     intrinsics[:2] *= FINER
     size = {"width": camera.width * FINER, "height": camera.height * FINER}
@@ -57,7 +57,7 @@ def backdrop(solids: Solids, camera: Camera, clip: tuple[float, float]) -> Backd
 
 
 def over_background(picture: Picture, people: Layer, background: tuple[float, float, float] | None) -> None:
-    """Writes people without solids into `picture`."""
+    """Write humans over the background into `picture`."""
     wall = np.float32(background is not None)
     colour = np.array(background or (0, 0, 0), np.float32)
     _compose_alone(people.rgb, people.alpha, people.depth, wall, colour, picture.combined, picture.depth)
@@ -70,7 +70,7 @@ def over_solids(
     behind: Backdrop,
     background: tuple[float, float, float] | None,
 ) -> None:
-    """Writes people among solids into `picture`; `expected` is their expected depth, inf where nobody is."""
+    """Write humans, solids and background into `picture`; `expected` is the humans' expected depth, inf if none."""
     wall = np.float32(background is not None)
     colour = np.array(background or (0, 0, 0), np.float32)
     solids = (behind.solids.rgb, behind.solids.alpha, behind.solids.depth, behind.hole, behind.outline)
@@ -88,7 +88,7 @@ def _find_ends(triangle, depth, pixel, end, outline):
                 low, high, inverse = min(low, depth[y, x]), max(high, depth[y, x]), inverse + 1.0 / depth[y, x]
                 one_triangle = one_triangle and triangle[y, x] == triangle[row * FINER, column * FINER]
             outline[row, column] = not one_triangle and not high - low <= STEEPEST * pixel * low
-            # On a plane the inverse of the depth is linear in the picture: this mean is the depth at the centre.
+            # Inverse depth of a plane is linear in image space, so this mean is the depth at the pixel centre.
             end[row, column] = high if outline[row, column] or inverse == 0.0 else FINER * FINER / inverse
 
 
@@ -115,7 +115,7 @@ def _compose(
             nearest, second, inverse = np.inf, np.inf, 0.0
             for i in range(FINER * FINER):
                 y, x = row * FINER + i // FINER, column * FINER + i % FINER
-                z = solid_depth[y, x]  # of a holdout: inf
+                z = solid_depth[y, x]  # inf for a holdout
                 hidden = outline[row, column] and z < expected[row, column]
                 through = np.float32(1) if hidden else np.float32(1) - alpha[row, column]
                 free = (np.float32(0) if hole[y, x] else np.float32(1) - solid_alpha[y, x]) * wall
@@ -126,6 +126,6 @@ def _compose(
                 nearest, second, inverse = min(nearest, z), min(second, max(nearest, z)), inverse + 1.0 / z
             for channel in range(4):
                 combined[row, column, channel] = light[channel] * share
-            # Where half of the points are covered: the depth at which opacity reaches one half, as for people.
+            # The depth at which half of the samples are covered: opacity one half, the same definition as for humans.
             solid = second if outline[row, column] or inverse == 0.0 else 1.0 / (share * inverse)
             depth[row, column] = min(hit[row, column], solid, NOTHING)

@@ -1,7 +1,7 @@
-"""A scene and a camera to a picture: people marched, solids rasterised, both composited by depth.
+"""Draw a scene: march the humans, rasterise the solids, and composite both by depth.
 
-A ray of the marcher ends where it meets a solid, so a solid may stand before, behind or inside a person; what people
-leave of a ray shows the solid there, or else the background.
+The marcher's rays end at solids, so solids may be in front of, behind or inside a human; the remaining transmittance
+shows the solid, or else the background.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from primdiffusion.render.solids import Layer
 
 
 def draw(scene: Scene, camera: Camera, look: Look = Look()) -> Picture:  # noqa: B008
-    """The picture of `scene`: people over solids over the background.
+    """Draw `scene`: humans over solids over the background.
 
-    Depth is the nearer of a person's first hit (opacity one half) and a solid. A holdout hides people behind it and
-    leaves a hole: combined 0, and no depth, unless a person stands before it. In the view "alpha" all is opaque and
-    grey is the people's coverage; "depth" gives people (expected depth) and solids the colours of `depth_colours`.
-    Works on the device of `scene.primitives`; the picture is on the CPU. Raises ValueError as `march` does.
+    Depth is the nearer of a human's first hit (opacity one half) and a solid. A holdout hides humans behind it and
+    leaves a hole (combined 0, no depth) unless a human is in front of it. The view "alpha" is opaque, with the humans'
+    coverage as grey; "depth" colours humans (by expected depth) and solids with `depth_colours`.
+    Computes on the device of `scene.primitives`; the result is on the CPU. Raises ValueError as `march` does.
     """
     picture = Picture.blank(camera.width, camera.height)
     draw_into(picture, scene, camera, look)
@@ -42,7 +42,7 @@ def draw(scene: Scene, camera: Camera, look: Look = Look()) -> Picture:  # noqa:
 
 
 def draw_into(picture: Picture, scene: Scene, camera: Camera, look: Look) -> float:
-    """As `draw`, into a picture of the camera's size; returns the seconds of the marcher alone."""
+    """As `draw`, into an existing picture of the camera's size; return the seconds spent in the marcher."""
     check_camera(camera)
     behind = None if scene.solids is None else backdrop(scene.solids, camera, look.clip)
     end = None if behind is None else behind.end
@@ -68,9 +68,9 @@ def draw_into(picture: Picture, scene: Scene, camera: Camera, look: Look) -> flo
 
 
 def depth_span(primitives: Primitives | None, camera: Camera, clip: tuple[float, float]) -> tuple[float, float]:
-    """The depths along the optical axis between which the boxes lie, as far as `clip` shows them.
+    """The range of depths along the optical axis covered by the boxes, cut to `clip`.
 
-    The same for all parts of a picture, whatever they show. (1, 2) where there is no box.
+    Does not depend on the crop of the image. (1, 2) if there are no boxes.
     """
     if primitives is None or primitives.position.shape[0] == 0:
         return 1.0, 2.0
@@ -83,13 +83,13 @@ def depth_span(primitives: Primitives | None, camera: Camera, clip: tuple[float,
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class People:
-    """The people of a picture, before anything else is in it."""
+    """The rendered humans, before compositing."""
 
     layer: Layer
     expected: Float32[ndarray, "h w"]
-    """Expected depth along the optical axis, inf where nobody is."""
+    """Expected depth along the optical axis; inf where no human is hit."""
     seconds: float
-    """Of the marcher."""
+    """Time spent in the marcher."""
 
 
 def _marched(primitives: Primitives, camera: Camera, look: Look, end: ndarray | None) -> People:
@@ -106,7 +106,7 @@ def _marched(primitives: Primitives, camera: Camera, look: Look, end: ndarray | 
 
 
 def _boxes(boxes: Layer, end: ndarray | None) -> People:
-    """Boxes as far as rays go."""
+    """The boxes that are not hidden by solids."""
     if end is None:
         return People(boxes, boxes.depth, 0.0)
     seen = boxes.depth < end
@@ -140,13 +140,13 @@ def _solids_in_black(behind: Backdrop | None) -> Backdrop | None:
 
 
 def _encode_coverage(picture: Picture) -> None:
-    """Grey that an sRGB screen shows as bright as the coverage, opaque."""
+    """Replace coverage by opaque linear grey whose sRGB encoding equals the coverage."""
     picture.combined[..., :3] = decode_srgb(picture.combined[..., :3])
     picture.combined[..., 3] = 1
 
 
 def _secants(camera: Camera) -> Float32[ndarray, "h w"]:
-    """Distance along a pixel's ray for each metre along the optical axis."""
+    """Distance along the pixel's ray per metre along the optical axis."""
     secant = np.empty((camera.height, camera.width), np.float32)
     _fill_secants(secant, np.linalg.inv(camera.intrinsics.detach().cpu().double().numpy()))
     return secant
@@ -164,7 +164,7 @@ def _fill_secants(secant, inverse):
 def _span(
     primitives: Primitives, camera: Camera, clip: tuple[float, float], end: ndarray | None, secant: ndarray
 ) -> Span | None:
-    """Where rays begin and end; None where neither planes nor solids can cut a box."""
+    """Start and end of each ray; None if neither clip planes nor solids intersect the boxes."""
     near, far = depth_span(primitives, camera, (-math.inf, math.inf))
     hidden = end is not None and bool((end < far).any())
     if not hidden and (clip[0] <= near or clip[0] == 0) and far <= clip[1]:

@@ -1,4 +1,4 @@
-"""What a picture shows and how: the nouns of drawing."""
+"""Records for drawing: the scene, the view settings and the resulting picture."""
 
 from __future__ import annotations
 
@@ -16,56 +16,54 @@ from primdiffusion.render.march import MarchSettings
 from primdiffusion.render.solids import Solids
 
 NOTHING = 1e10
-"""Depth where there is nothing, metres: what Blender's Depth pass holds there."""
+"""Depth of the background, metres, as in Blender's Depth pass."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
-    """People and opaque things in the world."""
+    """Humans and opaque meshes in world space."""
 
     primitives: Primitives | None
-    """All people's boxes, unbatched (`Primitives.together`); None without people."""
+    """Primitives of all humans, unbatched (`Primitives.together`); None if there are none."""
     solids: Solids | None = None
     chart: Int[Tensor, "k"] | None = None
-    """Which region of a body each box belongs to; the view "boxes" gives regions their hues."""
+    """The body region of each primitive; sets its hue in the view "boxes"."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Look:
-    """How a scene is drawn."""
+    """View settings."""
 
     view: View = VIEWS[0]
     background: tuple[float, float, float] | None = None
-    """Linear RGB behind everything; None leaves the picture transparent there."""
+    """Linear RGB; None is transparent."""
     clip: tuple[float, float] = (0.0, math.inf)
-    """Depths along the optical axis, metres, between which anything is seen."""
+    """Near and far clipping depths along the optical axis, metres."""
     settings: MarchSettings = MarchSettings()  # noqa: RUF009  frozen
 
     def __post_init__(self) -> None:
-        """ValueError for an unknown view and planes in the wrong order."""
+        """Raise ValueError for an unknown view or clip planes in the wrong order."""
         if self.view not in VIEWS:
-            raise ValueError(f"there is no view {self.view!r}; choose from {', '.join(VIEWS)}")
+            raise ValueError(f"unknown view {self.view!r}; choose from {', '.join(VIEWS)}")
         start, end = self.clip
         if not 0 <= start < end:
-            raise ValueError(
-                f"the clip distances are {start} and {end} m: the end must lie behind the start, from 0 on"
-            )
+            raise ValueError(f"the clip distances are {start} and {end} m: give a start of at least 0 and a larger end")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Picture:
-    """What was drawn, or room for it; top row first. Its arrays may be views into a file."""
+    """An image buffer, top row first. The arrays may be memory-mapped."""
 
     combined: Float32[ndarray, "h w 4"]
     """Linear RGB, premultiplied by alpha, and alpha."""
     depth: Float32[ndarray, "h w"]
-    """Metres along the optical axis to where opacity reaches one half; NOTHING where it never does."""
+    """Metres along the optical axis to where opacity reaches one half; NOTHING if it never does."""
 
     @classmethod
     def blank(cls, width: int, height: int) -> Picture:
-        """A transparent picture."""
+        """An empty, transparent picture."""
         return cls(np.zeros((height, width, 4), np.float32), np.full((height, width), NOTHING, np.float32))
 
     def rows(self, top: int, bottom: int) -> Picture:
-        """The rows from `top` up to `bottom`; writing to them writes to this picture."""
+        """A view of the rows `top` to `bottom` (exclusive); writing to it writes to this picture."""
         return Picture(self.combined[top:bottom], self.depth[top:bottom])

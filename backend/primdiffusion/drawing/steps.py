@@ -1,13 +1,13 @@
-"""How far apart a picture's samples may be asked to lie. Imports no torch."""
+"""Limits on the distance between samples of a ray. Imports no torch."""
 
 from __future__ import annotations
 
 FINEST_STEP = 1e-4
-"""Metres; finer, a picture takes hours and gains nothing."""
+"""Metres; a finer step takes hours without visible gain."""
 COARSEST_STEP = 1.0
 
 
 def check_step(step: float) -> None:
-    """ValueError for a step, metres between the samples of a ray, that no picture of a person wants."""
+    """Raise ValueError if `step`, metres between samples of a ray, is out of range."""
     if not FINEST_STEP <= step <= COARSEST_STEP:
         raise ValueError(f"the step is {step} m: choose {FINEST_STEP} to {COARSEST_STEP}")

@@ -14,7 +14,7 @@ from primdiffusion.geometry.records import TensorRecord
 
 @dataclasses.dataclass(frozen=True)
 class Camera(TensorRecord):
-    """One view, or a batch of views of one size: `x_pixel ~ intrinsics @ (world_to_camera @ [x_world, 1])`."""
+    """A camera, or a batch of cameras of one image size: `x_pixel ~ intrinsics @ (world_to_camera @ [x_world, 1])`."""
 
     intrinsics: Float[Tensor, "*#c 3 3"]
     """Focal lengths and principal point, pixels."""
@@ -29,7 +29,7 @@ class Camera(TensorRecord):
         return -(self.world_to_camera[..., :3].mT @ self.world_to_camera[..., 3:])[..., 0]
 
     def rays(self) -> tuple[Float[Tensor, "*#c 3"], Float[Tensor, "*#c height width 3"]]:
-        """The common origin and, for each pixel centre, a unit direction in the world (SPEC 4)."""
+        """The common origin and the unit world direction of the ray through each pixel centre (SPEC 4)."""
         k = self.intrinsics[..., None, None]
         v, u = torch.meshgrid(
             torch.arange(self.height, dtype=k.dtype, device=k.device) + 0.5,
@@ -43,19 +43,19 @@ class Camera(TensorRecord):
         return self.position, torch.nn.functional.normalize(in_world, dim=-1)
 
     def moved_in_picture(self, right: float, down: float) -> Camera:
-        """The camera whose pixel (u + right, v + down) sees what this one's (u, v) does: the principal point moves."""
+        """Shift the principal point, so that what was seen at pixel (u, v) is seen at (u + right, v + down)."""
         shift = torch.zeros_like(self.intrinsics)
         shift[..., 0, 2], shift[..., 1, 2] = right, down
         return dataclasses.replace(self, intrinsics=self.intrinsics + shift)
 
     def crop(self, left: int, top: int, width: int, height: int) -> Camera:
-        """The part of the picture from pixel (left, top): its pixels' rays are the whole picture's."""
+        """The camera of a crop that starts at pixel (left, top); pixels keep their rays."""
         return dataclasses.replace(self.moved_in_picture(float(-left), float(-top)), width=width, height=height)
 
     def project(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 2"], Float[Tensor, "*b"]]:
         """Pixel coordinates and depth along the optical axis; points behind the camera have depth <= 0.
 
-        Of one camera, not of a batch.
+        Unbatched cameras only.
         """
         in_camera = points @ self.world_to_camera[:, :3].T + self.world_to_camera[:, 3]
         depth = in_camera[..., 2]
@@ -72,15 +72,15 @@ def look_at(
     height: int,
     up: tuple[float, float, float] = (0.0, 1.0, 0.0),
 ) -> Camera:
-    """A camera at `position` that sees `target` in the middle of its picture; `vertical_fov` in radians, square pixels.
+    """A camera at `position` with `target` at the image centre; `vertical_fov` in radians, square pixels.
 
-    Raises ValueError where position and target coincide or the view runs along `up`.
+    Raises ValueError if position and target coincide or the view direction is parallel to `up`.
     """
     forward = target - position
     right = torch.linalg.cross(forward, torch.as_tensor(up, dtype=position.dtype, device=position.device))
     if right.norm() < 1e-8 * max(1.0, float(forward.norm())):
         raise ValueError(
-            f"no camera looks from {position.tolist()} at {target.tolist()} with up {up}: move one of the points"
+            f"cannot look from {position.tolist()} at {target.tolist()} with up {up}: move one of the points"
         )
     forward, right = torch.nn.functional.normalize(forward, dim=0), torch.nn.functional.normalize(right, dim=0)
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])

@@ -1,4 +1,4 @@
-"""Frozen records of tensors: the nouns of this package move between devices and dtypes as one."""
+"""Frozen records of tensors that move between devices and dtypes as a unit."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from torch import Tensor
 
 @dataclasses.dataclass(frozen=True)
 class TensorRecord:
-    """A frozen dataclass whose tensor fields (nested records included) are converted and indexed together."""
+    """A frozen dataclass whose tensor fields, including those of nested records, are converted together."""
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
-        """The same record with `change` applied to every tensor in it."""
+        """Return a copy with `change` applied to every tensor."""
         changed = {}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
@@ -26,5 +26,5 @@ class TensorRecord:
         return dataclasses.replace(self, **changed)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
-        """Move to `device`; convert floating tensors (only those) to `dtype`."""
+        """Return a copy on `device`, with floating-point tensors (only those) converted to `dtype`."""
         return self.map(lambda t: t.to(device=device, dtype=dtype if t.is_floating_point() else None))

@@ -1,4 +1,4 @@
-"""Rotations as 3x3 matrices; axis-angle vectors (radians) only at the borders, where files use them."""
+"""Rotations as 3x3 matrices; axis-angle vectors (radians) appear only where files are read and written."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def axis_angle_to_matrix(axis_angle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b
 def matrix_to_axis_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     """The logarithm of a rotation, angle in [0, pi]; exact near 0 and near pi. Not differentiable at pi.
 
-    Goes through the quaternion whose largest component comes from the diagonal, so no division by a small number.
+    Computed from the quaternion with the largest diagonal component, to avoid division by small numbers.
     """
     m = rotation
     t = torch.stack(

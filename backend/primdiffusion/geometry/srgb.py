@@ -18,7 +18,7 @@ def encode_srgb(linear: Colours) -> Colours:
     Values outside [0, 1] are not clamped; negative ones stay on the curve's linear piece.
     """
     if isinstance(linear, Tensor):
-        # The power never sees values of the linear piece: its slope at 0 is infinite and would turn into NaN gradients.
+        # Clamp before the power: its slope at 0 is infinite, so torch.where alone would produce NaN gradients.
         power = 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
         return torch.where(linear <= 0.0031308, 12.92 * linear, power)
     power = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
@@ -27,7 +27,7 @@ def encode_srgb(linear: Colours) -> Colours:
 
 def decode_srgb(encoded: Colours) -> Colours:
     """The inverse of `encode_srgb`."""
-    # The knee is where the encoder puts its own, 12.92 * 0.0031308, so that the pair inverts exactly.
+    # The same knee as the encoder's, 12.92 * 0.0031308 instead of 0.04045, so that the pair inverts exactly.
     knee = 12.92 * 0.0031308
     if isinstance(encoded, Tensor):
         power = ((encoded.clamp_min(knee) + 0.055) / 1.055) ** 2.4

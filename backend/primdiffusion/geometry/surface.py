@@ -16,13 +16,13 @@ def surface_points(
     face: Int[Tensor, "k"],
     barycentric: Float[Tensor, "k 3"],
 ) -> Float[Tensor, "*b k c"]:
-    """The points (or what else vertices carry) with these barycentric coordinates on these faces; differentiable."""
+    """Interpolate vertex positions (or other vertex attributes) at barycentric coordinates on faces; differentiable."""
     corners = vertices.index_select(-2, faces[face].flatten()).unflatten(-2, (-1, 3))
     return (corners * barycentric[..., None]).sum(-2)
 
 
 def face_cross(vertices: Float[Tensor, "*b v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "*b f 3"]:
-    """Normals of the faces by the right-hand rule, twice the area long."""
+    """Face normals by the right-hand rule, scaled to twice the face area."""
     a, b, c = vertices[..., faces, :].unbind(-2)
     return torch.linalg.cross(b - a, c - a)
 
@@ -39,13 +39,12 @@ def vertex_normals(vertices: Float[Tensor, "*b v 3"], faces: Int[Tensor, "f 3"])
 def uv_gradient(
     uv: Float[Tensor, "t 2"], uv_faces: Int[Tensor, "f 3"]
 ) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
-    """Weights of a face's three corners that give dP/du and dP/dv of the face, metres per unit of UV.
+    """Weights of each face's three corners whose sums are dP/du and dP/dv of the face, metres per unit of UV.
 
     P is linear over a face, so with D = (u1-u0)(v2-v0) - (u2-u0)(v1-v0),
     dP/du = [(v1-v2) P0 + (v2-v0) P1 + (v0-v1) P2] / D and dP/dv = [(u2-u1) P0 + (u0-u2) P1 + (u1-u0) P2] / D.
-    The sign of dv is the one that lets du x dv point along the face's normal: on mirrored charts (D < 0) it is turned
-    round. A face without area in UV gets its edges, du = P1 - P0 and dv = P2 - P0, whose plane is right and whose
-    direction is arbitrary.
+    dv is signed so that du x dv points along the face normal: on mirrored charts (D < 0) it is negated. A face without
+    area in UV space gets its edges, du = P1 - P0 and dv = P2 - P0: the correct plane, with an arbitrary direction.
     """
     (u0, v0), (u1, v1), (u2, v2) = (corner.unbind(-1) for corner in uv[uv_faces].unbind(-2))
     determinant = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
@@ -60,6 +59,6 @@ def uv_gradient(
 
 
 def signed_volume(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, ""]:
-    """Volume enclosed by the faces about their centroid, m^3; negative if their normals point inward."""
+    """Volume enclosed by the faces, m^3, as signed tetrahedra to the centroid; negative if normals point inward."""
     a, b, c = (vertices - vertices.mean(0))[faces].unbind(-2)
     return (a * torch.linalg.cross(b, c)).sum() / 6

@@ -1,4 +1,4 @@
-"""Textured, skinned triangle meshes in parts: what a dressed person is before it becomes primitives.
+"""Textured, skinned triangle meshes in parts: a dressed human before conversion to primitives.
 
 Conventions: metres, y up, z forward. Texture row 0 is the image's top row and the texture coordinates' v points up, so
 the texel under (u, v) is column floor(u * W), row floor((1 - v) * H); coordinates outside [0, 1] wrap around.
@@ -14,10 +14,10 @@ from jaxtyping import Float, Int, UInt8
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TexturedPart:
-    """One mesh with one texture: a body, a garment, a pair of eyes. Its arrays may be shared: never write to them."""
+    """A mesh with one texture, such as a body or a garment. Arrays may be shared: never write to them."""
 
     name: str
-    """What it is, such as "body", "outfit", "hair"; names of parts are unique within a mesh."""
+    """Name such as "body", "outfit", "hair"; unique within a mesh."""
     vertices: Float[np.ndarray, "V 3"]
     """Metres, float64."""
     faces: Int[np.ndarray, "F 3"]
@@ -27,15 +27,15 @@ class TexturedPart:
     texture: UInt8[np.ndarray, "H W 4"]
     """sRGB-encoded colour and straight (not premultiplied) alpha; 1 x 1 is a plain colour."""
     skin_index: Int[np.ndarray, "V M"]
-    """Joints (of 24) that move a vertex; M is 4 for the people made here."""
+    """Joints (of 24) that influence each vertex; M is 4 for MakeHuman samples."""
     skin_weight: Float[np.ndarray, "V M"]
     """Their weights; each row sums to one."""
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not belong together.
+        """Check that the shapes of the arrays agree.
 
         Raises:
-            ValueError: an array's shape does not fit the others'.
+            ValueError: an array's shape does not match the others.
         """
         vertex_count, face_count = len(self.vertices), len(self.faces)
         fits = {
@@ -50,7 +50,7 @@ class TexturedPart:
             if not right:
                 array = getattr(self, field)
                 raise ValueError(
-                    f"Part {self.name!r}: {field} has shape {array.shape} ({array.dtype}), which does not fit "
+                    f"Part {self.name!r}: {field} has shape {array.shape} ({array.dtype}), which does not match "
                     f"{vertex_count} vertices and {face_count} faces; see TexturedPart for the shapes."
                 )
 
@@ -63,12 +63,12 @@ class TexturedPart:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TexturedMesh:
-    """A person or any other thing made of textured parts that one skeleton moves."""
+    """Textured parts that share one skeleton, such as a dressed human."""
 
     parts: tuple[TexturedPart, ...]
 
     def posed(self, skinning: Float[np.ndarray, "J 4 4"]) -> TexturedMesh:
-        """Every part moved by `skinning`, the world <- rest transforms of a posed body's joints."""
+        """Skin every part with `skinning`, the world <- rest transforms of a posed body's joints."""
         return TexturedMesh(tuple(part.posed(skinning) for part in self.parts))
 
     @property

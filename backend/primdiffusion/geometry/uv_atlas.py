@@ -1,4 +1,4 @@
-"""The UV square as a raster of surface points: row = v * H, column = u * W, texel centres at +0.5 (SPEC 2)."""
+"""Rasterise the UV square to surface points: row = v * H, column = u * W, texel centres at +0.5 (SPEC 2)."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from numpy import ndarray as Array
 
 @dataclasses.dataclass(frozen=True)
 class UvRaster:
-    """Which surface point each texel shows."""
+    """The surface point of each texel."""
 
     face: Int[Array, "h w"]
     """Index of the face, -1 where no chart covers the texel's centre."""
     barycentric: Float[Array, "h w 3"]
-    """Coordinates on that face; zero where there is none."""
+    """Barycentric coordinates on that face; zero if there is none."""
 
     @property
     def covered(self) -> Array:
-        """[h, w] bool: the texels whose centre lies in a chart."""
+        """[h, w] bool: texels whose centre lies in a chart."""
         return self.face >= 0
 
     def every(self, stride: int, offset: int) -> UvRaster:
@@ -30,13 +30,13 @@ class UvRaster:
 
 
 def rasterise_uv(corner_uv: Float[Array, "f 3 2"], height: int, width: int) -> UvRaster:
-    """The charts drawn into height x width texels; where charts overlap, the later face wins.
+    """Rasterise the charts into height x width texels; where charts overlap, the later face wins.
 
     UV faces without area are skipped. Raises ValueError on coordinates that are not finite.
     """
     corner_uv = np.asarray(corner_uv, dtype=np.float64)
     if not np.isfinite(corner_uv).all():
-        raise ValueError("the UV coordinates hold NaN or infinite values; export the mesh's UV map again")
+        raise ValueError("the UV coordinates hold NaN or infinite values: export the mesh's UV map again")
     face = np.full((height, width), -1, dtype=np.int64)
     barycentric = np.zeros((height, width, 3))
     _draw(corner_uv * (width, height), face, barycentric)
@@ -71,9 +71,9 @@ def _draw(corners, face, barycentric):  # pragma: no cover (compiled)
 def closest_in_uv(
     corner_uv: Float[Array, "f 3 2"], uv_faces: Int[Array, "f 3"], points: Float[Array, "n 2"]
 ) -> tuple[Int[Array, "n"], Float[Array, "n 3"]]:
-    """For points outside every chart, the face and barycentric coordinates of the nearest chart point.
+    """Face and barycentric coordinates of the chart point nearest to each point; the points lie outside every chart.
 
-    That point lies on the outline of a chart, so only edges that belong to one face are searched.
+    The nearest point lies on the outline of a chart, so only edges of a single face are searched.
     """
     corner_uv = np.asarray(corner_uv, dtype=np.float64)
     owner = np.tile(np.arange(len(uv_faces)), 3)
@@ -83,7 +83,7 @@ def closest_in_uv(
     _, index, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
     outline = np.flatnonzero(count[index.reshape(-1)] == 1)
     if not len(outline):
-        raise ValueError("the UV map has no outline, so it covers no area; give the body a UV map with open charts")
+        raise ValueError("the UV map has no boundary edges: give the body a UV map with open charts")
     owner, first, second = owner[outline], first[outline], second[outline]
     start, along = corner_uv[owner, first], corner_uv[owner, second] - corner_uv[owner, first]
     length_squared = np.maximum((along**2).sum(-1), 1e-30)

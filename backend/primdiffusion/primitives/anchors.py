@@ -1,7 +1,7 @@
-"""Anchors: the 32 x 32 grid of the UV square on a body's surface, and the frames it has on a posed one.
+"""Anchors: the points of the 32 x 32 UV grid on the body surface, and their frames on a posed body.
 
 Paper sec. 3.1: primitive k is attached to the surface point under UV grid point k; its frame follows the surface's
-tangent plane there. An anchor states both as sums over vertices of the mesh, so `attach` is one gather for any pose.
+tangent plane there. An anchor expresses both as weighted sums of mesh vertices, so `attach` is one gather for any pose.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ JOINT_REGION = (
 )  # fmt: skip
 """Region of each of SMPL's 24 joints, in their order."""
 SPACING_TO_HALF_EXTENT = 1.0
-"""In-plane half extent as a share of the distance to the next cell; 0.5 would tile. The marcher's window fades the
-outer fifth of a box, and boxes fan out where cloth hangs off the skin: of the surface of eight dressed people 94 %
-lies in the unfaded part of some box at 0.75, 97 % at 0.9, 97.6 % at 1.0 with coarser voxels."""
+"""In-plane half extent relative to the distance to the next cell; 0.5 would tile. Boxes overlap because the marcher's
+window fades the outer fifth of a box, and neighbouring boxes diverge where cloth hangs off the skin: of the surface of
+eight dressed humans 94 % lies in the unfaded part of some box at 0.75, 97 % at 0.9, 97.6 % at 1.0 (coarser voxels)."""
 SMALLEST_IN_PLANE = 0.008
-"""Metres; voxels finer than 2 mm are finer than any picture needs."""
+"""Metres; gives voxels of about 2 mm, finer than any rendering needs."""
 LARGEST_IN_PLANE = {"torso": 0.050, "head": 0.050, "arm": 0.050, "hand": 0.035, "leg": 0.050, "foot": 0.050}
-"""Metres, by region. The cells at the thumb span the gap to the fingers and would fill it with one coarse box."""
+"""Metres, by region. Cells at the thumb span the gap to the fingers, which one coarse box would fill."""
 NORMAL_HALF_EXTENT = {"torso": 0.055, "head": 0.055, "arm": 0.045, "hand": 0.025, "leg": 0.060, "foot": 0.040}
-"""Metres along the normal, by region. Jackets, skirts and hair stand 4-6 cm off the skin; a surface outside every box
-is a hole. Sleeves and shoes stand off less, and a hand's eight voxels must resolve fingers 2 cm thick."""
+"""Metres along the normal, by region. Jackets, skirts and hair are 4-6 cm away from the skin; surface outside all boxes
+is missing from the result. Sleeves and shoes are closer, and a hand's eight voxels must resolve fingers 2 cm thick."""
 RELEASED_NEIGHBOURS = 23
 RELEASED_DISTANCE_LIMITS = (0.005, 0.050)
 """Metres; SPEC 2."""
@@ -60,18 +60,18 @@ RELEASED_DISTANCE_LIMITS = (0.005, 0.050)
 
 @dataclasses.dataclass(frozen=True)
 class Anchors(TensorRecord):
-    """Where the primitives sit on a mesh, whatever its pose (paper sec. 3.1)."""
+    """Where the primitives are attached to a mesh, independent of pose (paper sec. 3.1)."""
 
     face: Int[Tensor, "k"]
     barycentric: Float[Tensor, "k 3"]
     rest_half_extent: Float[Tensor, "k 3"]
-    """Metres along T, B, N, before a person's delta_scale."""
+    """Metres along T, B, N, before multiplication by delta_scale."""
     stencil_vertex: Int[Tensor, "k m"]
-    """Vertices that span a cell's tangent plane, padded with weight 0."""
+    """Vertices that determine a cell's tangent plane, padded with weight 0."""
     stencil_du: Float[Tensor, "k m"]
     """dP/du = sum over m of stencil_du[k, m] * vertices[stencil_vertex[k, m]], metres per cell of the grid."""
     stencil_dv: Float[Tensor, "k m"]
-    """Likewise dP/dv; its sign lets du x dv point out of the body."""
+    """As `stencil_du`, for dP/dv; signed so that du x dv points out of the body."""
     chart: Int[Tensor, "k"]
     """Index into CHARTS."""
 
@@ -79,10 +79,10 @@ class Anchors(TensorRecord):
 def attach(anchors: Anchors, vertices: Float[Tensor, "*b v 3"], faces: Int[Tensor, "f 3"]) -> Frames:
     """Frames on a posed mesh: T = normalize(dP/du), N = normalize(dP/du x dP/dv), B = N x T (SPEC 1.8, 2).
 
-    `faces` are the body's own. Differentiable in `vertices`. Raises ValueError if these hold NaN or infinite values.
+    `faces` are those of the body. Differentiable in `vertices`. Raises ValueError if vertices are NaN or infinite.
     """
     if not torch.isfinite(vertices).all():
-        raise ValueError("the posed vertices hold NaN or infinite values; check the pose and the betas they come from")
+        raise ValueError("the posed vertices hold NaN or infinite values: check the pose and the betas")
     du, dv = tangent_plane(anchors, vertices)
     tangent = torch.nn.functional.normalize(du, dim=-1)
     normal = torch.nn.functional.normalize(torch.linalg.cross(tangent, dv), dim=-1)
@@ -103,7 +103,7 @@ def tangent_plane(
 
 
 def anchor_skin_weights(anchors: Anchors, body: BodyModel) -> Float[Tensor, "k j"]:
-    """The body's skinning weights at the anchors, by their barycentric coordinates; rows add up to 1."""
+    """Skinning weights interpolated at the anchors; rows sum to 1."""
     return surface_points(body.skin_weights, body.faces, anchors.face, anchors.barycentric)
 
 
@@ -112,7 +112,7 @@ def default_anchors() -> Anchors:
     """The anchors of the default body, from the layout in body/data/layout.npz (made by scripts/bake_layout)."""
     layout = _layout()
     body = default_body()
-    # In float64: a tangent plane's weights must cancel to the last bit, or frames would depend on where a body stands.
+    # float64, because the weights of a tangent plane must cancel: otherwise frames would depend on the body's position.
     return footprint_anchors(
         body.template.double(),
         body.faces,
@@ -125,7 +125,7 @@ def default_anchors() -> Anchors:
 
 @functools.lru_cache(maxsize=1)
 def default_texels() -> tuple[Int[Tensor, "h w"], Float[Tensor, "h w 3"]]:
-    """The surface point of the default body under every texel of its layout, 8 x 8 for each primitive: face, place."""
+    """Face and barycentric coordinates of every texel of the default body's layout, 8 x 8 texels per primitive."""
     face, barycentric = _texels_of(_layout())
     return face, barycentric.float()
 
@@ -149,10 +149,10 @@ def footprint_anchors(
     texel_face: Int[Tensor, "h w"],
     texel_barycentric: Float[Tensor, "h w 3"],
 ) -> Anchors:
-    """Anchors whose tangent planes are those of the whole cell rather than of the one face under its centre.
+    """Anchors whose tangent planes are averaged over the cell instead of taken from the face under its centre.
 
-    dP/du of a cell is the mean of its last column of texels less that of its first, scaled to the cell's whole width;
-    dP/dv likewise along rows. One face of a 4 cm cell may be a nostril; the mean is what a box should lie along.
+    dP/du of a cell is the mean of its last column of texels minus the mean of its first, scaled to the cell's width;
+    dP/dv likewise along rows. A single face of a 4 cm cell may be part of a nostril, so its plane is unreliable.
     """
     side = texel_face.shape[0] // GRID
 
@@ -181,7 +181,7 @@ def footprint_anchors(
 def _merge(
     vertex: Int[Tensor, "k n"], du: Float[Tensor, "k n"], dv: Float[Tensor, "k n"]
 ) -> tuple[Int[Tensor, "k m"], Float[Tensor, "k m"], Float[Tensor, "k m"]]:
-    """The same sums with each vertex once; rows padded with weight 0 to the longest."""
+    """Merge duplicate vertices in each row; pad rows with weight 0 to equal length."""
     rows = []
     for k in range(len(vertex)):
         used = (du[k] != 0) | (dv[k] != 0)
@@ -198,7 +198,7 @@ def _merge(
 
 
 def paper_half_extent(anchors: Anchors, template: Float[Tensor, "v 3"]) -> Float[Tensor, "k 3"]:
-    """Per-axis sizes: in-plane from the UV gradient (paper sec. 3.1), along the normal by region; metres."""
+    """Half extents per axis, metres: in-plane from the UV gradient (paper sec. 3.1), along the normal by region."""
     along_t, along_b = (SPACING_TO_HALF_EXTENT * edge.norm(dim=-1) for edge in tangent_plane(anchors, template))
     limits = [(LARGEST_IN_PLANE[region], NORMAL_HALF_EXTENT[region]) for region in (c.split("_")[-1] for c in CHARTS)]
     largest, depth = template.new_tensor(limits)[anchors.chart].unbind(-1)
@@ -207,8 +207,8 @@ def paper_half_extent(anchors: Anchors, template: Float[Tensor, "v 3"]) -> Float
 
 
 def released_half_extent(position: Float[Tensor, "k 3"]) -> Float[Tensor, "k 3"]:
-    """Isotropic sizes of the released code: 2/3 of the mean distance to the 23 nearest others, clipped to 5-50 mm."""
-    # The faster mode of cdist goes through squares and puts coincident points a millimetre apart.
+    """Isotropic half extents of the released code: 2/3 of the mean distance to the 23 nearest, clipped to 5-50 mm."""
+    # The faster mode of cdist uses matrix products, whose rounding puts coincident points a millimetre apart.
     every = torch.cdist(position, position, compute_mode="donot_use_mm_for_euclid_dist")
     distance = every.sort(-1).values[:, 1 : RELEASED_NEIGHBOURS + 1].mean(-1)
     return (distance.clamp(*RELEASED_DISTANCE_LIMITS) * (2 / 3))[:, None].expand(-1, 3).contiguous()
@@ -217,19 +217,19 @@ def released_half_extent(position: Float[Tensor, "k 3"]) -> Float[Tensor, "k 3"]
 def build_anchors(body: BodyModel, rule: Literal["paper", "released"] = "paper") -> Anchors:
     """Anchors for any body with UV coordinates; grid points are texels 4, 12, 20, ... of a 256 x 256 raster (SPEC 2).
 
-    "paper": a grid point outside every chart takes the closest chart point, sizes follow the UV gradient per axis.
-    "released": such points all take the body's last face (SPEC 1.2) and sizes are isotropic; released checkpoints
-    need that. Tangent planes are those of the face under the grid point.
+    "paper": a grid point outside every chart maps to the closest chart point; sizes follow the UV gradient per axis.
+    "released": such points all map to the body's last face (SPEC 1.2), and sizes are isotropic; required by released
+    checkpoints. Tangent planes are those of the face under the grid point.
 
     Raises:
-        ValueError: the body has no UV map, its template is not finite, or there is no such rule.
+        ValueError: the body has no UV map, its template is not finite, or the rule is unknown.
     """
     if rule not in ("paper", "released"):
-        raise ValueError(f"there is no anchor rule {rule!r}; choose 'paper' or 'released'")
+        raise ValueError(f"unknown anchor rule {rule!r}: choose 'paper' or 'released'")
     if body.uv.numel() == 0:
-        raise ValueError("the body has no UV coordinates; load it with a UV map (vt and ft arrays, or an OBJ file)")
+        raise ValueError("the body has no UV coordinates: load it with a UV map (vt and ft arrays, or an OBJ file)")
     if not torch.isfinite(body.template).all():
-        raise ValueError("the body's template holds NaN or infinite values; load the body file again")
+        raise ValueError("the body's template holds NaN or infinite values: load the body file again")
     corner_uv = body.uv[body.uv_faces].double().cpu().numpy()
     raster = rasterise_uv(corner_uv, GRID * S, GRID * S).every(S, S // 2)
     face, barycentric = raster.face.reshape(K).copy(), raster.barycentric.reshape(K, 3).copy()
@@ -245,7 +245,7 @@ def build_anchors(body: BodyModel, rule: Literal["paper", "released"] = "paper")
 
 
 def _face_anchors(body: BodyModel, face: Tensor, barycentric: Tensor, rule: str) -> Anchors:
-    """Anchors with the tangent planes of single faces."""
+    """Anchors with the tangent planes of the faces under the grid points."""
     device, dtype = body.template.device, body.template.dtype
     face, barycentric = face.to(device), barycentric.to(device, dtype)
     du, dv = uv_gradient(body.uv.double(), body.uv_faces)
@@ -266,7 +266,7 @@ def _face_anchors(body: BodyModel, face: Tensor, barycentric: Tensor, rule: str)
 
 
 def region_charts(body: BodyModel) -> Int[Tensor, "v"]:
-    """The region of each vertex as an index into CHARTS, from the joint that moves it most."""
+    """The region of each vertex, as an index into CHARTS, from the joint with the largest skinning weight."""
     return torch.tensor([CHARTS.index(region) for region in JOINT_REGION], device=body.template.device)[
         body.skin_weights.argmax(-1)
     ]

@@ -1,6 +1,6 @@
-"""What a person's primitives stand on where it is not the default body: a body of the user's own files.
+"""A body loaded from the user's own files and the anchors on it, used in place of the default body.
 
-Such bodies may be licensed to the user alone, so files that need one hold paths and fingerprints, never its data.
+The license of such a body may not allow redistribution, so our files store its path and hash, never its data.
 """
 
 from __future__ import annotations
@@ -23,48 +23,48 @@ from primdiffusion.primitives.primitives import K
 
 
 class BodySetupError(ValueError):
-    """A body that a file needs is not there, or not the same; the message names it and says what to do."""
+    """A required body file is missing or has changed."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FileFingerprint:
-    """A file of the user's by place and content."""
+    """Path and content hash of a user's file."""
 
     path: str
     sha256: str
 
     @classmethod
     def of(cls, path: Path) -> FileFingerprint:
-        """Of a file as it is now. Raises OSError."""
+        """Hash the file. Raises OSError."""
         with open(path, "rb") as file:
             return cls(str(path.resolve()), hashlib.file_digest(file, "sha256").hexdigest())
 
 
 @dataclasses.dataclass(frozen=True)
 class BodyFiles:
-    """Which files of the user's a body and its anchors are made from, by the released rule (SPEC 1.2)."""
+    """The user's files from which a body and its anchors (rule "released", SPEC 1.2) are loaded."""
 
     smpl: FileFingerprint
     uv: tuple[FileFingerprint, ...]
     """One .obj or .npz, or the pair vt.npy and ft.npy."""
 
     def to_json(self) -> str:
-        """For the metadata of a file."""
+        """Serialise to JSON for file metadata."""
         return json.dumps(dataclasses.asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> BodyFiles:
-        """The inverse; ValueError for anything else."""
+        """Parse the result of `to_json`; ValueError if malformed."""
         try:
             tree = json.loads(text)
             return cls(FileFingerprint(**tree["smpl"]), tuple(FileFingerprint(**file) for file in tree["uv"]))
         except (KeyError, TypeError) as error:
-            raise ValueError(f"it does not say which body it needs ({type(error).__name__}: {error})") from error
+            raise ValueError(f"malformed body metadata ({type(error).__name__}: {error})") from error
 
 
 @dataclasses.dataclass(frozen=True)
 class BodySetup(TensorRecord):
-    """A body and the anchors on it, which go together."""
+    """A body and its anchors."""
 
     body: BodyModel
     anchors: Anchors
@@ -72,9 +72,9 @@ class BodySetup(TensorRecord):
 
 
 def body_setup_from_files(smpl: Path, uv: tuple[Path, ...]) -> BodySetup:
-    """The stand that files make, fingerprinted; rest extents are those of the template in the T pose.
+    """Load a body and build its anchors; rest extents are those of the template in the T pose.
 
-    Raises what `load_body` does, and OSError.
+    Raises OSError and the errors of `load_body`.
     """
     files = BodyFiles(FileFingerprint.of(smpl), tuple(map(FileFingerprint.of, uv)))
     body = load_body(smpl, uv=uv[0] if len(uv) == 1 else (uv[0], uv[1]))
@@ -82,23 +82,23 @@ def body_setup_from_files(smpl: Path, uv: tuple[Path, ...]) -> BodySetup:
 
 
 def find_body_setup(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], beside: Iterable[Path]) -> BodySetup:
-    """The stand that another file needs, with the rest extents that this file holds.
+    """Load the body that a checkpoint or human refers to, with the rest extents stored there.
 
-    Each file is looked for where it was, then by its name in the folders `beside`; only its content counts.
-    Raises BodySetupError where one is nowhere, or has another content; BodyFileError.
+    Each file is searched at its recorded path, then by name in the folders `beside`; the content hash must match.
+    Raises BodySetupError if a file is missing or has changed, and BodyFileError.
     """
     folders = tuple(beside)
     smpl, *uv = (_found(file, folders) for file in (files.smpl, *files.uv))
     body_setup = _loaded(smpl, tuple(uv))
     if tuple(rest_half_extent.shape) != (K, 3) or not bool((rest_half_extent > 0).all()):
-        raise BodySetupError(f"the rest extents are no {K} x 3 positive numbers: import or generate it again")
+        raise BodySetupError(f"the stored rest extents are not {K} x 3 positive: import or generate the file again")
     return dataclasses.replace(
         body_setup, anchors=dataclasses.replace(body_setup.anchors, rest_half_extent=rest_half_extent), files=files
     )
 
 
 def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> _Stamp:
-    name = PureWindowsPath(file.path).name  # of paths of any system
+    name = PureWindowsPath(file.path).name  # also parses POSIX paths
     paths = [Path(file.path), *(folder / name for folder in folders)]
     there = [path for path in paths if path.is_file()]
     for path in there:
@@ -107,18 +107,18 @@ def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> _Stamp:
             return stamp
     if there:
         raise BodySetupError(
-            f"{there[0]} is not the body file it was (sha256 {file.sha256[:12]}...): put the same file back, or import "
-            "the checkpoint again with this one"
+            f"the body file {there[0]} has changed (expected sha256 {file.sha256[:12]}...): restore it, or import the "
+            "checkpoint again with this file"
         )
     raise BodySetupError(
-        f"the body file {file.path} is not there any more: put it back, or a copy (sha256 {file.sha256[:12]}...) "
-        "beside the file that needs it"
+        f"the body file {file.path} is missing (sha256 {file.sha256[:12]}...): restore it, or put a copy beside the "
+        "file that refers to it"
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class _Stamp:
-    """A file as it was when looked at: what changes it changes this."""
+    """Cache key of a file; changes when the file changes."""
 
     path: Path
     nanoseconds: int

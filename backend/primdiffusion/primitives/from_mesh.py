@@ -1,4 +1,4 @@
-"""From a textured mesh to the payload of primitives, without a network: what people to learn from are made of."""
+"""Convert a textured mesh to the payload of primitives without a network; produces the training samples."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ from primdiffusion.raster.mip import pyramid
 from primdiffusion.raster.triangle_soup import TriangleSoup, flatten
 
 FULL_DENSITY = 200.0
-"""Opacity per metre of solid matter; one over this is the depth at which solid matter hides what is behind it."""
+"""Density of solid matter, 1/m; its inverse is the attenuation length."""
 RAMP = 0.020
-"""Depth below the surface at which density is full, metres. A ramp centred on the surface would fatten silhouettes."""
+"""Depth below the surface at which density is full, metres. A ramp centred on the surface would enlarge silhouettes."""
 INSET = 0.2
-"""Depth at which the ramp starts, in voxel spacings across the surface: between an outer voxel and an inner one density
-is interpolated, and without this the figure grows by about 3 mm."""
+"""Depth at which the ramp starts, in voxel spacings across the surface: without it, interpolation between outer and
+inner voxels would enlarge the figure by about 3 mm."""
 REACH = 0.030
-"""Voxels farther than this from the surface have no colour of their own, metres."""
+"""Voxels farther than this from the surface (metres) take the mean colour of their primitive."""
 STRETCH = 0.3
-"""What way along a primitive's normal counts for the choice of a voxel's colour. In plain distance the points that lie
-deepest win below the surface: the corners of an eye, not its iris."""
+"""Weight of the distance along the primitive's normal when choosing the surface point that colours a voxel. With plain
+distance, voxels below the surface take the deepest points: the corners of an eye instead of the iris."""
 MIP_LEVELS = 6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SurfaceField:
-    """What of a mesh each voxel shows: everything but the colours, so recoloured meshes share it."""
+    """Density and texture lookup of each voxel: a payload without its colours, shared by recoloured meshes."""
 
     density: Float32[np.ndarray, "k s s s"]
     """1/m."""
     part: Int32[np.ndarray, "k s s s"]
-    """Part that the nearest surface point belongs to, -1 out of reach."""
+    """Part of the nearest surface point; -1 beyond REACH."""
     uv: Float32[np.ndarray, "k s s s 2"]
     """Texture coordinates of that point, v up."""
     footprint: Float32[np.ndarray, "k s s s"]
-    """Side of a voxel in texture coordinates there (1 = the whole texture)."""
+    """Voxel size in texture coordinates at that point (1 = the whole texture)."""
     own: Float32[np.ndarray, "k s s s"]
-    """Share of the voxel's own colour, the rest is the mean of its primitive; 1 at the surface, 0 out of reach."""
+    """Blend weight of the voxel's own colour against the mean of its primitive; 1 at the surface, 0 beyond REACH."""
 
 
 def from_mesh(mesh: TexturedMesh, frames: Frames) -> Payload:
-    """The payload that makes primitives in `frames` look like `mesh`; `surface_field`, then `colour`.
+    """The payload with which primitives in `frames` look like `mesh`: `surface_field`, then `colour`.
 
     Raises:
         UnusableMesh, ValueError: as `surface_field`.
@@ -57,9 +57,9 @@ def from_mesh(mesh: TexturedMesh, frames: Frames) -> Payload:
 def surface_field(mesh: TexturedMesh, frames: Frames) -> SurfaceField:
     """Density and nearest visible surface point for every voxel of `frames` (unbatched, in the pose of `mesh`).
 
-    The mesh is drawn from all sides but below. A voxel that some view sees past is outside; the others are solid, with
-    a density that rises from 0 at the surface to FULL_DENSITY at a depth of RAMP. Open sheets such as hair and skirts
-    need no inside of their own.
+    The mesh is rasterised from all sides except below. A voxel in front of the visible surface of any view is empty;
+    the others are solid (space carving), with a density that rises from 0 at the surface to FULL_DENSITY at a depth of
+    RAMP. Meshes need not be closed: hair and skirts may be single sheets.
 
     Raises:
         UnusableMesh: the mesh is empty or not finite.
@@ -90,7 +90,7 @@ def surface_field(mesh: TexturedMesh, frames: Frames) -> SurfaceField:
 
 
 def colour(field: SurfaceField, mesh: TexturedMesh) -> Payload:
-    """The payload of `field` with the colours of `mesh`, which differs from the field's mesh only in its textures.
+    """The payload of `field` with the colours of `mesh`, which may differ from the field's mesh only in its textures.
 
     A voxel takes the mean of the texture over its footprint.
     """
@@ -110,7 +110,7 @@ def colour(field: SurfaceField, mesh: TexturedMesh) -> Payload:
 
 
 def voxel_centres(frames: Frames) -> Float32[np.ndarray, "k s s s 3"]:
-    """World positions of the voxels in the order D, H, W, metres.
+    """World positions of the voxel centres in the order D, H, W, metres.
 
     Raises:
         ValueError: the frames are batched or not finite.
@@ -121,7 +121,7 @@ def voxel_centres(frames: Frames) -> Float32[np.ndarray, "k s s s 3"]:
     if position.ndim != 2:
         raise ValueError(f"frames.position has shape {position.shape}; give the frames of one body, [k, 3].")
     if not all(np.isfinite(field).all() for field in (position, rotation, half_extent)):
-        raise ValueError("The frames hold NaN or infinite values; check the body they were attached to.")
+        raise ValueError("The frames hold NaN or infinite values: check the body they are attached to.")
     local = np.linspace(-1, 1, S)
     t, b, n = (rotation[:, None, :, axis] * (half_extent[:, axis, None] * local)[:, :, None] for axis in range(3))
     centres = position[:, None, None, None] + n[:, :, None, None] + b[:, None, :, None] + t[:, None, None, :]
@@ -131,7 +131,7 @@ def voxel_centres(frames: Frames) -> Float32[np.ndarray, "k s s s 3"]:
 def _spacing(
     frames: Frames, normal: Float32[np.ndarray, "k n 3"]
 ) -> tuple[Float32[np.ndarray, "kn"], Float32[np.ndarray, "kn"]]:
-    """Distance between voxels along each of the normals of each primitive, and (geometric mean) across it, metres."""
+    """Voxel spacing along each normal of each primitive, and across it (geometric mean), metres."""
     pitch = frames.half_extent.detach().cpu().numpy()[:, None] * np.float32(2 / (S - 1))
     local = normal @ frames.rotation.detach().cpu().numpy().astype(np.float32)
     along = np.linalg.norm(local * pitch, axis=-1)
@@ -142,7 +142,7 @@ def _spacing(
 def _texture_coordinates(
     soup: TriangleSoup, face: np.ndarray, barycentric: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Texture coordinates of surface points, and texture coordinates per metre there."""
+    """Texture coordinates of surface points, and their scale in texture coordinates per metre."""
     uv = np.einsum("ni,nij->nj", barycentric, soup.corner_uv[face])
     corners = soup.vertices[soup.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -154,7 +154,7 @@ def _texture_coordinates(
 def _sample(
     texture: np.ndarray, uv: Float32[np.ndarray, "n 2"], footprint: Float32[np.ndarray, "n"]
 ) -> Float32[np.ndarray, "n 3"]:
-    """Linear colour, from the halving of the texture whose texels are nearest in size to the footprint."""
+    """Linear colour from the mip level whose texel size is closest to the footprint."""
     levels = pyramid(texture, MIP_LEVELS)
     texels = footprint * np.sqrt(texture.shape[0] * texture.shape[1])
     level = np.clip(np.rint(np.log2(np.maximum(texels, 1e-6))), 0, len(levels) - 1).astype(np.int64)

@@ -1,6 +1,6 @@
-"""The slab: a person's payload as the 56-channel picture that is diffused (SPEC 3; paper sec. 3.3).
+"""The slab: a payload as the 56-channel image that is diffused (SPEC 3; paper sec. 3.3).
 
-The only place that knows 255, 20 and 0.182.
+The constants 255, 20 and 0.182 appear nowhere else.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from primdiffusion.primitives.primitives import GRID, Payload, S
 CHANNELS_PER_LAYER = 7
 """Per voxel: encoded RGB, density, delta scale along T, B, N."""
 RELEASED_FULL_DENSITY = 25.5
-"""1/m that the value 255 stands for in the authors' checkpoints."""
+"""Density (1/m) encoded as 255 in the authors' checkpoints."""
 DELTA_SCALE_UNIT = 255 / 20
 NETWORK_SCALE = 0.182
 
 
 def pack(payload: Payload, full_density: float) -> Float[Tensor, "*b 56 256 256"]:
-    """The payload of a person as a network input, x = (v / 255 * 2 - 1) * 0.182 with v in 0 ... 255 (SPEC 3).
+    """Encode a payload as network input, x = (v / 255 * 2 - 1) * 0.182 with v in 0 ... 255 (SPEC 3).
 
-    Channel = d*7 + c, row = ny*8 + h, column = nx*8 + w for the voxel (d, h, w) of primitive ny*32 + nx; c counts
+    Channel = d*7 + c, row = ny*8 + h, column = nx*8 + w for the voxel (d, h, w) of primitive ny*32 + nx; c runs over
     sRGB-encoded red, green, blue, density and the three delta scales, which are repeated over the voxels.
-    `full_density` (1/m) is the density stored as 255. Nothing is clamped, so `unpack` gives the payload back exactly.
-    Raises ValueError where the payload's shapes disagree or a value is not finite, or `full_density` is not positive.
+    `full_density` (1/m) is the density encoded as 255. Values are not clamped, so `unpack` is the exact inverse.
+    Raises ValueError if the payload is invalid or `full_density` is not positive.
     """
     _check_full_density(full_density)
     payload.validate()
@@ -41,17 +41,17 @@ def pack(payload: Payload, full_density: float) -> Float[Tensor, "*b 56 256 256"
 
 
 def unpack(slab: Float[Tensor, "*b 56 256 256"], full_density: float) -> Payload:
-    """The payload in a slab: the inverse of `pack` (SPEC 3).
+    """Decode a slab: the inverse of `pack` (SPEC 3).
 
-    Sampled slabs leave the range of real people, so colours are clamped to 0 ... 1, densities and delta scales from
-    below to 0. The delta scale is the mean over its 8^3 copies. Raises ValueError where the slab's shape is not
+    Sampled slabs may leave the valid range, so colours are clamped to 0 ... 1, and densities and delta scales to
+    non-negative values. The delta scale is the mean over its 8^3 copies. Raises ValueError if the slab's shape is not
     [*b, 56, 256, 256] or `full_density` (1/m) is not positive.
     """
     _check_full_density(full_density)
     expected = (S * CHANNELS_PER_LAYER, GRID * S, GRID * S)
     if tuple(slab.shape[-3:]) != expected:
         raise ValueError(
-            f"the slab has shape {tuple(slab.shape)}; it must end in {expected}: give the network's output whole"
+            f"the slab has shape {tuple(slab.shape)}; it must end in {expected}: pass the network's complete output"
         )
     value = (slab / NETWORK_SCALE + 1) / 2 * 255
     value = value.unflatten(-1, (GRID, S)).unflatten(-3, (GRID, S)).unflatten(-5, (S, CHANNELS_PER_LAYER))

@@ -1,4 +1,4 @@
-"""The visible surface of a mesh as points, found by drawing it from several sides, and the nearest one to any place."""
+"""Sample the visible surface of a mesh by rasterising it from several sides, and find nearest surface points."""
 
 from __future__ import annotations
 
@@ -25,35 +25,35 @@ DIRECTIONS = (
     (0.0, -1.0, -1.0),
     (0.0, -1.0, 1.0),
 )
-"""Where the parallel rays of the views go. None looks up: from below, the space between jacket and trousers would count
-as outside, and hems would become holes."""
+"""View directions. None looks up: from below, the space between jacket and trousers would be carved away, and hems
+would become holes."""
 
 PIXEL = 0.003
-"""Side of a pixel of these views, metres."""
+"""Pixel size of these views, metres."""
 
 FACING = 0.5
-"""Cosine of the largest angle at which a view can tell whether a point is covered."""
+"""Cosine of the largest angle to the normal at which a view decides whether a point is covered."""
 COVER = (0.005, 0.030)
-"""A surface this far above a point (metres) covers it: farther than the views' depth is uncertain, nearer than the next
-limb."""
+"""A surface whose distance above a point is in this range (metres) covers it: more than the depth uncertainty of the
+views, less than the distance to the next limb."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points of the outer surface that at least one view sees, about one for each pixel of area."""
+    """Points of the outer surface visible in at least one view, about one per pixel area."""
 
     position: Float32[np.ndarray, "n 3"]
     """Metres."""
     normal: Float32[np.ndarray, "n 3"]
-    """Unit, towards the viewer."""
+    """Unit length, towards the viewer."""
     face: Int32[np.ndarray, "n"]
     """Face of the soup."""
     barycentric: Float32[np.ndarray, "n 3"]
-    """Where on the face."""
+    """Barycentric coordinates on the face."""
 
 
 def look_around(soup: TriangleSoup) -> tuple[list[OrthographicView], list[Fragments]]:
-    """The mesh drawn along all DIRECTIONS."""
+    """Rasterise the mesh along all DIRECTIONS."""
     used = soup.vertices[np.unique(soup.faces)]
     bounds = np.stack([used.min(0), used.max(0)])
     views = [view_along(direction, bounds, PIXEL) for direction in DIRECTIONS]
@@ -61,7 +61,7 @@ def look_around(soup: TriangleSoup) -> tuple[list[OrthographicView], list[Fragme
 
 
 def visible_points(soup: TriangleSoup, views: list[OrthographicView], drawn: list[Fragments]) -> SurfacePoints:
-    """What the views see, thinned to one point a cube of PIXEL; the one that most faces its viewer stays."""
+    """Visible points, thinned to one per cube of side PIXEL: the one that faces its view most directly."""
     corners = soup.vertices[soup.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
@@ -95,9 +95,9 @@ def _covered(
     views: list[OrthographicView],
     drawn: list[Fragments],
 ) -> Bool[np.ndarray, "n"]:
-    """Which points lie closely under another surface, as the view that looks straightest at them shows.
+    """Mark points that lie closely under another surface, by the view that faces them most directly.
 
-    A view down a collar sees skin under cloth; its colour must not spread into the cloth.
+    A view down a collar sees skin under cloth, whose colour must not bleed into the cloth.
     """
     facing = -(normal @ np.stack([view.direction for view in views]).T)
     best = facing.argmax(1)
@@ -113,14 +113,14 @@ def _covered(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Nearest:
-    """For each query the point nearest to it, in two senses; -1 where no point is within reach."""
+    """Nearest points of each query in two metrics; -1 if no point is within reach."""
 
     index: Int32[np.ndarray, "q"]
     """The nearest point."""
     distance: Float32[np.ndarray, "q"]
-    """To that point, metres; inf where there is none."""
+    """Distance to that point, metres; inf if there is none."""
     along: Int32[np.ndarray, "q"]
-    """The nearest where way along the query's axis counts less; among the same points."""
+    """Nearest point in the metric that weighs distance along the query's axis less."""
 
 
 def nearest(
@@ -130,9 +130,9 @@ def nearest(
     stretch: float,
     reach: float,
 ) -> Nearest:
-    """The nearest points within `reach` metres; way along a query's unit axis counts `stretch` (0 ... 1) for `along`.
+    """Nearest points within `reach` metres; `along` scales distance along a query's unit axis by `stretch` (0 ... 1).
 
-    Points are sorted into cubes of side `reach`, so a query looks at 27 of them.
+    Points are hashed into cubes of side `reach`, so a query searches 27 of them.
     """
     low = points.min(0)
     shape = np.floor((points.max(0) - low) / reach).astype(np.int64) + 1
@@ -187,7 +187,7 @@ def _nearest(points, order, start, shape, low, reach, queries, axes, gain, found
 def carve(
     queries: Float32[np.ndarray, "q 3"], views: list[OrthographicView], drawn: list[Fragments]
 ) -> Float32[np.ndarray, "q"]:
-    """Over all views the least depth of a query behind what the view sees, metres; negative: some view sees past it."""
+    """The least depth of each query behind the surface that a view sees, metres; negative if any view sees past it."""
     behind = np.full(len(queries), np.inf, np.float32)
     for view, fragments in zip(views, drawn, strict=True):
         _carve(queries, view.world_to_view.astype(np.float32), np.float32(view.pixel_size), fragments.depth, behind)
