@@ -29,7 +29,7 @@ def test_unknown_and_missing_settings_are_refused_by_name():
         ({"attention": "some"}, "attention is 'some'"),
         ({"grid": ()}, "0 levels: give 1 to 6"),
         ({"grid": (8,) * 7}, "7 levels"),
-        ({"attention_width": 6, "attention_heads": 4}, "6 is no multiple"),
+        ({"attention_width": 6, "attention_heads": 4}, "attention_width 6"),
         ({"scale_outputs": 2}, "3 numbers"),
     ],
 )

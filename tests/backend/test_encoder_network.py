@@ -363,16 +363,16 @@ def test_each_output_channel_of_a_convolution_has_one_gain(resize, shape):
 
 def test_what_another_kind_of_encoder_looks_up_is_refused():
     texels = dataclasses.replace(TINY, appearance="texels")
-    with pytest.raises(ValueError, match="as for voxels: look it up with this encoder's configuration"):
+    with pytest.raises(ValueError, match="as for voxels"):
         Encoder(TINY)(seen_from(texels), poses())
     with pytest.raises(ValueError, match="as for texels"):
         Encoder(texels)(seen_from(TINY), poses())
-    with pytest.raises(ValueError, match="stack people"):
+    with pytest.raises(ValueError, match="stack subjects"):
         Encoder(TINY)(seen_from(TINY).map(lambda tensor: tensor[0]), poses())
     with pytest.raises(ValueError, match=r"256, 256\]"):
         Encoder(TINY)(seen_from(TINY).map(lambda tensor: tensor[..., ::2, :]), poses())
 
 
 def test_poses_must_be_as_many_as_people():
-    with pytest.raises(ValueError, match=r"2 people were looked up, .* give \[2, 24, 3\]"):
+    with pytest.raises(ValueError, match=r"2 subjects, .* give \[2, 24, 3\]"):
         Encoder(TINY)(seen_from(TINY, 2), poses(1))

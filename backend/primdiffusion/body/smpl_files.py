@@ -1,7 +1,7 @@
-"""Reading body models in SMPL's file format: users' own SMPL files, or any body in the same layout.
+"""Load body models in SMPL's file format: the user's own SMPL files, or any body in the same layout.
 
-SMPL itself is licensed by its authors and never part of this package. Its files hold no texture coordinates, and
-primitives are laid out in texture space, so these come from a second file or from an automatic unwrap.
+SMPL is licensed by its authors and never part of this package. Its files hold no texture coordinates, which the layout
+of primitives needs, so these come from a second file or from an automatic unwrap.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from primdiffusion.body.model import BodyModel, J
 from primdiffusion.body.smpl_pickle import BodyFileError, as_array, read_pickle
 
 SHAPE_COMPONENTS = 10
-"""Of SMPL's up to 300 shape components this many are kept unless more are asked for."""
+"""Shape components loaded by default, of the up to 300 in SMPL files."""
 POSE_FEATURES = (J - 1) * 9
 _ROOT_MARKS = (-1, 2**32 - 1, 2**64 - 1)
-"""How files write "no parent": -1 or what it becomes in an unsigned integer."""
+"""Encodings of "no parent": -1, or -1 converted to an unsigned integer."""
 
 Path = str | os.PathLike[str]
 
@@ -29,19 +29,19 @@ Path = str | os.PathLike[str]
 def load_body(
     path: Path, uv: Path | tuple[Path, Path] | None = None, shape_components: int = SHAPE_COMPONENTS
 ) -> BodyModel:
-    """A body (float32) from an SMPL .pkl or .npz.
+    """Load a body (float32) from an SMPL .pkl or .npz.
 
     Args:
-        path: the model. Pickles are read by `smpl_pickle` and cannot run code.
-        uv: texture coordinates: an .obj with the body's vertex numbers, an .npz that holds vt [T, 2] and ft [F, 3], or
-            the pair (vt.npy, ft.npy). Without it, "vt" and "ft" of the model file are used, and without those an
-            automatic unwrap (seconds; many small islands).
-        shape_components: how many leading shape components to keep, at most; files hold 10 to 300.
+        path: the body model. Pickles are read by `smpl_pickle` and cannot run code.
+        uv: texture coordinates: an .obj with the body's vertex indices, an .npz with vt [T, 2] and ft [F, 3], or
+            the pair (vt.npy, ft.npy). Defaults to "vt" and "ft" of the model file or, if absent, an automatic
+            unwrap (takes seconds; many small islands).
+        shape_components: maximum number of leading shape components to load; files hold 10 to 300.
 
     Raises:
-        FileNotFoundError: a file is not there.
-        BodyFileError: a file is cut short, misses an array, or holds one of the wrong shape, type or range.
-        UnsafePickleError: a pickle asks for more than a body model needs.
+        FileNotFoundError: a file does not exist.
+        BodyFileError: a file is truncated, lacks an array, or holds one of the wrong shape, type or range.
+        UnsafePickleError: a pickle names a global that a body model does not need.
     """
     path = pathlib.Path(path)
     if not path.is_file():
@@ -71,7 +71,7 @@ def load_body(
 
 
 class _ArrayFile:
-    """Named arrays of one file, checked as they are taken out."""
+    """Named arrays of one file, validated on access."""
 
     def __init__(self, path: pathlib.Path) -> None:
         self.path = path
@@ -174,10 +174,10 @@ def _texture_coordinates(
 
 
 def _unwrapped(template: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Faces and coordinates of an automatic unwrap."""
+    """Unwrap automatically; return UV faces and coordinates."""
     try:
         import xatlas
-    except ModuleNotFoundError as error:  # it has no package for Python 3.14 or Linux on ARM
+    except ModuleNotFoundError as error:  # xatlas has no wheels for Python 3.14 or Linux on ARM
         raise BodyFileError(
             "the body has no texture coordinates, and this Python has no xatlas to make some: give them by a second "
             "file (uv), or install xatlas."
@@ -197,7 +197,7 @@ def _numpy_file(path: pathlib.Path) -> np.ndarray:
 
 
 def _obj_texture_coordinates(path: pathlib.Path, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Texture coordinates of an OBJ whose triangles are the body's, in any order."""
+    """Read texture coordinates from an OBJ with the body's triangles, in any order."""
     coordinates: list[list[float]] = []
     corner_of_face: dict[frozenset[int], dict[int, int]] = {}
     try:

@@ -1,9 +1,9 @@
-"""Reading the pickles that SMPL is distributed as, without running anything in them.
+"""Read the pickles in which SMPL is distributed, without executing code from them.
 
-A pickle is a program: it may name any importable function and call it. Here every global it may name is one of the
-inert records below, which only remember what they were given; everything else is refused. Arrays are rebuilt afterwards
-by `as_array`, so not even numpy or scipy sees the file's instructions. Files of Python 2 (latin1 strings), of chumpy,
-and of old and new numpy and scipy are understood; chumpy need not be installed.
+A pickle is a program that may call any importable function. This reader maps every allowed global to one of the inert
+records below, which only store their arguments, and rejects all others. `as_array` rebuilds arrays afterwards, so not
+even numpy or scipy interprets the file's instructions. Reads files written by Python 2 (latin1 strings), chumpy, and
+old and new versions of numpy and scipy; chumpy need not be installed.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ import numpy as np
 import scipy.sparse
 
 MAX_NESTING = 8
-"""Arrays made from arrays (chumpy's selections) deeper than this are not a body model."""
+"""Limit on nested chumpy selections; body models nest less."""
 _NUMBER_TYPE = re.compile(r"[biuf][1248]")
 
 
 class BodyFileError(ValueError):
-    """A file does not hold a body model; the message names the file, what is wrong, and what to do."""
+    """A file is not a valid body model."""
 
 
 class UnsafePickleError(BodyFileError):
-    """A pickle asks for something that a body model does not need."""
+    """A pickle names a global that a body model does not need."""
 
 
 class _Stored:
-    """What a pickle said about one object: constructor arguments and state."""
+    """Constructor arguments and state of a pickled object."""
 
     def __init__(self, *arguments: object) -> None:
         self.arguments = arguments
@@ -74,7 +74,7 @@ class _SparseColumns(_Stored):
 
 
 class _Reconstructed:
-    """copyreg's way to make an object of protocol 0 and 1: arguments (class, base, base state)."""
+    """copyreg's object constructor of protocols 0 and 1: arguments (class, base, base state)."""
 
     def __new__(cls, kind: object, *_: object) -> _Stored:  # type: ignore[misc]
         if not (isinstance(kind, type) and issubclass(kind, _Stored)):
@@ -118,11 +118,11 @@ class _Unpickler(pickle.Unpickler):
 
 
 def read_pickle(path: pathlib.Path) -> dict[str, object]:
-    """The top-level dictionary of an SMPL pickle; turn the values you need into arrays with `as_array`.
+    """Return the top-level dictionary of an SMPL pickle; convert values to arrays with `as_array`.
 
     Raises:
         UnsafePickleError: the pickle names a global outside the list above.
-        BodyFileError: it is no pickle, is cut short, or does not hold a dictionary.
+        BodyFileError: it is not a pickle, is truncated, or does not hold a dictionary.
     """
     with open(path, "rb") as file:
         content = load_restricted(file, str(path))
@@ -134,11 +134,11 @@ def read_pickle(path: pathlib.Path) -> dict[str, object]:
 
 
 def load_restricted(file: IO[bytes], name: str) -> object:
-    """What a pickle describes, with inert records in place of objects; `name` is what an error calls it.
+    """Load a pickle with inert records in place of objects; `name` identifies it in errors.
 
     Raises:
         UnsafePickleError: the pickle names a global outside the list above.
-        BodyFileError: it is no pickle, or is cut short.
+        BodyFileError: it is not a pickle, or is truncated.
     """
     try:
         return _Unpickler(file, encoding="latin1").load()
@@ -152,10 +152,10 @@ def load_restricted(file: IO[bytes], name: str) -> object:
 
 
 def array_of_objects(value: object) -> list[object]:
-    """The objects in a pickled array of objects, such as the dictionary that `np.save` puts into one of no dimension.
+    """Return the elements of a pickled object array, such as the 0-d array in which `np.save` stores a dictionary.
 
     Raises:
-        ValueError: the value is something else.
+        ValueError: the value is not an object array.
     """
     match value:
         case _Array(state=(_, tuple(), _NumberType(arguments=("O8" | "O", *_)), _, list() as objects)):
@@ -164,7 +164,7 @@ def array_of_objects(value: object) -> list[object]:
 
 
 def as_array(value: object, nesting: int = 0) -> np.ndarray:
-    """The numbers in a value that `read_pickle` returned; sparse matrices become dense.
+    """Convert a value returned by `read_pickle` to a numeric array; sparse matrices become dense.
 
     Raises:
         ValueError: the value is not a plain array of numbers, or its parts contradict each other.

@@ -1,1 +1,1 @@
-"""Stage 1: pictures of a person from several sides -> the person's primitives, by one network for everybody."""
+"""Stage 1: one network for all subjects that maps multi-view images of a human to primitives."""

@@ -1,4 +1,4 @@
-"""Layers of the encoder: convolutions with a bias for every place, and attention between two branches (SPEC 2)."""
+"""Layers of the encoder: convolutions with untied biases, and attention between two branches (SPEC 2)."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from torch.nn import functional
 from torch.nn.utils.parametrizations import weight_norm
 
 SLOPE = 0.2
-"""Of the leaky rectifier below zero."""
+"""Negative slope of the leaky ReLU."""
 
 
 class UntiedConv(nn.Module):
-    """A weight-normalised convolution with a bias [C, H, W]: every place of the UV square is a certain part of a body.
+    """A weight-normalised convolution with a bias [C, H, W], because each UV position is a fixed part of the body.
 
-    `resize` is "same" (3 x 3 or 1 x 1), "down" or "up" (4 x 4, a factor of 2); `side` is the result's.
+    `resize` is "same" (3 x 3 or 1 x 1), "down" or "up" (4 x 4, factor 2); `side` is the output's height and width.
     """
 
     def __init__(self, inputs: int, outputs: int, side: int, resize: str = "same", kernel: int = 3) -> None:
@@ -33,23 +33,23 @@ class UntiedConv(nn.Module):
         self.bias = nn.Parameter(torch.zeros(outputs, side, side))
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
-        """The convolution, without an activation."""
+        """Convolution and bias, without activation."""
         return self.convolution(x) + self.bias
 
     def quiet(self) -> UntiedConv:
-        """Itself, with weights a tenth as large: what adds to something begins by nearly leaving it alone."""
+        """Scale the weights by 0.1 in place and return self, so that a residual branch starts close to zero."""
         with torch.no_grad():
             self.convolution.get_parameter("parametrizations.weight.original0").mul_(0.1)
         return self
 
 
 def rectified(x: Tensor) -> Tensor:
-    """Leaky, so that nothing dies."""
+    """Leaky ReLU."""
     return functional.leaky_relu(x, SLOPE)
 
 
 class ResidualConv(nn.Module):
-    """Two convolutions beside a shortcut."""
+    """A residual block of two convolutions."""
 
     def __init__(self, inputs: int, outputs: int, side: int) -> None:
         super().__init__()
@@ -58,7 +58,7 @@ class ResidualConv(nn.Module):
         self.shortcut = nn.Identity() if inputs == outputs else UntiedConv(inputs, outputs, side, kernel=1)
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
-        """Same side, rectified."""
+        """Output of the same size, after the activation."""
         return rectified(self.second(rectified(self.first(x))) + self.shortcut(x))
 
 
@@ -88,7 +88,7 @@ class GridNetwork(nn.Module):
 
 
 class HalvingGridNetwork(nn.Module):
-    """The U-Net of SPEC 2: it halves at once, with additive skips below, and what goes in joins in at the end."""
+    """The U-Net of SPEC 2: downsamples first, with additive skips below, and concatenates the input at the end."""
 
     def __init__(self, inputs: int, channels: Sequence[int], side: int) -> None:
         super().__init__()
@@ -114,7 +114,7 @@ class HalvingGridNetwork(nn.Module):
 
 
 class Attention(nn.Module):
-    """Multi-head attention of tokens to those of a context, which may be themselves."""
+    """Multi-head attention from tokens to a context, which may be the tokens themselves."""
 
     def __init__(self, width: int, context: int, heads: int, inner: int) -> None:
         super().__init__()
@@ -124,7 +124,7 @@ class Attention(nn.Module):
         self.out = nn.Linear(inner, width)
 
     def forward(self, tokens: Float[Tensor, "b n c"], context: Float[Tensor, "b m d"]) -> Float[Tensor, "b n c"]:
-        """What the tokens find in the context."""
+        """Attention output, one vector per token."""
         split = [
             part.unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for part in (self.query(tokens), *self.key_value(context).chunk(2, dim=-1))
@@ -142,13 +142,13 @@ class GatedFeedForward(nn.Module):
         self.leave = nn.Linear(4 * width, width)
 
     def forward(self, tokens: Float[Tensor, "b n c"]) -> Float[Tensor, "b n c"]:
-        """Of each token alone."""
+        """Apply to each token independently."""
         value, gate = self.enter(tokens).chunk(2, dim=-1)
         return self.leave(value * functional.gelu(gate))
 
 
 class CrossBlock(nn.Module):
-    """Appearance tokens ask motion tokens and these ask back; then each thinks for itself (paper sec. 3.2)."""
+    """Cross-attention from appearance to motion tokens and back, each followed by an MLP (paper sec. 3.2)."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -160,7 +160,7 @@ class CrossBlock(nn.Module):
     def forward(
         self, appearance: Float[Tensor, "b n c"], motion: Float[Tensor, "b n c"]
     ) -> tuple[Float[Tensor, "b n c"], Float[Tensor, "b n c"]]:
-        """Both branches, each with what it found in the other."""
+        """Updated tokens of both branches."""
         a, m = self.norms[0](appearance), self.norms[1](motion)
         appearance, motion = appearance + self.to_motion(a, m), motion + self.to_appearance(m, a)
         return (
@@ -170,7 +170,7 @@ class CrossBlock(nn.Module):
 
 
 class CrossModalAttention(nn.Module):
-    """Cross-attention both ways between features of two branches on one grid, added to them."""
+    """Bidirectional cross-attention between two feature maps on one grid, as a residual."""
 
     def __init__(self, appearance: int, motion: int, width: int, heads: int, blocks: int) -> None:
         super().__init__()
@@ -196,7 +196,7 @@ class CrossModalAttention(nn.Module):
 
 
 class ConcatenatedAttention(nn.Module):
-    """The released code's: self-attention over both branches' channels side by side (SPEC 2)."""
+    """Self-attention over the concatenated channels of both branches, as in the released code (SPEC 2)."""
 
     def __init__(self, appearance: int, motion: int, width: int, heads: int, blocks: int) -> None:
         super().__init__()

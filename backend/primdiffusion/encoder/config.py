@@ -1,4 +1,4 @@
-"""Settings of the encoder, and the named ones: ours, the paper's, the released code's, and the paper's ablations."""
+"""Settings of the encoder, and presets: ours, the paper's, the released code's, and the paper's ablations."""
 
 from __future__ import annotations
 
@@ -11,69 +11,69 @@ from primdiffusion.primitives.primitives import GRID, S
 
 @dataclasses.dataclass(frozen=True)
 class EncoderConfig:
-    """What the encoder is made of (paper sec. 3.2; SPEC 2)."""
+    """Architecture of the encoder (paper sec. 3.2; SPEC 2)."""
 
     appearance: Literal["voxels", "texels"] = "voxels"
-    """What is looked up in the pictures: the body's surface under every texel (paper), or every voxel of the boxes."""
+    """Where images are sampled: on the body surface at each texel (paper), or at each voxel of the boxes."""
     unseen: Literal["filled", "black"] = "filled"
-    """filled: points that no view sees take colours from around them, and further channels hold what is seen and what
-    masks cover; black: they are black, and the network is given nothing but colours (SPEC 2)."""
+    """filled: points that no view sees are inpainted from their surroundings, and extra channels hold visibility and
+    mask coverage; black: such points are black, and the network's input is colours only (SPEC 2)."""
     facing: int = 2
-    """Views count by the cosine to the surface's normal to this power; 0: all visible ones alike (paper)."""
+    """Views are weighted by the cosine to the surface normal to this power; 0: all visible views equally (paper)."""
     attention: Literal["cross", "concatenated", "none"] = "cross"
     """cross: appearance queries motion and back (paper); concatenated: self-attention over both (released); none."""
     delta_scale: Literal["varying", "shared"] = "varying"
-    """A box's own factors on its size, or the same for all boxes of a person (the paper's ablation)."""
+    """Scale factors per box, or shared by all boxes of a human (the paper's ablation)."""
     frames: Literal["person", "template"] = "person"
-    """Whose body the boxes sit on: the person's, or one of mean shape (the paper's ablation "w/o R, T")."""
+    """The body that carries the boxes: the subject's, or the mean shape (the paper's ablation "w/o R, T")."""
     base: Literal["looked_up", "constant"] = "looked_up"
-    """What networks add to: what was looked up at each voxel, or nothing but a constant (paper)."""
+    """What the networks' output is added to: the value sampled at each voxel, or a constant (paper)."""
     detail: Literal["skips", "bottleneck"] = "skips"
-    """skips: the mapping networks see the image encoder's finer levels; bottleneck: the 32 x 32 features (paper)."""
+    """skips: mapping networks also get the image encoder's finer levels; bottleneck: the 32 x 32 features (paper)."""
     stem: tuple[int, int, int] = (24, 48, 64)
     """Channels of the image encoder at 128, 64 and 32 squared."""
     grid: tuple[int, ...] = (64, 96, 96, 96)
     """Channels of its U-Net at 32, 16, 8, ... squared."""
     grid_entry: Literal["residual", "halving"] = "residual"
-    """residual: a residual block at 32 squared comes first; halving: the U-Net's first layer is the one to 16 squared,
-    and what goes in joins in at the end (SPEC 2)."""
+    """residual: starts with a residual block at 32 squared; halving: starts with the downsampling to 16 squared, and
+    concatenates the input at the end (SPEC 2)."""
     grid_gain: float = 1.0
-    """Factor on what the U-Net gives."""
+    """Factor on the U-Net's output."""
     motion: int = 32
     """Channels of the motion branch."""
     attention_width: int = 128
-    """Channels of all heads together."""
+    """Channels over all heads."""
     attention_heads: int = 4
     """Heads."""
     attention_blocks: int = 1
-    """Blocks in a row."""
+    """Consecutive blocks."""
     fused: int = 64
-    """Channels of what the mapping networks are given."""
+    """Input channels of the mapping networks."""
     colour: tuple[int, int] = (48, 24)
     """Channels of the colour network at 64 and 128 squared."""
     density: tuple[int, int] = (32, 16)
     """Channels of the density network at 64 and 128 squared."""
     finest: int = 16
-    """Channels of both at 256 squared, before what was looked up joins in."""
+    """Channels of both at 256 squared, before concatenation with the sampled input."""
     scale: tuple[int, ...] = (64, 64)
     """Channels of the delta-scale network."""
     scale_outputs: int = 3
-    """Channels at its end, of which the last three count: the released code has six dead ones before (SPEC 1.7)."""
+    """Its output channels; only the last three are used: the released code has six unused ones before (SPEC 1.7)."""
     extent: tuple[float, float, float] = (0.85, 0.85, 0.6)
-    """Delta scales along T, B, N before anything is learned: the anchors' boxes reach for all that may hang off a body,
-    and most of a person is seen sharper in smaller ones."""
+    """Initial delta scales along T, B, N: the anchors' boxes are large enough for loose clothing, and most of a human
+    is sharper with smaller ones."""
     scale_gain: float = 0.02
     """delta scale = extent exp(gain x)."""
     colour_gain: float = 0.06
-    """Colours = base + gain x, clamped to 0 ... 1. Small, so that colours do not learn to hide what densities lack."""
+    """Colours = base + gain x, clamped to 0 ... 1. Small, so that colours do not compensate for wrong densities."""
     density_gain: float = 0.25
-    """Relative densities likewise."""
+    """As `colour_gain`, for relative densities."""
     full_density: float = 100.0
-    """1/m: the density of 1."""
+    """1/m: the density that corresponds to a relative density of 1."""
 
     @property
     def channels(self) -> int:
-        """Channels of the picture of 256 x 256 that the image encoder reads."""
+        """Input channels of the image encoder at 256 x 256."""
         colours = 3 * self.layers
         if self.unseen == "black":
             return colours
@@ -81,11 +81,11 @@ class EncoderConfig:
 
     @property
     def layers(self) -> int:
-        """Points that are looked up under each texel."""
+        """Sampled points per texel."""
         return S if self.appearance == "voxels" else 1
 
     def __post_init__(self) -> None:
-        """Raises ValueError for settings that cannot be."""
+        """Raise ValueError for invalid settings."""
         for name, hint in get_type_hints(EncoderConfig).items():
             value = getattr(self, name)
             if get_origin(hint) is Literal and value not in get_args(hint):
@@ -94,7 +94,7 @@ class EncoderConfig:
             raise ValueError(f"grid has {len(self.grid)} levels: give 1 to {GRID.bit_length()}, down to one texel")
         if self.attention_width % self.attention_heads:
             raise ValueError(
-                f"attention_width {self.attention_width} is no multiple of attention_heads {self.attention_heads}"
+                f"attention_width {self.attention_width} is not a multiple of attention_heads {self.attention_heads}"
             )
         if self.scale_outputs < 3:
             raise ValueError(f"scale_outputs is {self.scale_outputs}: delta scales are 3 numbers")
@@ -122,7 +122,7 @@ PAPER = EncoderConfig(
     density_gain=25 / 255,
     full_density=25.5,
 )
-"""The paper's text, with the sizes of SPEC 2 where it names none."""
+"""The architecture of the paper, with the sizes of SPEC 2 where the paper gives none."""
 PRESETS: Mapping[str, EncoderConfig] = {
     "default": DEFAULT,
     "shared_scale": dataclasses.replace(DEFAULT, delta_scale="shared"),
@@ -135,10 +135,10 @@ PRESETS: Mapping[str, EncoderConfig] = {
 
 
 def config_from_json(tree: Mapping[str, Any]) -> EncoderConfig:
-    """A configuration from what `dataclasses.asdict` made of it and JSON carried.
+    """Restore a configuration from the JSON form of `dataclasses.asdict`.
 
     Raises:
-        ValueError: it has settings that this version does not know, lacks some, or holds impossible ones.
+        ValueError: settings are unknown to this version, missing or invalid.
     """
     names = {field.name for field in dataclasses.fields(EncoderConfig)}
     if set(tree) != names:

@@ -1,4 +1,4 @@
-"""From views of a person to the person's payload, by a trained encoder."""
+"""Encode views of a human to a payload with a trained encoder."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 
 @dataclasses.dataclass(frozen=True)
 class EncoderModel:
-    """A trained encoder: what a checkpoint of stage 1 holds."""
+    """A trained encoder, as stored in a checkpoint of stage 1."""
 
     encoder: Encoder
     card: Mapping[str, Any]
-    """What it is and how it was trained; JSON values."""
+    """Model card: description and training settings; JSON values."""
 
     @property
     def config(self) -> EncoderConfig:
-        """Its settings."""
+        """Settings of the encoder."""
         return self.encoder.config
 
     def encode(self, views: Views, betas: Float[Tensor, "n"]) -> Payload:
-        """The payload of the person in `views` (unbatched, of one pose); see `encode`."""
+        """The payload of the human in `views` (unbatched, one pose); see `encode`."""
         return encode(self.encoder, views, betas)
 
     def place(self, payload: Payload, betas: Float[Tensor, "n"], pose: BodyPose) -> Primitives:
-        """The payload on the body that this encoder's boxes sit on; on the payload's device."""
+        """Place the payload on the body that carries this encoder's boxes; on the payload's device."""
         frames = frames_of(self.config, betas.cpu(), pose.to("cpu"))[1]
         return Primitives.place(frames.to(payload.density.device), payload)
 
 
 @torch.no_grad()
 def encode(encoder: Encoder, views: Views, betas: Float[Tensor, "n"]) -> Payload:
-    """The payload of one person: unprojection and one pass of the network, without gradients; on the encoder's device.
+    """The payload of one human: unprojection and one forward pass, without gradients; on the encoder's device.
 
     Raises:
-        ValueError: there are no views, they are batched, or pose or betas are not finite or of another body.
+        ValueError: there are no views, they are batched, or pose or betas are not finite or do not match the body.
     """
     device = encoder.scale_out.bias.device
     views, betas = views.to("cpu"), betas.cpu()
@@ -58,7 +58,7 @@ def encode(encoder: Encoder, views: Views, betas: Float[Tensor, "n"]) -> Payload
 
 
 def look_up(config: EncoderConfig, views: Views, betas: Float[Tensor, "n"]) -> Unprojected:
-    """What an encoder of this configuration reads of the pictures of one person in one pose; on the CPU."""
+    """Unproject the images of one human in one pose to the input of an encoder with this configuration; on the CPU."""
     if not torch.isfinite(betas).all() or betas.shape != default_body().shape_basis.shape[-1:]:
         expected = default_body().shape_basis.shape[-1]
         raise ValueError(
@@ -73,12 +73,12 @@ def look_up(config: EncoderConfig, views: Views, betas: Float[Tensor, "n"]) -> U
 
 
 def frames_of(config: EncoderConfig, betas: Float[Tensor, "n"], pose: BodyPose) -> tuple[Tensor, Frames]:
-    """The posed body's vertices [V, 3] and the boxes' frames on it; of mean shape with `frames` "template"."""
+    """Vertices [V, 3] of the posed body and the boxes' frames on it; of mean shape if `frames` is "template"."""
     body = default_body()
     vertices = body.shape(betas_of_frames(config, betas)).pose(pose).vertices
     return vertices, attach(default_anchors(), vertices, body.faces)
 
 
 def betas_of_frames(config: EncoderConfig, betas: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """The shape of the body that the boxes sit on: the person's, or with `frames` "template" the mean one."""
+    """The shape of the body that carries the boxes: the subject's, or the mean shape if `frames` is "template"."""
     return torch.zeros_like(betas) if config.frames == "template" else betas

@@ -1,4 +1,4 @@
-"""The generalizable encoder (paper sec. 3.2, SPEC 2): what pictures show of a person, and the pose -> payload."""
+"""The generalizable encoder (paper sec. 3.2, SPEC 2): unprojected images and the pose -> payload."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.primitives.primitives import GRID, Payload, S
 
 MOTION = 3 * (J - 1)
-"""Numbers of a pose: axis-angles of all joints but the pelvis, whose turn is not the body's."""
+"""Inputs of the motion branch: axis-angles of all joints except the pelvis, which only rotates the whole body."""
 CONSTANT_BASE = 100 / 255
-"""What the networks of the paper add to (SPEC 2: relu(25 x + 100))."""
+"""Base value of the paper's networks (SPEC 2: relu(25 x + 100))."""
 HULL_BASE = (0.8, -0.5)
-"""Relative density of a voxel that masks cover by c, before anything is learned: clamp(0.8 c - 0.5). A voxel inside
-reaches half way to its neighbour outside, so that silhouettes would grow if this were steeper."""
+"""Initial relative density of a voxel with mask coverage c: clamp(0.8 c - 0.5). Interpolation extends an inner voxel
+half way to its outer neighbour, so a larger value would enlarge silhouettes."""
 
 
 class Encoder(nn.Module):
@@ -66,10 +66,10 @@ class Encoder(nn.Module):
         self.scale_out = UntiedConv(scale[-1], config.scale_outputs, GRID).quiet()
 
     def forward(self, found: Unprojected, axis_angle: Float[Tensor, "b 24 3"]) -> Payload:
-        """Payloads [b] of people from what was looked up [b, d, ...] and the pose in which it was.
+        """Payloads [b] from unprojected images [b, d, ...] and the poses of the subjects.
 
         Raises:
-            ValueError: the input is of another kind than this encoder's, or there are not as many poses as people.
+            ValueError: the input does not match this encoder's configuration, or the number of poses is wrong.
         """
         self._check(found, axis_angle)
         x, base = self.read(found)
@@ -100,10 +100,10 @@ class Encoder(nn.Module):
         )
 
     def read(self, found: Unprojected) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 32 h w"]]:
-        """What the image encoder reads, and what colours (d, c) and densities (d) add to; encoded, 0 ... 1.
+        """Input of the image encoder, and base values of colours (d, c) and densities (d); sRGB-encoded, 0 ... 1.
 
-        The former is -1 ... 1 with `unseen` "filled": colours, what is seen and, of voxels, what masks cover; with
-        "black" it is colours alone, 0 ... 1.
+        With `unseen` "filled" the input is -1 ... 1: colours, visibility and, for voxels, mask coverage; with "black"
+        it is colours only, 0 ... 1.
         """
         dtype = self.scale_out.bias.dtype
         seen, covered = found.seen.to(dtype) / 255, found.covered.to(dtype) / 255
@@ -127,18 +127,18 @@ class Encoder(nn.Module):
         given, expected = tuple(found.seen.shape), (self.config.layers, SIDE, SIDE)
         if len(given) != 4 or given[1:] != expected:
             raise ValueError(
-                f"what was looked up has the shape {given}, not [b, {', '.join(map(str, expected))}] as for "
-                f"{self.config.appearance}: look it up with this encoder's configuration, and stack people"
+                f"the unprojected input has shape {given}, not [b, {', '.join(map(str, expected))}] as for "
+                f"{self.config.appearance}: unproject with this encoder's configuration, and stack subjects"
             )
         if tuple(axis_angle.shape) != (given[0], J, 3):
             raise ValueError(
-                f"{given[0]} people were looked up, but axis-angles have the shape {tuple(axis_angle.shape)}: "
+                f"the input has {given[0]} subjects, but axis-angles have shape {tuple(axis_angle.shape)}: "
                 f"give [{given[0]}, {J}, 3]"
             )
 
 
 class MappingNetwork(nn.Module):
-    """From 32 x 32 features to a picture of 256 x 256: values of voxels, `layers` channels, depth slowest."""
+    """Upsample 32 x 32 features to voxel values at 256 x 256: `layers` channels, depth slowest."""
 
     def __init__(self, config: EncoderConfig, channels: tuple[int, int], layers: int) -> None:
         super().__init__()
@@ -163,7 +163,7 @@ class MappingNetwork(nn.Module):
         self.out = UntiedConv(finest, layers, SIDE).quiet() if self.skips is not None else None
 
     def forward(self, fused: Float[Tensor, "b c 32 32"], fine: list[Tensor]) -> Float[Tensor, "b l 256 256"]:
-        """`fine` are the image encoder's levels, the input first; used where it has skips."""
+        """`fine` holds the image encoder's levels, starting with its input; used only with skips."""
         first, second, third = self.up
         if self.skips is None or self.out is None:
             return third(rectified(second(rectified(first(fused)))))
@@ -184,7 +184,7 @@ def motion_of(joint_rotation: Float[Tensor, "*b 24 3 3"]) -> Float[Tensor, "*b 2
 
 
 class _Clamp(torch.autograd.Function):
-    """Clamped to 0 ... 1; the gradient passes outside too where it leads back in, so that nothing sticks there."""
+    """Clamp to 0 ... 1; outside, pass gradients that point back into the range, so that values do not get stuck."""
 
     @staticmethod
     def forward(ctx, x: Tensor) -> Tensor:
@@ -199,12 +199,12 @@ class _Clamp(torch.autograd.Function):
 
 
 def clamp(x: Tensor) -> Tensor:
-    """`x` clamped to 0 ... 1, with a gradient that leads values outside back in but never farther out."""
+    """Clamp `x` to 0 ... 1; gradients outside the range pass only if they point back into it."""
     return _Clamp.apply(x)
 
 
 def fill(rgb: Float[Tensor, "b d c h w"], seen: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d c h w"]:
-    """Colours of points that no view sees, from seen ones: of the same column, then of ever wider surroundings."""
+    """Inpaint colours of points that no view sees: from the same column, then from increasingly large surroundings."""
     weight = seen[:, :, None]
     total, weights = (rgb * weight).sum(1), weight.sum(1)
     coarser = [(total, weights)]

@@ -1,4 +1,4 @@
-"""Pictures sampled at points: which views see each, and the mean of what they show (paper sec. 3.2, SPEC 2)."""
+"""Sample images at surface points: visibility per view and mean colour over views (paper sec. 3.2, SPEC 2)."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from primdiffusion.capture.dataset import Views
 from primdiffusion.raster.nearest_triangle import nearest_triangles
 
 TOLERANCE = 0.020
-"""Metres behind the body's surface within which a point counts as seen (SPEC 2)."""
+"""Depth behind the body surface, metres, up to which a point counts as visible (SPEC 2)."""
 COVERED = 128
-"""Of 255: pixels that the person covers less say nothing of their colour."""
+"""Smallest mask value (of 255) of a pixel whose colour is used."""
 
 
 def check(views: Views, vertices: Tensor, body: BodyModel) -> None:
-    """Raises ValueError unless views, cameras and body go together: compiled code reads where they tell it to."""
+    """Raise ValueError unless views, cameras and body match: compiled code does no bounds checks."""
     shape, camera = tuple(views.rgba.shape), views.camera
     if len(shape) != 4 or not shape[0] or shape[-1] != 4 or views.rgba.dtype != torch.uint8:
         raise ValueError(f"views are {views.rgba.dtype} {shape}: give one person's, uint8 [v, H, W, 4], v > 0")
@@ -46,7 +46,7 @@ def check(views: Views, vertices: Tensor, body: BodyModel) -> None:
 
 
 def body_depth(views: Views, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float32[ndarray, "v H W"]:
-    """Metres along each view's axis to the body's surface; inf beside it."""
+    """Depth of the body surface along each view's optical axis, metres; inf outside the silhouette."""
     corners = vertices.detach()[faces].cpu().numpy().astype(np.float64)
     camera = views.camera.to("cpu")
     depth = np.empty(views.rgba.shape[:3], np.float32)
@@ -66,9 +66,9 @@ def sample(
     normals: Float[Tensor, "n 3"],
     facing: int,
 ) -> tuple[UInt8[ndarray, "n 3"], UInt8[ndarray, "n"], UInt8[ndarray, "n"]]:
-    """Colour, share of the views' weight and least mask at points, as `Unprojected` holds them; NaN points are unseen.
+    """Colour, visible weight and least mask at points, in the encoding of `Unprojected`; NaN points are not visible.
 
-    `depth` is that of the body's surface in each view; views count by the cosine to the normal to the power `facing`.
+    `depth` is the body surface's depth in each view; views are weighted by the normal's cosine to the power `facing`.
     """
     rgba = np.ascontiguousarray(views.rgba.cpu().numpy())
     world_to_pixel = (views.camera.intrinsics @ views.camera.world_to_camera).cpu().numpy().astype(np.float32)
@@ -85,7 +85,7 @@ def sample(
 
 
 def _in_parts(count: int, work: Callable[[int, int], None]) -> None:
-    """`work(first, last)` over all of 0 ... count, on torch's threads; a loader's worker has one."""
+    """Run `work(first, last)` over 0 ... count on as many threads as torch uses, or one in a data loader worker."""
     threads = 1 if get_worker_info() is not None else max(torch.get_num_threads(), 1)
     edges = np.linspace(0, count, threads + 1).astype(int).tolist()
     if threads == 1:

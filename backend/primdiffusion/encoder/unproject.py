@@ -1,8 +1,8 @@
-"""The appearance branch's input: what pictures show at points of a person, averaged over the views that see them.
+"""Input of the appearance branch: image colours at points of a human, averaged over the views that see them.
 
-Paper sec. 3.2 looks up the body's surface, texel by texel of its UV square. Cloth and hair stand centimetres off it, so
-that several views of one texel show several things; looking up the voxels of the boxes themselves does without this,
-and the masks then say which voxels are outside of the person.
+The paper (sec. 3.2) samples the body surface at every texel of its UV square. Cloth and hair are centimetres off the
+surface, so different views of one texel show different points. Sampling at the voxels of the boxes avoids this, and
+the masks then tell which voxels are outside of the human.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ from primdiffusion.primitives.anchors import default_texels
 from primdiffusion.primitives.primitives import GRID, Frames, K, S
 
 SIDE = GRID * S
-"""Texels a side: one for every column of voxels."""
+"""Texels per side: one per column of voxels."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Unprojected(TensorRecord):
-    """What the pictures show at points that form a picture of SIDE x SIDE, in `d` layers."""
+    """Image samples at points arranged as an image of SIDE x SIDE with `d` layers."""
 
     rgb: UInt8[Tensor, "*b d 3 h w"]
-    """sRGB-encoded mean of the views; 0 where none sees the point."""
+    """sRGB-encoded mean over the views; 0 if no view sees the point."""
     seen: UInt8[Tensor, "*b d h w"]
-    """255 times the share of the views' weight that sees the point."""
+    """255 times the fraction of the views' weight that sees the point."""
     covered: UInt8[Tensor, "*b d h w"]
-    """The least of the masks at the point, of 255: below 128 some view sees past it. 255 where no picture shows it."""
+    """Least mask value at the point, of 255: below 128, some view sees past it. 255 if it is outside all images."""
 
 
 def unproject_texels(
     views: Views, vertices: Float[Tensor, "V 3"], facing: int, body: BodyModel | None = None
 ) -> Unprojected:
-    """The pictures at the body's surface under every texel of its UV square (paper sec. 3.2, SPEC 2): one layer.
+    """Sample the images at the body surface for every texel of its UV square (paper sec. 3.2, SPEC 2): one layer.
 
-    `views` are one person's in one pose (unbatched), `vertices` (metres) the body in it. A view counts where the point
-    lies no more than TOLERANCE behind the body's surface as that view sees it, by the cosine of its angle to the normal
-    to the power `facing`. Texels outside of every chart are seen by nobody.
+    `views` show one human in one pose (unbatched), `vertices` (metres) are the body in that pose. A view sees a point
+    that is at most TOLERANCE behind the body surface in that view; its weight is the cosine of the angle to the normal
+    to the power `facing`. Texels outside of every chart are not visible.
 
     Raises:
-        ValueError: there are no views, they are batched or their cameras are of other sizes or numbers; vertices are
-            not finite or not the body's; the body has no UV map.
+        ValueError: there are no views, they are batched, or their cameras differ in size or number; vertices are not
+            finite or do not match the body; the body has no UV map.
     """
     body = default_body() if body is None else body
     check(views, vertices, body)
@@ -66,13 +66,13 @@ def unproject_texels(
 def unproject_voxels(
     views: Views, vertices: Float[Tensor, "V 3"], frames: Frames, facing: int, body: BodyModel | None = None
 ) -> Unprojected:
-    """The pictures at every voxel of the boxes in `frames` (unbatched, at their rest size): S layers, from inside out.
+    """Sample the images at every voxel of the boxes in `frames` (unbatched, at rest size): S layers, from inside out.
 
-    Layer d, row ny * 8 + h, column nx * 8 + w is voxel (d, h, w) of primitive ny * 32 + nx. Views as in
-    `unproject_texels`, by the angle to the box's normal; a voxel in front of the body's surface is seen too.
+    Layer d, row ny * 8 + h, column nx * 8 + w is voxel (d, h, w) of primitive ny * 32 + nx. Views are
+    weighted as in `unproject_texels`, by the box's normal; a voxel in front of the body surface is visible too.
 
     Raises:
-        ValueError: as `unproject_texels`, and for another number of frames than a person has boxes.
+        ValueError: as `unproject_texels`, and if the number of frames is not K.
     """
     body = default_body() if body is None else body
     check(views, vertices, body)
@@ -91,7 +91,7 @@ def unproject_voxels(
 
 @functools.lru_cache(maxsize=4)
 def _texels(body: BodyModel) -> tuple[Tensor, Tensor]:
-    """Face and barycentric coordinates of SIDE x SIDE texels, -1 outside of the charts."""
+    """Face and barycentric coordinates of SIDE x SIDE texels; face -1 outside of the charts."""
     if body is default_body():
         return default_texels()
     if body.uv.numel() == 0:
