@@ -20,7 +20,7 @@ from .remedies import defect_in_the_scene, error_in_the_scene
 
 if TYPE_CHECKING:
     from ..worker.backend import Backend
-    from ..worker.job import JobError, Request
+    from ..worker.request import Request, RequestError
 
 CANCELLED = "Cancelled"
 GONE = "The scene {!r} was deleted meanwhile: nothing was added. Undo the deletion and try again."
@@ -48,7 +48,7 @@ class Outcome:
     entry: Entry
     notice: str = ""
     """Message, when it succeeded or was cancelled."""
-    error: JobError | None = None
+    error: RequestError | None = None
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     """"work" from the click to the child's answer, "finish" in the scene."""
 
@@ -146,7 +146,7 @@ class Queue:
         seconds = {"work": began - entry.asked_at, "finish": time.monotonic() - began}
         return self._end(Outcome(entry, notice, error, seconds))
 
-    def refuse(self, error: JobError) -> Outcome:
+    def refuse(self, error: RequestError) -> Outcome:
         """End the running job without looking at its answer."""
         return self._end(Outcome(self.current, error=error))
 
@@ -216,7 +216,7 @@ class Queue:
         return self._backend.log if self._backend is not None else ()
 
     def _begin(self, entry: Entry) -> None:
-        from ..worker.job import Request
+        from ..worker.request import Request
 
         self.current = entry
         try:

@@ -12,7 +12,7 @@ import bpy
 from ..worker.sentence import sentence
 
 if TYPE_CHECKING:
-    from ..worker.job import JobError
+    from ..worker.request import RequestError
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
 
@@ -44,7 +44,7 @@ _OF_PREFERENCES = re.compile("checkpoint|encoder|safetensors")
 """A missing folder of captures is chosen in its panel."""
 
 
-def remedy_for(error: JobError) -> Remedy | None:
+def remedy_for(error: RequestError) -> Remedy | None:
     """The button for an error; None where the sentence must do, or this version has no such button."""
     remedy = _REMEDIES.get(error.kind)
     if remedy is None or (error.kind == "missing_file" and not _OF_PREFERENCES.search(error.message)):
@@ -57,33 +57,33 @@ def remedy_for(error: JobError) -> Remedy | None:
     return remedy
 
 
-def error_in_the_scene(error: Exception) -> JobError:
+def error_in_the_scene(error: Exception) -> RequestError:
     """Why a result is not in the scene; an exception may name its kind itself, in an attribute `kind`."""
-    from ..worker.job import JobError
+    from ..worker.request import RequestError
 
     kind = getattr(error, "kind", "scene")
     cause = error if isinstance(error, OSError) else error.__cause__
     while cause is not None and not getattr(cause, "errno", None):
         cause = cause.__cause__
     if cause is not None and cause.errno in _NO_ROOM:
-        return JobError(
+        return RequestError(
             sentence(error), "Save the file where there is room and you may write, then try again", "unwritable"
         )
-    return JobError(sentence(error), "", str(kind))
+    return RequestError(sentence(error), "", str(kind))
 
 
-def defect_in_the_scene(error: Exception) -> JobError:
+def defect_in_the_scene(error: Exception) -> RequestError:
     """As `error_in_the_scene`, of an exception that is being handled and that nobody foresaw: with its traceback."""
     import traceback
 
-    from ..worker.job import JobError
+    from ..worker.request import RequestError
 
     trace = tuple(traceback.format_exc().splitlines())
-    return JobError(f"the result could not be put into the scene: {sentence(error)}", "", "scene", trace)
+    return RequestError(f"the result could not be put into the scene: {sentence(error)}", "", "scene", trace)
 
 
-def refusal_of_the_scene(message: str) -> JobError:
+def refusal_of_the_scene(message: str) -> RequestError:
     """Why a result could not even begin to enter the scene."""
-    from ..worker.job import JobError
+    from ..worker.request import RequestError
 
-    return JobError(message, "", "scene")
+    return RequestError(message, "", "scene")

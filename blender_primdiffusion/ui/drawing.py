@@ -16,7 +16,7 @@ from ..jobs.remedies import remedy_for
 from ..places import EXTENSION
 
 if TYPE_CHECKING:
-    from ..worker.job import JobError
+    from ..worker.request import RequestError
 
 _LINE = 34
 """Letters that fit a sidebar as wide as Blender makes it, beside an icon."""
@@ -118,7 +118,7 @@ def _draw_outcome(layout: bpy.types.UILayout, outcome: Outcome) -> None:
     column.operator("primdiffusion.copy_diagnostics", icon="COPYDOWN")
 
 
-def _draw_remedy(layout: bpy.types.UILayout, error: JobError, kind: str) -> None:
+def _draw_remedy(layout: bpy.types.UILayout, error: RequestError, kind: str) -> None:
     remedy = remedy_for(error)
     if remedy is None:
         return

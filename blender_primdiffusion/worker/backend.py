@@ -1,4 +1,4 @@
-"""The child that jobs share: started at first use, kept warm, started anew after it died."""
+"""The child that requests share: started at first use, kept warm, started anew after it died."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ END_S = 2.0
 """What a child that was asked to end may take for it."""
 
 
-class Job(Protocol):
-    """What the child is at work on."""
+class Request(Protocol):
+    """A request to the child."""
 
     @property
     def finished(self) -> bool:
@@ -23,7 +23,7 @@ class Job(Protocol):
 
 
 class Backend:
-    """The child that jobs share: started at first use, kept warm, started anew after it died.
+    """The child that requests share: started at first use, kept warm, started anew after it died.
 
     Blender may be closed between any two calls, so what takes long is a generator that yields while it waits.
     """
@@ -35,13 +35,13 @@ class Backend:
         self._leaving: list[tuple[BackendClient, float, Callable[[], None]]] = []
         """Each with the time at which it is killed, and what is to be done after it has gone."""
         self._closed = False
-        self._job: Job | None = None
+        self._request: Request | None = None
 
-    def admit(self, job: Job) -> bool:
-        """Takes `job` as the one at work; False while another is."""
-        if self._job is not None and not self._job.finished:
+    def admit(self, request: Request) -> bool:
+        """Takes `request` as the one at work; False while another is."""
+        if self._request is not None and not self._request.finished:
             return False
-        self._job = job
+        self._request = request
         return True
 
     @property
@@ -72,12 +72,12 @@ class Backend:
         return self._client.stderr if self._client is not None else ()
 
     def listen(self) -> list[Event]:
-        """What has happened between jobs: the child's end, or its silence."""
+        """What has happened between requests: the child's end, or its silence."""
         self.see_off()
         return self._client.poll() if self._client is not None else []
 
     def release(self) -> None:
-        """Ends the child that is kept warm, without waiting for it; the next job starts another."""
+        """Ends the child that is kept warm, without waiting for it; the next request starts another."""
         client, self._client = self._client, None
         if client is not None:
             client.end()

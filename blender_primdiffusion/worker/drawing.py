@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from .backend import Backend
 from .client import BackendClient, Died, Event, Failure, Notification, Response, Silent
-from .job import CANCELLED_CODE, JobError
+from .request import CANCELLED_CODE, RequestError
 
 IDLE_S = 600.0
 """A child at rest holds about half a gigabyte; starting one takes seconds."""
@@ -38,7 +38,7 @@ class Drawing:
         """Seconds that are left, None while unknown."""
         self.result: dict[str, Any] = {}
         """When done: seconds, and what they were spent on."""
-        self.error: JobError | None = None
+        self.error: RequestError | None = None
         self.cancel_asked_at: float | None = None
         self._advance = advance
         self._version = self._seen = 0
@@ -176,7 +176,7 @@ class DrawingChild:
             self._ask(connected.value, drawing)
         except Exception as e:
             self._connecting = None
-            drawing.become("failed", error=JobError(str(e) or type(e).__name__, "", "environment"))
+            drawing.become("failed", error=RequestError(str(e) or type(e).__name__, "", "environment"))
 
     def _ask(self, client: BackendClient, drawing: Drawing) -> None:
         client.poll()  # what concerned an earlier picture
@@ -205,12 +205,12 @@ def _take(event: Event, client: BackendClient, request: int, drawing: Drawing) -
         if event.code == CANCELLED_CODE:
             drawing.become("cancelled")
         else:
-            error = JobError(event.message, event.remedy, event.kind, client.stderr)
+            error = RequestError(event.message, event.remedy, event.kind, client.stderr)
             drawing.become("failed", error=error)
     elif isinstance(event, Died):
         remedy = "render again; if it happens again, a smaller picture needs less memory"
-        drawing.become("failed", error=JobError(event.message, remedy, "died", event.stderr))
+        drawing.become("failed", error=RequestError(event.message, remedy, "died", event.stderr))
     elif isinstance(event, Silent):
         client.kill(0.0)
         sentence = f"the backend hung: it said nothing for {event.seconds:.0f} s and was ended"
-        drawing.become("failed", error=JobError(sentence, "render again", "hung", client.stderr))
+        drawing.become("failed", error=RequestError(sentence, "render again", "hung", client.stderr))

@@ -25,7 +25,7 @@ from typing import Any, Literal
 from .backend import Backend
 from .client import BackendClient
 from .environment import MARK, BackendPython, python_of_environment, search
-from .job import Request
+from .request import Request
 from .setup_packages import Lock
 from .setup_pip import SetUpFailed, clean_environment, followed, what_went_wrong
 

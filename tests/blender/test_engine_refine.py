@@ -11,7 +11,7 @@ import pytest
 from blender_primdiffusion.engine.refine import COARSENESS, REST_S, Refinement, Wish
 from blender_primdiffusion.engine.view import View, view_from_matrices, without_scale
 from blender_primdiffusion.worker.drawing import Drawing
-from blender_primdiffusion.worker.job import JobError
+from blender_primdiffusion.worker.request import RequestError
 
 pytestmark = pytest.mark.any_blender
 
@@ -115,7 +115,7 @@ def test_the_same_wish_again_asks_for_nothing(bench):
 def test_an_error_is_told_once_and_another_wish_is_tried_anew(bench):
     bench.refinement.want(wish("a"))
     bench.refinement.advance()
-    answer(bench, "failed", error=JobError("no backend", "set it up", "environment"))
+    answer(bench, "failed", error=RequestError("no backend", "set it up", "environment"))
     assert bench.refinement.advance()
     assert bench.refinement.error == "No backend. Set it up."
     assert bench.refinement.resting
@@ -131,7 +131,7 @@ def test_a_child_that_died_is_replaced_once_before_the_user_is_told(bench):
     bench.refinement.advance()
     for _ in range(2):
         assert bench.refinement.error == ""
-        answer(bench, "failed", error=JobError("the child has died", "", "died"))
+        answer(bench, "failed", error=RequestError("the child has died", "", "died"))
         bench.refinement.advance()
     assert len(bench.asked) == 2
     assert bench.refinement.error == "The child has died."
@@ -142,7 +142,7 @@ def test_a_child_that_died_is_replaced_once_before_the_user_is_told(bench):
     assert bench.refinement.shown.wish.key == "b"
     bench.refinement.want(wish("c"))
     bench.refinement.advance()
-    answer(bench, "failed", error=JobError("the child has died", "", "died"))
+    answer(bench, "failed", error=RequestError("the child has died", "", "died"))
     bench.refinement.advance()
     assert bench.refinement.error == ""
 

@@ -22,8 +22,8 @@ from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui import drawing, jobs_panel
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
-from blender_primdiffusion.worker.job import JobError
 from blender_primdiffusion.worker.memory_advice import memory_advice
+from blender_primdiffusion.worker.request import RequestError
 
 pytestmark = pytest.mark.any_blender
 
@@ -54,6 +54,7 @@ def started_and_idle() -> int:
 def ended(pid: int, seconds: float = 3.0) -> bool:
     end = time.monotonic() + seconds
     while time.monotonic() < end:
+        queue.listen()  # as a timer does
         try:
             os.kill(pid, 0)
         except ProcessLookupError:
@@ -100,13 +101,13 @@ def test_the_childs_picture_is_shown_while_it_works_and_then_no_more(addon):
 def test_each_error_has_a_button_where_there_is_something_to_do(addon):
     expected = {"died": "try_again", "hung": "try_again", "busy": "try_again", "out_of_memory": "release_memory"}
     for kind, operator in expected.items():
-        assert remedies.remedy_for(JobError("", "", kind)).operator == f"primdiffusion.{operator}"
-    assert remedies.remedy_for(JobError("", "", "unwritable")).operator == "wm.save_as_mainfile"
-    no_checkpoint = JobError("there is no checkpoint at 'x.safetensors'", "", "missing_file")
+        assert remedies.remedy_for(RequestError("", "", kind)).operator == f"primdiffusion.{operator}"
+    assert remedies.remedy_for(RequestError("", "", "unwritable")).operator == "wm.save_as_mainfile"
+    no_checkpoint = RequestError("there is no checkpoint at 'x.safetensors'", "", "missing_file")
     assert remedies.remedy_for(no_checkpoint).operator == "preferences.addon_show"
-    assert remedies.remedy_for(JobError("there is no folder of captures 'x'", "", "missing_file")) is None
-    assert remedies.remedy_for(JobError("", "", "bad_input")) is None
-    environment = remedies.remedy_for(JobError("", "", "environment"))
+    assert remedies.remedy_for(RequestError("there is no folder of captures 'x'", "", "missing_file")) is None
+    assert remedies.remedy_for(RequestError("", "", "bad_input")) is None
+    environment = remedies.remedy_for(RequestError("", "", "environment"))
     assert environment is None or environment.operator == "primdiffusion.set_up_backend"
 
 
@@ -181,7 +182,7 @@ def test_release_ends_the_child_says_what_was_freed_and_the_next_person_starts_a
 def test_release_is_refused_while_the_child_works(addon):
     queue.add(bpy.context, GenerateJob(TAKES_LONG, 50))
     until_running()
-    with pytest.raises(RuntimeError, match="the backend is at work: wait for it, or cancel it first"):
+    with pytest.raises(RuntimeError, match="the backend is busy"):
         ops.release_memory()
     assert queue.busy
 

@@ -13,7 +13,7 @@ LATE = (
     "scene.build", "scene.edit", "scene.merged", "scene.shape", "scene.shape_model", "scene.surface", "scene.volumes",
     "scene.human_npz", "scene.grid_cache", "scene.collect", "scene.human_file", "scene.proxy", "scene.reshape",
     "capture.settings", "formats.camera_rig", "motion.poses", "engine.viewport", "engine.studio", "worker.client",
-    "worker.environment", "worker.job", "jobs.generate", "jobs.edit", "jobs.assets",
+    "worker.environment", "worker.request", "jobs.generate", "jobs.edit", "jobs.assets",
     "jobs.export_person", "ui.motion_placing",
 )  # fmt: skip
 """Modules of ours that registering must not import: they bring others along, or numpy."""

@@ -7,8 +7,8 @@ import sys
 import time
 
 import pytest
-from child_jobs import generate_job, this_pythons_backend
-from worker.job import Request
+from child_requests import generate_request, this_pythons_backend
+from worker.request import Request
 
 TICK_S = 0.1
 """Of Blender's timer."""
@@ -40,12 +40,12 @@ sys.meta_path.insert(0, LongSteps())
 """
 
 
-def tick(job: Request, until, timeout_s: float = 90.0) -> None:
+def tick(request: Request, until, timeout_s: float = 90.0) -> None:
     """As Blender's timer does."""
     end = time.monotonic() + timeout_s
     while not until():
-        assert time.monotonic() < end, (job.state, job.message)
-        job.tick()
+        assert time.monotonic() < end, (request.state, request.message)
+        request.tick()
         time.sleep(TICK_S)
 
 
@@ -60,13 +60,13 @@ def backend(tmp_path):
 @pytest.mark.skipif(sys.platform == "win32", reason="the long step is made by libc")
 def test_a_cancel_in_the_middle_of_a_step_does_not_wait_for_the_step_and_leaves_nothing(backend, checkpoint, tmp_path):
     out = tmp_path / "out"
-    job = generate_job(backend, seed=4, steps=5, out_dir=out, checkpoint=checkpoint)
-    tick(job, lambda: job.step >= 1)
+    request = generate_request(backend, seed=4, steps=5, out_dir=out, checkpoint=checkpoint)
+    tick(request, lambda: request.step >= 1)
     client = backend.client
     time.sleep(0.3)
-    job.cancel()
-    tick(job, lambda: job.finished, timeout_s=30.0)
-    assert job.state == "cancelled"
+    request.cancel()
+    tick(request, lambda: request.finished, timeout_s=30.0)
+    assert request.state == "cancelled"
     assert backend.client is None, "nobody is given a child that is about to end"
     assert client.gone_within(10.0)
     end = time.monotonic() + 10.0

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture_scenes import captured
-from child_jobs import reconstruct_job, this_pythons_backend
+from child_requests import reconstruct_request, this_pythons_backend
 from conversation import Conversation
 from tiny_encoder import save_tiny_encoder
-from worker.job import Request
+from worker.request import Request
 
 CANCELLED, DOMAIN_ERROR, INVALID_PARAMS = -32001, -32002, -32602
 FIRST = "person_000000"
@@ -86,14 +86,14 @@ def test_a_cancel_ends_the_job_and_leaves_nothing(child, asked):
     assert not Path(asked["out_dir"]).parent.exists()
 
 
-def follow(job: Request, timeout_s: float = 60) -> list[str]:
+def follow(request: Request, timeout_s: float = 180) -> list[str]:
     """Ticks as Blender's timer does; returns the messages passed through."""
-    messages, end = [job.message], time.monotonic() + timeout_s
-    while not job.finished:
-        assert time.monotonic() < end, (job.state, job.message)
-        job.tick()
-        if job.message != messages[-1]:
-            messages.append(job.message)
+    messages, end = [request.message], time.monotonic() + timeout_s
+    while not request.finished:
+        assert time.monotonic() < end, (request.state, request.message)
+        request.tick()
+        if request.message != messages[-1]:
+            messages.append(request.message)
         time.sleep(0.005)
     return messages
 
@@ -109,38 +109,38 @@ def backend():
 def start(backend, captures, encoder, tmp_path):
     def start(**more) -> Request:
         settings = {"capture": captures, "subject": FIRST, "checkpoint": encoder, "out_dir": tmp_path / "out", **more}
-        return reconstruct_job(backend, **settings)
+        return reconstruct_request(backend, **settings)
 
     return start
 
 
 def test_the_panels_job_runs_from_a_cold_start_to_its_files(start):
-    job = start(views=1)
-    messages = follow(job)
-    assert job.state == "done", job.message
+    request = start(views=1)
+    messages = follow(request)
+    assert request.state == "done", request.message
     assert messages[0] == "Starting the backend"
     assert {"Reading the pictures", "Reconstructing", "Writing the person"} <= set(messages)
-    assert job.fraction == 1.0
-    assert Path(job.result["human"]).exists()
-    assert job.result["warnings"][0] == "one view only: sides that it does not see are guessed"
+    assert request.fraction == 1.0
+    assert Path(request.result["human"]).exists()
+    assert request.result["warnings"][0] == "one view only: sides that it does not see are guessed"
 
 
-def test_a_refusal_of_the_backend_becomes_the_jobs_error(start):
-    job = start(subject="nobody")
-    follow(job)
-    assert (job.state, job.error.kind) == ("failed", "bad_input")
-    assert str(job.error).startswith("There is no subject 'nobody'")
+def test_a_refusal_of_the_backend_becomes_the_requests_error(start):
+    request = start(subject="nobody")
+    follow(request)
+    assert (request.state, request.error.kind) == ("failed", "bad_input")
+    assert str(request.error).startswith("There is no subject 'nobody'")
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
-def test_a_killed_child_fails_the_job_leaves_nothing_and_the_next_job_works(start, tmp_path):
-    job = start()
-    while job.step < 1:
-        job.tick()
-        assert not job.finished
-    os.kill(job._client.pid, signal.SIGKILL)
-    follow(job)
-    assert (job.state, job.error.kind) == ("failed", "died")
+def test_a_killed_child_fails_the_request_leaves_nothing_and_the_next_request_works(start, tmp_path):
+    request = start()
+    while request.step < 1:
+        request.tick()
+        assert not request.finished
+    os.kill(request._client.pid, signal.SIGKILL)
+    follow(request)
+    assert (request.state, request.error.kind) == ("failed", "died")
     assert not (tmp_path / "out").exists()
     again = start()
     follow(again)

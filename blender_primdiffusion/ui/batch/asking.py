@@ -15,7 +15,7 @@ from ...console import Stop
 from ...places import EXTENSION, new_backend, preference
 from ...worker.backend import Backend
 from ...worker.environment import VARIABLE
-from ...worker.job import Request
+from ...worker.request import Request
 
 _TICK_S = 0.03
 

@@ -16,7 +16,7 @@ from ...capture.report import Report
 from ...console import Stop, duration
 from ...places import preference
 from ...worker.backend import Backend
-from ...worker.job import Request
+from ...worker.request import Request
 from ..attributes import Attributes, parsed
 from .asking import NoBackend, Stopped, ask, backend_of
 from .people import NPZ_FILE, PERSON_FILE, Movement, motion_name, movement_of, person_blend

@@ -4,10 +4,10 @@ import time
 from pathlib import Path
 
 import pytest
-from child_jobs import edit_job, generate_job, this_pythons_backend
+from child_requests import edit_request, generate_request, this_pythons_backend
 from conversation import BUSY_STEPS
 from primdiffusion.human_file import load_human
-from worker.job import Request
+from worker.request import Request
 
 PART = {"region": ["hair"], "seed": 2}
 PARAMS = {
@@ -18,14 +18,14 @@ PARAMS = {
 }
 
 
-def follow(job: Request, until=lambda job: job.finished, timeout_s: float = 120) -> Request:
+def follow(request: Request, until=lambda request: request.finished, timeout_s: float = 120) -> Request:
     """Ticks as Blender's timer does."""
     end = time.monotonic() + timeout_s
-    while not until(job):
-        assert time.monotonic() < end, (job.state, job.message)
-        job.tick()
+    while not until(request):
+        assert time.monotonic() < end, (request.state, request.message)
+        request.tick()
         time.sleep(0.01)
-    return job
+    return request
 
 
 @pytest.fixture(scope="module")
@@ -39,34 +39,34 @@ def backend():
 def people(backend, checkpoint, tmp_path_factory) -> list[Path]:
     folders = [tmp_path_factory.mktemp("people") / name for name in ("anna", "berta")]
     for seed, folder in enumerate(folders):
-        job = follow(generate_job(backend, seed=seed, steps=1, out_dir=folder, checkpoint=checkpoint))
-        assert job.state == "done", job.message
+        request = follow(generate_request(backend, seed=seed, steps=1, out_dir=folder, checkpoint=checkpoint))
+        assert request.state == "done", request.message
     return [folder / "person.human.safetensors" for folder in folders]
 
 
 def edit(backend, people, checkpoint, method, out, steps=3, **changes) -> Request:
     others = {"transfer": {"source": str(people[1])}, "interpolate": {"other": str(people[1])}}
     asked = {**PARAMS[method], **others.get(method, {}), **changes}
-    return edit_job(backend, method, people[0], **asked, out_dir=out, steps=steps, checkpoint=checkpoint)
+    return edit_request(backend, method, people[0], **asked, out_dir=out, steps=steps, checkpoint=checkpoint)
 
 
 @pytest.mark.parametrize("method", PARAMS)
 def test_an_edit_takes_steps_and_leaves_another_person(backend, people, checkpoint, tmp_path, method):
     steps = []
-    job = edit(backend, people, checkpoint, method, tmp_path / "out")
-    follow(job, lambda job: steps.append(job.step) or job.finished)
-    assert job.state == "done", job.message
-    assert job.fraction == 1.0
-    before, after = load_human(people[0]), load_human(job.result["person"])
+    request = edit(backend, people, checkpoint, method, tmp_path / "out")
+    follow(request, lambda request: steps.append(request.step) or request.finished)
+    assert request.state == "done", request.message
+    assert request.fraction == 1.0
+    before, after = load_human(people[0]), load_human(request.result["person"])
     assert not before.payload.rgb.equal(after.payload.rgb)
-    assert Path(job.result["human"]).is_file()
+    assert Path(request.result["human"]).is_file()
 
 
 def test_a_cancelled_edit_leaves_nothing(backend, people, checkpoint, tmp_path):
-    job = edit(backend, people, checkpoint, "vary", tmp_path / "out", BUSY_STEPS, amount=1.0)
-    follow(job, lambda job: job.step > 2)
-    job.cancel()
-    assert follow(job).state == "cancelled"
+    request = edit(backend, people, checkpoint, "vary", tmp_path / "out", BUSY_STEPS, amount=1.0)
+    follow(request, lambda request: request.step > 2)
+    request.cancel()
+    assert follow(request).state == "cancelled"
     assert not (tmp_path / "out").exists()
 
 
@@ -74,10 +74,10 @@ def test_a_cancelled_edit_leaves_nothing(backend, people, checkpoint, tmp_path):
     ("changes", "named"),
     [({"person": "nobody.human.safetensors"}, "nobody"), ({"amount": 2.0}, "amount is 2"), ({"seed": -1}, "seed -1")],
 )
-def test_what_the_child_refuses_becomes_the_jobs_error(backend, people, checkpoint, tmp_path, changes, named):
+def test_what_the_child_refuses_becomes_the_requests_error(backend, people, checkpoint, tmp_path, changes, named):
     wanted = {**PARAMS["vary"], **changes}
     person = Path(wanted.pop("person", people[0]))
-    job = edit_job(backend, "vary", person, **wanted, out_dir=tmp_path / "out", steps=2, checkpoint=checkpoint)
-    assert follow(job).state == "failed"
-    assert named in job.error.message
+    request = edit_request(backend, "vary", person, **wanted, out_dir=tmp_path / "out", steps=2, checkpoint=checkpoint)
+    assert follow(request).state == "failed"
+    assert named in request.error.message
     assert not (tmp_path / "out").exists()

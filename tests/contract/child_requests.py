@@ -8,7 +8,7 @@ from pathlib import Path
 
 from worker.backend import Backend
 from worker.client import BackendClient
-from worker.job import Request
+from worker.request import Request
 
 _PICTURE_PX = 16
 
@@ -23,21 +23,21 @@ def this_pythons_backend(**settings) -> Backend:
     return Backend(make_client)
 
 
-def _job(backend: Backend, method: str, out_dir: Path, checkpoint: Path | None, **params) -> Request:
+def _request(backend: Backend, method: str, out_dir: Path, checkpoint: Path | None, **params) -> Request:
     chosen = {} if checkpoint is None else {"checkpoint": str(checkpoint)}
     return Request(backend, method, {**params, **chosen, "out_dir": str(out_dir)})
 
 
-def generate_job(backend: Backend, *, out_dir: Path, checkpoint: Path | None = None, **params) -> Request:
+def generate_request(backend: Backend, *, out_dir: Path, checkpoint: Path | None = None, **params) -> Request:
     """A person from noise."""
-    return _job(backend, "generate", out_dir, checkpoint, size=_PICTURE_PX, **params)
+    return _request(backend, "generate", out_dir, checkpoint, size=_PICTURE_PX, **params)
 
 
-def edit_job(backend: Backend, method: str, person: Path, *, out_dir: Path, checkpoint: Path, **params) -> Request:
+def edit_request(backend: Backend, method: str, person: Path, *, out_dir: Path, checkpoint: Path, **params) -> Request:
     """A person of one that exists."""
-    return _job(backend, method, out_dir, checkpoint, person=str(person), size=_PICTURE_PX, **params)
+    return _request(backend, method, out_dir, checkpoint, person=str(person), size=_PICTURE_PX, **params)
 
 
-def reconstruct_job(backend: Backend, *, capture: Path, out_dir: Path, checkpoint: Path, **params) -> Request:
+def reconstruct_request(backend: Backend, *, capture: Path, out_dir: Path, checkpoint: Path, **params) -> Request:
     """A person from captures."""
-    return _job(backend, "reconstruct", out_dir, checkpoint, capture=str(capture), **params)
+    return _request(backend, "reconstruct", out_dir, checkpoint, capture=str(capture), **params)

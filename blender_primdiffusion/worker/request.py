@@ -37,8 +37,8 @@ STAGES = {
 
 
 @dataclasses.dataclass(frozen=True)
-class JobError:
-    """Why a job failed, for the user and, in `log`, for a bug report."""
+class RequestError:
+    """Why a request failed, for the user and, in `log`, for a bug report."""
 
     message: str
     remedy: str
@@ -65,7 +65,7 @@ class Request:
         self._out_dir = Path(params["out_dir"]) if "out_dir" in params else None
         self._out_dir_is_new = self._out_dir is not None and not self._out_dir.exists()
         self._client: BackendClient | None = None
-        self._request: int | None = None
+        self._id: int | None = None
         self._cancel_asked_at: float | None = None
         self.state: State = "starting"
         self.step = 0
@@ -79,10 +79,10 @@ class Request:
         """PNGs by index, of a method that makes several people."""
         self.result: dict[str, Any] | None = None
         """The child's."""
-        self.error: JobError | None = None
+        self.error: RequestError | None = None
         self._connecting = backend.connecting()
         if not backend.admit(self):
-            self._fail(JobError("the backend is at work already", "wait for it, or cancel it first", "busy"))
+            self._fail(RequestError("the backend is at work already", "wait for it, or cancel it first", "busy"))
 
     @property
     def finished(self) -> bool:
@@ -112,7 +112,7 @@ class Request:
                 self._take(event)
                 if self.finished:
                     break
-            if self._request is None and not self.finished:
+            if self._id is None and not self.finished:
                 self._ask(self._client)
         self._lose_patience()
         return before != (
@@ -125,8 +125,8 @@ class Request:
             return
         self._cancel_asked_at = time.monotonic()
         self.state, self.message, self.eta_s = "cancelling", "Cancelling", None
-        if self._client is not None and self._request is not None:
-            self._client.cancel(self._request)
+        if self._client is not None and self._id is not None:
+            self._client.cancel(self._id)
 
     # starting
 
@@ -142,41 +142,41 @@ class Request:
             if not client.info.get("ready"):
                 self.message = "Loading PyTorch"
         except Exception as error:  # whatever it is, the user is to read it
-            self._fail(JobError(str(error) or type(error).__name__, "", "environment"))
+            self._fail(RequestError(str(error) or type(error).__name__, "", "environment"))
 
     def _ask(self, client: BackendClient) -> None:
         """Sends the request, unless the child has still to find out that an earlier one is not wanted any more."""
         if self._cancel_asked_at is not None:
             self._end("cancelled", "Cancelled")
         elif not client.occupied:
-            self._request = client.request(self.method, self._params)
+            self._id = client.request(self.method, self._params)
 
     # following
 
     def _take(self, event: Event) -> None:
-        if isinstance(event, Notification) and event.method == "progress" and event.params.get("id") == self._request:
+        if isinstance(event, Notification) and event.method == "progress" and event.params.get("id") == self._id:
             self._take_progress(event.params)
-        elif isinstance(event, Response) and event.id == self._request:
+        elif isinstance(event, Response) and event.id == self._id:
             self.result = event.result
             self.step = self.total
             self._end("done", "Done")
-        elif isinstance(event, Failure) and event.id == self._request:
+        elif isinstance(event, Failure) and event.id == self._id:
             if event.code == CANCELLED_CODE:
                 self._end("cancelled", "Cancelled")
             else:
                 remedy = memory_advice(self._params) if event.kind == "out_of_memory" else event.remedy
-                self._fail(JobError(event.message, remedy, event.kind, self._log()))
+                self._fail(RequestError(event.message, remedy, event.kind, self._log()))
         elif isinstance(event, Died):
             self._clear_leftovers()
             if self._cancel_asked_at is not None:
                 self._end("cancelled", "Cancelled")
             else:
                 remedy = f"Try again; if it was the memory, {memory_advice(self._params)}"
-                self._fail(JobError(event.message, remedy, "died", event.stderr))
+                self._fail(RequestError(event.message, remedy, "died", event.stderr))
         elif isinstance(event, Silent):
             self._kill()
             said = f"the backend hung: it said nothing for {event.seconds:.0f} s and was ended"
-            self._fail(JobError(said, "Try again", "hung", self._log()))
+            self._fail(RequestError(said, "Try again", "hung", self._log()))
 
     def _take_progress(self, params: dict[str, Any]) -> None:
         if self._cancel_asked_at is not None:
@@ -200,11 +200,11 @@ class Request:
         if self.finished or asked is None or time.monotonic() - asked < CANCEL_PATIENCE_S:
             return
         client = self._client
-        if client is not None and self._request is not None:
+        if client is not None and self._id is not None:
             if client.info.get("ready"):
                 self._kill()
             else:  # importing torch takes seconds that need not be spent again: the child drops the request after it
-                client.abandon(self._request)
+                client.abandon(self._id)
         self._end("cancelled", "Cancelled")
 
     def _kill(self) -> None:
@@ -226,7 +226,7 @@ class Request:
     def _log(self) -> tuple[str, ...]:
         return self._client.stderr if self._client is not None else ()
 
-    def _fail(self, error: JobError) -> None:
+    def _fail(self, error: RequestError) -> None:
         self.error = error
         self._end("failed", str(error))
 

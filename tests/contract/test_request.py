@@ -1,0 +1,176 @@
+"""A generation as the panel follows it, with the real child."""
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from child_requests import generate_request, this_pythons_backend
+from conversation import BUSY_STEPS
+from worker.backend import Backend
+from worker.client import BackendClient
+from worker.environment import BackendNotFound
+from worker.request import Request
+
+PYTHON = Path(sys.executable)
+
+
+def follow(request: Request, until=lambda request: request.finished, timeout_s: float = 180) -> list[str]:
+    """Ticks as Blender's timer does; returns the states passed through."""
+    states = [request.state]
+    end = time.monotonic() + timeout_s
+    while not until(request):
+        assert time.monotonic() < end, (request.state, request.message)
+        request.tick()
+        if request.state != states[-1]:
+            states.append(request.state)
+        time.sleep(0.01)
+    return states
+
+
+@pytest.fixture(scope="module")
+def backend():
+    backend = this_pythons_backend()
+    yield backend
+    backend.shutdown()
+
+
+@pytest.fixture
+def start(backend, checkpoint, tmp_path):
+    def start(steps: int, name: str = "out", **settings) -> Request:
+        return generate_request(
+            backend, seed=4, steps=steps, out_dir=tmp_path / name, **{"checkpoint": checkpoint, **settings}
+        )
+
+    return start
+
+
+def test_a_request_runs_from_a_cold_start_to_its_files(start):
+    request = start(200)
+    assert (request.state, request.fraction, request.message) == ("starting", 0.0, "Starting the backend")
+    etas = []
+    states = follow(request, lambda request: etas.append(request.eta_s) or request.finished)
+    assert states == ["starting", "running", "done"]
+    assert request.step == request.total == 200
+    assert request.fraction == 1.0
+    assert request.error is None
+    assert Path(request.result["human"]).exists()
+    assert any(eta is not None and eta > 0 for eta in etas)
+    assert request.info["device"] in ("cpu", "cuda")
+    assert not request.tick(), "a finished request stays as it is"
+
+
+def test_a_child_that_was_being_started_when_all_was_shut_down_is_ended_too(checkpoint, tmp_path):
+    clients = []
+
+    def slowly():
+        for _ in range(3):
+            yield
+        clients.append(BackendClient(PYTHON))
+        return clients[0]
+
+    backend = Backend(slowly)
+    request = generate_request(backend, seed=1, steps=1, out_dir=tmp_path / "out", checkpoint=checkpoint)
+    request.tick()
+    backend.shutdown()
+    assert follow(request)[-1] == "failed"
+    assert not clients[0].alive
+
+
+def test_a_second_request_uses_the_same_child(start, backend):
+    first = backend.connect()
+    follow(start(1))
+    assert backend.connect() is first
+
+
+def test_a_cancelled_request_leaves_nothing(start, tmp_path):
+    request = start(BUSY_STEPS)
+    follow(request, lambda request: request.step > 2)
+    request.cancel()
+    assert request.state == "cancelling"
+    assert follow(request) == ["cancelling", "cancelled"]
+    assert request.step < request.total
+    assert not (tmp_path / "out").exists()
+    assert request.result is None
+
+
+def test_a_request_cancelled_before_the_child_is_up_is_cancelled(checkpoint, tmp_path):
+    backend = this_pythons_backend()
+    request = generate_request(backend, seed=1, steps=1, out_dir=tmp_path / "out", checkpoint=checkpoint)
+    request.cancel()
+    assert follow(request) == ["cancelling", "cancelled"]
+    backend.shutdown()
+
+
+def test_the_second_of_two_clicks_is_refused_with_a_sentence_and_the_first_goes_on(start):
+    first, second = start(3), start(3, "second")
+    assert second.state == "failed"
+    assert second.error.kind == "busy"
+    assert str(second.error) == "The backend is at work already. Wait for it, or cancel it first."
+    assert follow(first)[-1] == "done"
+
+
+def test_a_killed_child_fails_the_request_leaves_nothing_and_the_next_request_works(start, tmp_path):
+    request = start(BUSY_STEPS)
+    follow(request, lambda request: request.step > 2)
+    assert list((tmp_path / "out").iterdir()), "the child keeps half-written files here"
+    os.kill(request._client.pid, signal.SIGKILL)
+    assert follow(request)[-1] == "failed"
+    assert request.error.kind == "died"
+    assert "killed" in request.error.message
+    assert not (tmp_path / "out").exists()
+    assert follow(start(1))[-1] == "done"
+
+
+@pytest.mark.parametrize(
+    ("settings", "kind", "named"),
+    [
+        ({"checkpoint": Path("nowhere.safetensors")}, "missing_file", "nowhere.safetensors"),
+        ({"sampler": "magic"}, "bad_input", "magic"),
+        ({"steps": 0}, "", "0 steps"),
+    ],
+)
+def test_a_refusal_of_the_backend_becomes_the_requests_error(start, settings, kind, named):
+    request = start(**{"steps": 1, **settings})
+    assert follow(request)[-1] == "failed"
+    assert request.error.kind == kind
+    assert named in request.error.message
+    assert request.message == str(request.error)
+
+
+def test_a_missing_python_is_the_requests_error(tmp_path):
+    def nowhere():
+        raise BackendNotFound("No Python for the backend: name one in the preferences.")
+
+    request = generate_request(Backend(nowhere), seed=1, steps=1, out_dir=tmp_path / "out")
+    assert follow(request) == ["starting", "failed"]
+    assert request.error.kind == "environment"
+    assert str(request.error) == "No Python for the backend: name one in the preferences."
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="needs SIGSTOP to hang a process")
+def test_a_child_that_hangs_is_ended_and_fails_the_request(checkpoint, tmp_path):
+    backend = this_pythons_backend(silence_s=5.0)
+    request = generate_request(backend, seed=1, steps=BUSY_STEPS, out_dir=tmp_path / "out", checkpoint=checkpoint)
+    follow(request, lambda request: request.step > 2)
+    os.kill(request._client.pid, signal.SIGSTOP)
+    assert follow(request)[-1] == "failed"
+    assert request.error.kind == "hung"
+    assert backend.client is None
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_cancel_while_torch_is_loaded_keeps_the_child(checkpoint, tmp_path):
+    backend = this_pythons_backend()
+    request = generate_request(backend, seed=1, steps=1, out_dir=tmp_path / "out", checkpoint=checkpoint)
+    follow(request, lambda request: request._id is not None)
+    assert not request.info.get("ready")
+    request.cancel()
+    assert follow(request)[-1] == "cancelled"
+    first = backend.connect()
+    again = generate_request(backend, seed=1, steps=1, out_dir=tmp_path / "again", checkpoint=checkpoint)
+    assert follow(again)[-1] == "done"
+    assert backend.connect() is first
+    backend.shutdown()
