@@ -30,7 +30,7 @@ from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_fie
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.raster.rasterise import rasterise
 from primdiffusion.render.march import march
-from primdiffusion.training.stored_people import StoredPerson, read_person
+from primdiffusion.training.stored_people import PersonVariants, read_person
 from torch import Tensor
 
 FIRST_SEED = 10_000_000
@@ -125,9 +125,9 @@ def start_of(person: Person, frames: Frames) -> Payload:
     return colour(surface_field(person.mesh, frames), person.mesh)
 
 
-def stored(payload: Payload, betas: np.ndarray) -> StoredPerson:
+def stored(payload: Payload, betas: np.ndarray) -> PersonVariants:
     """A payload as its file would hold it."""
-    return StoredPerson(
+    return PersonVariants(
         torch.from_numpy(voxels_from_payload(payload))[None],
         payload.delta_scale[None],
         torch.from_numpy(betas).float(),
@@ -141,12 +141,12 @@ def learns_fitted(model: DiffusionModel) -> bool:
     return model.full_density == FULL_DENSITY
 
 
-def at_density(person: StoredPerson, full_density: float) -> Payload:
+def at_density(person: PersonVariants, full_density: float) -> Payload:
     """The stored payload, its densities relative to another full one."""
     return dataclasses.replace(person, full_density=full_density).payload(0)
 
 
-def latents_of(model: DiffusionModel, person: StoredPerson) -> Tensor:
+def latents_of(model: DiffusionModel, person: PersonVariants) -> Tensor:
     """Clean samples [1, *shape] of a stored person, as training makes them.
 
     Training encodes stored voxels as they are; `model.encode` also undoes the dead zone of decoding.
@@ -196,6 +196,6 @@ def recoloured(person: Person, number: int, count: int) -> list[Person]:
     return [person, *(recolour(person, seed + variant * VARIANT_STRIDE) for variant in range(1, count + 1))]
 
 
-def stored_fit(folder: Path, number: int) -> StoredPerson:
+def stored_fit(folder: Path, number: int) -> PersonVariants:
     """A held-out person's fitted payload from its file."""
     return read_person(folder / f"person_{FIRST_SEED + number:06d}.npz")

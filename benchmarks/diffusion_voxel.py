@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from primdiffusion.diffusion.conditioning import Vocabulary
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.evaluation.voxel_baseline import (
@@ -119,7 +119,9 @@ def read_betas(path: Path) -> np.ndarray:
         return file["betas"]
 
 
-def prepared(paths: Sequence[Path], vocabulary: Vocabulary, folder: Path) -> tuple[VoxelCodec, LatentSet, PersonPrior]:
+def prepared(
+    paths: Sequence[Path], vocabulary: AttributeVocabulary, folder: Path
+) -> tuple[VoxelCodec, LatentSet, PersonPrior]:
     """Codec, latents and prior; read back from the folder when they are there."""
 
     def grids() -> Iterator[Tensor]:
@@ -148,7 +150,9 @@ def prepared(paths: Sequence[Path], vocabulary: Vocabulary, folder: Path) -> tup
     return codec, people, prior
 
 
-def encoded(paths: Sequence[Path], vocabulary: Vocabulary, codec: VoxelCodec, grids: Iterator[Tensor]) -> LatentSet:
+def encoded(
+    paths: Sequence[Path], vocabulary: AttributeVocabulary, codec: VoxelCodec, grids: Iterator[Tensor]
+) -> LatentSet:
     """Everybody's latents and what is said of them, as of primitives."""
     latents, conditions, betas = [], [], []
     for path, one in zip(paths, grids, strict=True):
@@ -165,7 +169,7 @@ class Run(NamedTuple):
 
     people: LatentSet
     codec: VoxelCodec
-    vocabulary: Vocabulary
+    vocabulary: AttributeVocabulary
     folder: Path
     seed: int
 

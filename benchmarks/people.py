@@ -30,7 +30,7 @@ from primdiffusion.people.person import make_person
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import colour, surface_field
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.raster.rasterise import Picture, rasterise
+from primdiffusion.raster.rasterise import RasterImage, rasterise
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.march import march
 from record import tell
@@ -69,7 +69,7 @@ def camera_at(bounds: np.ndarray, yaw: float, pitch: float) -> Camera:
     return look_at(position, target, vertical_fov=FIELD_OF_VIEW, width=SIZE, height=SIZE)
 
 
-def compare(drawn: Picture, marched: Rendering) -> dict[str, float]:
+def compare(drawn: RasterImage, marched: Rendering) -> dict[str, float]:
     first, second = drawn.alpha > 0.5, marched.alpha.numpy() > 0.5
     squared = (displayed(drawn.rgb) - displayed(marched.rgb.numpy())) ** 2
     rows, columns = np.nonzero(first)

@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 from primdiffusion.diffusion.checkpoint import save_checkpoint
 from primdiffusion.diffusion.codec import SCALE_VALUE, LinearCodec
-from primdiffusion.diffusion.conditioning import Vocabulary
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import STANDARD_SHAPES, CellCodec, DiffusionModel
@@ -15,7 +15,7 @@ from primdiffusion.primitives.primitives import GRID, K, S
 FULL_DENSITY = 100.0
 CHANNELS = 4
 COMPONENTS = 3
-VOCABULARY = Vocabulary({"outfit": ("jeans", "suit")}, {"height": (1.75, 0.1), "weight": (66.0, 8.0)})
+VOCABULARY = AttributeVocabulary({"outfit": ("jeans", "suit")}, {"height": (1.75, 0.1), "weight": (66.0, 8.0)})
 
 
 def tiny_model() -> DiffusionModel:

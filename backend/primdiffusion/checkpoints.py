@@ -1,4 +1,4 @@
-"""Loading a diffusion model from any kind of checkpoint: trained here, or imported from the authors'."""
+"""Load a diffusion model from a checkpoint of either kind: trained here, or imported from the released weights."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from primdiffusion.released.imported import KIND, released_model
 
 
 def load_checkpoint(path: Path | str | None = None, device: torch.device | str = "cpu") -> DiffusionModel:
-    """A model ready to sample, in float32; without a path the package's default.
+    """Return a model ready to sample, in float32; without a path the package's default.
 
     Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
     format or version, does not match its own architecture or holds values that are not finite. An imported one

@@ -25,7 +25,7 @@ from primdiffusion.body.measures import betas_of_measures
 from primdiffusion.body.model import BodyModel, BodyPose, PosedBody, default_body
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import DiffusionModel, sample
-from primdiffusion.diffusion.samplers import Step
+from primdiffusion.diffusion.samplers import SamplerStep
 from primdiffusion.formats import requests
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
@@ -77,7 +77,7 @@ def generate(
     seed: int,
     steps: int = requests.STEPS,
     sampler: str = requests.SAMPLERS[0],
-    on_step: Callable[[Step], None] | None = None,
+    on_step: Callable[[SamplerStep], None] | None = None,
     attributes: Attributes = MappingProxyType({}),
     guidance: float = requests.GUIDANCE,
 ) -> Human:
@@ -96,7 +96,7 @@ def generate_batch(
     seeds: Sequence[int],
     steps: int = requests.STEPS,
     sampler: str = requests.SAMPLERS[0],
-    on_step: Callable[[Step], None] | None = None,
+    on_step: Callable[[SamplerStep], None] | None = None,
     attributes: Attributes = MappingProxyType({}),
     guidance: float = requests.GUIDANCE,
 ) -> list[Human]:

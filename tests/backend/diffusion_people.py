@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from primdiffusion.diffusion.codec import SCALE_VALUE, VALUES, LinearCodec
-from primdiffusion.diffusion.conditioning import Vocabulary
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkConfig
@@ -17,7 +17,7 @@ from primdiffusion.diffusion.schedule import linear
 from primdiffusion.primitives.primitives import GRID, K, S
 
 CHANNELS, COMPONENTS = 4, 6
-VOCABULARY = Vocabulary({"outfit": ("jeans", "suit")}, {})
+VOCABULARY = AttributeVocabulary({"outfit": ("jeans", "suit")}, {})
 SMALL = DenoiserConfig(
     PersonNetworkConfig(width=16, blocks=1),
     LocalUNetConfig(widths=(8, 8), position_channels=2, condition_width=8, heads=2),

@@ -15,7 +15,7 @@ from primdiffusion.formats.capture_layout import picture_path
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.training.captured_people import EncodeSettings, encode_people, frames_of_looks, read_cards
 from primdiffusion.training.shards import INDEX
-from primdiffusion.training.stored_people import PeopleFolder, read_person
+from primdiffusion.training.stored_people import PersonFolder, read_person
 from tiny_encoder import save_tiny_encoder, tiny_encoder
 
 AS_ENCODED = EncodeSettings()
@@ -56,7 +56,7 @@ def test_the_file_holds_what_the_encoder_makes_of_the_pictures(root, line, tmp_p
     assert (got.delta_scale != 1).all()
     assert (got.density - wanted.density).abs().max() < 0.51 / 255 * stored.full_density
     assert torch.equal(stored.betas, person.betas)
-    people = PeopleFolder(tmp_path / "out")
+    people = PersonFolder(tmp_path / "out")
     assert list(people.names) == [FIRST, SECOND]
     assert people.known(0)[0].keys() == {"outfit", "height", "weight"}
     assert people.known(0)[0]["outfit"] == "suit"

@@ -1,8 +1,8 @@
 import pytest
 import torch
-from primdiffusion.diffusion.conditioning import NOTHING, Vocabulary
+from primdiffusion.diffusion.conditioning import NOTHING, AttributeVocabulary
 
-WORDS = Vocabulary({"sex": ("female", "male"), "hair": ("bald", "bob", "long")}, {"height": (1.7, 0.1)})
+WORDS = AttributeVocabulary({"sex": ("female", "male"), "hair": ("bald", "bob", "long")}, {"height": (1.7, 0.1)})
 
 
 def test_what_is_not_asked_for_is_zero():
@@ -29,7 +29,7 @@ def test_what_a_model_does_not_know_is_refused_with_what_it_knows(asked, words):
 
 
 def test_a_vocabulary_survives_json():
-    assert Vocabulary.from_json(WORDS.to_json()) == WORDS
+    assert AttributeVocabulary.from_json(WORDS.to_json()) == WORDS
 
 
 def test_all_subsets_of_attributes_are_learnt():

@@ -28,7 +28,7 @@ from primdiffusion.training.losses import LEVELS
 from primdiffusion.training.phase import step_seed
 from primdiffusion.training.shards import INDEX, pack_people
 from primdiffusion.training.slabs import SlabTrainee
-from primdiffusion.training.stored_people import PeopleFolder
+from primdiffusion.training.stored_people import PersonFolder
 from safetensors.torch import load_file
 
 DIES_IN_THE_FIFTH_SAVE = """
@@ -285,11 +285,11 @@ def test_the_paper_preset_goes_on_bit_for_bit(few, paper, tmp_path, monkeypatch)
 
 def test_the_paper_preset_learns_slabs_of_the_people(few):
     config = settings(few, Path("unused"), preset="paper")
-    trainee = SlabTrainee(config, PeopleFolder(few), [0, 2], [1], torch.device("cpu"))
+    trainee = SlabTrainee(config, PersonFolder(few), [0, 2], [1], torch.device("cpu"))
     assert trainee.places == [(0, 0), (0, 1), (2, 0), (2, 1)]
     (slab,) = trainee.slabs([(2, 1)])
     payload = trainee.model().decode(slab)
-    stored = PeopleFolder(few).person(2).payload(1)
+    stored = PersonFolder(few).person(2).payload(1)
     for name in ("rgb", "density", "delta_scale"):
         assert torch.allclose(getattr(payload, name), getattr(stored, name), atol=1e-4), name
 
@@ -297,7 +297,7 @@ def test_the_paper_preset_learns_slabs_of_the_people(few):
 def test_an_untrained_paper_network_has_the_loss_of_guessing_nothing(few):
     # it starts at 0, so the plain error is the mean square of the slabs themselves, at any level
     config = settings(few, Path("unused"), preset="paper", slab=PhaseConfig(steps=1, batch=2, weighting="plain"))
-    trainee = SlabTrainee(config, PeopleFolder(few), [0], [1], torch.device("cpu"))
+    trainee = SlabTrainee(config, PersonFolder(few), [0], [1], torch.device("cpu"))
     energy = trainee.slabs([(0, 0)]).square().mean().item(), trainee.slabs([(0, 1)]).square().mean().item()
     loss = trainee.loss("slab", torch.Generator().manual_seed(0)).item()
     assert min(energy) - 1e-6 <= loss <= max(energy) + 1e-6
@@ -307,7 +307,7 @@ def test_bfloat16_computes_the_network_in_it_and_nothing_else(few):
     config = settings(
         few, Path("unused"), preset="paper", slab=PhaseConfig(steps=1, batch=1, weighting="plain", bfloat16=True)
     )
-    trainee = SlabTrainee(config, PeopleFolder(few), [0], [1], torch.device("cpu"))
+    trainee = SlabTrainee(config, PersonFolder(few), [0], [1], torch.device("cpu"))
     seen = []
     trainee.denoiser.input_blocks[0][0].register_forward_hook(lambda module, given, out: seen.append(out.dtype))
     loss = trainee.loss("slab", torch.Generator().manual_seed(0))

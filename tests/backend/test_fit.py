@@ -248,7 +248,7 @@ def test_held_boxes_are_drawn_as_large_as_they_start_and_then_learn(captures, tm
         sample, _ = next(fit_batches(dataset, config, FIRST, ALONE))
         with torch.no_grad():
             state.network.scale_out.bias.fill_(30.0)  # as if boxes had learned to be larger
-        clock = recorder_module.Clock(torch.device("cpu"))
+        clock = recorder_module.StepTimer(torch.device("cpu"))
         terms[hold_scale] = fit_module.objective(config, state, sample, MarchSettings(step=0.02), clock)
         start = sample.frames.half_extent * torch.tensor(PRESETS["default"].extent)
     assert torch.allclose(terms[1]["volume"], config.loss.volume * volume_loss(start))

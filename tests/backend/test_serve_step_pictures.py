@@ -15,7 +15,7 @@ from primdiffusion.commands.session import Session
 from primdiffusion.commands.step_pictures import Allowance, PassingPictures, draw_front_and_back, step_pictures
 from primdiffusion.commands.transfer import TransferRequest
 from primdiffusion.commands.vary import VaryRequest
-from primdiffusion.diffusion.samplers import Step
+from primdiffusion.diffusion.samplers import SamplerStep
 from tiny_model import save_tiny_checkpoint
 
 FILES = ["depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"]
@@ -101,12 +101,12 @@ def test_at_most_the_last_two_pictures_are_there_and_none_in_the_end(tmp_path):
 
 def test_without_pixels_nothing_is_drawn(tmp_path):
     with step_pictures(tmp_path, 0, pytest.fail) as picture:
-        assert picture(Step(0, 2, 500, torch.zeros(1), torch.zeros(1))) is None
+        assert picture(SamplerStep(0, 2, 500, torch.zeros(1), torch.zeros(1))) is None
 
 
 def test_the_last_step_has_no_picture_for_the_result_follows(tmp_path, always):
     with step_pictures(tmp_path, 16, pytest.fail) as picture:
-        assert picture(Step(1, 2, 500, torch.zeros(1), torch.zeros(1))) is None
+        assert picture(SamplerStep(1, 2, 500, torch.zeros(1), torch.zeros(1))) is None
 
 
 def test_generate_shows_what_the_person_will_look_like_and_leaves_no_pictures_behind(checkpoint, tmp_path, always):

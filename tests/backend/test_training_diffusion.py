@@ -9,7 +9,7 @@ import torch
 from diffuse_runs import settings
 from diffusion_people import write_people
 from primdiffusion.diffusion.codec import mirror_cells
-from primdiffusion.diffusion.conditioning import Vocabulary
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.schedule import fine_linear, linear, sqrt_linear
 from primdiffusion.primitives.primitives import GRID
 from primdiffusion.training.cells import CellTrainee, prepare
@@ -294,7 +294,7 @@ def test_an_empty_folder_is_refused(tmp_path):
 
 def test_blends_are_asked_for_by_what_both_people_have():
     condition = torch.tensor([[1.0, 0, 1, 0], [1.0, 0, 0, 1]])
-    words = Vocabulary({"sex": ("female", "male"), "pattern": ("patterned", "plain")}, {})
+    words = AttributeVocabulary({"sex": ("female", "male"), "pattern": ("patterned", "plain")}, {})
     people = LatentSet(torch.zeros(2, 1, 32, 32), torch.zeros(2, dtype=torch.int64), torch.zeros(1, 10), condition)
     indices, weights = torch.tensor([[0, 1], [0, 1]]), torch.tensor([[0.6, 0.4], [1.0, 0.0]])
     asked = [asked_of(people, indices, weights, words, 0.0, torch.Generator().manual_seed(s)) for s in range(200)]

@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-from primdiffusion.diffusion.conditioning import NOTHING, Vocabulary
+from primdiffusion.diffusion.conditioning import NOTHING, AttributeVocabulary
 from primdiffusion.diffusion.gaussian import IMPOSSIBLE
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.mixture import fit_mixture
 
-WORDS = Vocabulary(
+WORDS = AttributeVocabulary(
     {
         "sex": ("female", "male"),
         "outfit": ("dress", "jeans"),

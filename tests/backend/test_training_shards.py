@@ -8,7 +8,7 @@ from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import K
 from primdiffusion.training import shards
 from primdiffusion.training.shards import INDEX, PackedPeople, ShardError, damaged_shards, open_people, pack_people
-from primdiffusion.training.stored_people import PeopleFolder, read_person
+from primdiffusion.training.stored_people import PersonFolder, read_person
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def same(one, other):
 
 def test_packed_people_are_those_of_the_folder_bit_for_bit(folder, packed):
     files, people = open_people(folder), open_people(packed)
-    assert isinstance(files, PeopleFolder)
+    assert isinstance(files, PersonFolder)
     assert isinstance(people, PackedPeople)
     assert sorted(path.name for path in packed.iterdir()) == [INDEX, *(f"shard_000{i}.safetensors" for i in range(3))]
     assert list(people.names) == list(files.names) == [f"person_00000{i}" for i in range(5)]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from tqdm import tqdm
 
 if TYPE_CHECKING:
-    from primdiffusion.diffusion.samplers import Step
+    from primdiffusion.diffusion.samplers import SamplerStep
 
 
 class Report(Protocol):
@@ -35,16 +35,18 @@ class Pace:
         return round((self._times[-1] - self._times[0]) / (len(self._times) - 1) * (total - done), 3)
 
 
-def no_picture(_step: Step) -> str | None:
+def no_picture(_step: SamplerStep) -> str | None:
     """The picture after a step of a request without pictures."""
     return None
 
 
-def step_reporter(report: Report, picture: Callable[[Step], str | None] = no_picture) -> Callable[[Step], None]:
+def step_reporter(
+    report: Report, picture: Callable[[SamplerStep], str | None] = no_picture
+) -> Callable[[SamplerStep], None]:
     """Reports each step with the seconds left, and its picture where there is one."""
     pace = Pace()
 
-    def on_step(step: Step) -> None:
+    def on_step(step: SamplerStep) -> None:
         path = picture(step)
         more = {} if path is None else {"picture": path}
         done = step.index + 1

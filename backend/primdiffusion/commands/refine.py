@@ -26,7 +26,7 @@ ENCODER_VIEWS = 8
 
 
 @dataclasses.dataclass(frozen=True)
-class Refine:
+class RefineCommand:
     """Optimise one captured person: human.npz for Blender, person.human.safetensors to keep, and pictures.
 
     Captures are those of `primdiffusion captures`, of Blender's Render Captures, or a dataset in the released code's
@@ -149,4 +149,4 @@ def dealt_cameras(count: int, held: int) -> tuple[list[int], list[int]]:
 
 def run(arguments: Sequence[str]) -> None:
     """One command line, errors as exceptions."""
-    tyro.cli(Refine, args=arguments, prog="primdiffusion refine").run()
+    tyro.cli(RefineCommand, args=arguments, prog="primdiffusion refine").run()

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from primdiffusion.body.model import BodyPose
 from primdiffusion.commands.progress import no_picture
-from primdiffusion.diffusion.samplers import Step
+from primdiffusion.diffusion.samplers import SamplerStep
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.human import Human, framing, place
 from primdiffusion.render.image import rgba_to_png, to_png
@@ -86,7 +86,7 @@ class PassingPictures(contextlib.AbstractContextManager):
 
 
 @contextlib.contextmanager
-def step_pictures(folder: Path, px: int, show: Show) -> Iterator[Callable[[Step], str | None]]:
+def step_pictures(folder: Path, px: int, show: Show) -> Iterator[Callable[[SamplerStep], str | None]]:
     """A function to call after each step, which may draw a picture of `px` x `px` pixels in `folder`; returns its path.
 
     None where there is no picture; px = 0 draws none. Those of the steps before vanish.
@@ -96,7 +96,7 @@ def step_pictures(folder: Path, px: int, show: Show) -> Iterator[Callable[[Step]
         return
     allowance = Allowance()
 
-    def picture(step: Step) -> str | None:
+    def picture(step: SamplerStep) -> str | None:
         if step.index + 1 == step.total or not allowance.granted():  # the result itself comes after the last step
             return None
         with allowance.spending():

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from primdiffusion.commands.session import Session
     from primdiffusion.diffusion.model import DiffusionModel
-    from primdiffusion.diffusion.samplers import Step
+    from primdiffusion.diffusion.samplers import SamplerStep
     from primdiffusion.human import Human
 
 MOST_VARIATIONS = 64
@@ -114,7 +114,7 @@ def _people(model: DiffusionModel, request: VariationsRequest, folder: Path, rep
             return people_of(model, x0, [seed], request.attributes)[0]
         return with_payload(model, person, x0)
 
-    def on_step(step: Step) -> None:
+    def on_step(step: SamplerStep) -> None:
         done = step.index + 1
         left = pace.left(done, step.total)
         report("sample", done, step.total, left)

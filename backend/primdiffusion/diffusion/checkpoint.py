@@ -1,4 +1,4 @@
-"""The file of a trained model: weights, codec, prior and a card that says what it is, as one safetensors file."""
+"""Checkpoint files: weights, codec, prior and model card in one safetensors file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from primdiffusion.diffusion.codec import LinearCodec
-from primdiffusion.diffusion.conditioning import Vocabulary
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkConfig
@@ -37,16 +37,16 @@ _SECTIONS = ("held_out_rms_x0_error", "limits")
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that cannot be used; the message says which, why and what to do."""
+    """A checkpoint that cannot be used; the message names the file and the remedy."""
 
 
 def default_checkpoint() -> Path:
-    """Where the package's own weights are."""
+    """Path of the weights that ship with the package."""
     return Path(str(resources.files("primdiffusion.weights") / "default.safetensors"))
 
 
 def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
-    """Write a model; networks, prior and codec in half precision. `schedule` is its schedule's name."""
+    """Write a model with networks, prior and codec in half precision; `schedule` is the name of its schedule."""
     tensors: dict[str, Tensor] = {f"denoiser.{key}": value for key, value in model.denoiser.state_dict().items()}
     chain = next(name for name, chain in CHAINS.items() if chain is model.chain)
     architecture: dict[str, Any] = {"schedule": schedule, "chain": chain, "full_density": model.full_density}
@@ -79,7 +79,7 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
 
 
 def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Any]]:
-    """Tensors in float32, architecture and card (with the file's SHA-256) of a checkpoint of any kind.
+    """Return tensors in float32, architecture and card (with the file's SHA-256) of a checkpoint of any kind.
 
     Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
     format or version, or holds values that are not finite.
@@ -95,7 +95,7 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], dict
 
 @contextlib.contextmanager
 def mismatches_named(path: Path) -> Iterator[None]:
-    """Turn what a file raises that contradicts its own description into CheckpointError."""
+    """Raise CheckpointError for errors caused by tensors that contradict the file's own architecture."""
     try:
         yield
     except (KeyError, TypeError, json.JSONDecodeError, RuntimeError) as error:
@@ -112,9 +112,9 @@ def file_hash(path: Path) -> str:
 
 
 def read_card(path: Path | str | None = None) -> dict[str, Any]:
-    """The card of a checkpoint or an encoder, without its weights; errors as in `read_checkpoint`.
+    """Return the card of a checkpoint or encoder without reading weights; errors as in `read_checkpoint`.
 
-    A checkpoint's says under "attributes" what its model can be asked for, as `Vocabulary.to_json`.
+    A checkpoint's card lists under "attributes" what its model can be conditioned on (`AttributeVocabulary.to_json`).
     """
     path = default_checkpoint() if path is None else Path(path)
     metadata = read_metadata(path, (FORMAT, ENCODER_FORMAT))
@@ -125,7 +125,7 @@ def read_card(path: Path | str | None = None) -> dict[str, Any]:
 def build_model(
     tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card: Mapping[str, Any]
 ) -> DiffusionModel:
-    """The model of a checkpoint that was trained here, on the CPU; raises as `mismatches_named` catches."""
+    """Build the model of a checkpoint trained here, on the CPU; raises what `mismatches_named` catches."""
     schedule = SCHEDULES[architecture["schedule"]]()
     config = architecture["config"]
     weights = _under(tensors, "denoiser.")
@@ -138,18 +138,18 @@ def build_model(
         denoiser = PersonDenoiser(denoiser_config(config), prior, schedule)
         codec = CellCodec(LinearCodec(**_under(tensors, "codec.")))
         if codec.shape != tuple(prior.mean.shape):
-            raise RuntimeError(f"its codec makes latents {codec.shape}, its network is for {tuple(prior.mean.shape)}")
+            raise RuntimeError(f"codec latents are {codec.shape}, the network expects {tuple(prior.mean.shape)}")
         shapes = ShapePrior(**_under(tensors, "shapes."))
     denoiser.load_state_dict(weights)
     denoiser.eval().requires_grad_(False)
-    vocabulary = Vocabulary.from_json(architecture["vocabulary"])
+    vocabulary = AttributeVocabulary.from_json(architecture["vocabulary"])
     chain = CHAINS[architecture.get("chain", "trailing")]
     density = float(architecture["full_density"])
     return DiffusionModel(denoiser, schedule, codec, shapes, density, card, vocabulary, chain)
 
 
 def denoiser_config(tree: Mapping[str, Any]) -> DenoiserConfig:
-    """A denoiser's configuration from its JSON."""
+    """Parse a denoiser's configuration."""
     person, local = tree["person"], tree["local"]
     return DenoiserConfig(
         person=None if person is None else PersonNetworkConfig(**person),
@@ -158,7 +158,7 @@ def denoiser_config(tree: Mapping[str, Any]) -> DenoiserConfig:
 
 
 def read_metadata(path: Path, formats: Sequence[str] = (FORMAT,)) -> dict[str, str]:
-    """The metadata of a checkpoint or encoder; errors as in `read_checkpoint`."""
+    """Return the metadata of a checkpoint or encoder; errors as in `read_checkpoint`."""
     if not path.is_file():
         raise FileNotFoundError(
             f"there is no checkpoint at {path}: give the path of a .safetensors file, or reinstall the package"
@@ -197,7 +197,7 @@ def _under(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 def model_card(card: Mapping[str, Any]) -> str:
-    """The card as a page for docs/model_card.md."""
+    """Return the card as Markdown, for docs/model_card.md."""
     errors = card["held_out_rms_x0_error"]
     levels = list(next(iter(errors.values())))
     rows = [f"| {name} | " + " | ".join(f"{by[level]:.4f}" for level in levels) + " |" for name, by in errors.items()]
@@ -210,7 +210,7 @@ def model_card(card: Mapping[str, Any]) -> str:
             "",
             *(f"- {key.replace('_', ' ')}: {_plain(value)}" for key, value in facts.items()),
             "",
-            *_asked_for(card.get("attributes", {})),
+            *_attribute_section(card.get("attributes", {})),
             "## Held-out error",
             "",
             "Root mean square error of the guessed clean latents at each step t of 1000, for people whose geometry was",
@@ -229,8 +229,8 @@ def model_card(card: Mapping[str, Any]) -> str:
     )
 
 
-def _asked_for(attributes: Mapping[str, Any]) -> list[str]:
-    """The section on attributes; nothing where there are none."""
+def _attribute_section(attributes: Mapping[str, Any]) -> list[str]:
+    """Lines of the section on attributes; empty for an unconditional model."""
     values = [f"- {name}: {', '.join(words)}" for name, words in attributes.get("categories", {}).items()]
     numbers = [
         f"- {name}: about {mean:.3g}, of standard deviation {spread:.2g}"

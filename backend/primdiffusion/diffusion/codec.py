@@ -2,8 +2,8 @@
 
 A primitive's 4 x 8^3 values (sRGB-encoded colour, density / full density; the slab's values, SPEC 3) and its delta
 scale become C numbers in one basis that all primitives share. Noise of the slab projected on orthonormal rows is
-standard normal again, and what the basis leaves out never feeds back, so diffusing latents is diffusing the slab with
-these two layers fixed. The slab repeats a delta scale over 8^3 voxels; here it is one number of the same energy.
+standard normal again, and nothing outside the basis feeds back, so diffusing latents is diffusing the slab with these
+two layers fixed. The slab repeats a delta scale over 8^3 voxels; here it is one number of the same energy.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ SCALE_VALUE = S**1.5 * DELTA_SCALE_UNIT / 255
 SLAB_UNIT = 2 * NETWORK_SCALE
 """Network units per value: noise on latents is the noise that the paper puts on the slab."""
 DEAD_ZONE = (0.08, 0.84)
-"""Decoded relative density a becomes clip((a - start) / width): what truncation leaves around a person is not haze.
-These are of codecs that state no other: of payloads from meshes, at 96 numbers a primitive."""
+"""Decoded relative density a becomes clip((a - start) / width), which removes the haze that truncation leaves around a
+person. The default for codecs that store none: fitted to payloads from meshes, at 96 numbers a primitive."""
 FITTED_DEAD_ZONE = (0.03, 0.94)
-"""Of codecs of fitted payloads, whose densities are exact enough for silhouettes."""
+"""For codecs of fitted payloads, whose densities are exact enough for silhouettes."""
 LEAST_WEIGHT = 0.1
-"""Of a voxel in a corner of its box, which the window all but hides."""
+"""Weight of a voxel in a corner of its box, which the window all but hides."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,12 +47,12 @@ class LinearCodec(TensorRecord):
     parity: Float[Tensor, "c"]
     """1 for even rows, -1 for odd ones."""
     weight: Float[Tensor, "v"] = dataclasses.field(default_factory=lambda: torch.ones(VALUES))
-    """How much of a value pictures show; equal to its own mirror image."""
+    """How visible each value is in a picture; equal to its own mirror image."""
     dead_zone: Float[Tensor, "2"] = dataclasses.field(default_factory=lambda: torch.tensor(DEAD_ZONE))
     """Start and width, see DEAD_ZONE."""
 
     def encode(self, cells: Float[Tensor, "*b k v"]) -> Float[Tensor, "*b c 32 32"]:
-        """Latents of cells; loses what lies outside the basis."""
+        """Project cells onto the basis; the remainder is lost."""
         latents = (cells - self.mean) @ (self.basis * self.weight).T * SLAB_UNIT
         return latents.transpose(-1, -2).unflatten(-1, (GRID, GRID))
 
@@ -61,9 +61,9 @@ class LinearCodec(TensorRecord):
         return latents.flatten(-2).transpose(-1, -2) @ (self.basis / self.weight) / SLAB_UNIT + self.mean
 
     def mirror(self, latents: Float[Tensor, "*b c 32 32"]) -> Float[Tensor, "*b c 32 32"]:
-        """The person seen in a mirror: columns reversed, each cell reversed along W (the layout is symmetric).
+        """Mirror a person: columns reversed, each cell reversed along W (the layout is symmetric).
 
-        Also of the leading channels alone.
+        Accepts the leading channels alone.
         """
         return latents.flip(-1) * self.parity[: latents.shape[-3], None, None]
 
@@ -71,7 +71,7 @@ class LinearCodec(TensorRecord):
 def cells_from_voxels(
     voxels: UInt8[Tensor, "*b k 8 8 8 4"], delta_scale: Float[Tensor, "*b k 3"] | None = None
 ) -> Float[Tensor, "*b k v"]:
-    """Stored voxels (encoded RGB and relative density, 0 ... 255) and delta scales (None: all 1) as cells."""
+    """Return cells of stored voxels (encoded RGB and relative density, 0 ... 255) and delta scales (None: all 1)."""
     values = voxels.movedim(-1, -4).flatten(-4).float() / 255
     scale = values.new_ones((*values.shape[:-1], 3)) if delta_scale is None else delta_scale.float()
     return torch.cat([values, scale * SCALE_VALUE], dim=-1)
@@ -80,7 +80,7 @@ def cells_from_voxels(
 def cells_from_payload(
     payload: Payload, full_density: float, dead_zone: tuple[float, float] = DEAD_ZONE
 ) -> Float[Tensor, "*b k v"]:
-    """What `payload_from_cells` makes this payload of; `full_density` (1/m) is the density that counts as 1.
+    """Inverse of `payload_from_cells`; `full_density` (1/m) is the density stored as 1.
 
     Denser voxels are clamped to it. The dead zone is undone between empty and full voxels, which stay 0 and 1.
     """
@@ -94,7 +94,7 @@ def cells_from_payload(
 def payload_from_cells(
     cells: Float[Tensor, "*b k v"], full_density: float, dead_zone: tuple[float, float] = DEAD_ZONE
 ) -> Payload:
-    """The payload of decoded cells: clamped, with the dead zone on density."""
+    """Return the payload of decoded cells: clamped, with the dead zone applied to density."""
     start, width = dead_zone
     voxels, scale = cells.split((VOXEL_VALUES, 3), dim=-1)
     voxels = voxels.unflatten(-1, (4, S, S, S))
@@ -103,7 +103,7 @@ def payload_from_cells(
 
 
 def mirror_cells(cells: Float[Tensor, "*b k v"]) -> Float[Tensor, "*b k v"]:
-    """Cells of the mirrored person; what `LinearCodec.mirror` does to latents."""
+    """Mirror cells, as `LinearCodec.mirror` mirrors latents."""
     voxels, scale = cells.unflatten(-2, (GRID, GRID)).flip(-2).split((VOXEL_VALUES, 3), dim=-1)
     voxels = voxels.unflatten(-1, (4 * S * S, S)).flip(-1).flatten(-2)
     return torch.cat([voxels, scale], dim=-1).flatten(-3, -2)
@@ -112,9 +112,9 @@ def mirror_cells(cells: Float[Tensor, "*b k v"]) -> Float[Tensor, "*b k v"]:
 def fit_codec(
     cells: Float[Tensor, "n k v"], channels: int, generator: torch.Generator, cells_each: int = 512
 ) -> LinearCodec:
-    """Per-cell mean, and shared principal components of `cells_each` random cells of every person and their mirrors.
+    """Fit each cell's mean, and shared principal components of `cells_each` random cells a sample and their mirrors.
 
-    Values are weighted by the marcher's window: what a picture does not show takes no component.
+    Values are weighted by the marcher's window, so invisible values take no component.
 
     Raises ValueError for fewer samples than channels.
     """

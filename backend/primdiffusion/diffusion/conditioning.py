@@ -1,7 +1,7 @@
-"""What a model can be asked for: attributes of a person as numbers that a denoiser understands.
+"""Conditioning: attributes of a person encoded as numbers for the denoiser.
 
-Classifier-free (Ho and Salimans 2022): an attribute that is not asked for is a block of zeros, so one network knows
-people with all, some or no attributes, and the paper's unconditional model is the one that is asked for nothing.
+Classifier-free (Ho and Salimans 2022): a missing attribute is a block of zeros, so one network models people given
+all, some or no attributes, and the paper's unconditional model is the one with no attributes.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 Attributes = Mapping[str, str | float]
-"""What a person is asked to be: {"sex": "female", "height": 1.7}."""
+"""Requested attributes of a person: {"sex": "female", "height": 1.7}."""
 FARTHEST = 4.0
-"""Standard deviations from the mean within which a number may be asked for."""
+"""Largest distance from the mean of a requested number, in standard deviations."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Vocabulary:
-    """Attributes and their values, as the people had them that a model was trained on."""
+class AttributeVocabulary:
+    """Attributes and their values in the data that a model was trained on."""
 
     categories: Mapping[str, tuple[str, ...]]
     """Name -> values to choose from."""
@@ -36,9 +36,9 @@ class Vocabulary:
         return sum(map(len, self.categories.values())) + 2 * len(self.scalars)
 
     def encode(self, attributes: Attributes) -> Float[Tensor, "a"]:
-        """One-hot blocks, then (known, standardised) pairs; attributes that are not given are 0 throughout.
+        """One-hot blocks, then (known, standardised) pairs; missing attributes are all 0.
 
-        Raises ValueError for a name or value the model does not know, which says what it knows.
+        Raises ValueError for an unknown name or value; the message lists the known ones.
         """
         self._check_names(attributes)
         numbers: list[float] = []
@@ -52,7 +52,7 @@ class Vocabulary:
         return torch.tensor(numbers)
 
     def blocks(self) -> dict[str, slice]:
-        """Where each category's numbers are in a condition."""
+        """Slice of each category's numbers in a condition."""
         places, start = {}, 0
         for name, values in self.categories.items():
             places[name] = slice(start, start + len(values))
@@ -60,10 +60,10 @@ class Vocabulary:
         return places
 
     def forget(self, condition: Float[Tensor, "b a"], share: float, generator: torch.Generator) -> Float[Tensor, "b a"]:
-        """Conditions for training, of which parts are forgotten.
+        """Drop attributes at random, for training.
 
-        Of a sample, everything with a chance of `share`; otherwise each attribute with a chance that is drawn for the
-        sample, so that subsets of all sizes are seen.
+        A sample loses all attributes with probability `share`; otherwise each attribute with a probability drawn for
+        that sample, so that subsets of all sizes occur.
         """
         count = len(self.categories) + len(self.scalars)
         if not count:
@@ -74,15 +74,15 @@ class Vocabulary:
         return condition * kept.to(condition).repeat_interleave(sizes, dim=1)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, for a checkpoint's description."""
+        """Return plain values for a checkpoint's metadata."""
         return {
             "categories": {name: list(values) for name, values in self.categories.items()},
             "scalars": {name: list(values) for name, values in self.scalars.items()},
         }
 
     @classmethod
-    def from_json(cls, tree: Mapping[str, Any]) -> Vocabulary:
-        """Inverse of `to_json`; raises KeyError, TypeError or ValueError for anything else."""
+    def from_json(cls, tree: Mapping[str, Any]) -> AttributeVocabulary:
+        """Inverse of `to_json`; raises KeyError, TypeError or ValueError for other input."""
         categories = {name: tuple(map(str, values)) for name, values in tree["categories"].items()}
         scalars = {name: (float(mean), float(std)) for name, (mean, std) in tree["scalars"].items()}
         return cls(categories, scalars)
@@ -109,7 +109,7 @@ class Vocabulary:
 
 
 def read_attributes(words: Sequence[str]) -> dict[str, str | float]:
-    """Attributes of a command line's words NAME=VALUE; ValueError for other words and for a name given twice."""
+    """Parse command line arguments NAME=VALUE; ValueError for malformed arguments and repeated names."""
     attributes: dict[str, str | float] = {}
     for word in words:
         name, sign, value = word.partition("=")
@@ -121,5 +121,5 @@ def read_attributes(words: Sequence[str]) -> dict[str, str | float]:
     return attributes
 
 
-NOTHING = Vocabulary({}, {})
-"""Of models that cannot be asked for anything."""
+NOTHING = AttributeVocabulary({}, {})
+"""Vocabulary of an unconditional model."""

@@ -1,4 +1,4 @@
-"""The default denoiser: closed-form person prior, corrected by a network for the whole person and one for its cells."""
+"""The default denoiser: a closed-form person prior, corrected by one network over components and one over the grid."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from primdiffusion.diffusion.schedule import Schedule
 
 @dataclasses.dataclass(frozen=True)
 class DenoiserConfig:
-    """Networks of the default denoiser; None leaves a part to the closed form."""
+    """Networks of the default denoiser; None means the closed form alone."""
 
     person: PersonNetworkConfig | None = dataclasses.field(default_factory=PersonNetworkConfig)
     """Network over the person components."""
@@ -63,7 +63,7 @@ class PersonDenoiser(nn.Module):
     def forward(
         self, x: Float[Tensor, "b c h w"], t: Int[Tensor, "b"], condition: Float[Tensor, "b a"] | None = None
     ) -> Float[Tensor, "b c h w"]:
-        """The x0 guess of latents x at steps t, of people who are what `condition` asks for (None: anybody)."""
+        """Return the x0 guess for latents x at steps t, given `condition` (None: unconditional)."""
         signal, _ = self.schedule.levels(t, x)
         prior = self.prior
         y, rest = prior.split(x, signal)
@@ -73,7 +73,7 @@ class PersonDenoiser(nn.Module):
     def coefficients(
         self, y: Float[Tensor, "b r"], t: Int[Tensor, "b"], condition: Float[Tensor, "b a"] | None = None
     ) -> Float[Tensor, "b r"]:
-        """The guess of clean person coefficients of noisy ones."""
+        """Denoise person coefficients."""
         signal, noise = self.schedule.levels(t, y)
         guess = self.prior.denoise_coefficients(y, signal, noise, condition)
         if self.person is None:
@@ -91,7 +91,7 @@ class PersonDenoiser(nn.Module):
         t: Int[Tensor, "b"],
         condition: Float[Tensor, "b a"] | None = None,
     ) -> Float[Tensor, "b c h w"]:
-        """The guess of the clean rest of a noisy one, for guessed person coefficients."""
+        """Denoise the rest, given denoised person coefficients."""
         guess, deviation, correction = self.rest_parts(rest, coefficients, t, condition)
         return guess if correction is None else guess + deviation * correction
 
@@ -102,7 +102,7 @@ class PersonDenoiser(nn.Module):
         t: Int[Tensor, "b"],
         condition: Float[Tensor, "b a"] | None = None,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """The closed form's guess, its posterior standard deviation, and the network's correction in units of it."""
+        """Return the closed-form guess, its posterior standard deviation, and the correction in units of that."""
         signal, noise = self.schedule.levels(t, rest)
         prior = self.prior
         total = torch.addcmul(noise**2, signal**2, prior.rest_variance)
@@ -117,7 +117,7 @@ class PersonDenoiser(nn.Module):
         return guess, deviation, correction.float()
 
     def _precision(self, like: Tensor) -> torch.autocast:
-        """Networks may compute in `network_dtype`; the closed form never does."""
+        """Autocast for the networks only: the closed form needs full precision."""
         return torch.autocast(like.device.type, self.network_dtype, enabled=self.network_dtype != torch.float32)
 
 

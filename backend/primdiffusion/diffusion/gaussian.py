@@ -1,9 +1,9 @@
-"""What is known of people in closed form: Gaussian person components, a mixture of them, and their exact denoiser.
+"""The closed-form person prior: a mixture of Gaussians over person components, and its exact denoiser.
 
 A latent is z = mean + sum_i c_i u_i + r with orthonormal person components u and a rest r orthogonal to them. White
 noise splits the same way, so the c and r parts of a noisy person are diffusions of their own, each with its own
 denoiser. For c ~ sum_k weight_k N(centre_k, cov_g(k)) and r of independent entries, the posterior means below are exact
-up to the projection of r. They are the yardstick a network has to beat and the base it starts from.
+up to the projection of r. They are the baseline that a network has to beat and the base that it corrects.
 
 Parts k of the mixture are kinds of people (an outfit, a hair style, shoes): many, with few people each. So parts lie in
 groups of one covariance, and what is common to a group is computed once.
@@ -21,7 +21,7 @@ from torch.nn import functional
 from primdiffusion.geometry.records import TensorRecord
 
 IMPOSSIBLE = -1e4
-"""Logarithm of the weight of a part that is not what was asked for, or does not exist."""
+"""Log weight of a part that contradicts the condition, or is padding."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +44,7 @@ class PersonPrior(TensorRecord):
     variance: Float[Tensor, "g r"]
     """Variance along each axis."""
     kind: Float[Tensor, "g m a"]
-    """What each part is: the condition (`Vocabulary.encode`) that it meets; a may be 0."""
+    """The condition (`AttributeVocabulary.encode`) of each part; a may be 0."""
 
     def split(self, z: Float[Tensor, "b c h w"], signal: Tensor | float = 1.0) -> tuple[Tensor, Tensor]:
         """Person coefficients [b, R] and rest [b, C, H, W] of latents whose mean is scaled by `signal` [b, 1, 1, 1]."""
@@ -57,7 +57,7 @@ class PersonPrior(TensorRecord):
         return self.mean + rest + self.picture(coefficients - self._along(rest))
 
     def picture(self, coefficients: Float[Tensor, "b r"]) -> Float[Tensor, "b c h w"]:
-        """What person coefficients draw."""
+        """Return the contribution of person coefficients to latents, without the mean."""
         flat = coefficients @ self.basis
         return functional.pad(flat, (0, self.mean.numel() - flat.shape[1])).unflatten(1, self.mean.shape)
 
@@ -65,14 +65,14 @@ class PersonPrior(TensorRecord):
         return z.flatten(1)[:, : self.basis.shape[1]] @ self.basis.T
 
     def log_weights(self, condition: Float[Tensor, "b a"] | None) -> Float[Tensor, "b g m"] | Float[Tensor, "1 g m"]:
-        """Logarithms of the parts' weights, those that are not what is asked for made IMPOSSIBLE.
+        """Return the log weights of the parts, lowered by IMPOSSIBLE where a part contradicts the condition.
 
-        A category is asked for where its block of the condition is not 0; a part that lacks its value is out. A value
-        that no part has is not held against any.
+        A category is requested where its block of the condition is not 0; a part without its value is excluded. A value
+        that no part has excludes none.
         """
         if condition is None or not condition.shape[-1]:
             return self.log_weight[None]
-        asked = (condition[:, None, None, :] * self.kind).sum(-1)  # values of the condition that a part has
+        asked = (condition[:, None, None, :] * self.kind).sum(-1)  # requested values that a part has
         return self.log_weight + IMPOSSIBLE * (asked.amax((1, 2), keepdim=True) - asked)
 
     def denoise_coefficients(
@@ -121,7 +121,7 @@ class PersonPrior(TensorRecord):
     def sample(
         self, count: int, generator: torch.Generator, condition: Float[Tensor, "1 a"] | None = None
     ) -> Float[Tensor, "count c h w"]:
-        """Draws from the prior, of what is asked for, on the prior's device; drawn on the generator's."""
+        """Draw latents given the condition; drawn on the generator's device, returned on the prior's."""
 
         def normal(*shape: int) -> Tensor:
             draws = torch.randn(shape, generator=generator, dtype=self.mean.dtype, device=generator.device)
@@ -136,7 +136,7 @@ class PersonPrior(TensorRecord):
         return self.join(coefficients, self.rest_variance.sqrt() * normal(count, *self.mean.shape))
 
     def gaussian(self) -> PersonPrior:
-        """The single Gaussian with this mixture's mean and covariance: the yardstick without kinds of people."""
+        """Return the single Gaussian with this mixture's mean and covariance, as a baseline."""
         weight = self.log_weight.exp()
         mean = torch.einsum("gm,gmr->r", weight, self.centre)
         within = torch.einsum("g,gij,gi,gik->jk", weight.sum(1), self.axes, self.variance, self.axes)

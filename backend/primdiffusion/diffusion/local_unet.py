@@ -1,8 +1,7 @@
-"""The light networks of the default denoiser: one for the whole person, one for its 32 x 32 neighbourhoods.
+"""The light networks of the default denoiser: a perceptron over person components and a U-Net over the 32 x 32 grid.
 
-A local network is slow to learn what correlates over the whole body, such as one shirt's colour on 300 primitives. So
-a multilayer perceptron denoises the person components, which are few, and a small U-Net over the grid what they leave
-out.
+A local network is slow to learn correlations over the whole body, such as one shirt's colour on 300 primitives. So a
+multilayer perceptron denoises the person components, which are few, and a small U-Net over the grid denoises the rest.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ class PersonNetworkConfig:
     blocks: int = 4
     """Residual blocks."""
     dropout: float = 0.1
-    """Share of hidden features dropped in training; people are few and components are quickly learnt by heart."""
+    """Share of hidden features dropped in training; with few samples the perceptron overfits quickly."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +37,7 @@ class LocalUNetConfig:
     blocks: int = 1
     """Residual blocks of a level, down and up."""
     position_channels: int = 16
-    """Learned maps that tell the network which cell of the body it looks at."""
+    """Learned feature maps that encode the cell's position on the body."""
     condition_width: int = 192
     """Features of the time and person embedding that modulate every block."""
     heads: int = 4
@@ -138,7 +137,7 @@ class LocalStage(nn.ModuleList):
 
 
 class LocalUNet(nn.Module):
-    """Correction of the closed-form guess of what person components leave out, in standard deviations; starts at 0."""
+    """Correction of the closed-form guess of the rest, in standard deviations; starts at 0."""
 
     def __init__(self, channels: int, components: int, grid: int, asked_width: int, config: LocalUNetConfig):
         super().__init__()
@@ -171,7 +170,7 @@ class LocalUNet(nn.Module):
         t: Int[Tensor, "b"],
         condition: Float[Tensor, "b a"] | None = None,
     ) -> Float[Tensor, "b c h w"]:
-        """Correction for a noisy rest, beside the picture that guessed person components draw, and the components."""
+        """Return the correction for a noisy rest, given denoised person components and their contribution `picture`."""
         condition = functional.silu(embedded(self.time(t), self.asked, condition) + self.person(person))
         position = self.position.expand(len(noisy), -1, -1, -1)
         x = self.inner(torch.cat([noisy, picture, position], dim=1).contiguous(memory_format=torch.channels_last))
@@ -192,5 +191,5 @@ class LocalUNet(nn.Module):
 def embedded(
     time: Float[Tensor, "b e"], asked: nn.Linear | None, condition: Float[Tensor, "b a"] | None
 ) -> Float[Tensor, "b e"]:
-    """The embedding of a step and of what is asked for; None asks for nothing, as zeros do."""
+    """Return the embedding of step and condition; None is the same as zeros: unconditional."""
     return time if asked is None or condition is None else time + asked(condition)

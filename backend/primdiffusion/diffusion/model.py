@@ -1,4 +1,4 @@
-"""A loaded generator of people: denoiser, schedule, codec and body shapes in one record."""
+"""A loaded diffusion model: denoiser, schedule, codec and shape prior in one record."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from primdiffusion.diffusion.codec import LinearCodec, cells_from_payload, payload_from_cells
-from primdiffusion.diffusion.conditioning import NOTHING, Attributes, Vocabulary
+from primdiffusion.diffusion.conditioning import NOTHING, Attributes, AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
-from primdiffusion.diffusion.samplers import SAMPLERS, Step, gaussian_noise
+from primdiffusion.diffusion.samplers import SAMPLERS, SamplerStep, gaussian_noise
 from primdiffusion.diffusion.schedule import Schedule, trailing_steps
 from primdiffusion.formats import requests
 from primdiffusion.geometry.records import TensorRecord
@@ -22,15 +22,15 @@ from primdiffusion.primitives.primitives import GRID, K, Payload, S
 from primdiffusion.primitives.slab import CHANNELS_PER_LAYER, pack, unpack
 
 BETAS = 10
-"""What `sample` does where nothing else is said; guidance is of no effect without a condition."""
+"""Shape coefficients of a sampled body."""
 
 
 class Codec(Protocol):
-    """Between what is diffused and a payload."""
+    """Converts between clean samples of the diffusion and payloads."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Channels, height and width of what is diffused."""
+        """Channels, height and width of a sample."""
         ...
 
     def to_payload(self, x0: Tensor, full_density: float) -> Payload:
@@ -38,12 +38,12 @@ class Codec(Protocol):
         ...
 
     def from_payload(self, payload: Payload, full_density: float) -> Tensor:
-        """The clean sample [*b, *shape] of a payload, as far as samples can tell payloads apart."""
+        """The clean sample [*b, *shape] nearest to a payload; may be lossy."""
         ...
 
     @property
     def cell_side(self) -> int:
-        """Pixels a side that a primitive covers in what is diffused."""
+        """Pixels a side that a primitive covers in a sample."""
         ...
 
 
@@ -59,11 +59,11 @@ class CellCodec:
         return self.codec.basis.shape[0], GRID, GRID
 
     def to_payload(self, x0: Float[Tensor, "*b c h w"], full_density: float) -> Payload:
-        """Clamped, dead zone applied."""
+        """Decode; clamped, with the dead zone applied."""
         return payload_from_cells(self.codec.decode(x0), full_density, self._dead_zone)
 
     def from_payload(self, payload: Payload, full_density: float) -> Float[Tensor, "*b c h w"]:
-        """Latents; what the basis leaves out is lost."""
+        """Encode as latents; the part outside the basis is lost."""
         return self.codec.encode(cells_from_payload(payload, full_density, self._dead_zone))
 
     @property
@@ -87,11 +87,11 @@ class WholeSlab:
         return S * CHANNELS_PER_LAYER, GRID * S, GRID * S
 
     def to_payload(self, x0: Float[Tensor, "*b c h w"], full_density: float) -> Payload:
-        """Unpacked and clamped."""
+        """Unpack and clamp."""
         return unpack(x0, full_density)
 
     def from_payload(self, payload: Payload, full_density: float) -> Float[Tensor, "*b c h w"]:
-        """Packed."""
+        """Pack."""
         return pack(payload, full_density)
 
     @property
@@ -102,31 +102,31 @@ class WholeSlab:
 
 @dataclasses.dataclass(frozen=True)
 class ShapePrior(TensorRecord):
-    """Body shapes given the person that wears them: betas ~ N(bias + weight x0_features, scale scale^T)."""
+    """Body shapes given the rest of the person: betas ~ N(bias + weight x0_features, scale scale^T)."""
 
     weight: Float[Tensor, "10 r"]
     """On the first r person coefficients in standard deviations; r may be 0."""
     bias: Float[Tensor, "10"]
     scale: Float[Tensor, "10 10"]
-    """Lower triangular factor of the covariance that is left."""
+    """Lower triangular factor of the residual covariance."""
     limit: Float[Tensor, "10"]
     """Largest absolute value of each beta among the training people; draws are clamped to it."""
 
     def sample(
         self, features: Float[Tensor, "b r"], generator: torch.Generator | Sequence[torch.Generator]
     ) -> Float[Tensor, "b 10"]:
-        """Body shapes for people with these coefficients; of one generator, or of one for each person."""
+        """Draw body shapes for these coefficients, from one generator or one for each sample."""
         mean = features @ self.weight.T + self.bias
         return (mean + gaussian_noise(mean, generator) @ self.scale.T).clamp(-self.limit, self.limit)
 
 
 STANDARD_SHAPES = ShapePrior(torch.zeros(BETAS, 0), torch.zeros(BETAS), torch.eye(BETAS), torch.full((BETAS,), 3.0))
-"""Independent standard normal betas, for models that know nothing of shapes."""
+"""Independent standard normal betas, for models without a shape prior."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DiffusionModel:
-    """What `load_checkpoint` returns and `sample` needs."""
+    """A loaded diffusion model, ready to sample."""
 
     denoiser: nn.Module
     """x0 guess of (x [b, *shape], t [b])."""
@@ -136,9 +136,9 @@ class DiffusionModel:
     full_density: float
     """1/m that a stored density of 1 stands for."""
     card: Mapping[str, Any]
-    """Where the weights come from and what was measured on them."""
-    vocabulary: Vocabulary = NOTHING
-    """What it can be asked for."""
+    """Origin of the weights and their measured errors."""
+    vocabulary: AttributeVocabulary = NOTHING
+    """Attributes that it can be conditioned on."""
     chain: Callable[[int, int], list[int]] = trailing_steps
     """Descending t that a sampler visits, from the schedule's length and the number of steps."""
     body_setup: BodySetup | None = None
@@ -146,7 +146,7 @@ class DiffusionModel:
 
     @property
     def device(self) -> torch.device:
-        """Where the denoiser's parameters are."""
+        """Device of the denoiser's parameters."""
         return next(iter(self.denoiser.state_dict().values())).device
 
     def to(self, device: torch.device | str) -> DiffusionModel:
@@ -155,9 +155,9 @@ class DiffusionModel:
         return dataclasses.replace(self, denoiser=self.denoiser.to(device), codec=codec, shapes=self.shapes.to(device))
 
     def condition(self, attributes: Attributes) -> Float[Tensor, "a"] | None:
-        """What is asked for, as the denoiser understands it; None for nothing.
+        """Encode attributes for the denoiser; None without attributes.
 
-        Raises ValueError for attributes or values that the model does not know.
+        Raises ValueError for attributes or values unknown to the model.
         """
         encoded = self.vocabulary.encode(attributes)
         return encoded.to(self.device) if attributes else None
@@ -167,8 +167,8 @@ class DiffusionModel:
     ) -> Float[Tensor, "b c h w"]:
         """The denoiser's x0 guess without gradients, all samples at step t.
 
-        With a condition: u + guidance (c - u) of the guesses u for anybody and c for people as asked for (Ho and
-        Salimans 2022). 1 is the plain conditional guess, more exaggerates what was asked for at the cost of variety.
+        With a condition: u + guidance (c - u) of the unconditional guess u and the conditional guess c (Ho and Salimans
+        2022). 1 is the plain conditional guess; more follows the condition more closely at the cost of variety.
         """
         steps = torch.full((len(x),), t, dtype=torch.int64, device=x.device)
         with torch.inference_mode():
@@ -183,7 +183,7 @@ class DiffusionModel:
     def start(
         self, generators: Sequence[torch.Generator], t: int, condition: Float[Tensor, "#b a"] | None = None
     ) -> Float[Tensor, "b c h w"]:
-        """Samples at step t to start from, one of each generator: signal * (a draw of the person prior) + noise * eps.
+        """Return initial samples at step t, one a generator: signal * (a draw of the person prior) + noise * eps.
 
         The paper starts from noise alone. People correlate so strongly that their first components still show at T-1,
         and a start without them loses variety; the prior's draw is exact there to second order. Without a prior: noise
@@ -209,19 +209,19 @@ class DiffusionModel:
         return self.codec.to_payload(x0, self.full_density)
 
     def encode(self, payload: Payload) -> Float[Tensor, "*b c h w"]:
-        """The clean samples that are nearest to payloads, on the model's device."""
+        """The clean samples nearest to payloads, on the model's device."""
         return self.codec.from_payload(payload.to(self.device), self.full_density)
 
     def cell_mask(self, region: Bool[Tensor, "k"]) -> Bool[Tensor, "h w"]:
-        """Which pixels of what is diffused belong to the primitives of a region; ValueError for another number."""
+        """Mask pixels of a sample that belong to a region of primitives; ValueError for another shape or dtype."""
         if tuple(region.shape) != (K,) or region.dtype != torch.bool:
-            raise ValueError(f"a region is {K} yes or no; this one is {region.dtype} {tuple(region.shape)}")
+            raise ValueError(f"a region is a bool mask [{K}]; this one is {region.dtype} {tuple(region.shape)}")
         side = self.codec.cell_side
         grid = region.to(self.device).unflatten(0, (GRID, GRID))
         return grid.repeat_interleave(side, 0).repeat_interleave(side, 1)
 
     def betas(self, x0: Float[Tensor, "b c h w"], seeds: Sequence[int]) -> Float[Tensor, "b 10"]:
-        """Body shapes that suit clean samples; the same for the same sample and seed."""
+        """Draw body shapes that match clean samples; deterministic in sample and seed."""
         features = x0.new_zeros((len(x0), 0))
         wanted = self.shapes.weight.shape[1]
         if wanted and isinstance(self.denoiser, PersonDenoiser):
@@ -237,18 +237,18 @@ def sample(
     sampler: str = requests.SAMPLERS[0],
     condition: Float[Tensor, "#b a"] | None = None,
     guidance: float = requests.GUIDANCE,
-) -> Iterator[Step]:
-    """Generate a person of each seed, yielding every step; the last step's x0 is the result (30 DDIM steps by default).
+) -> Iterator[SamplerStep]:
+    """Generate a person for each seed, yielding every step; the last step's x0 is the result (default: 30 DDIM steps).
 
-    The same seeds in the same batch give the same bits on one device with one version of torch and number of threads.
-    A seed's noise is the same in any batch and on any device; so is the person, but for rounding. Stop asking to
-    cancel. ValueError for an unknown sampler, no seeds, a seed outside 0 ... 2^63-1 or a number of steps outside
+    The same batch of seeds gives the same bits on one device with one version of torch and number of threads. A seed's
+    noise is the same in any batch and on any device, so the person is the same up to rounding. To cancel, stop
+    iterating. ValueError for an unknown sampler, no seeds, a seed outside 0 ... 2^63-1 or a number of steps outside
     1 ... T.
     """
     if sampler not in SAMPLERS:
         raise ValueError(f"there is no sampler {sampler!r}; choose one of {', '.join(sorted(SAMPLERS))}")
     if not len(seeds):
-        raise ValueError("no seeds were given: a person needs one")
+        raise ValueError("no seeds were given: give one for each person")
     chain = model.chain(model.schedule.length, steps)
     generators = [seeded(seed) for seed in seeds]
     start = model.start(generators, chain[0], condition)
@@ -260,9 +260,9 @@ def sample(
 
 
 def seeded(seed: int) -> torch.Generator:
-    """A generator in the state of `seed`; ValueError for a seed that is no unsigned 63-bit number.
+    """Return a CPU generator seeded with `seed`; ValueError unless 0 <= seed < 2^63.
 
-    On the processor, whatever the model is on: devices have generators of their own, and a seed is to be one person.
+    Always on the CPU: each kind of device has its own random number generator, and a seed should give one person.
     """
     if not 0 <= seed < 2**63:
         raise ValueError(f"seed {seed} is out of range; choose a whole number from 0 to {2**63 - 1}")

@@ -1,7 +1,7 @@
-"""Samplers: pure functions of a denoiser, a schedule and a start that yield each step back (paper sec. 3.3).
+"""Samplers: pure functions of a denoiser, a schedule and an initial sample that yield each step (paper sec. 3.3).
 
-The caller owns progress and cancelling: it stops by not asking for the next step. Noise of each sample comes from a
-generator of its own, so that a person does not depend on who else is in the batch.
+The caller owns progress and cancelling: it stops by not iterating further. Each sample has its own noise generator, so
+that a person does not depend on the rest of the batch.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ Generators = torch.Generator | Sequence[torch.Generator]
 
 
 @dataclasses.dataclass(frozen=True)
-class Step:
-    """What a sampler knows after one step."""
+class SamplerStep:
+    """State of a sampler after one step."""
 
     index: int
     """Steps done before this one, 0 ... total-1."""
     total: int
     t: int
-    """Noise level that the denoiser was asked about."""
+    """Noise level of the denoiser's input."""
     x0: Tensor
     """The denoiser's guess of the clean sample."""
     x: Tensor
@@ -39,19 +39,19 @@ class Step:
 
 def ddpm(
     denoise: Denoise, schedule: Schedule, x: Tensor, steps: Sequence[int], generators: Generators
-) -> Iterator[Step]:
+) -> Iterator[SamplerStep]:
     """Ancestral sampling with the posterior's variance (paper eq. 6-7) down the descending `steps`."""
     for index, (t, t_prev) in enumerate(pairwise((*steps, CLEAN))):
         x0 = denoise(x, t)
         x = schedule.posterior_mean(x, x0, t, t_prev)
         if t_prev != CLEAN:
             x = x + schedule.posterior_std(t, t_prev) * gaussian_noise(x, generators)
-        yield Step(index, len(steps), t, x0, x)
+        yield SamplerStep(index, len(steps), t, x0, x)
 
 
 def ddim(
     denoise: Denoise, schedule: Schedule, x: Tensor, steps: Sequence[int], generators: Generators, eta: float = 0.0
-) -> Iterator[Step]:
+) -> Iterator[SamplerStep]:
     """Implicit sampling (Song et al. 2021, eq. 12) down the descending `steps`.
 
     `eta` scales the posterior's noise: 0 is deterministic after the start, 1 has the variance of `ddpm`.
@@ -63,21 +63,21 @@ def ddim(
             x = x0
         else:
             added = eta * schedule.posterior_std(t, t_prev)
-            kept = (schedule.noise(t_prev) ** 2 - added**2) ** 0.5
-            x = schedule.signal(t_prev) * x0 + kept * schedule.epsilon(x, x0, t)
+            implied = (schedule.noise(t_prev) ** 2 - added**2) ** 0.5
+            x = schedule.signal(t_prev) * x0 + implied * schedule.epsilon(x, x0, t)
             if added > 0:
                 x = x + added * gaussian_noise(x, generators)
-        yield Step(index, len(steps), t, x0, x)
+        yield SamplerStep(index, len(steps), t, x0, x)
 
 
 def dpmpp_2m(
     denoise: Denoise, schedule: Schedule, x: Tensor, steps: Sequence[int], generators: Generators
-) -> Iterator[Step]:
+) -> Iterator[SamplerStep]:
     """DPM-Solver++(2M) (Lu et al. 2022, alg. 2) down the descending `steps`; draws no noise.
 
     A multistep method of second order: the clean guess is extrapolated to the middle of the step, in half log SNR, from
-    this one and the one before. The first step has none before it, and the last reaches infinite SNR, where the guess
-    itself is the answer: both are those of `ddim`.
+    this one and the previous one. The first step has no previous one, and the last reaches infinite SNR, where the
+    guess itself is the answer: both equal those of `ddim`.
     """
     before: tuple[Tensor, float] | None = None
     for index, (t, t_prev) in enumerate(pairwise((*steps, CLEAN))):
@@ -87,10 +87,10 @@ def dpmpp_2m(
             x = x0
         else:
             middle = x0 if before is None else x0 + gain / (2 * before[1]) * (x0 - before[0])
-            kept = schedule.noise(t_prev) / schedule.noise(t)
-            x = kept * x - schedule.signal(t_prev) * math.expm1(-gain) * middle
+            ratio = schedule.noise(t_prev) / schedule.noise(t)
+            x = ratio * x - schedule.signal(t_prev) * math.expm1(-gain) * middle
         before = x0, gain
-        yield Step(index, len(steps), t, x0, x)
+        yield SamplerStep(index, len(steps), t, x0, x)
 
 
 def gaussian_noise(like: Tensor, generators: Generators) -> Tensor:
@@ -112,4 +112,4 @@ def _normal(like: Tensor, generator: torch.Generator) -> Tensor:
 
 
 SAMPLERS = {"ddim": ddim, "ddpm": ddpm, "dpmpp_2m": dpmpp_2m}
-"""Samplers by the name a user states."""
+"""Samplers by name."""

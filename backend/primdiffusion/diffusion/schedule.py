@@ -1,4 +1,4 @@
-"""Noise schedules: how much of a person is left at step t, and one step back (paper eq. 4-7)."""
+"""Noise schedules: signal and noise at step t, and the posterior of an earlier step (paper eq. 4-7)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Schedule(TensorRecord):
         return self.alpha_bar.shape[0]
 
     def signal(self, t: int) -> float:
-        """sqrt(alpha_bar_t), the factor on the person; 1 at `CLEAN`."""
+        """sqrt(alpha_bar_t), the factor on the clean sample; 1 at `CLEAN`."""
         return 1.0 if t == CLEAN else float(self.alpha_bar[t]) ** 0.5
 
     def noise(self, t: int) -> float:
@@ -44,7 +44,7 @@ class Schedule(TensorRecord):
         return alpha_bar.sqrt().to(like), (1.0 - alpha_bar).sqrt().to(like)
 
     def q_sample(self, x0: Float[Tensor, "b *s"], t: Int[Tensor, "b"], noise: Float[Tensor, "b *s"]) -> Tensor:
-        """The person with noise of level t (paper eq. 5)."""
+        """Add noise of level t (paper eq. 5)."""
         signal, sigma = self.levels(t, x0)
         return signal * x0 + sigma * noise
 
@@ -106,13 +106,13 @@ def zero_terminal_snr(schedule: Schedule) -> Schedule:
 def fine_linear(length: int = 1000, last: float = 2e-2) -> Schedule:
     """beta linear in t from nearly 0, so that the first steps hold less noise than the finest detail of people.
 
-    With DDPM's first beta of 1e-4 a sample is never asked about noise below 0.01, as much as faces differ by.
+    With DDPM's first beta of 1e-4 the noise never falls below 0.01, which is as large as the differences between faces.
     """
     return linear(length, last / (10 * length), last)
 
 
 SCHEDULES = {"linear": linear, "sqrt_linear": sqrt_linear, "fine_linear": fine_linear}
-"""Schedules by the name a configuration or checkpoint states."""
+"""Schedules by their name in configurations and checkpoints."""
 
 
 def trailing_steps(length: int, steps: int) -> list[int]:
@@ -128,7 +128,7 @@ def leading_steps(length: int, steps: int, offset: int = 1) -> list[int]:
 
 
 def dense_steps(length: int, steps: int, power: float = 2.2) -> list[int]:
-    """Descending t from T-1, closer the lower: evenly spaced ones draw all fine detail in the last step."""
+    """Descending t from T-1, denser at low noise: with evenly spaced steps all fine detail comes from the last one."""
     _check_steps(length, steps)
     chain = [length - 1]
     for i in range(1, steps):
@@ -138,7 +138,7 @@ def dense_steps(length: int, steps: int, power: float = 2.2) -> list[int]:
 
 
 CHAINS = {"trailing": trailing_steps, "dense": dense_steps}
-"""Which steps a sampler visits, by the name a checkpoint states."""
+"""Timesteps that a sampler visits, by their name in checkpoints."""
 
 
 def _check_back(t: int, t_prev: int) -> None:
@@ -148,7 +148,7 @@ def _check_back(t: int, t_prev: int) -> None:
 
 def _check_steps(length: int, steps: int) -> None:
     if not 1 <= steps <= length:
-        raise ValueError(f"a schedule of {length} steps can be sampled in 1 to {length}; {steps} were asked for")
+        raise ValueError(f"a schedule of {length} steps can be sampled in 1 to {length}; {steps} were requested")
 
 
 def _from_betas(betas: Float[Tensor, "t"]) -> Schedule:

@@ -1,6 +1,6 @@
 """The paper's denoiser: a U-Net over the whole slab, with the parameter names of the ADM family (SPEC 3).
 
-The names and shapes are those of the released checkpoints' `diffusion.*` keys, so such weights load as they are.
+The names and shapes are those of the released checkpoints' `diffusion.*` keys, so such weights load unchanged.
 956 GFLOP a call for one person: a network for GPUs. `local_unet` is the light one.
 """
 
@@ -91,7 +91,7 @@ class ResidualBlock(nn.Module):
         return self.skip_connection(x) + self.out_layers(h)
 
 
-class Attention(nn.Module):
+class CrossAttention(nn.Module):
     """Multi-head attention of queries on a context; without a bias on the projections in."""
 
     def __init__(self, channels: int, heads: int):
@@ -141,7 +141,11 @@ class TransformerBlock(nn.Module):
 
     def __init__(self, channels: int, heads: int):
         super().__init__()
-        self.attn1, self.ff, self.attn2 = Attention(channels, heads), FeedForward(channels), Attention(channels, heads)
+        self.attn1, self.ff, self.attn2 = (
+            CrossAttention(channels, heads),
+            FeedForward(channels),
+            CrossAttention(channels, heads),
+        )
         self.norm1, self.norm2, self.norm3 = (nn.LayerNorm(channels) for _ in range(3))
 
     def forward(self, x: Float[Tensor, "b n c"], context: Float[Tensor, "b m c"]) -> Float[Tensor, "b n c"]:
@@ -194,7 +198,7 @@ class Upsample(nn.Module):
         return self.conv(functional.interpolate(x, scale_factor=2.0, mode="nearest"))
 
 
-class Stage(nn.Sequential):
+class UNetStage(nn.Sequential):
     """Layers in a row, of which residual blocks also get the time embedding."""
 
     def forward(self, x: Tensor, time: Tensor) -> Tensor:
@@ -213,7 +217,7 @@ class SlabUNet(nn.Module):
         time_width = 4 * config.width
         self.time_embed = TimeEmbedding(config.width, time_width)
         channels = config.width
-        self.input_blocks = nn.ModuleList([Stage(nn.Conv2d(config.slab_channels, channels, 3, padding=1))])
+        self.input_blocks = nn.ModuleList([UNetStage(nn.Conv2d(config.slab_channels, channels, 3, padding=1))])
         skips = [channels]
         for level, multiplier in enumerate(config.multipliers):
             for _ in range(config.blocks):
@@ -221,9 +225,9 @@ class SlabUNet(nn.Module):
                 channels = multiplier * config.width
                 skips.append(channels)
             if level + 1 < len(config.multipliers):
-                self.input_blocks.append(Stage(Downsample(channels)))
+                self.input_blocks.append(UNetStage(Downsample(channels)))
                 skips.append(channels)
-        self.middle_block = Stage(
+        self.middle_block = UNetStage(
             ResidualBlock(channels, channels, time_width),
             SpatialTransformer(channels, config.heads),
             ResidualBlock(channels, channels, time_width),
@@ -240,8 +244,8 @@ class SlabUNet(nn.Module):
             nn.GroupNorm(32, channels), nn.SiLU(), zeroed(nn.Conv2d(channels, config.slab_channels, 3, padding=1))
         )
 
-    def _stage(self, channels: int, out_channels: int, level: int) -> Stage:
-        stage = Stage(ResidualBlock(channels, out_channels, 4 * self.config.width))
+    def _stage(self, channels: int, out_channels: int, level: int) -> UNetStage:
+        stage = UNetStage(ResidualBlock(channels, out_channels, 4 * self.config.width))
         if level in self.config.attention_levels:
             stage.append(SpatialTransformer(out_channels, self.config.heads))
         return stage

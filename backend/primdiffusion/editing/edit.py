@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.diffusion.model import DiffusionModel, seeded
-from primdiffusion.diffusion.samplers import Denoise, Step
+from primdiffusion.diffusion.samplers import Denoise, SamplerStep
 from primdiffusion.diffusion.schedule import Schedule, trailing_steps
 from primdiffusion.editing.unit_interval import check_unit_interval
 from primdiffusion.human import Human
@@ -22,7 +22,7 @@ from primdiffusion.primitives.primitives import Payload
 EVENNESS = 0.7
 EDITING = 0x6ED1F7A9C35B2D84
 """Tells seeds of edits from those of generating: with a person's own noise, an edit would lead back to them."""
-OnStep = Callable[[Step], None]
+OnStep = Callable[[SamplerStep], None]
 """Sees each step after it is done; an exception it raises ends the work (that is how cancelling works)."""
 
 
@@ -87,7 +87,7 @@ def chain_down(schedule: Schedule, amount: float, steps: int) -> list[int]:
     return trailing_steps(levels, min(steps, levels)) if levels else []
 
 
-def last(steps: Iterable[Step], on_step: OnStep | None) -> Float[Tensor, "b c h w"]:
+def last(steps: Iterable[SamplerStep], on_step: OnStep | None) -> Float[Tensor, "b c h w"]:
     """The clean samples that a sampler ends with; `on_step` is told of each step."""
     final = None
     for step in steps:

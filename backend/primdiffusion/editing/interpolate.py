@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.diffusion.samplers import Denoise, Step, ddim
+from primdiffusion.diffusion.samplers import Denoise, SamplerStep, ddim
 from primdiffusion.diffusion.schedule import Schedule
 from primdiffusion.editing.edit import (
     OnStep,
@@ -74,13 +74,13 @@ def inversion_steps(schedule: Schedule, steps: int) -> list[int]:
 
 def inverted(
     denoise: Denoise, schedule: Schedule, x0: Float[Tensor, "b c h w"], steps: Sequence[int]
-) -> Iterator[Step]:
+) -> Iterator[SamplerStep]:
     """DDIM backwards: from clean samples, taken for samples of the last of the descending `steps`, up to the first."""
     x, upwards = x0, list(reversed(steps))
     for index, (t, t_up) in enumerate(pairwise(upwards)):
         guess = denoise(x, t)
         x = schedule.signal(t_up) * guess + schedule.noise(t_up) * schedule.epsilon(x, guess, t)
-        yield Step(index, len(upwards) - 1, t, guess, x)
+        yield SamplerStep(index, len(upwards) - 1, t, guess, x)
 
 
 def slerp(a: Float[Tensor, "c h w"], b: Float[Tensor, "c h w"], fraction: float) -> Float[Tensor, "c h w"]:
@@ -94,7 +94,7 @@ def slerp(a: Float[Tensor, "c h w"], b: Float[Tensor, "c h w"], fraction: float)
 
 def there_and_back(
     denoise: Denoise, schedule: Schedule, ends: Float[Tensor, "2 c h w"], fraction: float, steps: Sequence[int]
-) -> Iterator[Step]:
+) -> Iterator[SamplerStep]:
     """Both ends up to noise, then both and the point between them down; the last x0 is that of [a, b, between]."""
     noise, total, up = ends, 2 * len(steps) - 1, 0
     for step in inverted(denoise, schedule, ends, steps):

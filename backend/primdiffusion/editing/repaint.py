@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from primdiffusion.diffusion.samplers import Denoise, Step, gaussian_noise
+from primdiffusion.diffusion.samplers import Denoise, SamplerStep, gaussian_noise
 from primdiffusion.diffusion.schedule import CLEAN, Schedule
 
 JUMP = 1
@@ -29,7 +29,7 @@ def repaint(
     generator: torch.Generator,
     jump: int = JUMP,
     resamples: int = RESAMPLES,
-) -> Iterator[Step]:
+) -> Iterator[SamplerStep]:
     """Sample what is `inside` down the descending `steps`, while what is outside follows the clean sample `known`.
 
     At every level t the outside is q_sample(known, t) with fresh noise: what a sample of that level has there (SPEC 3).
@@ -50,7 +50,7 @@ def repaint(
         if t_next != CLEAN:
             x = x + schedule.posterior_std(t, t_next) * gaussian_noise(x, generator)
         x = torch.where(inside, x, noised(schedule, known, t_next, generator))
-        yield Step(done, total, t, x0, x)
+        yield SamplerStep(done, total, t, x0, x)
         done += 1
 
 

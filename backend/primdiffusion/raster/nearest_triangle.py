@@ -22,7 +22,7 @@ CLOSEST = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Nearest:
+class NearestTriangle:
     """What is seen through each pixel's centre."""
 
     triangle: Int32[ndarray, "h w"]
@@ -31,7 +31,7 @@ class Nearest:
     """Metres along the optical axis; inf where there is none."""
 
     @classmethod
-    def nothing(cls, camera: Camera) -> Nearest:
+    def nothing(cls, camera: Camera) -> NearestTriangle:
         """A picture without triangles; read only."""
         size = (camera.height, camera.width)
         return cls(np.broadcast_to(np.int32(-1), size), np.broadcast_to(np.float32(np.inf), size))
@@ -39,7 +39,7 @@ class Nearest:
 
 def nearest_triangles(
     corners: Float[ndarray, "f 3 3"], camera: Camera, clip: tuple[float, float] = (0.0, np.inf)
-) -> Nearest:
+) -> NearestTriangle:
     """The nearest triangle in each pixel, from both sides; of several at one depth the one of lowest number.
 
     Only what lies between the depths `clip` (metres along the optical axis) is seen: a triangle that crosses one of
@@ -48,8 +48,8 @@ def nearest_triangles(
     k = camera.intrinsics.detach().cpu().double().numpy()
     view = camera.world_to_camera.detach().cpu().double().numpy()
     start, end = max(clip[0], CLOSEST), clip[1]
-    nothing = Nearest.nothing(camera)
-    nearest = Nearest(nothing.triangle.copy(), nothing.depth.copy())
+    nothing = NearestTriangle.nothing(camera)
+    nearest = NearestTriangle(nothing.triangle.copy(), nothing.depth.copy())
     linear, shift = k @ view[:, :3], k @ view[:, 3]
     _draw(np.ascontiguousarray(corners), linear, shift, start, end, nearest.triangle, nearest.depth)
     return nearest

@@ -40,7 +40,7 @@ class Fragments:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Picture:
+class RasterImage:
     """A rasterised mesh on black."""
 
     rgb: Float32[np.ndarray, "H W 3"]
@@ -53,7 +53,7 @@ class Picture:
     """Part of the nearest sample; -1 where alpha is 0."""
 
 
-def rasterise(mesh: TexturedMesh, view: Camera | OrthographicView, supersample: int = 1) -> Picture:
+def rasterise(mesh: TexturedMesh, view: Camera | OrthographicView, supersample: int = 1) -> RasterImage:
     """The mesh seen from `view`, unlit, from both sides of its faces.
 
     `supersample` squared samples a pixel are averaged in linear light, which is the remedy for aliasing of edges
@@ -68,7 +68,7 @@ def rasterise(mesh: TexturedMesh, view: Camera | OrthographicView, supersample: 
 
 def rasterise_colourings(
     meshes: Sequence[TexturedMesh], view: Camera | OrthographicView, supersample: int = 1
-) -> list[Picture]:
+) -> list[RasterImage]:
     """As `rasterise`, of meshes that differ only in the colours of their textures: triangles are drawn once.
 
     Raises:
@@ -86,14 +86,16 @@ def rasterise_colourings(
     return pictures
 
 
-def _picture(soup: TriangleSoup, fragments: Fragments, view: Camera | OrthographicView, supersample: int) -> Picture:
+def _picture(
+    soup: TriangleSoup, fragments: Fragments, view: Camera | OrthographicView, supersample: int
+) -> RasterImage:
     rgb = shade(soup, fragments)
     distance = fragments.depth * _ray_lengths(view, supersample)
     part = np.where(fragments.face >= 0, soup.part[fragments.face], -1).astype(np.int32)
     if supersample == 1:
-        return Picture(rgb, (fragments.face >= 0).astype(np.float32), distance, part)
+        return RasterImage(rgb, (fragments.face >= 0).astype(np.float32), distance, part)
     nearest = _blocks(distance, supersample).argmin(-1)[..., None]
-    return Picture(
+    return RasterImage(
         rgb=np.stack([_blocks(rgb[..., channel], supersample).mean(-1) for channel in range(3)], -1),
         alpha=_blocks((fragments.face >= 0).astype(np.float32), supersample).mean(-1),
         depth=np.take_along_axis(_blocks(distance, supersample), nearest, -1)[..., 0],

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32
 from numpy import ndarray
 
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.raster.nearest_triangle import Nearest
+from primdiffusion.raster.nearest_triangle import NearestTriangle
 
 SKY = 0.45
 """Light from all above: SKY * (1 + n_up) / 2."""
@@ -63,7 +63,7 @@ class Layer:
         return cls(np.broadcast_to(zero, (*size, 3)), np.broadcast_to(zero, size), np.broadcast_to(infinity, size))
 
 
-def shade_solids(solids: Solids, nearest: Nearest, camera: Camera) -> Layer:
+def shade_solids(solids: Solids, nearest: NearestTriangle, camera: Camera) -> Layer:
     """The solids lit by a sky and a headlight, flat over a triangle; empty at holdouts, whose depth is inf as well.
 
     colour * (SKY (1 + n_up) / 2 + HEADLIGHT |n . ray|), n the normal on the viewer's side. Pixels are wholly covered

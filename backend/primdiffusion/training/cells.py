@@ -14,7 +14,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from primdiffusion.diffusion.codec import LinearCodec
-from primdiffusion.diffusion.conditioning import Vocabulary
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import CellCodec, DiffusionModel, ShapePrior
@@ -24,7 +24,7 @@ from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
 from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors
 from primdiffusion.training.prior import fit_prior, fit_shapes
-from primdiffusion.training.stored_people import People
+from primdiffusion.training.stored_people import PersonDataset
 
 PREPARED = "prepared.safetensors"
 
@@ -38,11 +38,11 @@ class Prepared:
     codec: LinearCodec
     prior: PersonPrior
     shapes: ShapePrior
-    vocabulary: Vocabulary
+    vocabulary: AttributeVocabulary
     full_density: float
 
 
-def prepare(config: TrainingConfig, people: People, train: Sequence[int], held: Sequence[int]) -> Prepared:
+def prepare(config: TrainingConfig, people: PersonDataset, train: Sequence[int], held: Sequence[int]) -> Prepared:
     """Codec, latents, prior and body shapes of the run's people; read back from the run folder when they are there.
 
     Raises ValueError for a person's file, or prepared ones, that are damaged; OSError.
@@ -151,7 +151,7 @@ def _load_prepared(path: Path) -> Prepared:
             LinearCodec(**part("codec")),
             PersonPrior(**part("prior")),
             ShapePrior(**part("shapes")),
-            Vocabulary.from_json(json.loads(about["vocabulary"])),
+            AttributeVocabulary.from_json(json.loads(about["vocabulary"])),
             float(about["full_density"]),
         )
     except (SafetensorError, KeyError, TypeError, ValueError) as error:

@@ -24,7 +24,7 @@ from primdiffusion.training.phase import state_path, train_phase
 from primdiffusion.training.run_folder import begin, versions
 from primdiffusion.training.shards import open_people
 from primdiffusion.training.slabs import SlabTrainee
-from primdiffusion.training.stored_people import People
+from primdiffusion.training.stored_people import PersonDataset
 
 MODEL = "model.safetensors"
 DATA = "people dressed from MakeHuman's CC0 assets, in T-pose, as primitives made without a network"
@@ -74,7 +74,7 @@ def train(config: TrainingConfig) -> DiffusionModel:
     return model
 
 
-def _begin(config: TrainingConfig, people: People, held: Sequence[int], accelerator: Accelerator) -> None:
+def _begin(config: TrainingConfig, people: PersonDataset, held: Sequence[int], accelerator: Accelerator) -> None:
     """Notes the start in the run's folder, and cuts what a kill undid."""
     names = ("person", "local", "slab")
     steps = {name: AcceleratedState.saved_step(state_path(config, name)) for name in names}
@@ -88,7 +88,7 @@ def _begin(config: TrainingConfig, people: People, held: Sequence[int], accelera
 
 
 def _trainee(
-    config: TrainingConfig, people: People, chosen: Sequence[int], held: Sequence[int], accelerator: Accelerator
+    config: TrainingConfig, people: PersonDataset, chosen: Sequence[int], held: Sequence[int], accelerator: Accelerator
 ) -> CellTrainee | SlabTrainee:
     if config.preset == "paper":
         return SlabTrainee(config, people, chosen, held, accelerator.device)
@@ -97,7 +97,7 @@ def _trainee(
 
 def _card(
     config: TrainingConfig,
-    people: People,
+    people: PersonDataset,
     chosen: Sequence[int],
     held: Sequence[int],
     trainee: CellTrainee | SlabTrainee,

@@ -32,7 +32,7 @@ from primdiffusion.training.fit_perceptual import load_perceptual
 from primdiffusion.training.fit_record import FitRecorder
 from primdiffusion.training.fit_state import FitState
 from primdiffusion.training.interrupt import Interrupt
-from primdiffusion.training.recorder import Clock, Progress
+from primdiffusion.training.recorder import StepMetrics, StepTimer
 from primdiffusion.training.run_folder import versions
 from primdiffusion.training.state import NotFiniteError
 
@@ -103,7 +103,7 @@ def _run(
 
 def steps(
     config: FitConfig, state: FitState, dataset: FitDataset, perceptual: Features | None = None
-) -> Iterator[Progress]:
+) -> Iterator[StepMetrics]:
     """Optimiser steps from where the state is to `config.steps`; the caller owns progress, saving and stopping."""
     accelerator = state.accelerator
     share = Share(accelerator.process_index, accelerator.num_processes)
@@ -111,7 +111,7 @@ def steps(
     source = fit_batches(dataset, config, start, share)
     settings = MarchSettings(step=config.step)
     while state.step < config.steps:
-        clock = Clock(accelerator.device)
+        clock = StepTimer(accelerator.device)
         sample, position = next(source)
         with _memory_named(config):
             sample = sample.to(accelerator.device)
@@ -121,7 +121,7 @@ def steps(
         clock.lap("backward")
         state.place["position"] = json.dumps(list(position))
         values = {name: float(value.detach()) for name, value in terms.items()}
-        yield Progress(state.step, values, gradient, clock.seconds)
+        yield StepMetrics(state.step, values, gradient, clock.seconds)
 
 
 def objective(
@@ -129,7 +129,7 @@ def objective(
     state: FitState,
     sample: FitSample,
     settings: MarchSettings,
-    clock: Clock,
+    clock: StepTimer,
     perceptual: Features | None = None,
 ) -> dict[str, Tensor]:
     """The weighted terms of one batch."""

@@ -14,10 +14,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from primdiffusion.diffusion.codec import LinearCodec, cells_from_voxels, fit_codec
-from primdiffusion.diffusion.conditioning import Attributes, Vocabulary
+from primdiffusion.diffusion.conditioning import Attributes, AttributeVocabulary
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.training.config import CodecConfig
-from primdiffusion.training.stored_people import People
+from primdiffusion.training.stored_people import PersonDataset
 
 Item = TypeVar("Item", int, Path)
 
@@ -32,7 +32,7 @@ class LatentSet(TensorRecord):
     """Which geometry each has; those of one geometry lie together."""
     betas: Float[Tensor, "g 10"]
     condition: Float[Tensor, "n a"]
-    """All that is known of each person, as `Vocabulary.encode` gives it."""
+    """All that is known of each person, as `AttributeVocabulary.encode` gives it."""
 
     def __len__(self) -> int:
         return len(self.latents)
@@ -46,7 +46,7 @@ def split_people(people: Sequence[Item], holdout: float, seed: int) -> tuple[lis
 
 
 def fit_codec_to(
-    people: People, indices: Sequence[int], config: CodecConfig, generator: torch.Generator
+    people: PersonDataset, indices: Sequence[int], config: CodecConfig, generator: torch.Generator
 ) -> LinearCodec:
     """The codec of `config.people` random people among those of `indices`, one colouring each."""
     chosen = torch.randint(len(indices), (config.people,), generator=generator).tolist()
@@ -60,7 +60,9 @@ def fit_codec_to(
     return fit_codec(torch.stack(cells), config.channels, generator)
 
 
-def encode_people(people: People, indices: Sequence[int], codec: LinearCodec, vocabulary: Vocabulary) -> LatentSet:
+def encode_people(
+    people: PersonDataset, indices: Sequence[int], codec: LinearCodec, vocabulary: AttributeVocabulary
+) -> LatentSet:
     """Latents of every colouring of the people of `indices`."""
     latents, geometry, betas, conditions = [], [], [], []
     for place, index in enumerate(indices):
@@ -72,7 +74,7 @@ def encode_people(people: People, indices: Sequence[int], codec: LinearCodec, vo
     return LatentSet(torch.cat(latents), torch.cat(geometry), torch.stack(betas), torch.stack(conditions))
 
 
-def _known(attributes: Attributes, vocabulary: Vocabulary) -> Attributes:
+def _known(attributes: Attributes, vocabulary: AttributeVocabulary) -> Attributes:
     """Those that the vocabulary has a word for: people that are held out may wear what nobody else does."""
     return {
         name: value
@@ -81,7 +83,7 @@ def _known(attributes: Attributes, vocabulary: Vocabulary) -> Attributes:
     }
 
 
-def vocabulary_of(people: Iterable[Attributes]) -> Vocabulary:
+def vocabulary_of(people: Iterable[Attributes]) -> AttributeVocabulary:
     """What can be said of these people: all words that are, and mean and spread of all numbers."""
     words: dict[str, set[str]] = {}
     numbers: dict[str, list[float]] = {}
@@ -93,4 +95,4 @@ def vocabulary_of(people: Iterable[Attributes]) -> Vocabulary:
                 numbers.setdefault(name, []).append(value)
     categories = {name: tuple(sorted(values)) for name, values in words.items()}
     spread = {name: (float(np.mean(values)), float(max(np.std(values), 1e-3))) for name, values in numbers.items()}
-    return Vocabulary(categories, spread)
+    return AttributeVocabulary(categories, spread)

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from primdiffusion.diffusion.codec import LinearCodec
-from primdiffusion.diffusion.conditioning import Vocabulary
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.samplers import gaussian_noise
 from primdiffusion.diffusion.schedule import Schedule
@@ -60,7 +60,7 @@ class PersonObjective:
     denoiser: PersonDenoiser
     coefficients: Float[Tensor, "n r"]
     people: LatentSet
-    vocabulary: Vocabulary
+    vocabulary: AttributeVocabulary
     config: PhaseConfig
 
     @property
@@ -90,7 +90,7 @@ class RestObjective:
     denoiser: PersonDenoiser
     people: LatentSet
     codec: LinearCodec
-    vocabulary: Vocabulary
+    vocabulary: AttributeVocabulary
     config: PhaseConfig
 
     @property
@@ -176,7 +176,7 @@ def asked_of(
     people: LatentSet,
     indices: Int[Tensor, "b 2"],
     weights: Float[Tensor, "b 2"],
-    vocabulary: Vocabulary,
+    vocabulary: AttributeVocabulary,
     unasked: float,
     generator: torch.Generator,
 ) -> Float[Tensor, "b a"]:

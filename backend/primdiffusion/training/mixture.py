@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.diffusion.conditioning import Vocabulary
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.gaussian import IMPOSSIBLE
 from primdiffusion.training.config import PriorConfig
 
@@ -38,7 +38,7 @@ class Mixture(NamedTuple):
 
 
 def fit_mixture(
-    c: Float[Tensor, "n r"], condition: Float[Tensor, "n a"], vocabulary: Vocabulary, config: PriorConfig
+    c: Float[Tensor, "n r"], condition: Float[Tensor, "n a"], vocabulary: AttributeVocabulary, config: PriorConfig
 ) -> Mixture:
     """Parts for all kinds that can be put together of the people's attributes; a single Gaussian if they have none."""
     names = [name for name in config.groups if name in vocabulary.categories]
@@ -63,7 +63,7 @@ def fit_mixture(
     return Mixture(log_weight - log_weight.flatten().logsumexp(0), centre, axes, variance, kind)
 
 
-def _values(condition: Float[Tensor, "n a"], vocabulary: Vocabulary) -> dict[str, list[int]]:
+def _values(condition: Float[Tensor, "n a"], vocabulary: AttributeVocabulary) -> dict[str, list[int]]:
     """Number of each person's value of each category; -1 where unknown."""
     found = {}
     for name, block in vocabulary.blocks().items():
@@ -126,7 +126,9 @@ def _parts(
     return parts
 
 
-def _condition(part: Sequence[Values], keys: Sequence[Sequence[str]], vocabulary: Vocabulary) -> Float[Tensor, "a"]:
+def _condition(
+    part: Sequence[Values], keys: Sequence[Sequence[str]], vocabulary: AttributeVocabulary
+) -> Float[Tensor, "a"]:
     """The condition that a part meets."""
     condition, blocks = torch.zeros(vocabulary.width), vocabulary.blocks()
     for names, values in zip(keys, part, strict=True):

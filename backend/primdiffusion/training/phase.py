@@ -22,7 +22,7 @@ from primdiffusion.training.accelerated import AcceleratedState, agreed
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.diffuse_pictures import write_samples
 from primdiffusion.training.interrupt import Interrupt
-from primdiffusion.training.recorder import Clock, Progress, Recorder
+from primdiffusion.training.recorder import Recorder, StepMetrics, StepTimer
 from primdiffusion.training.run_folder import PICTURES, append_metrics
 from primdiffusion.training.state import NotFiniteError
 
@@ -93,12 +93,12 @@ def train_phase(
     return state
 
 
-def step(config: TrainingConfig, trainee: Trainee, name: str, state: AcceleratedState) -> Progress:
+def step(config: TrainingConfig, trainee: Trainee, name: str, state: AcceleratedState) -> StepMetrics:
     """One optimiser step. What it draws and drops follows from seed, phase, step and process alone."""
     device, phase = state.accelerator.device, trainee.phases[name]
     seed = step_seed(config.seed, name, state.step, state.accelerator.process_index)
     torch.manual_seed(seed)
-    clock = Clock(device)
+    clock = StepTimer(device)
     state.prepared.train()
     with _memory_named(name, phase):
         loss = trainee.loss(name, torch.Generator(device).manual_seed(seed))
@@ -111,7 +111,7 @@ def step(config: TrainingConfig, trainee: Trainee, name: str, state: Accelerated
         clock.lap("forward")
         gradient = state.update(loss)
     clock.lap("backward")
-    return Progress(state.step, {"loss": value}, gradient, clock.seconds)
+    return StepMetrics(state.step, {"loss": value}, gradient, clock.seconds)
 
 
 def step_seed(seed: int, phase: str, step: int, process: int) -> int:

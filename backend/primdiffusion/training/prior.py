@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from primdiffusion.diffusion.codec import LinearCodec
-from primdiffusion.diffusion.conditioning import Vocabulary
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.training.config import PriorConfig
@@ -15,7 +15,9 @@ from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.mixture import fit_mixture
 
 
-def fit_prior(people: LatentSet, codec: LinearCodec, vocabulary: Vocabulary, config: PriorConfig) -> PersonPrior:
+def fit_prior(
+    people: LatentSet, codec: LinearCodec, vocabulary: AttributeVocabulary, config: PriorConfig
+) -> PersonPrior:
     """Principal components of people and their mirror images, and a mixture of Gaussians over them.
 
     Components are found from Gram matrices of the even and the odd parts of people, so that each is even or odd under

@@ -22,7 +22,7 @@ MEMORY = 25
 
 
 @dataclasses.dataclass(frozen=True)
-class Progress:
+class StepMetrics:
     """One optimiser step."""
 
     step: int
@@ -34,7 +34,7 @@ class Progress:
     """Of the step's parts, the last of which includes the update."""
 
 
-class Clock:
+class StepTimer:
     """Seconds between laps, with the device's work waited for."""
 
     def __init__(self, device: torch.device) -> None:
@@ -78,7 +78,7 @@ class Recorder(ABC):
     def __exit__(self, *_: object) -> None:
         self.bar.close()
 
-    def __call__(self, progress: Progress) -> None:
+    def __call__(self, progress: StepMetrics) -> None:
         """Takes note of a step. Raises OSError where there is no room."""
         row = {**progress.terms, "gradient": progress.gradient}
         row |= {f"seconds_{name}": value for name, value in progress.seconds.items()}

@@ -27,7 +27,7 @@ from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
 from primdiffusion.primitives.primitives import Payload
-from primdiffusion.training.refine_views import Scene, drawn, psnr_of, scenes_of
+from primdiffusion.training.refine_views import PosedView, drawn, psnr_of, scenes_of
 
 BETAS = (0.9, 0.99)
 """Adam's memories. Short ones: a run is a few hundred steps."""
@@ -189,7 +189,7 @@ class _Leaves(NamedTuple):
         )
 
 
-def _shuffled(scenes: Sequence[Scene], seed: int) -> Iterator[Scene]:
+def _shuffled(scenes: Sequence[PosedView], seed: int) -> Iterator[PosedView]:
     """Without end; each once before any comes again."""
     generator = torch.Generator().manual_seed(seed)
     while True:
@@ -202,7 +202,7 @@ def _share_of_rate(done: int, settings: RefineSettings) -> float:
     return min(1, (done + 1) / WARM_UP) * (settings.last_rate + (1 - settings.last_rate) * fall)
 
 
-def _loss(scene: Scene, payload: Payload, settings: RefineSettings) -> Tensor:
+def _loss(scene: PosedView, payload: Payload, settings: RefineSettings) -> Tensor:
     """L_rgb + silhouette * L_sil as sums over the pixels; colours mean over their channels."""
     rendering = drawn(scene, payload, settings.step)
     target = scene.target.float() / 255

@@ -29,7 +29,7 @@ def view_psnr(human: Human, views: Sequence[Views]) -> Float[Tensor, "n"]:
     return psnr_of(scenes_of(human.validate(), views), human.payload)
 
 
-class Scene(NamedTuple):
+class PosedView(NamedTuple):
     """One picture and where the boxes are in it."""
 
     frames: Frames
@@ -38,7 +38,7 @@ class Scene(NamedTuple):
     """uint8 [H, W, 4]."""
 
 
-def scenes_of(human: Human, views: Sequence[Views]) -> list[Scene]:
+def scenes_of(human: Human, views: Sequence[Views]) -> list[PosedView]:
     """Every picture as a scene on the human's device; their bodies are posed once.
 
     Raises ValueError where there are none, they do not fit their cameras, or the human is of another body.
@@ -58,7 +58,7 @@ def scenes_of(human: Human, views: Sequence[Views]) -> list[Scene]:
         record = record.to(device)
         for camera, rgba in enumerate(record.rgba):
             one = record.camera.map(lambda values, camera=camera: values[camera])
-            scenes.append(Scene(frames, one, rgba))
+            scenes.append(PosedView(frames, one, rgba))
     return scenes
 
 
@@ -79,7 +79,7 @@ def _check(number: int, record: Views) -> None:
 
 
 @torch.no_grad()
-def psnr_of(scenes: Sequence[Scene], payload: Payload) -> Float[Tensor, "n"]:
+def psnr_of(scenes: Sequence[PosedView], payload: Payload) -> Float[Tensor, "n"]:
     """As `view_psnr`."""
     found = []
     for scene in scenes:
@@ -88,7 +88,7 @@ def psnr_of(scenes: Sequence[Scene], payload: Payload) -> Float[Tensor, "n"]:
     return torch.stack(found).cpu()
 
 
-def drawn(scene: Scene, payload: Payload, step: float) -> Rendering:
+def drawn(scene: PosedView, payload: Payload, step: float) -> Rendering:
     """The payload as the scene's camera sees it. Raises PictureOutOfMemory."""
     try:
         return march(Primitives.place(scene.frames, payload), scene.camera, MarchSettings(step=step))

@@ -26,7 +26,7 @@ from torch import Tensor
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.primitives.primitives import K
 from primdiffusion.staging import write_atomically, written_whole
-from primdiffusion.training.stored_people import People, PeopleFolder, StoredPerson, attributes_of
+from primdiffusion.training.stored_people import PersonDataset, PersonFolder, PersonVariants, attributes_of
 
 INDEX, FORMAT, VERSION = "index.json", "primdiffusion-payloads", 1
 PEOPLE_EACH = 32
@@ -36,14 +36,14 @@ class ShardError(ValueError):
     """Packed people that cannot be used; one sentence that names the file and says what to do."""
 
 
-def open_people(folder: Path) -> People:
+def open_people(folder: Path) -> PersonDataset:
     """The people of a folder: packed ones where there is an index, files of single people otherwise.
 
     Raises:
         FileNotFoundError: there are fewer than two.
         ValueError: a file or the index is damaged, or people have several full densities.
     """
-    return PackedPeople(folder) if (folder / INDEX).exists() else PeopleFolder(folder)
+    return PackedPeople(folder) if (folder / INDEX).exists() else PersonFolder(folder)
 
 
 def pack_people(folder: Path, out: Path, people_each: int = PEOPLE_EACH) -> Iterator[int]:
@@ -58,7 +58,7 @@ def pack_people(folder: Path, out: Path, people_each: int = PEOPLE_EACH) -> Iter
         raise ValueError(f"{people_each} people a shard: pack 1 or more")
     if (out / INDEX).exists():
         raise ShardError(f"{out} holds packed people already: choose another folder, or remove it")
-    people = PeopleFolder(folder)
+    people = PersonFolder(folder)
     out.mkdir(parents=True, exist_ok=True)
     shards, done = [], 0
     for number, first in enumerate(range(0, len(people.names), people_each)):
@@ -76,7 +76,7 @@ def pack_people(folder: Path, out: Path, people_each: int = PEOPLE_EACH) -> Iter
     write_atomically(out / INDEX, json.dumps(index, indent=1))
 
 
-def _write_shard(path: Path, people: Sequence[StoredPerson]) -> None:
+def _write_shard(path: Path, people: Sequence[PersonVariants]) -> None:
     tensors = {
         "voxels": torch.cat([person.voxels for person in people]),
         "betas": torch.stack([person.betas for person in people]),
@@ -131,11 +131,11 @@ class PackedPeople:
         shard, place, _ = self._rows(index)
         return attributes_of(self._stored[index], self._slice(shard, "betas")[place], self.variants[index])
 
-    def person(self, index: int) -> StoredPerson:
+    def person(self, index: int) -> PersonVariants:
         """One of them. Raises ShardError that names the shard where it is damaged, OSError."""
         shard, place, rows = self._rows(index)
         voxels, scale, betas = self._slice(shard, "voxels")[rows], self._scale(shard, rows), self._slice(shard, "betas")
-        return StoredPerson(voxels, scale, betas[place], self.known(index), self.full_density)
+        return PersonVariants(voxels, scale, betas[place], self.known(index), self.full_density)
 
     def variant(self, index: int, number: int) -> tuple[Tensor, Tensor]:
         """Voxels and delta scales of one colouring; nothing else is read. Raises what `person` does."""

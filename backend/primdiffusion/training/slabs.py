@@ -15,7 +15,7 @@ from primdiffusion.diffusion.unet import SlabUNet
 from primdiffusion.primitives.slab import pack
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.losses import level_weight, random_steps, x0_errors
-from primdiffusion.training.stored_people import People, payload_of_bytes
+from primdiffusion.training.stored_people import PersonDataset, payload_of_bytes
 
 NETWORK = "slab"
 MEASURED = 4
@@ -26,7 +26,12 @@ class SlabTrainee:
     """A `SlabUNet` and the people it learns: unweighted x0 error at uniform levels, as in the paper."""
 
     def __init__(
-        self, config: TrainingConfig, people: People, train: Sequence[int], held: Sequence[int], device: torch.device
+        self,
+        config: TrainingConfig,
+        people: PersonDataset,
+        train: Sequence[int],
+        held: Sequence[int],
+        device: torch.device,
     ) -> None:
         torch.manual_seed(config.seed)
         self.schedule = SCHEDULES[str(config.schedule)]()

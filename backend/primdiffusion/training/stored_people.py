@@ -29,7 +29,7 @@ _VOXELS = (K, S, S, S, 4)
 
 
 @dataclasses.dataclass(frozen=True)
-class StoredPerson:
+class PersonVariants:
     """One geometry with several colourings, or several looks of one captured person."""
 
     voxels: UInt8[Tensor, "n k 8 8 8 4"]
@@ -47,7 +47,7 @@ class StoredPerson:
         return payload_of_bytes(self.voxels[variant], self.delta_scale[variant], self.full_density)
 
 
-class People(Protocol):
+class PersonDataset(Protocol):
     """People that are read when they are asked for; the same order for the same files."""
 
     @property
@@ -66,10 +66,10 @@ class People(Protocol):
         ...
 
     def known(self, index: int) -> tuple[Attributes, ...]:
-        """`StoredPerson.attributes` of one of them, without reading voxels; raises what `person` does."""
+        """`PersonVariants.attributes` of one of them, without reading voxels; raises what `person` does."""
         ...
 
-    def person(self, index: int) -> StoredPerson:
+    def person(self, index: int) -> PersonVariants:
         """One of them. Raises ValueError that names the file where it is damaged, OSError."""
         ...
 
@@ -94,7 +94,7 @@ def attributes_of(stored: Mapping[str, Any], betas: Float[Tensor, "10"], count: 
     return tuple({**words_of(variant), **body} for variant in variants)
 
 
-def read_person(path: Path) -> StoredPerson:
+def read_person(path: Path) -> PersonVariants:
     """A person's file; ValueError if it is damaged or of another shape."""
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -110,7 +110,7 @@ def read_person(path: Path) -> StoredPerson:
     scale = torch.ones(len(voxels), K, 3) if scale is None else scale
     if tuple(scale.shape) != (len(voxels), K, 3) or not (torch.isfinite(scale) & (scale > 0)).all():
         raise ValueError(f"{path} holds delta_scale {tuple(scale.shape)}; positive [{len(voxels)}, {K}, 3] is needed")
-    return StoredPerson(voxels, scale, outline.betas, outline.known(), outline.full_density)
+    return PersonVariants(voxels, scale, outline.betas, outline.known(), outline.full_density)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Outline:
     full_density: float
 
     def known(self) -> tuple[Attributes, ...]:
-        """`StoredPerson.attributes`."""
+        """`PersonVariants.attributes`."""
         return attributes_of(self.stored, self.betas, self.variants)
 
 
@@ -156,7 +156,7 @@ def _length(member: IO[bytes]) -> int:
     return read(member)[0][0]
 
 
-class PeopleFolder:
+class PersonFolder:
     """A folder of people, a file each."""
 
     def __init__(self, folder: Path) -> None:
@@ -176,7 +176,7 @@ class PeopleFolder:
         """What is known of each colouring of one of them."""
         return self.outlines[index].known()
 
-    def person(self, index: int) -> StoredPerson:
+    def person(self, index: int) -> PersonVariants:
         """One of them. Raises ValueError where its file is damaged."""
         return read_person(self.paths[index])
 
