@@ -1,11 +1,10 @@
 """How good, how new and how fast generated people are: ours beside a Gaussian and the paper's voxel baseline.
 
 `python benchmarks/diffusion.py --people DIR --judge DIR --voxel voxel.safetensors --json F --table F` compares --count
-people of each with people held out of the training (the --holdout and --seed of `primdiffusion train`). The judge's
-folder keeps portraits and feature network, which are made where they are not there (some minutes). Distances are
-Frechet distances of features; `distance_floor` is that of training people, which nothing need undercut. Without
---people, --voxel, --inception or --clip the figures that need them are null. Times are of two threads. --quick takes
-few people of each.
+samples of each with the held-out set (the --holdout and --seed of `primdiffusion train`). The --judge folder caches
+portraits and the feature network, which take some minutes to make. Distances are Frechet distances of features;
+`distance_floor` is that of training samples, the best any model can be expected to reach. Without --people, --voxel,
+--inception or --clip the figures that need them are null. Times are of two threads. --quick takes few samples of each.
 """
 
 from __future__ import annotations
@@ -24,7 +23,14 @@ from primdiffusion.evaluation.attribute_network import features_of
 from primdiffusion.evaluation.clip_vision import load_clip_vision
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance
 from primdiffusion.evaluation.gallery import made_gallery, payload_of
-from primdiffusion.evaluation.generation import Judge, Likeness, floor, liken, open_judge, table
+from primdiffusion.evaluation.generation import (
+    Comparison,
+    ReferenceSet,
+    compare,
+    open_reference_set,
+    real_vs_real,
+    table,
+)
 from primdiffusion.evaluation.inception import load_inception
 from primdiffusion.evaluation.neighbours import nearest_stored
 from primdiffusion.evaluation.voxel_baseline import load_voxel_model
@@ -72,17 +78,17 @@ def main() -> None:
     given = () if arguments.checkpoint is None else ("--checkpoint", str(arguments.checkpoint))
     repeats = "2" if arguments.quick else "5"
     figures |= from_script("diffusion_speed.py", SPEED_FIGURES, "--repeats", repeats, *given)
-    rows: dict[str, Likeness] = {}
-    judge = None
+    rows: dict[str, Comparison] = {}
+    reference = None
     if arguments.people is not None:
         train, held = split_people(find_people(arguments.people), arguments.holdout, arguments.seed)
-        judge = open_judge(train, held, arguments.judge, read_person, progress("portraits"), epoch)
-        rows = likenesses(judge, model, held, arguments)
+        reference = open_reference_set(train, held, arguments.judge, read_person, progress("portraits"), epoch)
+        rows = comparisons(reference, model, held, arguments)
         figures |= photograph_figures(model, held, arguments)
         figures["nearest_neighbour_ratio_latent"] = None if arguments.quick else latent_ratio(model, train, held)
-    figures |= quality_figures(rows, judge)
+    figures |= quality_figures(rows, reference)
     tell(figures, arguments.json)
-    text = table_of(rows, judge)
+    text = table_of(rows, reference)
     print(text)
     if arguments.table is not None:
         arguments.table.write_text(text + "\n", encoding="utf-8")
@@ -105,10 +111,10 @@ def parsed() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def likenesses(
-    judge: Judge, model: DiffusionModel, held: list[Path], arguments: argparse.Namespace
-) -> dict[str, Likeness]:
-    """Every set that can be made here, beside the people held out."""
+def comparisons(
+    reference: ReferenceSet, model: DiffusionModel, held: list[Path], arguments: argparse.Namespace
+) -> dict[str, Comparison]:
+    """Compare every available set with the held-out one."""
     seeds = seeds_of(16 if arguments.quick else arguments.count)
     some = held[:4] if arguments.quick else held
     sets: dict[str, Callable[[], Iterable[Primitives]]] = {
@@ -120,17 +126,17 @@ def likenesses(
     if arguments.voxel is not None:
         baseline = load_voxel_model(arguments.voxel)
         sets |= {"voxel": lambda: voxels(baseline, seeds), "voxel_codec": lambda: stored_voxels(some, baseline)}
-    rows = {"floor": floor(judge, len(seeds))}
+    rows = {"floor": real_vs_real(reference, len(seeds))}
     for name, make in sets.items():
-        rows[name] = liken(judge, features_of(judge.network, made_gallery(make())))
+        rows[name] = compare(reference, features_of(reference.network, made_gallery(make())))
         print(name, rows[name], flush=True)
     return {name: rows[name] for name in SETS if name in rows}
 
 
 def photograph_figures(model: DiffusionModel, held: list[Path], arguments: argparse.Namespace) -> Figures:
-    """FID, KID * 100 and FID_CLIP of pictures from the front, by networks for photographs; None without their weights.
+    """FID, KID * 100 and FID_CLIP of front views; None without the networks' weights.
 
-    Few pictures: their values are far above those of tens of thousands, and only sets of equal size compare.
+    With few images, values are far above those of tens of thousands; compare only sets of equal size.
     """
     figures: Figures = {}
     networks = {"inception": (arguments.inception, load_inception), "clip": (arguments.clip, load_clip_vision)}
@@ -151,7 +157,7 @@ def photograph_figures(model: DiffusionModel, held: list[Path], arguments: argpa
 
 
 def latent_ratio(model: DiffusionModel, train: list[Path], held: list[Path]) -> float:
-    """Median distance to the nearest training person in what is diffused: of generated over that of held-out people."""
+    """Median latent distance to the nearest training sample: generated samples' over held-out ones'."""
 
     def encode(payload: object) -> Tensor:
         return model.encode(payload)  # pyright: ignore[reportArgumentType]
@@ -162,7 +168,7 @@ def latent_ratio(model: DiffusionModel, train: list[Path], held: list[Path]) -> 
     return float(found.distance[: len(made)].median() / found.distance[len(made) :].median())
 
 
-def quality_figures(rows: Mapping[str, Likeness], judge: Judge | None) -> Figures:
+def quality_figures(rows: Mapping[str, Comparison], reference: ReferenceSet | None) -> Figures:
     """The named figures; None where not measured."""
     figures: Figures = {}
     for name in SETS:
@@ -175,29 +181,31 @@ def quality_figures(rows: Mapping[str, Likeness], judge: Judge | None) -> Figure
         figures[f"nearest_neighbour_ratio{suffix}"] = None if row is None else round(row.nearest_ratio, 4)
         figures[f"precision{suffix}"] = None if row is None else round(row.precision, 4)
         figures[f"recall{suffix}"] = None if row is None else round(row.recall, 4)
-    told = {} if judge is None else judge.held_accuracies
-    figures |= {f"feature_accuracy_{name}": round(told[name], 4) if name in told else None for name in ATTRIBUTES}
-    for name, gallery in (("train", judge and judge.train), ("held", judge and judge.held)):
+    accuracy = {} if reference is None else reference.held_accuracies
+    figures |= {
+        f"feature_accuracy_{name}": round(accuracy[name], 4) if name in accuracy else None for name in ATTRIBUTES
+    }
+    for name, gallery in (("train", reference and reference.train), ("held", reference and reference.held)):
         figures[f"people_{name}"] = None if gallery is None else len(gallery.pictures)
     return figures
 
 
-def table_of(rows: Mapping[str, Likeness], judge: Judge | None) -> str:
-    """Distances, and how well the features tell what they were trained on."""
-    if judge is None:
+def table_of(rows: Mapping[str, Comparison], reference: ReferenceSet | None) -> str:
+    """Distances, and the accuracy of the feature network."""
+    if reference is None:
         return "No people were given (--people): distances are not measured."
-    told = judge.held_accuracies
+    accuracy = reference.held_accuracies
     return "\n".join(
         [
             table({TITLES[name]: row for name, row in rows.items()}),
             "",
             PAPER,
             "",
-            "What the feature network tells of people held out: share told right, of skin tone and height R^2:",
+            "Accuracy of the feature network on the held-out set; R^2 for skin tone and height:",
             "",
-            "| " + " | ".join(told) + " |",
-            "|---" * len(told) + "|",
-            "| " + " | ".join(f"{value:.3f}" for value in told.values()) + " |",
+            "| " + " | ".join(accuracy) + " |",
+            "|---" * len(accuracy) + "|",
+            "| " + " | ".join(f"{value:.3f}" for value in accuracy.values()) + " |",
         ]
     )
 

@@ -2,9 +2,9 @@
 
 `python benchmarks/diffusion_pictures.py --people DIR --judge DIR --voxel voxel.safetensors --neighbours
 docs/pictures/neighbours.png --comparison docs/pictures/generated_comparison.png` draws people of successive seeds,
-nobody picked, each beside the nearest training people by features and by latents with the distances (1 is the median of
-people held out); and rows of people held out, ours, the Gaussian's and the voxel baseline's. The judge's folder is that
-of benchmarks/diffusion.py.
+not cherry-picked, each beside the nearest training samples by features and by latents with the distances (1 is the
+median of the held-out set); and rows of held-out samples, ours, the Gaussian's and the voxel baseline's. --judge is the
+folder of benchmarks/diffusion.py.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.attribute_network import features_of
 from primdiffusion.evaluation.distances import nearest
 from primdiffusion.evaluation.gallery import made_gallery, payload_of
-from primdiffusion.evaluation.generation import Judge, open_judge
+from primdiffusion.evaluation.generation import ReferenceSet, open_reference_set
 from primdiffusion.evaluation.neighbours import nearest_stored
 from primdiffusion.evaluation.portraits import PORTRAITS, Portrait, camera_of
 from primdiffusion.evaluation.voxel_baseline import load_voxel_model
@@ -63,8 +63,8 @@ def main() -> None:
     model = load_checkpoint(arguments.checkpoint)
     train, held = split_people(find_people(arguments.people), arguments.holdout, arguments.seed)
     if arguments.neighbours is not None:
-        judge = open_judge(train, held, arguments.judge, read_person, progress("portraits"), epoch)
-        neighbours(judge, model, train, held, arguments.count).save(arguments.neighbours, optimize=True)
+        reference = open_reference_set(train, held, arguments.judge, read_person, progress("portraits"), epoch)
+        neighbours(reference, model, train, held, arguments.count).save(arguments.neighbours, optimize=True)
         print(arguments.neighbours)
     if arguments.comparison is not None:
         comparison(model, held, arguments.voxel, arguments.count).save(arguments.comparison, optimize=True)
@@ -72,7 +72,7 @@ def main() -> None:
 
 
 def neighbours(
-    judge: Judge, model: DiffusionModel, train: Sequence[Path], held: Sequence[Path], count: int
+    reference: ReferenceSet, model: DiffusionModel, train: Sequence[Path], held: Sequence[Path], count: int
 ) -> Image.Image:
     """A column a seed: the person, the nearest by features and the nearest by latents."""
 
@@ -81,8 +81,8 @@ def neighbours(
 
     people = list(generated(model, seeds_of(count)))
     primitives = [place(human) for human in people]
-    by_features = nearest(features_of(judge.network, made_gallery(primitives)), judge.train_features)
-    new = nearest(judge.held_features, judge.train_features).distance.median()
+    by_features = nearest(features_of(reference.network, made_gallery(primitives)), reference.train_features)
+    new = nearest(reference.held_features, reference.train_features).distance.median()
     references = [payload_of(read_person(path), 0) for path in held[:: max(len(held) // 32, 1)]]
     queries = torch.stack([encode(payload).flatten() for payload in (*(h.payload for h in people), *references)])
     by_latents = nearest_stored(queries, train, read_person, encode, progress("latents"))
@@ -94,8 +94,8 @@ def neighbours(
     ]
     for number in range(count):
         row = int(by_features.index[number])
-        geometry = int(judge.train.geometry[row])
-        colouring = row - int((judge.train.geometry < geometry).sum())
+        geometry = int(reference.train.geometry[row])
+        colouring = row - int((reference.train.geometry < geometry).sum())
         rows[1][1].append((stored(train[geometry], colouring), f"{float(by_features.distance[number] / new):.2f}"))
         path, colouring = train[int(by_latents.file[number])], int(by_latents.colouring[number])
         rows[2][1].append((stored(path, colouring), f"{float(by_latents.distance[number] / new_latents):.2f}"))

@@ -1,6 +1,6 @@
-"""Features of pictures by networks that others trained: VGG16, VGG19 and AlexNet, from weights files that a user has.
+"""Image features of pretrained VGG16, VGG19 and AlexNet, with weights from local files.
 
-The layers are torchvision's `features`, under torchvision's names, so its files fit; nothing is downloaded.
+The layers are torchvision's `features` under torchvision's names, so its files load; nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from torch import Tensor, nn
 
 
 class WeightsFileError(ValueError):
-    """A file of weights that cannot be used; the message says which, why and what to do."""
+    """A weights file that is damaged or of another network."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Convolution:
-    """One layer, a ReLU behind it."""
+    """A convolution followed by a ReLU."""
 
     channels: int
     kernel: int = 3
@@ -33,14 +33,14 @@ class Convolution:
 
 @dataclasses.dataclass(frozen=True)
 class Architecture:
-    """A network as blocks of convolutions; the largest of each square of pixels is kept between blocks."""
+    """A network as blocks of convolutions with max pooling between them."""
 
     name: str
     blocks: tuple[tuple[Convolution, ...], ...]
     pool: int
-    """Side of that square; squares are 2 pixels apart."""
+    """Kernel size of the pooling, whose stride is 2."""
     smallest: int
-    """Pixels a side of the least picture that reaches the last block."""
+    """Smallest width and height of an input, pixels."""
 
 
 def _vgg(name: str, depths: Sequence[int]) -> Architecture:
@@ -66,12 +66,13 @@ ALEXNET = Architecture(
 
 
 class PictureFeatures(nn.Module):
-    """The network up to the last layer asked for, frozen: gradients reach the picture, not the weights."""
+    """The network up to its last requested layer, frozen: gradients reach the input, not the weights."""
 
     def __init__(self, architecture: Architecture, taps: Sequence[str]) -> None:
-        """`taps` are names as "relu3_2": the second convolution of the third block. Weights are random.
+        """Build the network with random weights.
 
-        Raises ValueError for a layer that the network does not have.
+        `taps` names layers: "relu3_2" follows the second convolution of the third block. Raises ValueError for an
+        unknown layer.
         """
         super().__init__()
         layers, numbers, before = [], {}, 3
@@ -91,65 +92,62 @@ class PictureFeatures(nn.Module):
         self.requires_grad_(False).eval()
 
     def forward(self, pictures: Float[Tensor, "n 3 H W"]) -> list[Float[Tensor, "n c h w"]]:
-        """The layers asked for, in that order.
-
-        Raises ValueError for pictures too small for the network.
-        """
+        """Return the outputs of the tapped layers in order. Raises ValueError for images that are too small."""
         if min(pictures.shape[-2:]) < self.architecture.smallest:
             raise ValueError(
-                f"pictures of {pictures.shape[-1]} x {pictures.shape[-2]} pixels are too small for "
-                f"{self.architecture.name}: give at least {self.architecture.smallest} a side"
+                f"images of {pictures.shape[-1]} x {pictures.shape[-2]} pixels are too small for "
+                f"{self.architecture.name}: give at least {self.architecture.smallest} x {self.architecture.smallest}"
             )
-        seen = {}
+        outputs = {}
         for number, layer in enumerate(self.features):
             pictures = layer(pictures)
-            seen[number] = pictures
-        return [seen[tap] for tap in self._taps]
+            outputs[number] = pictures
+        return [outputs[tap] for tap in self._taps]
 
 
 def read_weights(path: Path | str) -> dict[str, Tensor]:
-    """The tensors of a .safetensors file or of one that torch.save wrote; nothing in it is run.
+    """Read a state dict from a .safetensors file or a file written by torch.save, without executing pickled code.
 
     Raises:
-        FileNotFoundError: there is none.
-        WeightsFileError: it is truncated, or holds anything else than tensors by name.
+        FileNotFoundError: the file does not exist.
+        WeightsFileError: the file is truncated or not a dictionary of named tensors.
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"there is no file of weights {path}: check the path")
+        raise FileNotFoundError(f"no weights file at {path}: check the path")
     try:
         if path.suffix == ".safetensors":
             return load_file(path)
-        held = torch.load(path, map_location="cpu", weights_only=True)
+        content = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, SafetensorError, RuntimeError, EOFError, ValueError, LookupError) as e:
         raise WeightsFileError(
-            f"{path} is truncated or no plain file of weights ({_reason(e)}): download it again, or save "
+            f"{path} is truncated or not a plain weights file ({_reason(e)}): download it again, or save "
             "the network's state_dict()"
         ) from e
-    if not isinstance(held, Mapping) or not all(isinstance(value, Tensor) for value in held.values()):
-        raise WeightsFileError(f"{path} holds something else than tensors by name: save the network's state_dict()")
-    return dict(held)
+    if not isinstance(content, Mapping) or not all(isinstance(value, Tensor) for value in content.values()):
+        raise WeightsFileError(f"{path} is not a dictionary of named tensors: save the network's state_dict()")
+    return dict(content)
 
 
 def _reason(error: Exception) -> str:
-    """The first sentence; torch's go on with advice to unpickle."""
+    """First sentence of the message; torch's messages continue with advice to unpickle."""
     return next(iter(str(error).split(". ")[0].splitlines()), type(error).__name__)
 
 
 def fill(network: nn.Module, weights: Mapping[str, Tensor], what: str, source: str) -> None:
-    """Copies the weights of `network`'s names; others of the file, such as a classifier's, are left.
+    """Load the weights that `network` has; extra ones, such as a classifier's, are ignored.
 
-    Raises WeightsFileError, which says that `source` is no file of `what`, where a name is missing, a shape differs or
-    a value is not finite.
+    `what` and `source` name the network and the file in messages. Raises WeightsFileError if a name is missing, a shape
+    differs or a value is not finite.
     """
     for name, own in network.state_dict().items():
         if name not in weights:
-            raise WeightsFileError(f"{source} has no {name!r}: give a file of {what}")
+            raise WeightsFileError(f"{source} has no {name!r}: give weights of {what}")
         given = weights[name]
         if given.shape != own.shape:
             raise WeightsFileError(
-                f"{source} has {name!r} of shape {tuple(given.shape)}, not {tuple(own.shape)}: give a file of {what}"
+                f"{name!r} in {source} has shape {tuple(given.shape)}, not {tuple(own.shape)}: give weights of {what}"
             )
         if not torch.isfinite(given).all():
-            raise WeightsFileError(f"{source} has NaN or infinite values in {name!r}: download it again")
+            raise WeightsFileError(f"{name!r} in {source} has NaN or infinite values: download it again")
     network.load_state_dict({name: weights[name] for name in network.state_dict()})

@@ -1,4 +1,4 @@
-"""A captured person as a human: the encoder's payload on the body that its boxes sit on."""
+"""Reconstruct a captured subject as a `Human` with the encoder."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from primdiffusion.human import Human
 
 
 def reconstruct(model: EncoderModel, person: CapturedPerson) -> Human:
-    """The person of these views, on the CPU; the same for the same model, views and device.
+    """Reconstruct the subject on the CPU; deterministic for a model, views and device.
 
-    Raises ValueError where the model's numbers are not finite.
+    Raises ValueError if the model's output is not finite.
     """
     payload = model.encode(person.views, person.betas)
     provenance = {

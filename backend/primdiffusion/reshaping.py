@@ -1,10 +1,10 @@
-"""The same person on another body: where their primitives go, and how large they are there.
+"""Change a human's body shape: give its payload other betas and resize the primitives.
 
-A person's payload belongs to the body they were generated with: half extents are constants of the layout times the
-person's own delta scale (paper sec. 3.1), whatever the betas. Give that payload to a body whose surface is stretched
-and boxes of the same size lie farther apart: gaps, and patterns seen twice. So a box grows along T and B with a share
-of the stretch of its cell of the UV grid. The whole stretch would do for a flat surface; on a round one the corners of
-a box stand off the body the farther the wider it is. `benchmarks/reshape_boxes.py` compares shares.
+A payload fits the body it was generated with: half extents are constants of the layout times the payload's delta scale
+(paper sec. 3.1), independent of betas. On a stretched surface, boxes of the same size lie farther apart, which shows as
+gaps and repeated patterns. So a box grows along T and B by a power of the stretch of its cell of the UV grid. The full
+stretch would suit a flat surface; on a curved one, the corners of wider boxes stand off the body.
+`benchmarks/reshape_boxes.py` compares exponents.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from primdiffusion.human import Human, body_of
 from primdiffusion.primitives.anchors import Anchors, tangent_plane
 
 SHARE = 0.5
-"""Exponent of the stretch: 0 leaves boxes alone, 1 lets them grow as much as the surface."""
+"""Exponent of the stretch: 0 keeps box sizes, 1 scales boxes with the surface."""
 SAME_BETAS = 1e-5
-"""Betas that differ by less are the same body."""
+"""Tolerance within which betas count as equal."""
 
 
 def reshaped(
     human: Human, betas: Float[Tensor, "n"], body: BodyModel | None = None, anchors: Anchors | None = None
 ) -> Human:
-    """The person with other shape coefficients; boxes grow by `box_growth`, in their delta scale. Density stays.
+    """Return the human with other betas, its delta scales multiplied by `box_growth`; density is unchanged.
 
-    With the betas they have it is the person themselves, bit for bit. `body` and `anchors` as of `place`. Raises
-    ValueError for another number of betas than the person has, or values that are not finite.
+    Unchanged betas return `human` itself. `body` and `anchors` are those of `place`. Raises ValueError for a wrong
+    number of betas or values that are not finite.
     """
     if betas.shape != human.betas.shape:
-        raise ValueError(f"{len(betas)} betas were given for a body of {len(human.betas)}: give as many")
+        raise ValueError(f"got {len(betas)} betas for a body with {len(human.betas)}: give {len(human.betas)}")
     betas = betas.to(human.betas)
     if torch.allclose(betas, human.betas, rtol=0, atol=SAME_BETAS):
         return human
@@ -48,9 +48,9 @@ def reshaped(
 def box_growth(
     body: BodyModel, anchors: Anchors, before: Float[Tensor, "n"], after: Float[Tensor, "n"]
 ) -> Float[Tensor, "k 3"]:
-    """Factors on half extents along T, B, N when a body gets other betas: stretch of the cell at rest ** SHARE; N 1.
+    """Factors on half extents along T, B, N when betas change: the rest cell's stretch ** SHARE; 1 along N.
 
-    Clothes stay as thick as they are. A product over reshapings is that of the last body and the first.
+    The thickness of clothes is unchanged. Factors of successive changes multiply to that of the whole change.
     """
     sides = [cell_sides(anchors, body.shape(betas).vertices) for betas in (before, after)]
     stretch = sides[1] / sides[0].clamp_min(torch.finfo(sides[0].dtype).tiny)
@@ -58,7 +58,7 @@ def box_growth(
 
 
 def cell_sides(anchors: Anchors, vertices: Float[Tensor, "v 3"]) -> Float[Tensor, "k 2"]:
-    """How long cells of the UV grid are along T, and how wide along B = N x T, metres."""
+    """Side lengths of the UV grid's cells along T and B = N x T, metres."""
     du, dv = tangent_plane(anchors, vertices)
     length = du.norm(dim=-1)
     area = torch.linalg.cross(du, dv).norm(dim=-1)

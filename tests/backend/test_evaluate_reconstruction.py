@@ -18,10 +18,10 @@ from primdiffusion.evaluation import command
 from primdiffusion.evaluation.reconstruction import (
     SPLITS,
     EvaluationSettings,
-    Likeness,
+    ImageMetrics,
     PictureScore,
-    compare,
     evaluate,
+    image_metrics,
     picture,
     summary,
     table,
@@ -153,10 +153,10 @@ def rendered(rgba):
 
 def test_a_picture_is_most_like_itself():
     rgba = torch.randint(0, 256, (24, 20, 4), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-    likeness = compare(rendered(rgba), rgba)
-    assert likeness.psnr > 90
-    assert likeness.ssim == pytest.approx(1, abs=1e-5)
-    assert likeness.mask_iou == 1
+    metrics = image_metrics(rendered(rgba), rgba)
+    assert metrics.psnr > 90
+    assert metrics.ssim == pytest.approx(1, abs=1e-5)
+    assert metrics.mask_iou == 1
 
 
 def test_the_box_leaves_out_what_is_black_around_the_person():
@@ -164,26 +164,26 @@ def test_the_box_leaves_out_what_is_black_around_the_person():
     rgba[10:30, 5:25] = 255
     other = rgba.clone()
     other[10:20, 5:25, 0] = 128
-    likeness = compare(rendered(other), rgba)
+    metrics = image_metrics(rendered(other), rgba)
     quarter = 20 * 20 / 40**2
-    assert likeness.psnr_box == pytest.approx(likeness.psnr + 10 * torch.tensor(quarter).log10().item(), abs=1e-3)
-    assert likeness.ssim_box < likeness.ssim
+    assert metrics.psnr_box == pytest.approx(metrics.psnr + 10 * torch.tensor(quarter).log10().item(), abs=1e-3)
+    assert metrics.ssim_box < metrics.ssim
 
 
 def test_an_empty_picture_has_no_box():
     rgba = torch.zeros(16, 16, 4, dtype=torch.uint8)
-    likeness = compare(rendered(rgba), rgba)
-    assert (likeness.psnr_box, likeness.ssim_box, likeness.mask_iou) == (None, None, 1)
+    metrics = image_metrics(rendered(rgba), rgba)
+    assert (metrics.psnr_box, metrics.ssim_box, metrics.mask_iou) == (None, None, 1)
 
 
 def test_colours_beyond_white_are_white():
     rgba = torch.full((12, 12, 4), 255, dtype=torch.uint8)
     bright = dataclasses.replace(rendered(rgba), rgb=torch.full((12, 12, 3), 7.0))
-    assert compare(bright, rgba).psnr == 100
+    assert image_metrics(bright, rgba).psnr == 100
 
 
 def score(psnr, given_view, given_pose, box=None):
-    return PictureScore("a", 0, 0, given_view, given_pose, Likeness(psnr, 0.5, box, box, 1.0))
+    return PictureScore("a", 0, 0, given_view, given_pose, ImageMetrics(psnr, 0.5, box, box, 1.0))
 
 
 def test_summary_averages_each_part_alone():
@@ -235,7 +235,7 @@ def test_command_tells_wrong_folders_and_numbers(captures, tmp_path, capsys):
         (["--captures", str(tmp_path / "none")], "there is no folder of captures"),
         (["--captures", str(captures.root), "--people", "-1"], "people is -1"),
         (["--captures", str(captures.root), "--checkpoint", str(tmp_path / "no.safetensors")], "no.safetensors"),
-        (["--captures", str(captures.root), "--lpips", str(tmp_path / "w.pth")], "there is no file of weights"),
+        (["--captures", str(captures.root), "--lpips", str(tmp_path / "w.pth")], "w.pth"),
     ):
         with pytest.raises(SystemExit) as end:
             cli.main(["evaluate", "reconstruction", *arguments])

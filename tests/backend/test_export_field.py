@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from export_people import ball, person
 from primdiffusion.body.model import default_body
-from primdiffusion.export.field import density_at, look_along, pack_field, weights_at
+from primdiffusion.export.field import density_at, march_rays, pack_field, weights_at
 from primdiffusion.human import framing, place
 from primdiffusion.primitives.anchors import anchor_skin_weights, default_anchors
 from primdiffusion.render.march import MarchSettings, march
@@ -32,7 +32,7 @@ def test_looking_along_rays_sees_what_the_marcher_draws():
     origin, directions = camera.rays()
     rays = directions.reshape(-1, 3).double().numpy()
     origins = np.broadcast_to(origin.double().numpy(), rays.shape)
-    colour, alpha = look_along(pack_field(primitives), origins, rays, 12.0, 0.001)
+    colour, alpha = march_rays(pack_field(primitives), origins, rays, 12.0, 0.001)
     expected = drawn.alpha.reshape(-1).numpy()
     assert np.abs(alpha - expected).mean() < 2e-3
     full = expected > 0.99

@@ -89,14 +89,14 @@ def test_metrics_take_any_batch_and_none():
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
 def test_pictures_of_two_shapes_are_refused(metric):
-    with pytest.raises(ValueError, match=r"give two of the same"):
+    with pytest.raises(ValueError, match=r"\[\.\.\., H, W, 3\]"):
         metric(torch.zeros(20, 20, 3), torch.zeros(20, 21, 3))
-    with pytest.raises(ValueError, match=r"give two of the same"):
+    with pytest.raises(ValueError, match=r"\[\.\.\., H, W, 3\]"):
         metric(torch.zeros(3, 20, 20), torch.zeros(3, 20, 20))
 
 
 def test_ssim_says_what_it_needs_of_small_pictures():
-    with pytest.raises(ValueError, match=r"10 x 20 pixels: SSIM needs 11"):
+    with pytest.raises(ValueError, match="10 x 20 pixels"):
         ssim(torch.zeros(20, 10, 3), torch.zeros(20, 10, 3))
 
 
@@ -168,24 +168,24 @@ def test_files_of_another_network_are_refused(tmp_path):
     alex = torchmetrics_lpips.__file__.removesuffix("lpips.py") + "lpips_models/alex.pth"
     with pytest.raises(WeightsFileError, match=r"'linear\.0\.weight'"):
         load_lpips([tmp_path / "vgg16.pth"])
-    with pytest.raises(WeightsFileError, match=r"'linear\.1\.weight' of shape \(1, 192, 1, 1\), not \(1, 128, 1, 1\)"):
+    with pytest.raises(WeightsFileError, match=r"linear\.1\.weight.*\(1, 192, 1, 1\), not \(1, 128, 1, 1\)"):
         load_lpips([tmp_path / "vgg16.pth", alex])
-    with pytest.raises(WeightsFileError, match="no network's weights"):
+    with pytest.raises(WeightsFileError, match="no backbone"):
         load_lpips([alex])
 
 
 def test_damaged_missing_and_foreign_files_are_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nothing\.pth: check the path"):
+    with pytest.raises(FileNotFoundError, match=r"nothing\.pth"):
         load_lpips([tmp_path / "nothing.pth"])
     for name, held in (("half.pth", b"PK\x03\x04"), ("empty.pth", b""), ("half.safetensors", b"12345678{")):
         (tmp_path / name).write_bytes(held)
-        with pytest.raises(WeightsFileError, match=f"{name} is truncated or no plain file"):
+        with pytest.raises(WeightsFileError, match=name):
             load_lpips([tmp_path / name])
     torch.save(nn.Linear(2, 2), tmp_path / "pickled.pth")
     with pytest.raises(WeightsFileError, match=r"state_dict"):
         load_lpips([tmp_path / "pickled.pth"])
     torch.save([1, 2], tmp_path / "list.pth")
-    with pytest.raises(WeightsFileError, match="something else than tensors by name"):
+    with pytest.raises(WeightsFileError, match="named tensors"):
         load_lpips([tmp_path / "list.pth"])
 
 

@@ -78,7 +78,7 @@ def test_reshaping_twice_is_reshaping_once_and_back_again_is_nothing(human):
 
 
 def test_another_number_of_betas_and_nan_are_refused(human):
-    with pytest.raises(ValueError, match=r"3 betas were given for a body of 10.*give as many"):
+    with pytest.raises(ValueError, match="3 betas for a body with 10"):
         reshaped(human, torch.zeros(3))
     with pytest.raises(ValueError, match="finite"):
         reshaped(human, torch.full((10,), torch.nan))

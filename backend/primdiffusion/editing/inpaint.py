@@ -1,4 +1,4 @@
-"""Parts of a person made anew, or brought into agreement with the rest of them; nothing else changes by a bit."""
+"""Resample a region of a human, or harmonise it with the rest; the other primitives stay bit-identical."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from torch import Tensor
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.editing.edit import (
     OnStep,
-    asked,
-    chain_down,
     combined,
+    conditional_denoiser,
     decoded,
     edit_generator,
+    edit_timesteps,
     encoded,
-    fitted,
-    last,
+    match_density,
+    run_sampler,
     with_edit,
 )
 from primdiffusion.editing.regions import check_region, name_region
@@ -37,26 +37,25 @@ def inpaint(
     guidance: float = requests.GUIDANCE,
     on_step: OnStep | None = None,
 ) -> Human:
-    """The person with the primitives of a region sampled anew so that they fit the others (`repaint`).
+    """Return the human with the primitives of a region resampled to fit the others (`repaint`).
 
-    The region starts as noise: nothing of what it was is kept. Outside it the payload, and the betas everywhere, are
-    the person's own, bit for bit: those primitives are never decoded. `attributes` say what the region should become;
-    without any it is whatever fits. Nearly 2 * `steps` calls of the denoiser, twice as many with attributes.
-    Deterministic for a model, person, seed and device.
+    The region starts from pure noise. Betas, and the payload outside the region, stay bit-identical: those primitives
+    are never decoded. `attributes` condition the region; without any the result is unconditional. Costs nearly
+    2 * `steps` denoiser calls, twice as many with attributes. Deterministic for a model, human, seed and device.
 
-    Raises ValueError for a region that is empty, whole or no mask of K, steps outside 1 ... T, a seed outside
-    0 ... 2^63-1 and attributes that the model does not know.
+    Raises ValueError for a region that is empty, whole or not a mask of K, steps outside 1 ... T, a seed outside
+    0 ... 2^63-1 and unknown attributes.
     """
     region = check_region(region)
     if region.all():
-        raise ValueError("the region is the whole person: generate a new one, or vary this one")
+        raise ValueError("the region is the whole person: generate or vary instead of inpainting")
     generator = edit_generator(seed)
     chain = model.chain(model.schedule.length, steps)
-    model = fitted(model, human)
-    denoise = asked(model, attributes, guidance)
+    model = match_density(model, human)
+    denoise = conditional_denoiser(model, attributes, guidance)
     known, inside = encoded(model, human), model.cell_mask(region)
     start = model.start([generator], chain[0], model.condition(attributes))
-    x0 = last(repaint(denoise, model.schedule, start, known, inside, chain, generator), on_step)
+    x0 = run_sampler(repaint(denoise, model.schedule, start, known, inside, chain, generator), on_step)
     edit = {"edit": "inpaint", "region": name_region(region, human.body_setup), "seed": seed, "steps": steps}
     edit = {**edit, "attributes": dict(attributes), "guidance": guidance, **made_by(model)}
     return with_edit(human, edit, combined(region, decoded(model, x0), human.payload))
@@ -71,22 +70,22 @@ def harmonise(
     steps: int = requests.STEPS,
     on_step: OnStep | None = None,
 ) -> Human:
-    """The person with a region, pasted there perhaps, brought into agreement with the rest by a little noise and back.
+    """Return the human with a region, for instance a transferred one, harmonised with the rest: noised and denoised.
 
-    As `inpaint`, but the region starts from what it is, with noise of a level that grows with `amount`: 0 is the
-    person themselves, exactly; at 1 the region is made anew. Outside it nothing changes by a bit. The region may be all
-    of the person; then it is a variant without the details that the codec leaves out. Raises ValueError as `inpaint`
-    does, and for an amount outside 0 ... 1.
+    As `inpaint`, but the region starts from its present content, noised to a level that grows with `amount`: 0 leaves
+    it unchanged, 1 starts from pure noise. The rest stays bit-identical. The region may be the whole human; the result
+    is then a variant without the detail that the codec drops. Raises ValueError as `inpaint`, and for an amount outside
+    0 ... 1.
     """
     region = check_region(region)
     generator = edit_generator(seed)
-    model = fitted(model, human)
-    chain = chain_down(model.schedule, amount, steps)
+    model = match_density(model, human)
+    chain = edit_timesteps(model.schedule, amount, steps)
     payload = human.payload
     if chain:
         known, inside = encoded(model, human), model.cell_mask(region)
         start = noised(model.schedule, known, chain[0], generator)
-        x0 = last(repaint(model.denoise, model.schedule, start, known, inside, chain, generator), on_step)
+        x0 = run_sampler(repaint(model.denoise, model.schedule, start, known, inside, chain, generator), on_step)
         payload = combined(region, decoded(model, x0), human.payload)
     edit = {
         "edit": "harmonise",

@@ -1,4 +1,4 @@
-"""People between two people: both back to noise, a point on the arc between, and forth again."""
+"""Interpolate between two humans: DDIM inversion of both, slerp of the noises, DDIM sampling."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from primdiffusion.editing.edit import (
     decoded,
     difference,
     encoded,
-    fitted,
-    last,
+    match_density,
+    run_sampler,
     with_edit,
 )
 from primdiffusion.editing.unit_interval import check_unit_interval
@@ -38,20 +38,19 @@ def interpolate(
     steps: int = requests.STEPS,
     on_step: OnStep | None = None,
 ) -> Human:
-    """The person at `fraction` of the way from `a` to `b`: a likely person all the way, not a double exposure.
+    """Return the human at `fraction` of the way from `a` to `b`: plausible throughout, not a cross-fade.
 
-    DDIM is run backwards for both (Song et al. 2021, sec. 4.3), the noises are interpolated on the arc between them,
-    and DDIM is run forwards for that. What the way there and back loses of a and b is added again in proportion to the
-    nearness to each, so the ends are the people themselves: exactly at 0 and 1. Betas are interpolated linearly.
-    Deterministic, without a seed. Provenance is that of the nearer person. Raises ValueError for a fraction outside
-    0 ... 1 and steps outside 1 ... T.
+    Both are inverted with DDIM (Song et al. 2021, sec. 4.3), the noises are interpolated spherically, and the result is
+    sampled with DDIM. The reconstruction residuals of a and b are interpolated and added, so that fractions 0 and 1
+    return them exactly. Betas are interpolated linearly. Deterministic, without a seed. The provenance is that of the
+    nearer end. Raises ValueError for a fraction outside 0 ... 1 and steps outside 2 ... T.
     """
     check_unit_interval("fraction", fraction)
     chain = inversion_steps(model.schedule, steps)
-    models = fitted(model, a), fitted(model, b)
+    models = match_density(model, a), match_density(model, b)
     if models[0].full_density != models[1].full_density:
         densities = " and ".join(f"{one.full_density:g}" for one in models)
-        raise ValueError(f"the two people are of different full densities ({densities} 1/m): choose two of one kind")
+        raise ValueError(f"the two have different full densities ({densities} 1/m): choose two of one checkpoint")
     if fraction in (0, 1):
         payload = (b if fraction else a).payload.to("cpu")
     else:
@@ -63,19 +62,19 @@ def interpolate(
 
 
 def inversion_steps(schedule: Schedule, steps: int) -> list[int]:
-    """Descending steps from T-1 to 0: as `trailing_steps`, but down to where a clean sample is nearly at home.
+    """Descending timesteps from T-1 to 0: as `trailing_steps`, but down to the level of nearly clean latents.
 
-    Raises ValueError for a number of steps outside 2 ... T; one alone leads nowhere.
+    Raises ValueError for a number of steps outside 2 ... T.
     """
     if not 2 <= steps <= schedule.length:
-        raise ValueError(f"people can be interpolated in 2 to {schedule.length} steps; {steps} were asked for")
+        raise ValueError(f"steps is {steps}: interpolation takes 2 to {schedule.length} steps")
     return [round((schedule.length - 1) * (1 - i / (steps - 1))) for i in range(steps)]
 
 
 def inverted(
     denoise: Denoise, schedule: Schedule, x0: Float[Tensor, "b c h w"], steps: Sequence[int]
 ) -> Iterator[SamplerStep]:
-    """DDIM backwards: from clean samples, taken for samples of the last of the descending `steps`, up to the first."""
+    """DDIM inversion: from clean latents, assigned to the last of the descending `steps`, up to the first."""
     x, upwards = x0, list(reversed(steps))
     for index, (t, t_up) in enumerate(pairwise(upwards)):
         guess = denoise(x, t)
@@ -84,7 +83,7 @@ def inverted(
 
 
 def slerp(a: Float[Tensor, "c h w"], b: Float[Tensor, "c h w"], fraction: float) -> Float[Tensor, "c h w"]:
-    """The point at `fraction` of the arc from a to b, as far from 0 as these are; linear where they are one."""
+    """Spherical linear interpolation; linear for nearly parallel vectors."""
     cosine = float((a * b).sum() / (a.norm() * b.norm()).clamp_min(1e-12))
     angle = math.acos(max(-1.0, min(1.0, cosine)))
     if math.sin(angle) < 1e-4:
@@ -92,10 +91,10 @@ def slerp(a: Float[Tensor, "c h w"], b: Float[Tensor, "c h w"], fraction: float)
     return (math.sin((1 - fraction) * angle) * a + math.sin(fraction * angle) * b) / math.sin(angle)
 
 
-def there_and_back(
+def invert_and_sample(
     denoise: Denoise, schedule: Schedule, ends: Float[Tensor, "2 c h w"], fraction: float, steps: Sequence[int]
 ) -> Iterator[SamplerStep]:
-    """Both ends up to noise, then both and the point between them down; the last x0 is that of [a, b, between]."""
+    """Invert both ends, then denoise both and their interpolation; the last x0 is that of [a, b, between]."""
     noise, total, up = ends, 2 * len(steps) - 1, 0
     for step in inverted(denoise, schedule, ends, steps):
         yield dataclasses.replace(step, total=total)
@@ -109,10 +108,10 @@ def _between(
     model: DiffusionModel, people: tuple[Human, Human], fraction: float, chain: Sequence[int], on_step: OnStep | None
 ) -> Payload:
     ends = torch.cat([encoded(model, human) for human in people])
-    back = last(there_and_back(model.denoise, model.schedule, ends, fraction, chain), on_step)
-    lost = ends - back[:2]
-    between = decoded(model, back[2:] + torch.lerp(lost[:1], lost[1:], fraction))
-    left_out = [
+    back = run_sampler(invert_and_sample(model.denoise, model.schedule, ends, fraction, chain), on_step)
+    latent_residual = ends - back[:2]
+    between = decoded(model, back[2:] + torch.lerp(latent_residual[:1], latent_residual[1:], fraction))
+    residuals = [
         difference(human.payload.to("cpu"), decoded(model, x0[None])) for human, x0 in zip(people, ends, strict=True)
     ]
-    return added(added(between, left_out[0], 1 - fraction), left_out[1], fraction)
+    return added(added(between, residuals[0], 1 - fraction), residuals[1], fraction)

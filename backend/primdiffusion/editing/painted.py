@@ -1,4 +1,4 @@
-"""Painted regions on disk: an .npz with `weights`, a number for each vertex of human.npz's body."""
+"""Read painted regions: an .npz with `weights`, one number for each vertex of the body in human.npz."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from primdiffusion.formats.arrays import read_arrays
 
 
 def read_weights(path: str | Path) -> Float[Tensor, "v"]:
-    """The painted weights in a file. Raises FileNotFoundError, and ValueError for a file that holds none."""
+    """Read painted weights. Raises FileNotFoundError, and ValueError for a file without usable weights."""
     weights = read_arrays(path, ("weights",))["weights"]
     if weights.dtype.kind not in "fiub" or weights.ndim != 1:
-        raise ValueError(f"the weights in {path} are {weights.dtype} {weights.shape}: give one number for each vertex")
+        raise ValueError(f"weights in {path} are {weights.dtype} {weights.shape}: give one number for each vertex")
     return torch.from_numpy(weights.astype(np.float32))

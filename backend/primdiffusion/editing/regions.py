@@ -1,8 +1,8 @@
-"""Regions of a person: sets of primitives, named as an artist names them or painted on the body.
+"""Regions of a human: sets of primitives, selected by part names or painted on the body.
 
-A part is a set of primitives: those whose anchor follows a certain joint most, cut where cloth and
-hair are rather than where bones end. The cuts were chosen by looking at which rows of the grid have the colour of the
-shirt, of the face, of the hair on the people that the default checkpoint learnt from (docs/design/diffusion_edits.md).
+A part consists of the primitives that mainly follow certain joints, cut at the borders of clothes and hair rather than
+at the joints. The cuts were chosen from the colours of the default checkpoint's training set: shirt, face and hair;
+docs/design/diffusion_edits.md shows them.
 """
 
 from __future__ import annotations
@@ -23,14 +23,13 @@ from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import GRID, K, S
 
 HEM, SEAT = -0.028, -0.125
-"""Metres above the rest body's pelvis: where most shirts end, and where hips become thighs."""
+"""Heights above the rest body's pelvis, metres: the hem of most shirts, and the border of hips and thighs."""
 COLLAR_HEIGHT, COLLAR_SLOPE = 0.007, -0.42
-"""The plane y = height + slope * z, metres from the neck's joint: below it a neck wears a shirt, above it skin."""
+"""The plane y = height + slope * z, metres from the neck's joint: shirt below, skin above."""
 NAPE_DEPTH, HAIRLINE_SLOPE = -0.052, 1.4
-"""The plane z = depth + slope * y, metres from the head's joint: behind it, from the nape over the ears to the
-hairline, grows hair."""
+"""The plane z = depth + slope * y, metres from the head's joint: hair lies behind it."""
 CUFF = 0.02
-"""Metres from the wrist's joint towards the hand: where long sleeves end."""
+"""End of long sleeves, metres from the wrist's joint towards the hand."""
 
 _TRUNK = ("pelvis", "spine1", "spine2", "spine3", "left_collar", "right_collar")
 _SIDED = {
@@ -41,7 +40,7 @@ _SIDED = {
     "shins": ("knee",),
     "feet": ("ankle", "foot"),
 }
-"""Parts that come in pairs, and the joints that move them."""
+"""Paired parts, and the joints that move them."""
 _ONE_OF = {
     "upper_arms": "upper_arm",
     "forearms": "forearm",
@@ -60,69 +59,67 @@ _UNIONS = {
     "clothes": ("top", "bottom", "shoes"),
     "skin": ("face", "neck", "hands"),
 }
-"""What an artist picks: several parts under one name."""
+"""Names for several parts together."""
 DISJOINT = ("face", "hair", "neck", "torso", "hips", *SIDED_PARTS)
-"""Parts that share no primitive; together they are the whole person."""
+"""A partition of all primitives."""
 
 
 def region_of(names: Sequence[str], body_setup: BodySetup | None = None) -> Bool[Tensor, "k"]:
-    """The primitives of the parts with these names, together, for humans on this body (None: the default body).
+    """Return the union of the named parts on a body (None: the default body).
 
-    Raises ValueError for no name or an unknown one.
+    Raises ValueError for no names or an unknown one.
     """
     if not names:
-        raise ValueError(f"the region names no part of the body: choose one or more of {', '.join(PARTS)}")
+        raise ValueError(f"the region is empty: name one or more of {', '.join(PARTS)}")
     parts = parts_of(body_setup)
     for name in names:
         if name not in parts:
-            raise ValueError(f"there is no part of the body {name!r}: choose from {', '.join(PARTS)}")
+            raise ValueError(f"unknown part of the body {name!r}: choose from {', '.join(PARTS)}")
     return torch.stack([parts[name] for name in names]).any(0)
 
 
 def region_from_weights(
     weights: Float[Tensor, "v"], threshold: float = 0.5, body_setup: BodySetup | None = None
 ) -> Bool[Tensor, "k"]:
-    """The primitives under paint: those on whose patch of skin the weight is at least `threshold` on average.
+    """Return the primitives whose mean painted weight is at least `threshold`.
 
-    `weights` hold a number from 0 to 1 for each vertex of the body, in the order of `human.npz` (a vertex group in
-    Blender). A patch is the primitive's 8 x 8 texels; on another body than the default one, its anchor.
+    `weights` holds a number from 0 to 1 for each vertex of the body, in the order of `human.npz` (a vertex group in
+    Blender). The mean is over the primitive's 8 x 8 texels; on a body other than the default one, at its anchor.
 
-    Raises ValueError for another number of vertices, values that are not finite, a threshold that is not in 0 ... 1 or
-    is 0, and paint that covers no primitive.
+    Raises ValueError for a wrong number of vertices, values that are not finite, a threshold outside (0, 1], and a
+    region without primitives.
     """
     body = default_body() if body_setup is None else body_setup.body
     if tuple(weights.shape) != (len(body.template),):
         given, wanted = tuple(weights.shape), len(body.template)
-        raise ValueError(
-            f"the painted weights have shape {given}: give one number for each of the body's {wanted} vertices"
-        )
+        raise ValueError(f"the painted weights have shape {given}: give one number for each of the {wanted} vertices")
     if not torch.isfinite(weights).all():
-        raise ValueError("the painted weights hold NaN or infinite values: paint them again")
+        raise ValueError("the painted weights contain NaN or infinite values: paint them again")
     if not 0 < threshold <= 1:
-        raise ValueError(f"the threshold of painted weights is {threshold}: choose one above 0, at most 1")
+        raise ValueError(f"the threshold is {threshold}: choose a number above 0 and at most 1")
     covered = _covered(weights.float().cpu(), body_setup)
-    # Weights of exactly the threshold, as from a brush of that strength, come back a rounding error below it.
+    # Weights painted at exactly the threshold average to slightly less, by rounding.
     region = covered >= threshold - 1e-6
     if not region.any():
         raise ValueError(
-            f"the painted region covers no primitive (at most {float(covered.max()):.2f} of one, {threshold} needed): "
-            "paint a larger area, or more strongly"
+            f"the painted region covers no primitive (mean weight at most {float(covered.max()):.2f}, threshold "
+            f"{threshold}): paint a larger area, or with more strength"
         )
     return region
 
 
 def check_region(region: Tensor) -> Bool[Tensor, "k"]:
-    """Itself, on the CPU, if it is a mask of the person's primitives with one or more of them; otherwise ValueError."""
+    """Return the region on the CPU. Raises ValueError unless it is a non-empty bool mask of K."""
     if tuple(region.shape) != (K,) or region.dtype != torch.bool:
         given = f"{region.dtype} {tuple(region.shape)}".removeprefix("torch.")
-        raise ValueError(f"a region is a mask bool ({K},), a value for each primitive, not {given}")
+        raise ValueError(f"the region is {given}: give a mask bool ({K},), a value for each primitive")
     if not region.any():
         raise ValueError("the region is empty: name a part of the body, or paint one")
     return region.cpu()
 
 
 def name_region(region: Bool[Tensor, "k"], body_setup: BodySetup | None = None) -> list[str] | str:
-    """How files tell a region: the names of its parts, or 1024 bits in hexadecimal, primitive 0 first, for paint."""
+    """Serialise a region: names of its parts, or for painted ones 1024 bits in hexadecimal, primitive 0 first."""
     parts = parts_of(body_setup)
     for name in PARTS:
         if torch.equal(parts[name], region):
@@ -134,7 +131,7 @@ def name_region(region: Bool[Tensor, "k"], body_setup: BodySetup | None = None) 
 
 
 def parts_of(body_setup: BodySetup | None = None) -> Mapping[str, Bool[Tensor, "k"]]:
-    """The primitives of every part in PARTS."""
+    """Masks of all PARTS on a body (None: the default body)."""
     return _default_parts() if body_setup is None else _parts(body_setup.body, body_setup.anchors)
 
 
@@ -144,7 +141,7 @@ def _default_parts() -> Mapping[str, Bool[Tensor, "k"]]:
 
 
 def _covered(weights: Float[Tensor, "v"], body_setup: BodySetup | None) -> Float[Tensor, "k"]:
-    """Mean weight under each primitive."""
+    """Mean weight of each primitive."""
     if body_setup is not None:
         face, barycentric = body_setup.anchors.face, body_setup.anchors.barycentric
         return surface_points(weights[:, None], body_setup.body.faces, face, barycentric)[:, 0]
@@ -158,7 +155,7 @@ def _parts(body: BodyModel, anchors: Anchors) -> Mapping[str, Bool[Tensor, "k"]]
     joints = body.shape(torch.zeros_like(body.shape_basis[0, 0])).joints
 
     def from_joint(name: str) -> tuple[Tensor, Tensor]:
-        """Metres up and forward."""
+        """Offsets of the anchors from a joint, up and forward, metres."""
         up, forward = (rest - joints[JOINT_NAMES.index(name)])[:, 1:].unbind(-1)
         return up, forward
 

@@ -1,4 +1,4 @@
-"""Sampling a part of a sample so that it fits the rest, without training (RePaint, Lugmayr et al. 2022)."""
+"""Resample a region of a latent to fit the rest, without training (RePaint, Lugmayr et al. 2022)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from primdiffusion.diffusion.samplers import Denoise, SamplerStep, gaussian_nois
 from primdiffusion.diffusion.schedule import CLEAN, Schedule
 
 JUMP = 1
-"""Steps of each stretch that is sampled again, after noise of as many steps was added. Lugmayr et al. jump ten of 250;
-of a few dozen, each is so long that for the same number of calls jumps of one fit best (tests/backend)."""
+"""Steps of each jump back to a higher noise level. Lugmayr et al. jump 10 of 250 steps; with a few dozen longer steps,
+jumps of one fit best for the same number of denoiser calls (tests/backend)."""
 RESAMPLES = 2
-"""How often each stretch is sampled: 1 is no resampling."""
+"""How often each jump's steps are sampled; 1 disables resampling."""
 
 
 def repaint(
@@ -30,12 +30,12 @@ def repaint(
     jump: int = JUMP,
     resamples: int = RESAMPLES,
 ) -> Iterator[SamplerStep]:
-    """Sample what is `inside` down the descending `steps`, while what is outside follows the clean sample `known`.
+    """Sample the region `inside` along the descending `steps`, conditioned on the clean latent `known` outside.
 
-    At every level t the outside is q_sample(known, t) with fresh noise: what a sample of that level has there (SPEC 3).
-    Inside, a step is the posterior's (paper eq. 6-7). A step alone fits the inside to an outside of a higher level;
-    after every `jump` steps, noise of `jump` steps is added to all of it and these are sampled again (their alg. 1), so
-    that both come to agree. `x` is a sample at steps[0]; only its inside matters. The last x0 is `known` outside.
+    At every level t the outside is q_sample(known, t) with fresh noise (SPEC 3); inside, a step samples the posterior
+    (paper eq. 6-7). A single step fits the inside to an outside of a higher noise level; after every `jump` steps,
+    noise of `jump` steps is added to both and these steps are repeated (their alg. 1), so that both come to agree. Only
+    the inside of `x`, a latent at steps[0], is used. The last x0 equals `known` outside.
     """
     levels = (*steps, CLEAN)
     moves = list(pairwise(resampling_path(len(steps), jump, resamples)))
@@ -55,12 +55,12 @@ def repaint(
 
 
 def resampling_path(count: int, jump: int, resamples: int) -> list[int]:
-    """Positions 0 (noisiest) to `count` (clean) in the order they are visited, jumps back included.
+    """Positions 0 (noisiest) to `count` (clean) in order, including jumps back.
 
-    Raises ValueError for a jump or a number of samplings below 1.
+    Raises ValueError for `jump` or `resamples` below 1.
     """
     if jump < 1 or resamples < 1:
-        raise ValueError(f"jumps of {jump} steps, {resamples} samplings of each: choose 1 or more of both")
+        raise ValueError(f"jump is {jump}, resamples {resamples}: choose 1 or more for both")
     path = [0]
     for bottom in range(jump, count, jump):
         path += range(path[-1] + 1, bottom + 1)
@@ -70,7 +70,7 @@ def resampling_path(count: int, jump: int, resamples: int) -> list[int]:
 
 
 def noised(schedule: Schedule, x0: Float[Tensor, "b c h w"], t: int, generator: torch.Generator) -> Tensor:
-    """Clean samples with noise of level t; themselves at `CLEAN`."""
+    """Noise clean latents to level t; unchanged for `CLEAN`."""
     if t == CLEAN:
         return x0
     level = torch.full((len(x0),), t, dtype=torch.int64, device=x0.device)
@@ -78,6 +78,6 @@ def noised(schedule: Schedule, x0: Float[Tensor, "b c h w"], t: int, generator: 
 
 
 def renoised(schedule: Schedule, x: Float[Tensor, "b c h w"], t: int, t_up: int, generator: torch.Generator) -> Tensor:
-    """Samples of level t with the noise added that level t_up > t has beyond it: q(x_up | x)."""
-    kept = schedule.signal(t_up) / schedule.signal(t)
-    return kept * x + (1 - kept**2) ** 0.5 * gaussian_noise(x, generator)
+    """Noise latents of level t to the higher level t_up: a sample of q(x_up | x)."""
+    ratio = schedule.signal(t_up) / schedule.signal(t)
+    return ratio * x + (1 - ratio**2) ** 0.5 * gaussian_noise(x, generator)

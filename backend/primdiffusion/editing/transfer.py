@@ -1,4 +1,4 @@
-"""What one person wears onto another, primitive by primitive: all people share one grid on the body (paper sec. 4)."""
+"""Transfer clothes between humans, primitive by primitive: all share one grid on the body (paper sec. 4)."""
 
 from __future__ import annotations
 
@@ -14,22 +14,20 @@ from primdiffusion.primitives.primitives import Payload
 
 
 def transfer_texture(source: Human, target: Human, region: Bool[Tensor, "k"]) -> Human:
-    """The target with the source's colours in a region: the paper's exchange between corresponding primitives.
+    """Return the target with the source's colours in a region: the paper's exchange of corresponding primitives.
 
-    Shapes stay the target's: densities, delta scales and betas. Right where both wear garments of one cut, and for
-    skin, hair colour and patterns. Exact and without a model; the other half of the exchange is the same call with the
-    people's parts swapped. Raises ValueError for a region that is empty or no mask of K, and for people who stand on
-    different bodies.
+    Densities, delta scales and betas stay the target's. Suits garments of the same cut, skin, hair colour and patterns.
+    Exact and model-free. Raises ValueError for a region that is empty or not a mask of K, and for different bodies.
     """
     payload = dataclasses.replace(target.payload, rgb=source.payload.rgb)
     return _transferred("transfer_texture", source, target, region, payload)
 
 
 def transfer_garment(source: Human, target: Human, region: Bool[Tensor, "k"]) -> Human:
-    """The target with all that fills the source's primitives in a region: colours, densities and delta scales.
+    """Return the target with the source's colours, densities and delta scales in a region.
 
-    Right where the cut differs, as of a coat over a shirt or of long hair: the silhouette comes along. It sits on the
-    target's own body, whose betas stay. At the region's border it may end abruptly; `harmonise` helps. Errors likewise.
+    Suits different cuts, such as a coat over a shirt or long hair, because the silhouette changes too. The target's
+    betas stay. The border of the region may be visible; `harmonise` smooths it. Raises as `transfer_texture`.
     """
     return _transferred("transfer_garment", source, target, region, source.payload)
 

@@ -1,4 +1,4 @@
-"""Neighbours of a person: some noise, and back (SDEdit, Meng et al. 2022)."""
+"""Variants of a human: partial noising and denoising (SDEdit, Meng et al. 2022)."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from primdiffusion.diffusion.samplers import ddim, gaussian_noise
 from primdiffusion.editing.edit import (
     OnStep,
     added,
-    asked,
-    chain_down,
+    conditional_denoiser,
     decoded,
     difference,
     edit_generator,
+    edit_timesteps,
     encoded,
-    fitted,
-    last,
+    match_density,
+    run_sampler,
     with_edit,
 )
 from primdiffusion.formats import requests
@@ -36,15 +36,15 @@ def vary(
     attributes: Mapping[str, str | float] = MappingProxyType({}),
     guidance: float = requests.GUIDANCE,
 ) -> Human:
-    """A variant of a person with the same body: noise of a level that grows with `amount`, then DDIM back.
+    """Return a variant with the same body: the latent is noised to a level that grows with `amount`, then DDIM samples.
 
-    0 is the person themselves, exactly; 1 keeps nothing but what shows through the noise of step T-1. In between coarse
-    things (which garments, which colours) stay longer than fine ones. Details that the model's codec leaves out are
-    added again in proportion to the signal at that level, so small amounts change little. The betas are kept:
-    the body, its armature and its poses stay. Deterministic for a model, person, seed and device.
+    Amount 0 returns the payload unchanged; 1 keeps only what remains visible through the noise of step T-1. In between,
+    coarse features (garments, colours) persist longer than fine ones. Detail that the codec drops is added back in
+    proportion to the signal at the noise level, so small amounts change little. Betas are unchanged, so armature and
+    poses still fit. Deterministic for a model, human, seed and device.
 
-    Raises ValueError for an amount outside 0 ... 1, steps outside 1 ... T, a seed outside 0 ... 2^63-1 and attributes
-    that the model does not know.
+    Raises ValueError for an amount outside 0 ... 1, steps outside 1 ... T, a seed outside 0 ... 2^63-1 and unknown
+    attributes.
     """
     return vary_batch(model, human, amount, [seed], steps, on_step, attributes, guidance)[0]
 
@@ -59,23 +59,24 @@ def vary_batch(
     attributes: Mapping[str, str | float] = MappingProxyType({}),
     guidance: float = requests.GUIDANCE,
 ) -> list[Human]:
-    """Variants of several seeds, who share the work; each as `vary` makes them, but for rounding. Errors likewise."""
+    """Return variants for several seeds, sampled as one batch; equal to `vary` up to rounding. Raises as `vary`."""
     generators = [edit_generator(seed) for seed in seeds]
-    model = fitted(model, human)
-    denoise = asked(model, attributes, guidance)
-    chain = chain_down(model.schedule, amount, steps)
+    model = match_density(model, human)
+    denoise = conditional_denoiser(model, attributes, guidance)
+    chain = edit_timesteps(model.schedule, amount, steps)
     payloads = [human.payload.to("cpu")] * len(seeds)
     if chain:
         x0 = encoded(model, human)
-        left_out = difference(payloads[0], decoded(model, x0))
-        people = x0.expand(len(seeds), *x0.shape[1:])
+        residual = difference(payloads[0], decoded(model, x0))
+        clean = x0.expand(len(seeds), *x0.shape[1:])
         level = torch.full((len(seeds),), chain[0], device=x0.device)
-        x = model.schedule.q_sample(people, level, gaussian_noise(people, generators))
-        varied = last(ddim(denoise, model.schedule, x, chain, generators), on_step)
+        x = model.schedule.q_sample(clean, level, gaussian_noise(clean, generators))
+        varied = run_sampler(ddim(denoise, model.schedule, x, chain, generators), on_step)
         signal = model.schedule.signal(chain[0])
-        payloads = [added(decoded(model, one[None]), left_out, signal) for one in varied]
+        payloads = [added(decoded(model, one[None]), residual, signal) for one in varied]
     edit = {"edit": "vary", "amount": amount}
-    same = {"steps": steps, "attributes": dict(attributes), "guidance": guidance, **made_by(model)}
+    shared = {"steps": steps, "attributes": dict(attributes), "guidance": guidance, **made_by(model)}
     return [
-        with_edit(human, {**edit, "seed": seed, **same}, payload) for seed, payload in zip(seeds, payloads, strict=True)
+        with_edit(human, {**edit, "seed": seed, **shared}, payload)
+        for seed, payload in zip(seeds, payloads, strict=True)
     ]

@@ -1,7 +1,7 @@
-"""A feature space for people: a small network that tells their known attributes from portraits.
+"""A feature space for humans: the features of a small network that predicts known attributes from portraits.
 
-Networks that others trained on photographs are not at hand everywhere. This one is trained in minutes on the people a
-diffusion model is trained on; what it needs to tell outfits, hair, age or patterns apart is what sets are compared by.
+Networks pretrained on photographs need weights that are not always available. This one is trained within minutes on the
+diffusion model's training set; sets are compared by the features it learns to classify outfit, hair, age or pattern.
 """
 
 from __future__ import annotations
@@ -25,76 +25,76 @@ from primdiffusion.staging import written_whole
 CATEGORIES = ("sex", "age", "outfit", "pattern", "shoes", "hair", "hair_colour", "hat")
 SCALARS = ("skin_tone", "height")
 UNKNOWN = -100
-"""Label of a value that no training person has, or that cannot be seen; counts for nothing."""
+"""Label of a value that is absent from the training set or not visible; ignored by loss and accuracy."""
 FEATURES = 96
 WIDTHS = (16, 32, 64, 96)
 POOLED = 3
-"""Places a side of the last picture."""
+"""Side of the last feature map after pooling."""
 SHIFT = 3
-"""Pixels by which portraits are moved at random in training."""
+"""Largest random shift of portraits in training, pixels."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Answers:
-    """What can be told of people: values of each category, mean and standard deviation of each scalar."""
+class AttributeSpace:
+    """The attributes to predict: values of each category, mean and standard deviation of each scalar."""
 
     categories: dict[str, tuple[str, ...]]
     scalars: dict[str, tuple[float, float]]
 
-    def labels(self, people: Sequence[Mapping[str, Any]]) -> dict[str, Tensor]:
-        """Numbers of the values, standardised scalars; UNKNOWN and NaN where a person's is not known."""
+    def labels(self, attributes: Sequence[Mapping[str, Any]]) -> dict[str, Tensor]:
+        """Class indices and standardised scalars of samples; UNKNOWN or NaN where an attribute is missing."""
         labels = {}
         for name, values in self.categories.items():
-            of: dict[str | None, int] = {value: number for number, value in enumerate(values)}
-            labels[name] = torch.tensor([of.get(category(person, name), UNKNOWN) for person in people])
+            index: dict[str | None, int] = {value: number for number, value in enumerate(values)}
+            labels[name] = torch.tensor([index.get(category(sample, name), UNKNOWN) for sample in attributes])
         for name, (mean, std) in self.scalars.items():
-            labels[name] = torch.tensor([(float(person.get(name, torch.nan)) - mean) / std for person in people])
+            labels[name] = torch.tensor([(float(sample.get(name, torch.nan)) - mean) / std for sample in attributes])
         return labels
 
 
-def category(person: Mapping[str, Any], name: str) -> str | None:
-    """A person's value; of patterns the first that is not plain; None for the hair colour of the bald."""
-    value = person.get(name)
+def category(sample: Mapping[str, Any], name: str) -> str | None:
+    """Value of one category of a sample: the first pattern that is not plain; None for the hair colour of the bald."""
+    value = sample.get(name)
     if name == "pattern" and value is not None:
         return min(set(str(value).split(", ")) - {"solid"}, default="solid")
-    if name == "hair_colour" and person.get("hair") == "none":
+    if name == "hair_colour" and sample.get("hair") == "none":
         return None
     return None if value is None else str(value)
 
 
-def answers_of(people: Sequence[Mapping[str, Any]]) -> Answers:
-    """All that is known of these people."""
+def attribute_space(attributes: Sequence[Mapping[str, Any]]) -> AttributeSpace:
+    """Collect the attributes of a training set; categories with a single value are left out."""
     categories = {}
     for name in CATEGORIES:
-        values = {category(person, name) for person in people} - {None}
+        values = {category(sample, name) for sample in attributes} - {None}
         if len(values) > 1:
             categories[name] = tuple(sorted(str(value) for value in values))
     scalars = {}
     for name in SCALARS:
-        if known := [float(person[name]) for person in people if name in person]:
+        if known := [float(sample[name]) for sample in attributes if name in sample]:
             values = torch.tensor(known)
             scalars[name] = (float(values.mean()), max(float(values.std(correction=0)), 1e-6))
-    return Answers(categories, scalars)
+    return AttributeSpace(categories, scalars)
 
 
 class AttributeNetwork(nn.Module):
-    """Four convolutions on each portrait, one linear layer on all: the features; a linear layer for each answer."""
+    """Four convolutions on each portrait, a linear layer on all of them (the features), a linear head an attribute."""
 
-    def __init__(self, answers: Answers):
+    def __init__(self, space: AttributeSpace):
         super().__init__()
-        self.answers = answers
+        self.space = space
         layers, before = [], 4
         for width in WIDTHS:
             layers += [nn.Conv2d(before, width, 3, stride=2, padding=1), nn.BatchNorm2d(width), nn.ReLU()]
             before = width
         self.trunk = nn.Sequential(*layers, nn.AdaptiveAvgPool2d(POOLED))
-        # Normalised: every feature varies by 1 over the training people, so distances are in such units.
+        # Batch normalisation gives each feature unit variance over the training set: the unit of distances.
         self.features = nn.Sequential(
             nn.Dropout(0.2),
             nn.Linear(len(PORTRAITS) * before * POOLED**2, FEATURES),
             nn.BatchNorm1d(FEATURES, affine=False),
         )
-        sizes = {name: len(values) for name, values in answers.categories.items()} | dict.fromkeys(answers.scalars, 1)
+        sizes = {name: len(values) for name, values in space.categories.items()} | dict.fromkeys(space.scalars, 1)
         self.heads = nn.ModuleDict({name: nn.Linear(FEATURES, size) for name, size in sizes.items()})
 
     def forward(self, pictures: UInt8[Tensor, "n v h w 4"]) -> Float[Tensor, "n 96"]:
@@ -102,21 +102,21 @@ class AttributeNetwork(nn.Module):
         values = pictures.movedim(-1, -3).flatten(0, 1).float() / 255 - 0.25
         return self.features(self.trunk(values).unflatten(0, pictures.shape[:2]).flatten(1))
 
-    def told(self, features: Float[Tensor, "n 96"]) -> dict[str, Tensor]:
-        """Scores of each category's values, and standardised scalars."""
-        shown = functional.relu(features)
-        return {name: head(shown) for name, head in self.heads.items()}
+    def predict(self, features: Float[Tensor, "n 96"]) -> dict[str, Tensor]:
+        """Logits of each category and standardised scalars."""
+        active = functional.relu(features)
+        return {name: head(active) for name, head in self.heads.items()}
 
 
 def features_of(network: AttributeNetwork, pictures: UInt8[Tensor, "n v h w 4"]) -> Float[Tensor, "n 96"]:
-    """Of any number of people, in evaluation mode."""
+    """Features of any number of samples, computed in batches without gradients."""
     with torch.inference_mode():
         return torch.cat([network(part) for part in pictures.split(64)]).clone()
 
 
 def fit_attribute_network(
     pictures: UInt8[Tensor, "n v h w 4"],
-    people: Sequence[Mapping[str, Any]],
+    attributes: Sequence[Mapping[str, Any]],
     *,
     epochs: int = 20,
     batch: int = 64,
@@ -124,94 +124,94 @@ def fit_attribute_network(
     seed: int = 0,
     report: Callable[[int, float], None] = lambda epoch, loss: None,
 ) -> AttributeNetwork:
-    """Trained on these people; `report` is told of each epoch's mean loss. Deterministic for a seed and device."""
-    answers = answers_of(people)
-    labels = answers.labels(people)
+    """Train a network; `report` receives each epoch and its mean loss. Deterministic for a seed and device."""
+    space = attribute_space(attributes)
+    labels = space.labels(attributes)
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = AttributeNetwork(answers)
+        network = AttributeNetwork(space)
         optimiser = torch.optim.AdamW(network.parameters(), lr=learning_rate, weight_decay=0.05)
-        steps = epochs * -(-len(people) // batch)
-        falling = torch.optim.lr_scheduler.OneCycleLR(optimiser, learning_rate, total_steps=steps + 1, pct_start=0.1)
+        steps = epochs * -(-len(attributes) // batch)
+        scheduler = torch.optim.lr_scheduler.OneCycleLR(optimiser, learning_rate, total_steps=steps + 1, pct_start=0.1)
         for epoch in range(epochs):
             losses = []
-            for chosen in torch.randperm(len(people), generator=generator).split(batch):
-                moved = _moved(pictures[chosen], generator)
-                told = network.told(network(moved))
-                loss = _loss(told, {name: values[chosen] for name, values in labels.items()}, answers)
+            for chosen in torch.randperm(len(attributes), generator=generator).split(batch):
+                shifted = _shifted(pictures[chosen], generator)
+                predicted = network.predict(network(shifted))
+                loss = _loss(predicted, {name: values[chosen] for name, values in labels.items()}, space)
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
-                falling.step()
+                scheduler.step()
                 losses.append(float(loss.detach()))
             report(epoch + 1, sum(losses) / len(losses))
     return network.eval().requires_grad_(False)
 
 
-def _moved(pictures: Tensor, generator: torch.Generator) -> Tensor:
-    """A batch moved by a few pixels, all alike; what enters is empty."""
+def _shifted(pictures: Tensor, generator: torch.Generator) -> Tensor:
+    """The batch shifted by one random offset, padded with empty pixels."""
     right, down = (torch.randint(-SHIFT, SHIFT + 1, (2,), generator=generator)).tolist()
     padded = functional.pad(pictures, (0, 0, SHIFT, SHIFT, SHIFT, SHIFT))
     height, width = pictures.shape[2:4]
     return padded[:, :, SHIFT - down : SHIFT - down + height, SHIFT - right : SHIFT - right + width]
 
 
-def _loss(told: Mapping[str, Tensor], labels: Mapping[str, Tensor], answers: Answers) -> Tensor:
+def _loss(predicted: Mapping[str, Tensor], labels: Mapping[str, Tensor], space: AttributeSpace) -> Tensor:
     total = torch.zeros(())
-    for name in answers.categories:
+    for name in space.categories:
         known = labels[name] != UNKNOWN
         if known.any():
-            total = total + functional.cross_entropy(told[name][known], labels[name][known])
-    for name in answers.scalars:
+            total = total + functional.cross_entropy(predicted[name][known], labels[name][known])
+    for name in space.scalars:
         known = labels[name].isfinite()
         if known.any():
-            total = total + (told[name][known, 0] - labels[name][known]).square().mean()
+            total = total + (predicted[name][known, 0] - labels[name][known]).square().mean()
     return total
 
 
 def accuracies(
-    network: AttributeNetwork, features: Float[Tensor, "n 96"], people: Sequence[Mapping[str, Any]]
+    network: AttributeNetwork, features: Float[Tensor, "n 96"], attributes: Sequence[Mapping[str, Any]]
 ) -> dict[str, float]:
-    """Share of people whose value is told; of scalars the share of variance about the training mean, R^2."""
-    labels = network.answers.labels(people)
+    """Accuracy for each category, R^2 about the training mean for each scalar."""
+    labels = network.space.labels(attributes)
     with torch.inference_mode():
-        told = network.told(features)
+        predicted = network.predict(features)
     result = {}
-    for name in network.answers.categories:
+    for name in network.space.categories:
         known = labels[name] != UNKNOWN
-        result[name] = float((told[name].argmax(-1) == labels[name])[known].double().mean())
-    for name in network.answers.scalars:
-        error = (told[name][:, 0] - labels[name]).square().mean()
+        result[name] = float((predicted[name].argmax(-1) == labels[name])[known].double().mean())
+    for name in network.space.scalars:
+        error = (predicted[name][:, 0] - labels[name]).square().mean()
         result[name] = float(1 - error / labels[name].square().mean())
     return result
 
 
 def save_attribute_network(path: Path, network: AttributeNetwork) -> None:
-    """Writes it in half precision, whole or not at all."""
+    """Write the network in half precision, atomically."""
     tensors = {k: v.half() if v.is_floating_point() else v for k, v in network.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as unfinished:
-        unfinished.write_bytes(save(tensors, metadata={"answers": json.dumps(dataclasses.asdict(network.answers))}))
+        unfinished.write_bytes(save(tensors, metadata={"answers": json.dumps(dataclasses.asdict(network.space))}))
 
 
 def load_attribute_network(path: Path) -> AttributeNetwork:
-    """What `save_attribute_network` wrote. Raises FileNotFoundError, and ValueError for another file."""
+    """Load what `save_attribute_network` wrote. Raises FileNotFoundError, and ValueError for an unreadable file."""
     if not path.is_file():
-        raise FileNotFoundError(f"there is no feature network {path}: name a folder that one can be trained into")
+        raise FileNotFoundError(f"no feature network at {path}: choose a folder to train one in")
     try:
         with safe_open(path, framework="pt") as file:
             stated = json.loads(file.metadata()["answers"])
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
-        answers = Answers(
+        space = AttributeSpace(
             {name: tuple(values) for name, values in stated["categories"].items()},
             {name: (mean, std) for name, (mean, std) in stated["scalars"].items()},
         )
-        network = AttributeNetwork(answers)
+        network = AttributeNetwork(space)
         network.load_state_dict(tensors)
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(
-            f"{path} is no feature network of this version ({reason}): remove it, to train it again"
+            f"{path} is not a feature network of this version ({reason}): delete it to train a new one"
         ) from error
     return network.eval().requires_grad_(False)

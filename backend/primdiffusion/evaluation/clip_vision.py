@@ -1,7 +1,7 @@
-"""CLIP's ViT-B/32 (Radford et al. 2021), whose features FID_CLIP compares (Kynkäänniemi et al. 2022), from a file.
+"""CLIP's ViT-B/32 (Radford et al. 2021), the feature extractor of FID_CLIP (Kynkäänniemi et al. 2022).
 
-Layers have OpenAI's names. OpenAI's own file is a program rather than weights and is not run: save its state_dict() as
-.safetensors. Nothing is downloaded.
+Weights come from a file under OpenAI's layer names; nothing is downloaded. OpenAI's own file is a TorchScript program
+and is not run: save its state_dict() as .safetensors.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from primdiffusion.picture_features import fill, read_weights
 SIDE, PATCH, WIDTH, LAYERS, HEADS, FEATURES = 224, 32, 768, 12, 12, 512
 MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 PREFIX = "visual."
-"""Of the names in files that hold the text network too."""
+"""Prefix of these weights in files that also hold the text encoder."""
 
 
 class QuickGelu(nn.Module):
     """x sigmoid(1.702 x)."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """The values."""
+        """Apply the activation elementwise."""
         return x * torch.sigmoid(1.702 * x)
 
 
 class Block(nn.Module):
-    """Self-attention and perceptron, each normalised first and added."""
+    """Pre-norm residual block: self-attention, then a perceptron."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ class Block(nn.Module):
 
 
 class Transformer(nn.Module):
-    """All blocks."""
+    """The stack of blocks."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -56,7 +56,7 @@ class Transformer(nn.Module):
 
 
 class ClipVision(nn.Module):
-    """Pictures to 512 features. Weights are random until `load_clip_vision` fills them."""
+    """Image encoder with 512 features. Weights are random until `load_clip_vision` fills them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -80,7 +80,7 @@ class ClipVision(nn.Module):
 
 
 def load_clip_vision(path: Path | str) -> ClipVision:
-    """With the weights of a file. Raises FileNotFoundError and WeightsFileError as `read_weights` and `fill` do."""
+    """Load the encoder from a weights file. Raises FileNotFoundError and WeightsFileError."""
     network = ClipVision()
     weights = {name.removeprefix(PREFIX): value.float() for name, value in read_weights(path).items()}
     fill(network, weights, "CLIP's ViT-B/32", str(path))

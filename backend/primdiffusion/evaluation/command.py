@@ -140,7 +140,7 @@ class EvaluateGeneration:
         from primdiffusion.evaluation.attribute_network import features_of
         from primdiffusion.evaluation.distances import NEIGHBOURS
         from primdiffusion.evaluation.gallery import made_gallery
-        from primdiffusion.evaluation.generation import floor, liken, open_judge, table
+        from primdiffusion.evaluation.generation import compare, open_reference_set, real_vs_real, table
         from primdiffusion.human import generate, place
 
         if self.count <= NEIGHBOURS:
@@ -154,16 +154,19 @@ class EvaluateGeneration:
             def report(done: int, total: int) -> None:
                 bar.update(1)
 
-            judge = open_judge(train, held, self.judge, stage_two.read_person, report)
+            reference = open_reference_set(train, held, self.judge, stage_two.read_person, report)
         with tqdm(range(self.first_seed, self.first_seed + self.count), unit="person", disable=None) as seeds:
             made = made_gallery(place(generate(model, seed, self.steps)) for seed in seeds)
-        rows = {"generated": liken(judge, features_of(judge.network, made)), "trained on": floor(judge, self.count)}
+        rows = {
+            "generated": compare(reference, features_of(reference.network, made)),
+            "trained on": real_vs_real(reference, self.count),
+        }
         if self.json is not None:
             record = {
                 "version": __version__,
                 "checkpoint": dict(model.card),
                 "people": {name: dataclasses.asdict(row) for name, row in rows.items()},
-                "feature_accuracy": judge.held_accuracies,
+                "feature_accuracy": reference.held_accuracies,
             }
             _write(self.json, record)
         print(table(rows))

@@ -1,6 +1,6 @@
-"""How far two sets of people are apart, by features [n, d] of each: pure functions, float64, as accurate as the sets.
+"""Distances between two sets of samples from their features [n, d]; pure functions, computed in float64.
 
-All are of samples, so two sets of one distribution are apart too: state the distance of two real sets beside them.
+Finite sets of one distribution have a distance too: report the distance between two real sets beside them.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from torch import Tensor
 NEIGHBOURS = 3
 """k of precision and recall (Kynkäänniemi et al. 2019)."""
 ROWS_AT_ONCE = 512
-"""Bounds the memory of tables of distances; no effect on the result."""
+"""Rows of a distance matrix computed at a time; limits memory, no effect on the result."""
 
 
 def frechet_distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -> float:
-    """|m1 - m2|^2 + tr(C1 + C2 - 2 (C1 C2)^1/2) of Gaussians fitted to both (Heusel et al. 2017).
+    """Frechet distance |m1 - m2|^2 + tr(C1 + C2 - 2 (C1 C2)^1/2) of Gaussians fitted to both (Heusel et al. 2017).
 
     Covariances are unbiased; the distance is not: it falls with the number of samples, so compare sets of equal size.
-    Raises ValueError for fewer than two samples or features of another width.
+    Raises ValueError for fewer than two samples or features of different widths.
     """
     _check(first, second)
     means, roots = [], []
@@ -35,9 +35,9 @@ def frechet_distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) 
 
 
 def kernel_distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -> float:
-    """Squared maximum mean discrepancy by the kernel (x.y / d + 1)^3 (KID, Binkowski et al. 2018).
+    """Squared maximum mean discrepancy with the kernel (x.y / d + 1)^3 (KID, Binkowski et al. 2018).
 
-    Unbiased, of all samples at once: 0 on average, and now and then below, for two sets of one distribution. Raises
+    The unbiased estimate over all samples: 0 on average for two sets of one distribution, so it can be negative. Raises
     ValueError as `frechet_distance`.
     """
     _check(first, second)
@@ -54,25 +54,26 @@ def kernel_distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -
 
 
 class PrecisionRecall(NamedTuple):
-    """Shares of samples; both 1 for sets that cover each other."""
+    """Fractions in [0, 1]; both are 1 for sets that cover each other."""
 
     precision: float
-    """Of made people that lie among real ones."""
+    """Fraction of generated samples within the real set."""
     recall: float
-    """Of real people that lie among made ones."""
+    """Fraction of real samples within the generated set."""
 
 
 def precision_recall(
     made: Float[Tensor, "n d"], real: Float[Tensor, "m d"], neighbours: int = NEIGHBOURS
 ) -> PrecisionRecall:
-    """Shares of each set within the reach of some of the other's samples (Kynkäänniemi et al. 2019, eq. 1-2).
+    """Improved precision and recall (Kynkäänniemi et al. 2019, eq. 1-2).
 
-    A sample reaches as far as its k-th nearest neighbour in its own set. Raises ValueError for sets of k or fewer.
+    A set is the union of balls around its samples, each reaching to the k-th nearest neighbour in that set. Raises
+    ValueError for sets of k or fewer.
     """
     _check(made, real)
     if min(len(made), len(real)) <= neighbours:
         raise ValueError(
-            f"sets of {len(made)} and {len(real)} people have no {neighbours} neighbours: give more people"
+            f"sets of {len(made)} and {len(real)} samples are too small for {neighbours} neighbours: use larger sets"
         )
 
     def covered(points: Tensor, centres: Tensor) -> float:
@@ -84,18 +85,16 @@ def precision_recall(
 
 
 class Nearest(NamedTuple):
-    """The nearest of a set to each of some samples."""
+    """The nearest neighbour of each query."""
 
     distance: Float[Tensor, "q"]
     index: Int[Tensor, "q"]
 
 
 def nearest(queries: Float[Tensor, "q d"], among: Float[Tensor, "n d"]) -> Nearest:
-    """Euclidean; ValueError for an empty set or features of another width."""
+    """Find Euclidean nearest neighbours. Raises ValueError for an empty set or features of different widths."""
     if queries.shape[-1] != among.shape[-1] or not len(among):
-        raise ValueError(
-            f"features {tuple(queries.shape)} have no nearest among {tuple(among.shape)}: same width, n > 0"
-        )
+        raise ValueError(f"queries {tuple(queries.shape)} do not match the set {tuple(among.shape)}: same width, n > 0")
     found = [torch.cdist(part.double(), among.double()).min(1) for part in queries.split(ROWS_AT_ONCE)]
     return Nearest(torch.cat([part.values for part in found]), torch.cat([part.indices for part in found]))
 
@@ -103,5 +102,5 @@ def nearest(queries: Float[Tensor, "q d"], among: Float[Tensor, "n d"]) -> Neare
 def _check(first: Tensor, second: Tensor) -> None:
     if first.ndim != 2 or second.ndim != 2 or first.shape[1] != second.shape[1] or min(len(first), len(second)) < 2:
         raise ValueError(
-            f"features of shapes {tuple(first.shape)} and {tuple(second.shape)}: give two or more rows, of one width"
+            f"features have shapes {tuple(first.shape)} and {tuple(second.shape)}: give [n, d] and [m, d], n, m > 1"
         )

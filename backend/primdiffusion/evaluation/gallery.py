@@ -1,4 +1,4 @@
-"""Portraits of people: stored ones, read once and kept in a folder; and those that a model makes."""
+"""Portraits of stored samples, cached in a folder, and of generated ones."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from primdiffusion.staging import written_whole
 
 
 class StoredPerson(Protocol):
-    """One geometry in n colourings, as `training.latents.read_person` gives it: evaluation imports no training."""
+    """One geometry in n colourings, as `training.latents.read_person` returns it (evaluation imports no training)."""
 
     @property
     def voxels(self) -> UInt8[Tensor, "n k 8 8 8 4"]:
@@ -41,44 +41,43 @@ class StoredPerson(Protocol):
 
     @property
     def full_density(self) -> float:
-        """1/m that 255 stands for."""
+        """Density that 255 encodes, 1/m."""
         ...
 
 
 ReadPerson = Callable[[Path], StoredPerson]
 Report = Callable[[int, int], None]
-"""Told how many of how many are done."""
+"""Progress callback: done, total."""
 
 
 def silent(done: int, total: int) -> None:
-    """Reports nothing."""
+    """Ignore progress."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Gallery:
-    """Portraits of n people of g geometries."""
+    """Portraits of n samples of g geometries."""
 
     pictures: UInt8[Tensor, "n v h w 4"]
     geometry: Int[Tensor, "n"]
-    """Which file each is from; those of one file lie together."""
+    """Index of each sample's file; ascending."""
     attributes: tuple[dict[str, Any], ...]
-    """What is known of each."""
 
 
 def payload_of(person: StoredPerson, colouring: int) -> Payload:
-    """What is stored, as the marcher takes it."""
+    """Decode one colouring to linear colour and density in 1/m."""
     voxels = person.voxels[colouring].movedim(-1, -4).float() / 255
     return Payload(decode_srgb(voxels[:, :3]), voxels[:, 3] * person.full_density, person.delta_scale[colouring])
 
 
 def stored_gallery(paths: Sequence[Path], folder: Path, read: ReadPerson, report: Report = silent) -> Gallery:
-    """Portraits of all colourings of people on disk; those that `folder` does not hold yet are drawn into it."""
+    """Portraits of all colourings of the files; cached in `folder`, rendered where they are missing or damaged."""
     folder.mkdir(parents=True, exist_ok=True)
     pictures, attributes = [], []
     for number, path in enumerate(paths):
-        pictures.append(_kept(folder / path.name) if (folder / path.name).is_file() else None)
+        pictures.append(_cached(folder / path.name) if (folder / path.name).is_file() else None)
         if pictures[-1] is None:
-            pictures[-1] = _drawn(read(path))
+            pictures[-1] = _rendered(read(path))
             with written_whole(folder / path.name) as unfinished, unfinished.open("wb") as file:
                 np.savez_compressed(file, pictures=pictures[-1].numpy())
         known = read_attributes(path, len(pictures[-1]))
@@ -88,15 +87,15 @@ def stored_gallery(paths: Sequence[Path], folder: Path, read: ReadPerson, report
     return Gallery(torch.cat(pictures), torch.arange(len(paths)).repeat_interleave(counts), tuple(attributes))
 
 
-def _drawn(person: StoredPerson) -> UInt8[Tensor, "n v h w 4"]:
+def _rendered(person: StoredPerson) -> UInt8[Tensor, "n v h w 4"]:
     frames = rest_frames(person.betas.numpy())
     return torch.stack(
         [portraits(Primitives.place(frames, payload_of(person, number))) for number in range(len(person.voxels))]
     )
 
 
-def _kept(path: Path) -> Tensor | None:
-    """Pictures from an earlier run; None where they are damaged or of other views."""
+def _cached(path: Path) -> Tensor | None:
+    """Pictures from an earlier run; None if they are damaged or of other views."""
     try:
         with np.load(path, allow_pickle=False) as file:
             pictures = torch.from_numpy(file["pictures"])
@@ -106,17 +105,17 @@ def _kept(path: Path) -> Tensor | None:
 
 
 def read_attributes(path: Path, colourings: int) -> list[dict[str, Any]]:
-    """What a person's file says of each colouring; ValueError where it says nothing readable."""
+    """Read the attributes of each colouring in a payload file. Raises ValueError if they are unreadable."""
     try:
         with np.load(path, allow_pickle=False) as file:
             stored = json.loads(str(file["attributes"]))
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(
-            f"{path} is no person's payload ({error}): make it again with `primdiffusion payloads`"
+            f"{path} is not a payload file ({error}): make it again with `primdiffusion payloads`"
         ) from error
     return list(stored.get("variants", [stored] * colourings))
 
 
-def made_gallery(people: Iterable[Primitives]) -> UInt8[Tensor, "n v h w 4"]:
-    """Portraits of people that are made one after the other."""
-    return torch.stack([portraits(primitives) for primitives in people])
+def made_gallery(samples: Iterable[Primitives]) -> UInt8[Tensor, "n v h w 4"]:
+    """Portraits of generated samples; the iterable is consumed one by one."""
+    return torch.stack([portraits(primitives) for primitives in samples])

@@ -1,7 +1,7 @@
-"""How good generated people are: how far from people nobody was trained on, and whether they are copies.
+"""Quality of generated humans: distance to a held-out set, and whether they copy the training set.
 
-Sets are compared in a feature space of the people's own attributes (`attribute_network`), in which two sets of real
-people are compared as well: nothing can be asked to come closer than those.
+Sets are compared in a feature space of human attributes (`attribute_network`). `real_vs_real` compares two real sets in
+the same way: no model can be expected to come closer.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ PORTRAITS_FOLDER = "portraits"
 
 
 @dataclasses.dataclass(frozen=True)
-class Judge:
-    """What generated people are held against."""
+class ReferenceSet:
+    """Training and held-out samples that generated ones are compared with, and their features."""
 
     network: AttributeNetwork
     train: Gallery
@@ -41,21 +41,21 @@ class Judge:
 
     @property
     def held_accuracies(self) -> dict[str, float]:
-        """How well the network tells the attributes of people it was not trained on."""
+        """Accuracy of the network's attributes on held-out samples."""
         return accuracies(self.network, self.held_features, self.held.attributes)
 
 
-def open_judge(
+def open_reference_set(
     train: Sequence[Path],
     held: Sequence[Path],
     folder: Path,
     read: ReadPerson,
     report: Report = silent,
     report_epoch: Callable[[int, float], None] = lambda epoch, loss: None,
-) -> Judge:
-    """Portraits and network from `folder`; what is not there is drawn and trained into it, which takes minutes.
+) -> ReferenceSet:
+    """Load portraits and network from `folder`; missing ones are rendered or trained first, which takes minutes.
 
-    Raises ValueError and FileNotFoundError as the files' readers do.
+    Raises ValueError and FileNotFoundError for unreadable files.
     """
     drawn, others = (stored_gallery(paths, folder / PORTRAITS_FOLDER, read, report) for paths in (train, held))
     stored = folder / NETWORK_FILE
@@ -63,12 +63,13 @@ def open_judge(
         network = fit_attribute_network(drawn.pictures, drawn.attributes, report=report_epoch)
         save_attribute_network(stored, network)
     network = load_attribute_network(stored)
-    return Judge(network, drawn, others, features_of(network, drawn.pictures), features_of(network, others.pictures))
+    train_features, held_features = (features_of(network, gallery.pictures) for gallery in (drawn, others))
+    return ReferenceSet(network, drawn, others, train_features, held_features)
 
 
 @dataclasses.dataclass(frozen=True)
-class Likeness:
-    """A set of people against those held out."""
+class Comparison:
+    """Distances of a set of samples to the held-out set."""
 
     people: int
     frechet: float
@@ -76,15 +77,15 @@ class Likeness:
     precision: float
     recall: float
     nearest_ratio: float
-    """Median distance to the nearest training person over that of held-out people: 1 is as new as new people are."""
+    """Median distance to the nearest training sample, divided by that of held-out samples: 1 means no copying."""
 
 
-def liken(judge: Judge, made: Float[Tensor, "n 96"]) -> Likeness:
-    """Compares features of made people with the judge's."""
-    held = judge.held_features
-    to_train = [nearest(features, judge.train_features).distance.median() for features in (made, held)]
+def compare(reference: ReferenceSet, made: Float[Tensor, "n 96"]) -> Comparison:
+    """Compare features of generated samples with the held-out and training sets."""
+    held = reference.held_features
+    to_train = [nearest(features, reference.train_features).distance.median() for features in (made, held)]
     precision, recall = precision_recall(made, held)
-    return Likeness(
+    return Comparison(
         len(made),
         frechet_distance(made, held),
         kernel_distance(made, held),
@@ -94,26 +95,26 @@ def liken(judge: Judge, made: Float[Tensor, "n 96"]) -> Likeness:
     )
 
 
-def floor(judge: Judge, count: int, draws: int = 8, seed: int = 0) -> Likeness:
-    """Training people against those held out: the mean of some draws of `count` of them.
+def real_vs_real(reference: ReferenceSet, count: int, draws: int = 8, seed: int = 0) -> Comparison:
+    """Training samples compared with held-out ones: the mean over `draws` random subsets of `count`.
 
-    Their nearest training person is looked for among the other geometries.
+    Nearest training samples are searched among other geometries only.
     """
     generator = torch.Generator().manual_seed(seed)
     found = []
-    others = nearest_other(judge.train_features, judge.train.geometry)
-    to_train = nearest(judge.held_features, judge.train_features).distance.median()
+    others = nearest_other(reference.train_features, reference.train.geometry)
+    to_train = nearest(reference.held_features, reference.train_features).distance.median()
     for _ in range(draws):
-        chosen = torch.randperm(len(judge.train_features), generator=generator)[:count]
-        likeness = liken(judge, judge.train_features[chosen])
+        chosen = torch.randperm(len(reference.train_features), generator=generator)[:count]
+        comparison = compare(reference, reference.train_features[chosen])
         ratio = float(others.distance[chosen].median() / to_train.clamp_min(1e-12))
-        found.append(dataclasses.astuple(dataclasses.replace(likeness, nearest_ratio=ratio)))
+        found.append(dataclasses.astuple(dataclasses.replace(comparison, nearest_ratio=ratio)))
     people, *means = (sum(values) / draws for values in zip(*found, strict=True))
-    return Likeness(round(people), *means)
+    return Comparison(round(people), *means)
 
 
 def nearest_other(features: Float[Tensor, "n d"], geometry: Int[Tensor, "n"]) -> Nearest:
-    """The nearest person of another geometry; people in another colour of clothes are not somebody else."""
+    """Nearest sample of another geometry: recoloured clothes do not make another human."""
     distances, indices = [], []
     for rows, own in zip(features.split(512), geometry.split(512), strict=True):
         table = torch.cdist(rows.double(), features.double())
@@ -127,8 +128,8 @@ def nearest_other(features: Float[Tensor, "n d"], geometry: Int[Tensor, "n"]) ->
 COLUMNS = ("people", "frechet", "kernel", "precision", "recall", "nearest_ratio")
 
 
-def table(rows: Mapping[str, Likeness]) -> str:
-    """Markdown: a row for each set."""
+def table(rows: Mapping[str, Comparison]) -> str:
+    """Format as a Markdown table, a row a set."""
     lines = [
         "| people | number | Frechet distance | kernel distance | precision | recall | nearest training person |",
         "|---" * 7 + "|",

@@ -1,7 +1,7 @@
-"""How alike two pictures are: PSNR, SSIM, LPIPS, fine detail, overlap of masks. Pictures are sRGB-encoded, in [0, 1].
+"""Image metrics: PSNR, SSIM, LPIPS, fine detail and mask IoU. Images are sRGB-encoded RGB in [0, 1].
 
-Written here rather than called from torchmetrics, which only the extra `training` installs: whoever has a checkpoint
-can evaluate it. The tests hold these against torchmetrics and scikit-image.
+Implemented here because torchmetrics comes only with the extra `training`, and evaluating a checkpoint should not need
+it. The tests compare them with torchmetrics and scikit-image.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from primdiffusion.picture_features import (
 )
 
 WINDOW, SIGMA = 11, 1.5
-"""Of SSIM's gaussian, pixels."""
+"""SSIM's Gaussian window, pixels."""
 K1, K2 = 0.01, 0.03
 """SSIM's constants, for a data range of 1."""
 FIGURE_MARGIN = 8
@@ -38,17 +38,17 @@ OUTLINE = 4
 """Pixels within the outline that `detail_energy` and `compare_detail` leave out: edges there are not detail."""
 LUMA = (0.299, 0.587, 0.114)
 LARGEST_PSNR = 100.0
-"""dB, of pictures that are equal: a mean over pictures stays finite."""
+"""PSNR of equal images, dB: keeps means finite."""
 LPIPS_LAYERS = {
     "VGG16": ("relu1_2", "relu2_2", "relu3_3", "relu4_3", "relu5_3"),
     "AlexNet": ("relu1_1", "relu2_1", "relu3_1", "relu3_2", "relu3_3"),
 }
 LPIPS_SHIFT, LPIPS_SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Of values in [-1, 1]."""
+"""Normalisation of LPIPS' inputs in [-1, 1]."""
 
 
 class Box(NamedTuple):
-    """A rectangle of a picture, pixels; right and bottom are the first ones outside."""
+    """A rectangle in pixels; right and bottom are exclusive."""
 
     left: int
     top: int
@@ -56,14 +56,14 @@ class Box(NamedTuple):
     bottom: int
 
     def cut(self, picture: Float[Tensor, "*b H W c"]) -> Float[Tensor, "*b h w c"]:
-        """That part of pictures."""
+        """Crop images to the box."""
         return picture[..., self.top : self.bottom, self.left : self.right, :]
 
 
 def psnr(image: Float[Tensor, "*b H W 3"], target: Float[Tensor, "*b H W 3"]) -> Float[Tensor, "*b"]:
-    """Peak signal-to-noise ratio of each picture, -10 log10 mean (I - I*)^2, dB; `LARGEST_PSNR` at most.
+    """Peak signal-to-noise ratio of each image, -10 log10 mean (I - I*)^2, dB; at most `LARGEST_PSNR`.
 
-    Raises ValueError where shapes differ.
+    Raises ValueError if shapes differ.
     """
     _check_pair(image, target)
     squared = (image - target).square().mean((-3, -2, -1))
@@ -71,15 +71,15 @@ def psnr(image: Float[Tensor, "*b H W 3"], target: Float[Tensor, "*b H W 3"]) ->
 
 
 def ssim(image: Float[Tensor, "*b H W 3"], target: Float[Tensor, "*b H W 3"]) -> Float[Tensor, "*b"]:
-    """Structural similarity of each picture (Wang et al. 2004, eq. 13), mean over channels and whole windows.
+    """Structural similarity of each image (Wang et al. 2004, eq. 13), mean over channels and windows.
 
-    Gaussian windows of 11 x 11 pixels, sigma 1.5, biased variances; windows that reach over the edge are left out, as
-    in the authors' program and in scikit-image. Raises ValueError where shapes differ or a side has under 11 pixels.
+    Gaussian windows of 11 x 11 pixels, sigma 1.5, biased variances; windows that cross the border are left out, as in
+    Wang et al.'s program and scikit-image. Raises ValueError if shapes differ or a side has fewer than 11 pixels.
     """
     _check_pair(image, target)
     height, width = image.shape[-3:-1]
     if min(height, width) < WINDOW:
-        raise ValueError(f"pictures of {width} x {height} pixels: SSIM needs {WINDOW} a side")
+        raise ValueError(f"images have {width} x {height} pixels: SSIM needs at least {WINDOW} x {WINDOW}")
     x, y = (picture.reshape(-1, height, width, 3).movedim(-1, 1) for picture in (image, target))
     moments = _blurred(torch.stack([x, y, x * x, y * y, x * y]).flatten(0, 2))
     mean_x, mean_y, square_x, square_y, product = moments.unflatten(0, (5, -1))
@@ -91,12 +91,12 @@ def ssim(image: Float[Tensor, "*b H W 3"], target: Float[Tensor, "*b H W 3"]) ->
 
 
 def _blurred(pictures: Float[Tensor, "n H W"]) -> Float[Tensor, "n h w"]:
-    """Weighted means over the windows that lie wholly inside."""
+    """Gaussian-weighted means over the windows that lie entirely inside."""
     count = len(pictures)
-    place = torch.arange(WINDOW, dtype=pictures.dtype, device=pictures.device) - WINDOW // 2
-    weight = (-0.5 * (place / SIGMA).square()).exp()
+    offset = torch.arange(WINDOW, dtype=pictures.dtype, device=pictures.device) - WINDOW // 2
+    weight = (-0.5 * (offset / SIGMA).square()).exp()
     weight = (weight / weight.sum()).expand(count, 1, 1, WINDOW)
-    # As channels of one picture: as pictures of one channel it is nine times slower on the CPU.
+    # A batch of images as channels of one: as a batch of one channel each it is nine times slower on CPU.
     columns = torch.nn.functional.conv2d(pictures[None], weight.mT, groups=count)
     return torch.nn.functional.conv2d(columns, weight, groups=count)[0]
 
@@ -156,13 +156,13 @@ def _fine(image: Float[Tensor, "H W 3"], figure: Bool[Tensor, "H W"]) -> Float[n
 
 
 def overlap(first: Bool[Tensor, "H W"], second: Bool[Tensor, "H W"]) -> float:
-    """Intersection over union of two masks; 1 where both are empty."""
+    """Intersection over union of two masks; 1 if both are empty."""
     union = int((first | second).sum())
     return int((first & second).sum()) / union if union else 1.0
 
 
 def bounding_box(mask: Bool[Tensor, "H W"]) -> Box | None:
-    """The least box around a mask, widened to SSIM's 11 pixels a side where the picture has them; None: it is empty."""
+    """Bounding box of a mask, grown to SSIM's 11 pixels a side if the image is large enough; None for an empty mask."""
     if not mask.any():
         return None
     left, right = _interval(mask.any(0))
@@ -171,21 +171,21 @@ def bounding_box(mask: Bool[Tensor, "H W"]) -> Box | None:
 
 
 def _interval(covered: Bool[Tensor, "n"]) -> tuple[int, int]:
-    places = covered.nonzero()[:, 0]
-    low, high = int(places[0]), int(places[-1]) + 1
+    indices = covered.nonzero()[:, 0]
+    low, high = int(indices[0]), int(indices[-1]) + 1
     length = min(max(high - low, WINDOW), len(covered))
     low = min(max((low + high - length) // 2, 0), len(covered) - length)
     return low, low + length
 
 
 class Lpips(nn.Module):
-    """Learned perceptual distance (Zhang et al. 2018): 0 of equal pictures. Its weights come from files."""
+    """Learned perceptual distance (Zhang et al. 2018); 0 for equal images. Its weights come from files."""
 
     shift: Tensor
     scale: Tensor
 
     def __init__(self, architecture: Architecture) -> None:
-        """With random weights, until `load_lpips` fills them. `architecture` is VGG16 or ALEXNET."""
+        """Initialise with random weights, which `load_lpips` replaces. `architecture` is VGG16 or ALEXNET."""
         super().__init__()
         taps = LPIPS_LAYERS[architecture.name]
         self.network = PictureFeatures(architecture, taps)
@@ -202,7 +202,7 @@ class Lpips(nn.Module):
         self.requires_grad_(False).eval()
 
     def forward(self, image: Float[Tensor, "*b H W 3"], target: Float[Tensor, "*b H W 3"]) -> Float[Tensor, "*b"]:
-        """The distance of each picture; differentiable. Raises ValueError where shapes differ or are too small."""
+        """Distance of each image; differentiable. Raises ValueError if shapes differ or images are too small."""
         _check_pair(image, target)
         distance = image.new_zeros(())
         pairs = zip(self._features(image), self._features(target), self.linear, strict=True)
@@ -211,22 +211,22 @@ class Lpips(nn.Module):
         return distance.reshape(image.shape[:-3])
 
     def _features(self, pictures: Float[Tensor, "*b H W 3"]) -> list[Tensor]:
-        """Features of unit length in each place."""
+        """Features of unit length at every pixel."""
         signed = 2 * pictures.reshape(-1, *pictures.shape[-3:]).movedim(-1, 1) - 1
         layers = self.network((signed - self.shift) / self.scale)
-        # The root never sees a zero, at which its slope is infinite.
+        # The epsilon keeps the gradient of the square root finite at zero.
         return [layer / (layer.square().sum(1, keepdim=True) + 1e-20).sqrt() for layer in layers]
 
 
 def load_lpips(paths: Sequence[Path | str]) -> Lpips:
-    """LPIPS from files of weights, VGG16 or AlexNet as these say.
+    """Load LPIPS from weights files, which determine the architecture: VGG16 or AlexNet.
 
-    Either one file that holds all (the state_dict of lpips.LPIPS or of torchmetrics' twin), or two: torchvision's file
-    of the network, and the linear weights (alex.pth or vgg.pth of lpips or torchmetrics).
+    Either one file with everything (the state_dict of lpips.LPIPS or of torchmetrics' equivalent), or two: the backbone
+    from torchvision, and the linear weights (alex.pth or vgg.pth of lpips or torchmetrics).
 
     Raises:
         FileNotFoundError: a file is missing.
-        WeightsFileError: one is damaged, weights are missing, or those of two networks are mixed.
+        WeightsFileError: a file is damaged, weights are missing, or the files are of two architectures.
     """
     source = " and ".join(str(path) for path in paths)
     weights: dict[str, Tensor] = {}
@@ -235,14 +235,14 @@ def load_lpips(paths: Sequence[Path | str]) -> Lpips:
     what = "torchvision's VGG16 or AlexNet and LPIPS' linear weights of the same network"
     first = weights.get("network.features.0.weight")
     if first is None:
-        raise WeightsFileError(f"{source or 'no file'} has no network's weights: give files of {what}")
+        raise WeightsFileError(f"no backbone weights in {source or 'no file'}: give {what}")
     lpips = Lpips(ALEXNET if tuple(first.shape[-2:]) == (11, 11) else VGG16)
     fill(lpips, weights, what, source)
     return lpips
 
 
 def _own_name(name: str) -> str:
-    """lpips: lin2.model.1.weight (or lins.2...), net.slice3.6.weight; torchvision: features.6.weight."""
+    """Map names of lpips (lin2.model.1.weight, lins.2..., net.slice3.6.weight) and torchvision (features.6.weight)."""
     parts = name.removeprefix("lins.").removeprefix("lin").removeprefix("net.").split(".")
     if name.startswith("lin") and parts[1:3] == ["model", "1"]:
         return f"linear.{parts[0]}.weight"
@@ -254,5 +254,5 @@ def _own_name(name: str) -> str:
 def _check_pair(image: Tensor, target: Tensor) -> None:
     if image.shape != target.shape or image.ndim < 3 or image.shape[-1] != 3:
         raise ValueError(
-            f"pictures of shapes {tuple(image.shape)} and {tuple(target.shape)}: give two of the same [..., H, W, 3]"
+            f"images have shapes {tuple(image.shape)} and {tuple(target.shape)}: give two of shape [..., H, W, 3]"
         )

@@ -1,8 +1,7 @@
-"""Inception-V3 as FID uses it (Szegedy et al. 2016, Heusel et al. 2017), from a weights file that a user has.
+"""Inception-V3 as FID uses it (Szegedy et al. 2016, Heusel et al. 2017), with weights from a local file.
 
-Layers have torchvision's names, so pt_inception-2015-12-05-6726825d.pth, to which published FIDs refer, fits; nothing
-is downloaded. Averages leave the padding out, and the last block takes the largest of its neighbours, as in that file's
-network.
+Layers have torchvision's names and match pt_inception-2015-12-05-6726825d.pth, the file behind published FIDs; nothing
+is downloaded. As in that network, average pooling excludes the padding, and the last block uses max pooling.
 """
 
 from __future__ import annotations
@@ -30,34 +29,34 @@ class Convolution(nn.Module):
         self.bn = nn.BatchNorm2d(out, eps=0.001)
 
     def forward(self, x: Tensor) -> Tensor:
-        """The layer's output."""
+        """Apply convolution, normalisation and ReLU."""
         return functional.relu(self.bn(self.conv(x)))
 
 
 def across(channels: int, out: int, length: int) -> Convolution:
-    """Over so many neighbours in a row."""
+    """1 x `length` convolution."""
     return Convolution(channels, out, (1, length), padding=(0, length // 2))
 
 
 def down(channels: int, out: int, length: int) -> Convolution:
-    """Over so many neighbours in a column."""
+    """`length` x 1 convolution."""
     return Convolution(channels, out, (length, 1), padding=(length // 2, 0))
 
 
 def chain(module: nn.Module, x: Tensor, *names: str) -> Tensor:
-    """The named layers of a block, one after the other."""
+    """Apply the named layers of a module in sequence."""
     for name in names:
         x = module.get_submodule(name)(x)
     return x
 
 
 def averaged(x: Tensor) -> Tensor:
-    """Means over 3 x 3 neighbours, of those that there are."""
+    """3 x 3 average pooling without the padding."""
     return functional.avg_pool2d(x, 3, 1, 1, count_include_pad=False)
 
 
 class BlockA(nn.Module):
-    """At 35 x 35."""
+    """Block on 35 x 35 feature maps."""
 
     def __init__(self, channels: int, pooled: int) -> None:
         super().__init__()
@@ -75,7 +74,7 @@ class BlockA(nn.Module):
 
 
 class BlockB(nn.Module):
-    """From 35 x 35 to 17 x 17."""
+    """Block from 35 x 35 to 17 x 17 feature maps."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -90,7 +89,7 @@ class BlockB(nn.Module):
 
 
 class BlockC(nn.Module):
-    """At 17 x 17."""
+    """Block on 17 x 17 feature maps."""
 
     def __init__(self, channels: int, inner: int) -> None:
         super().__init__()
@@ -112,7 +111,7 @@ class BlockC(nn.Module):
 
 
 class BlockD(nn.Module):
-    """From 17 x 17 to 8 x 8."""
+    """Block from 17 x 17 to 8 x 8 feature maps."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -129,7 +128,7 @@ class BlockD(nn.Module):
 
 
 class BlockE(nn.Module):
-    """At 8 x 8."""
+    """Block on 8 x 8 feature maps."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -147,20 +146,19 @@ class BlockE(nn.Module):
         return torch.cat([self.branch1x1(x), *single, *double, self.branch_pool(self.pooled(x))], 1)
 
     def pooled(self, x: Tensor) -> Tensor:
-        """What the last branch sees."""
+        """Input of the pooling branch."""
         return averaged(x)
 
 
 class LastBlock(BlockE):
-    """The block before the features."""
+    """The last block, with max pooling instead of average pooling."""
 
     def pooled(self, x: Tensor) -> Tensor:
-        """The largest of 3 x 3 neighbours."""
         return functional.max_pool2d(x, 3, 1, 1)
 
 
 class Inception(nn.Module):
-    """Pictures to 2048 features. Weights are random until `load_inception` fills them."""
+    """Image encoder with 2048 features. Weights are random until `load_inception` fills them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -185,10 +183,10 @@ class Inception(nn.Module):
 
 
 def load_inception(path: Path | str) -> Inception:
-    """With the weights of a file. Raises FileNotFoundError and WeightsFileError as `read_weights` and `fill` do."""
+    """Load the encoder from a weights file. Raises FileNotFoundError and WeightsFileError."""
     network = Inception()
     weights = read_weights(path)
-    # Files of old do not count the batches that normalisation has seen; nothing reads the number.
+    # Older files lack num_batches_tracked, which evaluation mode does not use.
     own = {name: value for name, value in network.state_dict().items() if name.endswith("num_batches_tracked")}
     fill(network, {**own, **weights}, "Inception-V3 as FID uses it", str(path))
     return network

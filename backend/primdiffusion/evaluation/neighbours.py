@@ -1,4 +1,4 @@
-"""The nearest training person of each generated one in what is diffused, read from disk person by person."""
+"""Nearest training sample of each generated one in latent space, streamed from disk file by file."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from primdiffusion.evaluation.gallery import ReadPerson, Report, payload_of, sil
 from primdiffusion.primitives.primitives import Payload
 
 Encode = Callable[[Payload], Tensor]
-"""A payload's clean sample: `DiffusionModel.encode`."""
+"""Encodes a payload as a clean latent: `DiffusionModel.encode`."""
 
 
 class NearestStored(NamedTuple):
-    """The nearest of the people on disk to each query."""
+    """The nearest stored sample of each query."""
 
     distance: Float[Tensor, "q"]
-    """Root mean square difference of the numbers that are diffused."""
+    """Root mean square difference of the latents."""
     file: Int[Tensor, "q"]
-    """Place in the paths."""
+    """Index in the paths."""
     colouring: Int[Tensor, "q"]
 
 
 def nearest_stored(
     queries: Float[Tensor, "q d"], paths: Sequence[Path], read: ReadPerson, encode: Encode, report: Report = silent
 ) -> NearestStored:
-    """Compares flattened samples with all colourings of all people. Raises ValueError for no paths."""
+    """Search all colourings of all files for the nearest to each flattened latent. Raises ValueError for no paths."""
     if not paths:
-        raise ValueError("there are no people to find the nearest of: name a folder of payloads")
+        raise ValueError("no payload files to search: give a folder of payloads")
     best = torch.full((len(queries),), torch.inf)
     file, colouring = (torch.zeros(len(queries), dtype=torch.int64) for _ in range(2))
     for number, path in enumerate(paths):
@@ -47,6 +47,6 @@ def nearest_stored(
 
 
 def encoded_person(path: Path, read: ReadPerson, encode: Encode) -> Float[Tensor, "n d"]:
-    """Flattened samples of all colourings of a person."""
+    """Flattened latents of all colourings in a file."""
     person = read(path)
     return torch.stack([encode(payload_of(person, one)).flatten().cpu() for one in range(len(person.voxels))])

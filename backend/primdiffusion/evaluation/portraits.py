@@ -1,4 +1,4 @@
-"""The pictures by which sets of people are compared: everybody in T pose before the same cameras."""
+"""The views by which sets of humans are compared: all in T pose, seen by the same cameras."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings, march
 
 SIDE = 96
-"""Pixels a side of a portrait."""
+"""Width and height of a portrait, pixels."""
 SETTINGS = MarchSettings(step=0.008)
-"""8 mm between samples: pixels of whole people are 2 cm wide."""
+"""8 mm between samples: in full-body views a pixel is 2 cm wide."""
 DISTANCE = 10.0
-"""Metres from camera to person: far, so that near and far parts look equally large."""
+"""Metres from camera to human: large, so that perspective is weak."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Portrait:
-    """One of the views; the default body's pelvis is at the origin."""
+    """One view; the default body's pelvis is at the origin."""
 
     name: str
     yaw: float
     """As in `human.framing`: 0 looks at the face, pi/2 at the left side."""
     middle: float
-    """Height above the pelvis that is in the middle, metres."""
+    """Height of the image centre above the pelvis, metres."""
     height: float
-    """Metres from the lower to the upper edge."""
+    """Height of the view, metres."""
 
 
 PORTRAITS = (
@@ -44,7 +44,7 @@ PORTRAITS = (
 
 
 def camera_of(portrait: Portrait, side: int = SIDE) -> Camera:
-    """The view's camera, for pictures of any size."""
+    """The camera of a view."""
     middle = torch.tensor([0.0, portrait.middle, 0.0])
     towards = torch.tensor([math.sin(portrait.yaw), 0.0, math.cos(portrait.yaw)])
     fov = 2 * math.atan(portrait.height / 2 / DISTANCE)
@@ -52,7 +52,7 @@ def camera_of(portrait: Portrait, side: int = SIDE) -> Camera:
 
 
 def portraits(primitives: Primitives) -> UInt8[Tensor, "4 96 96 4"]:
-    """A person's pictures: sRGB-encoded colour premultiplied by alpha, and alpha."""
+    """Render all views: sRGB-encoded colour premultiplied by alpha, and alpha."""
     pictures = []
     for portrait in PORTRAITS:
         seen = march(primitives, camera_of(portrait), SETTINGS)

@@ -1,7 +1,7 @@
-"""How well an encoder reconstructs people: its pictures against captured ones, all views and poses (paper Table 3).
+"""Reconstruction quality of an encoder: renders compared with captures, over all views and poses (paper Table 3).
 
-A person is encoded once, from a few views of one pose; what comes out is drawn from every camera in every pose.
-Pictures from cameras that were given, and in the pose that was, are told apart from those the encoder never saw.
+Each subject is encoded once, from a few views of one pose, then rendered from every camera in every pose. Metrics are
+reported separately for input and novel views, and for the input pose and novel poses.
 """
 
 from __future__ import annotations
@@ -25,71 +25,72 @@ from primdiffusion.render.march import MarchSettings, Rendering, march
 
 
 class Reconstructor(Protocol):
-    """What is evaluated: `primdiffusion.encoder.encode.EncoderModel`, or anything else that makes people of views."""
+    """The interface of an evaluated encoder, such as `primdiffusion.encoder.encode.EncoderModel`."""
 
     def encode(self, views: Views, betas: Float[Tensor, "n"]) -> Payload:
-        """The payload of the person in the views (unbatched, of one pose)."""
+        """Encode the subject in the views (unbatched, of one pose)."""
         ...
 
     def place(self, payload: Payload, betas: Float[Tensor, "n"], pose: BodyPose) -> Primitives:
-        """The payload on the person's body in a pose."""
+        """Place the payload on the subject's body in a pose."""
         ...
 
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationSettings:
-    """Which pictures count, and what the encoder is given."""
+    """Which images are compared, and the input of the encoder."""
 
     subjects: tuple[str, ...] = ()
-    """Names; empty: everybody."""
+    """Names; empty: all."""
     frames: tuple[int, ...] = ()
-    """Poses that are compared; empty: all."""
+    """Evaluated poses; empty: all."""
     cameras: tuple[int, ...] = ()
-    """Views that are compared; empty: all."""
+    """Evaluated views; empty: all."""
     given_views: int = 8
-    """Views that the encoder is given, spread around the person."""
+    """Number of input views, spread around the subject."""
     given_frame: int = 0
-    """The pose in which."""
+    """Pose of the input views."""
     size: int = 512
-    """Pixels a side; larger pictures are averaged down to it."""
+    """Image width and height, pixels; larger captures are downsampled."""
     march: MarchSettings = MarchSettings()  # noqa: RUF009  frozen
 
     def __post_init__(self) -> None:
-        """Raises ValueError for pictures without pixels and people without views."""
+        """Raise ValueError for no input views or images too small for SSIM."""
         for name, least in (("given_views", 1), ("size", 11)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} of the evaluation is {getattr(self, name)}: it must be {least} or more")
 
 
 @dataclasses.dataclass(frozen=True)
-class Likeness:
-    """How alike two pictures of a person are; None in the box where the mask is empty, LPIPS where it was not asked."""
+class ImageMetrics:
+    """Metrics of one image; box metrics are None if the mask is empty, LPIPS if it was not requested."""
 
     psnr: float
-    """dB, of the whole picture over black."""
+    """Over the whole image on black, dB."""
     ssim: float
     psnr_box: float | None
-    """dB, within the box around the target's mask."""
+    """Within the bounding box of the target's mask, dB."""
     ssim_box: float | None
     mask_iou: float
-    """Of the pixels that are at least half covered."""
+    """Of the masks of pixels that are at least half covered."""
     lpips: float | None = None
 
 
-FIGURES = tuple(field.name for field in dataclasses.fields(Likeness))
+FIGURES = tuple(field.name for field in dataclasses.fields(ImageMetrics))
 
 
 @dataclasses.dataclass(frozen=True)
 class PictureScore:
-    """One picture of one person."""
+    """Metrics of one view of one subject in one pose."""
 
     subject: str
     frame: int
     camera: int
     given_view: bool
-    """Whether its camera is one of those that the encoder was given."""
+    """Whether the encoder saw this camera's view."""
     given_pose: bool
-    likeness: Likeness
+    likeness: ImageMetrics
+    """Named as in the JSON report."""
 
 
 SPLITS = {
@@ -99,16 +100,16 @@ SPLITS = {
     "given_views_novel_poses": "given views, novel poses",
     "novel_views_novel_poses": "novel views, novel poses",
 }
-"""Parts of the pictures that are averaged, and how they are called; `all` is the paper's way."""
+"""Subsets that are averaged, and their titles; the paper reports `all`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Means:
-    """Means over the pictures of a part; None where none of them has the figure."""
+    """Means over a subset; None for metrics that no image has."""
 
     pictures: int
     psnr: float | None
-    """Mean of the pictures' decibels."""
+    """Mean of the images' decibels."""
     ssim: float | None
     psnr_box: float | None
     ssim_box: float | None
@@ -120,14 +121,14 @@ class Means:
 def evaluate(
     model: Reconstructor, captures: Captures, settings: EvaluationSettings | None = None, lpips: Lpips | None = None
 ) -> Iterator[PictureScore]:
-    """Scores of all pictures that the settings name, one after the other; the same for the same model and captures.
+    """Yield the metrics of every image that the settings select; deterministic.
 
-    Drawn on the device of the payloads. A 512 x 512 picture takes a CPU about a sixth of a second.
+    Images are rendered on the device of the payloads; one of 512 x 512 takes about a sixth of a second on CPU.
 
     Raises:
-        KeyError: there is no such subject.
+        KeyError: unknown subject.
         FileNotFoundError, ConditioningError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or
-            damaged, there is no such frame or camera, or a subject is of another body model.
+            damaged, a frame or camera does not exist, or a subject has another body model.
     """
     settings = settings or EvaluationSettings()
     for name in settings.subjects or captures.subjects:
@@ -141,8 +142,8 @@ def evaluate(
             cameras = settings.cameras or tuple(range(len(subject.views)))
             targets = conditioning_views(captures, name, frame, cameras, settings.size)
             primitives = model.place(payload.to("cpu"), betas, targets.pose).to(device)
-            for place, camera in enumerate(cameras):
-                view = targets.camera.map(lambda tensor, place=place: tensor[place])
+            for index, camera in enumerate(cameras):
+                view = targets.camera.map(lambda tensor, index=index: tensor[index])
                 rendering = march(primitives, view.to(device), settings.march)
                 yield PictureScore(
                     subject=name,
@@ -150,16 +151,16 @@ def evaluate(
                     camera=camera,
                     given_view=camera in given,
                     given_pose=frame == settings.given_frame,
-                    likeness=compare(rendering, targets.rgba[place].to(device), lpips),
+                    likeness=image_metrics(rendering, targets.rgba[index].to(device), lpips),
                 )
 
 
-def compare(rendering: Rendering, rgba: UInt8[Tensor, "H W 4"], lpips: Lpips | None = None) -> Likeness:
-    """A drawn picture against a captured one (sRGB-encoded over black, and the mask)."""
+def image_metrics(rendering: Rendering, rgba: UInt8[Tensor, "H W 4"], lpips: Lpips | None = None) -> ImageMetrics:
+    """Compare a render with a captured image (sRGB-encoded over black, and its mask)."""
     image, target = picture(rendering), rgba[..., :3].to(rendering.rgb.dtype) / 255
     mask = rgba[..., 3] >= 128
     box = bounding_box(rgba[..., 3] > 0)
-    return Likeness(
+    return ImageMetrics(
         psnr=float(psnr(image, target)),
         ssim=float(ssim(image, target)),
         psnr_box=None if box is None else float(psnr(box.cut(image), box.cut(target))),
@@ -170,12 +171,12 @@ def compare(rendering: Rendering, rgba: UInt8[Tensor, "H W 4"], lpips: Lpips | N
 
 
 def picture(rendering: Rendering) -> Float[Tensor, "*b H W 3"]:
-    """What a rendering looks like over black: sRGB-encoded, in [0, 1]."""
+    """The render over black, sRGB-encoded in [0, 1]."""
     return encode_srgb(rendering.rgb.clamp(0, 1))
 
 
 def summary(scores: Iterable[PictureScore]) -> dict[str, Means]:
-    """Means over each of the `SPLITS`."""
+    """Average over each of the `SPLITS`."""
     held = list(scores)
     parts = {
         "all": held,
@@ -187,16 +188,16 @@ def summary(scores: Iterable[PictureScore]) -> dict[str, Means]:
     return {name: _means([score.likeness for score in part]) for name, part in parts.items()}
 
 
-def _means(likenesses: list[Likeness]) -> Means:
+def _means(metrics: list[ImageMetrics]) -> Means:
     figures = {}
     for name in FIGURES:
-        values = [value for value in (getattr(one, name) for one in likenesses) if value is not None]
+        values = [value for value in (getattr(one, name) for one in metrics) if value is not None]
         figures[name] = sum(values) / len(values) if values else None
-    return Means(len(likenesses), **figures)
+    return Means(len(metrics), **figures)
 
 
 def table(means: Mapping[str, Means]) -> str:
-    """The summary as a markdown table, a part a row."""
+    """Format the summary as a Markdown table, a row a subset."""
     lines = ["| pictures of | number | PSNR | SSIM | PSNR in box | SSIM in box | mask IoU | LPIPS |", "|---" * 8 + "|"]
     formats = {"psnr": ".2f", "ssim": ".4f", "psnr_box": ".2f", "ssim_box": ".4f", "mask_iou": ".4f", "lpips": ".4f"}
     for name, part in means.items():

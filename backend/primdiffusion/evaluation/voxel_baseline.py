@@ -1,7 +1,7 @@
-"""The paper's Table 2 baseline: the same diffusion on 64^3 voxels in place of primitives.
+"""The paper's Table 2 baseline: the same diffusion on 64^3 voxels instead of primitives.
 
-As in our default model, cells (here blocks of 4^3 voxels) pass a frozen orthonormal linear codec, and a closed-form
-person prior is corrected by a network for the whole person and a U-Net for its cells (here in three dimensions).
+As in the default model, a frozen orthonormal linear codec encodes cells (here blocks of 4^3 voxels), and two networks
+correct a closed-form prior: one for the whole human, and a U-Net (here 3D) for the cells.
 """
 
 from __future__ import annotations
@@ -32,34 +32,34 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.staging import written_whole
 
 BLOCK = 4
-"""Voxels along a side of a cell."""
+"""Side of a cell, voxels."""
 BLOCKS = SIDE // BLOCK
 VALUES = 4 * BLOCK**3
 CELLS_EACH = 256
-"""Cells of each person that the components are fitted to."""
+"""Cells of each sample that the principal components are fitted to."""
 SCHEDULE = "linear"
 
 
 @dataclasses.dataclass(frozen=True)
 class VoxelCodec(TensorRecord):
-    """Grids to latents [*b, C, n, 1] of the n cells where anybody ever is, and back; as `LinearCodec`."""
+    """Encodes grids as latents [*b, C, n, 1] of the n cells that any training sample occupies; as `LinearCodec`."""
 
     cells: Int[Tensor, "n"]
-    """Which of the 16^3 cells (z, y, x), ascending; the others are empty in everybody."""
+    """Indices among the 16^3 cells (z, y, x), ascending; the other cells are always empty."""
     mirrored: Int[Tensor, "n"]
-    """Place in `cells` of each cell's mirror image."""
+    """Index in `cells` of each cell's mirror image."""
     mean: Float[Tensor, "n v"]
     basis: Float[Tensor, "c v"]
     """Orthonormal rows, each even or odd in x."""
     parity: Float[Tensor, "c"]
 
     def encode(self, grids: UInt8[Tensor, "*b 64 64 64 4"]) -> Float[Tensor, "*b c n 1"]:
-        """Latents of stored grids."""
+        """Encode stored grids."""
         values = blocks_of(grids)[..., self.cells, :].float() / 255
         return ((values - self.mean) @ self.basis.T * SLAB_UNIT).mT[..., None]
 
     def decode(self, latents: Float[Tensor, "*b c n 1"]) -> Float[Tensor, "*b 64 64 64 4"]:
-        """Grids in [0, 1] of latents, with the dead zone of primitives on density."""
+        """Decode to grids in [0, 1], with the same dead zone on density as primitives."""
         values = latents[..., 0].mT @ self.basis / SLAB_UNIT + self.mean
         blocks = values.new_zeros((*values.shape[:-2], BLOCKS**3, VALUES))
         blocks[..., self.cells, :] = values
@@ -69,20 +69,20 @@ class VoxelCodec(TensorRecord):
         return torch.cat([grid[..., :3], (grid[..., 3:] - start) / width], dim=-1).clamp(0, 1)
 
     def mirror(self, latents: Float[Tensor, "*b c n 1"]) -> Float[Tensor, "*b c n 1"]:
-        """The person seen in a mirror."""
+        """Latents of the grids mirrored in x."""
         return latents[..., self.mirrored, :] * self.parity[:, None, None]
 
 
 def blocks_of(grids: Tensor) -> Tensor:
-    """Grids [*b, 64, 64, 64, 4] as cells [*b, 16^3, 256]: z, y, x and channel of a block's voxels."""
+    """Split grids [*b, 64, 64, 64, 4] into cells [*b, 16^3, 256]; a cell's values run over z, y, x and channel."""
     split = grids.unflatten(-2, (BLOCKS, BLOCK)).unflatten(-4, (BLOCKS, BLOCK)).unflatten(-6, (BLOCKS, BLOCK))
     return split.movedim((-6, -4, -2), (-4, -3, -2)).flatten(-4).flatten(-4, -2)
 
 
 def fit_voxel_codec(people: Callable[[], Iterable[UInt8[Tensor, "n 64 64 64 4"]]], channels: int) -> VoxelCodec:
-    """Cells, their means, and the principal components that all share, from everybody and their mirror images.
+    """Fit occupied cells, their means, and principal components shared by all cells, on samples and mirror images.
 
-    `people` is called twice, once for the means.
+    `people` yields the grids of one file after another; it is called twice.
     """
     count, total = 0, torch.zeros(BLOCKS**3, VALUES)
     occupied = torch.zeros(BLOCKS**3, dtype=torch.bool)
@@ -93,20 +93,20 @@ def fit_voxel_codec(people: Callable[[], Iterable[UInt8[Tensor, "n 64 64 64 4"]]
         count += len(values)
     cells = occupied.nonzero()[:, 0]
     mean = total[cells] / count
-    place = torch.full((BLOCKS**3,), -1)
-    place[cells] = torch.arange(len(cells))
+    index_of = torch.full((BLOCKS**3,), -1)
+    index_of[cells] = torch.arange(len(cells))
     moment, generator = torch.zeros(VALUES, VALUES, dtype=torch.float64), torch.Generator().manual_seed(0)
     for grids in people():
         chosen = torch.randperm(len(cells), generator=generator)[:CELLS_EACH]
         part = (blocks_of(grids)[:, cells[chosen]].float() / 255 - mean[chosen]).flatten(0, 1)
         moment += (part.T @ part).double()
     basis, parity = _components(moment, channels)
-    mirrored = place[(cells - cells % BLOCKS) + (BLOCKS - 1 - cells % BLOCKS)]
+    mirrored = index_of[(cells - cells % BLOCKS) + (BLOCKS - 1 - cells % BLOCKS)]
     return VoxelCodec(cells, mirrored, mean, basis, parity)
 
 
 def _components(moment: Float[Tensor, "v v"], channels: int) -> tuple[Tensor, Tensor]:
-    """Principal components among the even and among the odd cells, the largest first, and their parity."""
+    """Principal components of the even and of the odd subspace, largest first, and their parity."""
     signs, sides = torch.linalg.eigh(_flipped(torch.eye(VALUES, dtype=moment.dtype)))  # -1 for odd, 1 for even
     variances, rows, parity = [], [], []
     for sign in (-1.0, 1.0):
@@ -125,7 +125,7 @@ def _flipped(values: Float[Tensor, "n 256"]) -> Float[Tensor, "n 256"]:
 
 
 class VoxelBlock(nn.Module):
-    """GroupNorm - SiLU - conv, modulated by the condition, SiLU - conv, plus the input; in three dimensions."""
+    """3D residual block: GroupNorm, SiLU, conv, modulation by the condition, SiLU, conv."""
 
     def __init__(self, channels: int, out_channels: int, condition_width: int):
         super().__init__()
@@ -138,7 +138,7 @@ class VoxelBlock(nn.Module):
         self.skip = nn.Identity() if channels == out_channels else nn.Conv3d(channels, out_channels, 1)
 
     def forward(self, x: Float[Tensor, "b c d h w"], condition: Float[Tensor, "b e"]) -> Float[Tensor, "b o d h w"]:
-        """The block's output."""
+        """Apply the block."""
         scale, shift = self.film(condition)[:, :, None, None, None].chunk(2, dim=1)
         h = self.norm2(self.conv1(functional.silu(self.norm1(x)))) * (1 + scale) + shift
         return self.skip(x) + self.conv2(functional.silu(h))
@@ -154,7 +154,7 @@ class VoxelUNetConfig:
 
 
 class VoxelUNet(nn.Module):
-    """As `LocalUNet`, on the cells of a grid; between a linear layer for each cell's latents and back."""
+    """`LocalUNet` on the 3D grid of cells, with linear layers from and to each cell's latents."""
 
     cells: Tensor
 
@@ -180,7 +180,7 @@ class VoxelUNet(nn.Module):
         t: Int[Tensor, "b"],
         condition: None = None,
     ) -> Float[Tensor, "b c n 1"]:
-        """Correction for a noisy rest, beside the picture that guessed person components draw; takes no condition."""
+        """Predict the correction of the noisy residual, given the prior's reconstruction; `condition` is unused."""
         modulation = functional.silu(self.time(t) + self.person(person))
         tokens = self.inner(torch.cat([noisy, picture], dim=1)[..., 0].mT) + self.position
         grid = tokens.new_zeros((len(tokens), BLOCKS**3, tokens.shape[-1]))
@@ -200,17 +200,17 @@ class VoxelUNet(nn.Module):
 
 @dataclasses.dataclass(frozen=True)
 class VoxelModel:
-    """A trained baseline."""
+    """A trained voxel baseline."""
 
     denoiser: PersonDenoiser
     codec: VoxelCodec
     full_density: float
-    """1/m that a stored density of 1 stands for."""
+    """Density that a stored value of 1 encodes, 1/m."""
     card: dict[str, object]
-    """What it was trained on, and how long."""
+    """Training data and duration."""
 
     def sample(self, seeds: Sequence[int], steps: int = 30) -> Iterator[Float[Tensor, "64 64 64 4"]]:
-        """One grid for each seed, by DDIM from the start that `DiffusionModel.start` states."""
+        """Sample a grid for each seed with DDIM, starting as `DiffusionModel.start` does."""
         schedule, prior = self.denoiser.schedule, self.denoiser.prior
         chain = trailing_steps(schedule.length, steps)
 
@@ -227,14 +227,14 @@ class VoxelModel:
             yield self.codec.decode(x.clone())[0]
 
     def primitives(self, grid: Float[Tensor, "64 64 64 4"]) -> Primitives:
-        """What the marcher draws."""
+        """Convert a grid to a primitive that the marcher can render."""
         return primitives_of(grid, self.full_density)
 
 
 def voxel_denoiser(
     prior: PersonPrior, codec: VoxelCodec, config: VoxelUNetConfig = VoxelUNetConfig(), blocks: int = 3
 ) -> PersonDenoiser:
-    """An untrained one: as our default's, but for the network of cells."""
+    """Build an untrained denoiser: the default model's with a 3D U-Net for the cells."""
     person = PersonNetworkConfig(blocks=blocks)
     denoiser = PersonDenoiser(DenoiserConfig(person=person, local=None), prior, SCHEDULES[SCHEDULE]())
     denoiser.local = VoxelUNet(len(codec.basis), len(prior.basis), codec.cells, config)
@@ -242,7 +242,7 @@ def voxel_denoiser(
 
 
 def save_voxel_model(path: Path, model: VoxelModel) -> None:
-    """Writes it, whole or not at all."""
+    """Write the model, atomically."""
     tensors = {f"denoiser.{name}": value for name, value in model.denoiser.state_dict().items()}
     tensors |= {f"codec.{field.name}": getattr(model.codec, field.name) for field in dataclasses.fields(VoxelCodec)}
     about = {"full_density": model.full_density, "card": model.card}
@@ -252,9 +252,9 @@ def save_voxel_model(path: Path, model: VoxelModel) -> None:
 
 
 def load_voxel_model(path: Path) -> VoxelModel:
-    """What `save_voxel_model` wrote. Raises FileNotFoundError, and ValueError for another file."""
+    """Load what `save_voxel_model` wrote. Raises FileNotFoundError, and ValueError for an unreadable file."""
     if not path.is_file():
-        raise FileNotFoundError(f"there is no voxel baseline {path}: train one with benchmarks/diffusion_voxel.py")
+        raise FileNotFoundError(f"no voxel baseline at {path}: train one with benchmarks/diffusion_voxel.py")
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads(file.metadata()["about"])
@@ -265,7 +265,7 @@ def load_voxel_model(path: Path) -> VoxelModel:
         denoiser.load_state_dict(weights)
     except (SafetensorError, KeyError, TypeError, RuntimeError, OSError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise ValueError(f"{path} is no voxel baseline of this version ({reason}): train it again") from error
+        raise ValueError(f"{path} is not a voxel baseline of this version ({reason}): train it again") from error
     return VoxelModel(denoiser, codec, about["full_density"], about["card"])
 
 

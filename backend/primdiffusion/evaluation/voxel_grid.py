@@ -1,6 +1,6 @@
-"""People as grids of 64^3 voxels in the T pose: the representation that the paper's Table 2 compares primitives with.
+"""Humans as 64^3 voxel grids in T pose: the representation that the paper's Table 2 compares primitives with.
 
-One box holds everybody; a voxel is the same place of it for all. A grid is drawn by the marcher as one large primitive.
+All grids share one bounding box. The marcher renders a grid as one large primitive.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Frames, Payload, Primitives
 
 SIDE = 64
-"""Voxels along each side (paper Table 2)."""
+"""Voxels along each axis (paper Table 2)."""
 SAMPLES = (3, 3, 1)
-"""Points of a cell along x, y, z whose mean a voxel is: cells are wide across a person and thin along the depth."""
+"""Samples along x, y, z that a voxel averages: voxels are wide in x and y and thin in depth."""
 FAINT = 1e-3
-"""Share of the full density that empty points weigh in a voxel's colour, so that it is that of its boxes."""
+"""Colour weight of empty samples, relative to full density: gives empty voxels the colour of the boxes around them."""
 UNSEEN = 0.5
-"""Encoded colour of voxels that no box covers."""
+"""Encoded colour of voxels outside all boxes."""
 FACE = 0.96
-"""Beyond this share of the large box nobody is; the marcher's window is not undone there."""
+"""Local coordinate beyond which the grid is always empty; the marcher's window is not compensated there."""
 
 BOUNDS = ((-1.06, -1.43, -0.21), (1.06, 0.81, 0.30))
-"""Lowest and highest corner of the box, metres from the pelvis: centres of the outermost voxels. The boxes of a
-thousand people in T pose reach from (-1.01, -1.36, -0.19) to (1.01, 0.75, 0.27); mirror images share the voxels."""
+"""Lowest and highest corner of the bounding box, metres from the pelvis: centres of the outermost voxels. The boxes of
+a thousand samples span (-1.01, -1.36, -0.19) to (1.01, 0.75, 0.27); symmetric in x, so that grids can be mirrored."""
 
 
 def voxelise(
     frames: Frames, rgb: Float[Tensor, "n k 3 s s s"], density: Float[Tensor, "k s s s"], full: float
 ) -> UInt8[Tensor, "n 64 64 64 4"]:
-    """Grids (z, y, x; encoded colour and density / `full`) of one geometry in n colourings.
+    """Voxelise one geometry in n colourings: grids (z, y, x) of encoded colour and density / `full`.
 
-    A voxel is the mean of what the marcher's rule (SPEC 4) finds at `SAMPLES` points of its cell: the sum of the boxes'
-    windowed densities, and their colours weighted by these.
+    A voxel averages the marcher's field (SPEC 4) over `SAMPLES` points: the sum of the boxes' windowed densities, and
+    their density-weighted colour.
     """
     colours = rgb.movedim(0, 1).flatten(1, 2)
     values = torch.cat([density[:, None], colours], dim=1).movedim(1, -1).contiguous().float().numpy()
@@ -66,7 +66,7 @@ def voxelise(
 
 @numba.njit(cache=True, nogil=True)
 def _gather(total, values, position, rotation, half_extent, low, fine, samples, faint):
-    """Adds each box's density, weighted colours and weights at the fine points inside it to their cells."""
+    """Accumulate each box's density, weighted colours and weights at the fine points inside it."""
     side, size, channels = total.shape[0], values.shape[1], values.shape[-1]
     first, last, local = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3)
     corner, far = np.empty(3, np.int64), np.empty(3)
@@ -124,17 +124,16 @@ def _gather(total, values, position, rotation, half_extent, low, fine, samples, 
 
 
 def voxelise_payload(frames: Frames, payload: Payload, full: float) -> UInt8[Tensor, "64 64 64 4"]:
-    """The grid of one person; delta scales count."""
+    """Voxelise one human, including its delta scales."""
     placed = Primitives.place(frames, payload)
     boxes = Frames(placed.position, placed.rotation, placed.half_extent)
     return voxelise(boxes, payload.rgb[None], payload.density, full)[0]
 
 
 def primitives_of(grid: Float[Tensor, "64 64 64 4"], full: float) -> Primitives:
-    """A grid of values in [0, 1] (others are clamped) as one primitive for `march`.
+    """Convert a grid (clamped to [0, 1]) to one primitive for `march`.
 
-    The marcher fades every box towards its faces; densities are divided by that window at the voxels' centres, so that
-    the grid is drawn as it is.
+    The marcher's window fades boxes towards their faces; densities are divided by it to compensate.
     """
     grid = grid.clamp(0, 1)
     low, high = torch.tensor(BOUNDS, dtype=grid.dtype)

@@ -1,1 +1,1 @@
-"""People for other programs: a textured, skinned mesh and 3D Gaussians."""
+"""Export humans as textured, skinned meshes, 3D Gaussians and voxel grids."""

@@ -1,4 +1,4 @@
-"""What fills a person's boxes, asked for at points: density, colour, and which boxes make it up."""
+"""The volume of a set of boxes sampled at points: density, colour, and skin weights."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from numpy import ndarray as Array
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives
 
 CELL = 0.04
-"""Side of the cells that list the boxes in reach, metres; no effect on the result."""
+"""Cell size of the acceleration grid, metres; no effect on the result."""
 NEAREST = 0.03
-"""How much farther than the nearest box's centre another one may be to count for skinning, metres. A box holds what
-lies in it, also a piece of the other leg, and must not move that."""
+"""Falloff of skin weights with distance beyond the nearest box's centre, metres. A box may reach into the other leg
+and must not move it."""
 _POWER, _SHARPNESS = int(WINDOW_POWER), float(WINDOW_SHARPNESS)
 
 
 class Field(NamedTuple):
-    """Boxes, packed for points: for each cell of a grid the boxes that reach into it."""
+    """Boxes in an acceleration grid: each cell lists the boxes that overlap it."""
 
     position: Float64[Array, "k 3"]
     to_local: Float64[Array, "k 3 3"]
@@ -30,13 +30,13 @@ class Field(NamedTuple):
     """Linear red, green, blue, and density (1/m)."""
     low: Float64[Array, "3"]
     start: Int64[Array, "cells"]
-    """Where each cell's boxes begin in `box`; one entry more than there are cells."""
+    """Offset of each cell's boxes in `box`, and the total."""
     box: Int64[Array, "n"]
     cells: Int64[Array, "3"]
 
 
 def pack_field(primitives: Primitives) -> Field:
-    """The field of an unbatched set of boxes. Boxes without extent hold no point and are left out."""
+    """Pack an unbatched set of boxes; boxes without extent are left out."""
     solid = (primitives.half_extent > 0).all(-1).nonzero()[:, 0]
     boxes = {name: tensor.detach().cpu()[solid.cpu()] for name, tensor in vars(primitives).items()}
     half, rotation = boxes["half_extent"].double().numpy(), boxes["rotation"].double().numpy()
@@ -55,25 +55,25 @@ def pack_field(primitives: Primitives) -> Field:
 
 
 def density_at(field: Field, points: Float[Array, "n 3"]) -> Float32[Array, "n"]:
-    """Density with the boxes' windows, summed over boxes (1/m)."""
+    """Windowed density, summed over boxes (1/m)."""
     return _density(field, np.ascontiguousarray(points, np.float64))
 
 
-def look_along(
+def march_rays(
     field: Field, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], length: float, step: float
 ) -> tuple[Float32[Array, "n 3"], Float32[Array, "n"]]:
-    """Straight (not premultiplied) linear colour and opacity along rays of `length` (m), sampled every `step`.
+    """March rays of `length` (m) in steps of `step`: straight (not premultiplied) linear colour, and opacity.
 
-    As the marcher composites: opacities add up until 1 is reached (SPEC 4). Where nothing is met the colour is black.
+    Composited as by the marcher: opacities add up until 1 is reached (SPEC 4). Empty rays are black.
     """
     rays = (np.ascontiguousarray(origins, np.float64), np.ascontiguousarray(directions, np.float64))
-    return _look(field, *rays, math.ceil(length / step), step)
+    return _march(field, *rays, math.ceil(length / step), step)
 
 
 def weights_at(field: Field, points: Float[Array, "n 3"], box_weights: Float[Array, "k j"]) -> Float32[Array, "n j"]:
-    """Skin weights at points: of the boxes that hold the matter there, by density, the nearest first (see NEAREST).
+    """Skin weights at points: a mean over the boxes there, weighted by density and closeness (NEAREST).
 
-    Rows sum to one; they are zero where there is no matter.
+    Rows sum to one; they are zero where density is zero.
     """
     return _weights(field, np.ascontiguousarray(points, np.float64), np.ascontiguousarray(box_weights, np.float32))
 
@@ -112,7 +112,7 @@ def _cell_of(field, x, y, z):  # pragma: no cover (compiled)
 
 @numba.njit(cache=True, nogil=True)
 def _in_box(field, k, x, y, z, value):  # pragma: no cover (compiled)
-    """Writes colour, and density times window, of box k at a point; False where the point is outside it."""
+    """Write colour and windowed density of box k at a point to `value`; return False if the point is outside."""
     dx, dy, dz = x - field.position[k, 0], y - field.position[k, 1], z - field.position[k, 2]
     m = field.to_local[k]
     a = m[0, 0] * dx + m[0, 1] * dy + m[0, 2] * dz
@@ -154,7 +154,7 @@ def _density(field, points):  # pragma: no cover (compiled)
 
 
 @numba.njit(cache=True, nogil=True)
-def _look(field, origins, directions, steps, step):  # pragma: no cover (compiled)
+def _march(field, origins, directions, steps, step):  # pragma: no cover (compiled)
     rgb = np.zeros((len(origins), 3), np.float32)
     alpha = np.zeros(len(origins), np.float32)
     value, mixed = np.empty(4), np.empty(3)

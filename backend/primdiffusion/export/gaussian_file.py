@@ -1,10 +1,10 @@
-"""3D Gaussians as the PLY files that viewers and trainers of Gaussian splatting exchange.
+"""Write 3D Gaussians as PLY, in the layout that Gaussian splatting viewers and trainers share.
 
-Binary little endian, float32, a vertex a Gaussian: x y z, nx ny nz (zero), f_dc_0..2, opacity, scale_0..2, rot_0..3.
-`opacity` is a logit, `scale` the logarithm of standard deviations in metres, `rot` a quaternion w x y z. f_dc is
-(colour - 0.5) / C0 with the colour encoded in sRGB: viewers show 0.5 + C0 f_dc as it is, without a transfer function.
-There are no f_rest: colours do not depend on the view. Axes are ours, y up and facing z; scenes reconstructed from
-photographs often have y down, so a viewer may show the person standing on their head until it is told.
+Binary little endian, float32, one vertex per Gaussian: x y z, nx ny nz (zero), f_dc_0..2, opacity, scale_0..2,
+rot_0..3. `opacity` is a logit, `scale` the logarithm of standard deviations in metres, `rot` a quaternion w x y z. f_dc
+is (colour - 0.5) / C0 with sRGB-encoded colour: viewers display 0.5 + C0 f_dc without a transfer function. There is no
+f_rest: colours do not depend on the view. Axes are y up, facing +z; viewers that expect y down, as in scenes
+reconstructed from photographs, show the human upside down by default.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ PROPERTIES = (
 
 
 def write_gaussians(path: str | Path, gaussians: Gaussians) -> None:
-    """Writes the file whole or not at all. Raises OSError."""
+    """Write the file, atomically. Raises OSError."""
     columns = [
         gaussians.position,
         torch.zeros_like(gaussians.position),

@@ -1,4 +1,4 @@
-"""A person as 3D Gaussians (Kerbl et al. 2023), one for every voxel that can be seen, for viewers of such files."""
+"""Convert a human to 3D Gaussians (Kerbl et al. 2023), one for each visible voxel."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, 
 WIDTH = 1 / 6**0.5
 """Standard deviation of a voxel's trilinear kernel, in voxel spacings: the Gaussian has the kernel's own variance."""
 GAIN = 1.2
-"""How much more optical depth Gaussians get than voxels have opacity: theirs multiplies up as 1 - product(1 - a), the
-marcher's adds up until it is 1 and so hides sooner."""
+"""Optical depth of a Gaussian relative to its voxel's opacity. Gaussians composite as 1 - product(1 - a), while the
+marcher adds opacities until 1 and so occludes sooner."""
 DEEPEST = 0.025
-"""How far below the surface a voxel is still drawn, metres: what lies deeper nobody sees."""
+"""Depth below the surface beyond which voxels are dropped as invisible, metres."""
 FAINTEST = 1 / 255
-"""Opacity below which viewers skip a Gaussian anyway."""
+"""Opacity below which viewers skip a Gaussian."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Gaussians(TensorRecord):
-    """Splats in the world."""
+    """3D Gaussians in world space."""
 
     position: Float[Tensor, "n 3"]
     """Metres."""
@@ -36,19 +36,19 @@ class Gaussians(TensorRecord):
     scale: Float[Tensor, "n 3"]
     """Standard deviations along the local axes, metres."""
     opacity: Float[Tensor, "n"]
-    """Of a ray through the centre, in (0, 1)."""
+    """Along a ray through the centre, in (0, 1)."""
     rgb: Float[Tensor, "n 3"]
     """Linear, in [0, 1]."""
 
 
 def gaussians_of(primitives: Primitives, limit: int = GAUSSIANS) -> Gaussians:
-    """The voxels of an unbatched set of boxes as Gaussians, at most `limit`: the most opaque of every box are kept.
+    """Convert the voxels of an unbatched set of boxes to at most `limit` Gaussians, the most opaque of each box.
 
-    A voxel's opacity is that of a ray along the box's normal through it; matter deeper than DEEPEST is left out. Raises
-    ValueError for a limit below one and where there is nothing to be seen.
+    A voxel's opacity is that along the box's normal; voxels deeper than DEEPEST are left out. Raises ValueError for a
+    limit below one and if no voxel is visible.
     """
     if limit < 1:
-        raise ValueError(f"{limit} Gaussians were asked for: choose 1 or more")
+        raise ValueError(f"the limit is {limit} Gaussians: choose 1 or more")
     size = primitives.density.shape[-1]
     share, centre = (moment.to(primitives.position) for moment in _kernel(size))
     window = share[:, None, None] * share[:, None] * share
@@ -64,7 +64,7 @@ def gaussians_of(primitives: Primitives, limit: int = GAUSSIANS) -> Gaussians:
     if len(chosen) > limit:
         chosen = chosen[_rank_in_box(box[chosen], kept[chosen]).argsort(stable=True)[:limit]]
     if not len(chosen):
-        raise ValueError("nothing of this person is dense enough to be seen: generate them again")
+        raise ValueError("no voxel of this human is dense enough to be visible: generate it again")
     box, d, h, w = (index[chosen] for index in (box, d, h, w))
     return Gaussians(
         position=position[chosen],
@@ -76,7 +76,7 @@ def gaussians_of(primitives: Primitives, limit: int = GAUSSIANS) -> Gaussians:
 
 
 def _rank_in_box(box: Int[Tensor, "n"], opacity: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
-    """How many of the same box are more opaque; so that a limit thins hands and torso alike."""
+    """Rank by opacity within each box, so that a limit thins all parts of the body evenly."""
     falling = opacity.argsort(descending=True, stable=True)
     order = falling[box[falling].argsort(stable=True)]
     count = torch.bincount(box)
@@ -86,7 +86,7 @@ def _rank_in_box(box: Int[Tensor, "n"], opacity: Float[Tensor, "n"]) -> Int[Tens
 
 
 def _kernel(size: int) -> tuple[Float[Tensor, "s"], Float[Tensor, "s"]]:
-    """For each voxel along an axis: the share of its linear kernel that the window leaves, and the centre of that."""
+    """Mass and centroid of each voxel's linear kernel times the window, along one axis."""
     place = torch.linspace(-1, 1, 4001, dtype=torch.float64)
     spacing = 2 / (size - 1)
     voxel = torch.linspace(-1, 1, size, dtype=torch.float64)[:, None]
@@ -96,7 +96,7 @@ def _kernel(size: int) -> tuple[Float[Tensor, "s"], Float[Tensor, "s"]]:
 
 
 def _quaternions(rotation: Float[Tensor, "k 3 3"]) -> Float[Tensor, "k 4"]:
-    """w, x, y, z."""
+    """Convert rotation matrices to quaternions w, x, y, z."""
     from scipy.spatial.transform import Rotation
 
     turned = Rotation.from_matrix(rotation.detach().cpu().double().numpy()).as_quat()[:, [3, 0, 1, 2]]

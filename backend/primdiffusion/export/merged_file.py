@@ -1,4 +1,4 @@
-"""People as one grid of voxels in a file: .npz for numpy, .vdb for renderers; z up, as Blender has it."""
+"""Write humans as one voxel grid, z up as in Blender: .npz for numpy, .vdb for renderers."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.merge import Merged, merge
 
 Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Blender's axes from the backend's. Grids are turned before they are made: their voxels would not turn afterwards."""
+"""Blender's axes from the backend's; applied before voxelising, because a grid cannot be rotated without resampling."""
 
 
 class NoOpenVDB(ValueError):
-    """This Python cannot write VDB files; the message says what to do."""
+    """This Python cannot write VDB files."""
 
 
 def upright_grid(primitives: Primitives, voxel: float = VOXEL) -> Merged:
-    """All of `primitives` (y up, unbatched) in one grid that is z up. Raises as `merge`."""
+    """Merge `primitives` (y up, unbatched) into one z-up grid. Raises as `merge`."""
     return merge(
         Primitives(
             primitives.position @ Z_UP.T,
@@ -34,7 +34,7 @@ def upright_grid(primitives: Primitives, voxel: float = VOXEL) -> Merged:
 
 
 def write_grid_npz(path: Path, grid: Merged) -> None:
-    """density float16 [X, Y, Z] (1/m), colour float16 [X, Y, Z, 3] (linear), origin [3] and voxel (metres)."""
+    """Write density float16 [X, Y, Z] (1/m), colour float16 [X, Y, Z, 3] (linear), origin [3] and voxel (metres)."""
     with path.open("wb") as file:  # savez would append .npz to a temporary name
         np.savez_compressed(
             file,
@@ -46,18 +46,18 @@ def write_grid_npz(path: Path, grid: Merged) -> None:
 
 
 def check_openvdb() -> None:
-    """Raises NoOpenVDB where there is no module `openvdb`."""
+    """Raise NoOpenVDB if the module `openvdb` is missing."""
     try:
         import openvdb  # noqa: F401
     except ImportError as error:
         raise NoOpenVDB(
-            "this Python has no module openvdb, which writes .vdb files: install it (Debian and Ubuntu: "
-            "python3-openvdb; Blender brings its own), or write an .npz"
+            "writing .vdb needs the module openvdb: install it (Debian and Ubuntu: python3-openvdb; Blender bundles "
+            "its own), or write an .npz"
         ) from error
 
 
 def write_grid_vdb(path: Path, grid: Merged) -> None:
-    """Grids `density` (1/m, a fog volume) and `Cd` (linear RGB), half floats. Raises NoOpenVDB, OSError."""
+    """Write the grids `density` (1/m, a fog volume) and `Cd` (linear RGB) as half floats. Raises NoOpenVDB, OSError."""
     check_openvdb()
     import openvdb
 
@@ -73,5 +73,5 @@ def write_grid_vdb(path: Path, grid: Merged) -> None:
         written.saveFloatAsHalf = True
     try:
         openvdb.write(str(path), grids=[density, colour])
-    except RuntimeError as error:  # also of a full disk
+    except RuntimeError as error:  # raised for a full disk too
         raise OSError(f"{path.name} could not be written: {error}") from error

@@ -1,4 +1,4 @@
-"""A clothed person at rest as one textured mesh that 24 joints move: for programs that draw no volumes."""
+"""Convert a human to one textured mesh in T pose, skinned to 24 joints, for programs without volume rendering."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from jaxtyping import Float, Float32, Float64, Int64, UInt8
 from numpy import ndarray as Array
 from torch import Tensor
 
-from primdiffusion.export.apart import apart
-from primdiffusion.export.field import Field, look_along, pack_field, weights_at
+from primdiffusion.export.field import Field, march_rays, pack_field, weights_at
+from primdiffusion.export.run_in_process import run_in_process
 from primdiffusion.export.simplify import simplified, unwrapped
 from primdiffusion.export.surface import Surface, outside_surface
 from primdiffusion.formats import requests
@@ -24,37 +24,37 @@ from primdiffusion.people.gltf import Skeleton
 from primdiffusion.primitives.anchors import anchor_skin_weights
 
 OUTSIDE = 0.008
-"""Where a texel's ray begins: this far outside the surface, metres."""
+"""Start of a texel's ray: distance outside the surface, metres."""
 INSIDE = 0.024
-"""Where it ends: this far below."""
+"""End of a texel's ray: depth below the surface, metres."""
 STEP = 0.002
 SMOOTHING = 6
-"""How often skin weights are averaged with their neighbours' along the mesh."""
+"""Smoothing iterations of skin weights along the mesh."""
 INFLUENCES = 4
-"""Joints that may move a vertex: what glTF and game engines take."""
+"""Joints per vertex, the limit of glTF and game engines."""
 RAYS_AT_ONCE = 2**16
 OnStage = Callable[[str, int, int], None]
-"""Told now and then what is done: a name, how many of the stages are behind, and how many there are."""
+"""Progress callback: name of the current stage, stages completed, stages in total."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ProxySettings:
-    """How fine the mesh is."""
+    """Resolution of the mesh."""
 
     spacing: float = requests.VOXEL
-    """Of the grid that the surface is found on, metres."""
+    """Grid spacing of the isosurface extraction, metres."""
     triangles: int = requests.TRIANGLES
-    """At most."""
+    """Maximum number of triangles."""
     texture_px: int = requests.TEXTURE_SIZE
-    """Pixels a side of the texture."""
+    """Width and height of the texture, pixels."""
 
     def __post_init__(self) -> None:
         if not 0.003 <= self.spacing <= 0.05:
-            raise ValueError(f"a grid of {self.spacing} m was asked for: choose 0.003 to 0.05")
+            raise ValueError(f"the grid spacing is {self.spacing} m: choose 0.003 to 0.05")
         if not 500 <= self.triangles <= 1_000_000:
-            raise ValueError(f"{self.triangles} triangles were asked for: choose 500 to 1000000")
+            raise ValueError(f"the triangle limit is {self.triangles}: choose 500 to 1000000")
         if not 64 <= self.texture_px <= 8192:
-            raise ValueError(f"a texture of {self.texture_px} pixels a side was asked for: choose 64 to 8192")
+            raise ValueError(f"the texture size is {self.texture_px} pixels: choose 64 to 8192")
 
 
 DEFAULT_PROXY = ProxySettings()
@@ -62,7 +62,7 @@ DEFAULT_PROXY = ProxySettings()
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MeshProxy:
-    """The mesh in the T pose of the person's betas; metres, y up, facing z."""
+    """A mesh in the T pose of the human's betas; metres, y up, facing z."""
 
     vertices: Float64[Array, "v 3"]
     faces: Int64[Array, "f 3"]
@@ -72,11 +72,11 @@ class MeshProxy:
     skin_weights: Float32[Array, "v 24"]
     """At most INFLUENCES joints a vertex; rows sum to one."""
     texture: UInt8[Array, "h w 3"]
-    """sRGB, the top row first."""
+    """sRGB, top row first."""
     skeleton: Skeleton
 
     def mesh(self) -> TexturedMesh:
-        """The same as a mesh of one part."""
+        """Convert to a `TexturedMesh` of one part."""
         index = np.argsort(-self.skin_weights, axis=1, kind="stable")[:, :INFLUENCES]
         weight = np.take_along_axis(self.skin_weights, index, 1).astype(np.float64)
         opaque = np.full((*self.texture.shape[:2], 1), 255, np.uint8)
@@ -93,9 +93,9 @@ class MeshProxy:
 
 
 def mesh_proxy(human: Human, settings: ProxySettings = DEFAULT_PROXY, on_stage: OnStage = lambda *_: None) -> MeshProxy:
-    """The person's outside with colours as the marcher sees them from there.
+    """Extract the outer surface, with colours rendered by the marcher from outside.
 
-    An exception that `on_stage` raises ends the work. Raises NoSurface. Takes some ten seconds.
+    Exceptions raised by `on_stage` cancel. Raises NoSurface. Takes about ten seconds.
     """
     body, anchors = body_of(human)
     field = pack_field(place(human))
@@ -105,17 +105,17 @@ def mesh_proxy(human: Human, settings: ProxySettings = DEFAULT_PROXY, on_stage: 
         on_stage("surface", 0, 3)
 
     fine = outside_surface(field, settings.spacing, meanwhile)
-    surface = Surface(*apart(simplified, *fine, settings.triangles, meanwhile=meanwhile))
+    surface = Surface(*run_in_process(simplified, *fine, settings.triangles, meanwhile=meanwhile))
     weights = skin_weights(field, surface, anchor_skin_weights(anchors, body))
-    corner_uv = apart(unwrapped, *surface, settings.texture_px, meanwhile=lambda: on_stage("unwrap", 1, 3))
-    texture = baked(field, surface, corner_uv, settings.texture_px, lambda: on_stage("texture", 2, 3))
+    corner_uv = run_in_process(unwrapped, *surface, settings.texture_px, meanwhile=lambda: on_stage("unwrap", 1, 3))
+    texture = bake_texture(field, surface, corner_uv, settings.texture_px, lambda: on_stage("texture", 2, 3))
     joints = body.shape(human.betas).joints.detach().double().numpy()
     skeleton = Skeleton(JOINT_NAMES, body.parents.tolist(), joints)
     return MeshProxy(surface.vertices, surface.faces, corner_uv, weights, texture, skeleton)
 
 
 def skin_weights(field: Field, surface: Surface, box_weights: Float[Tensor, "k 24"]) -> Float32[Array, "v 24"]:
-    """The boxes' weights at the vertices, smoothed along the mesh, the largest INFLUENCES of them."""
+    """Skin weights of the vertices: those of the boxes, smoothed along the mesh, limited to INFLUENCES joints."""
     from scipy import sparse
 
     weights = weights_at(field, surface.vertices, box_weights.detach().cpu().numpy())
@@ -125,21 +125,21 @@ def skin_weights(field: Field, surface: Surface, box_weights: Float[Tensor, "k 2
     links = ((links + links.T + sparse.eye_array(count)) > 0).astype(np.float32)
     for _ in range(SMOOTHING):
         weights = links @ weights
-        weights /= np.maximum(weights.sum(1, keepdims=True), 1e-12)  # rows of zeros take what is around them
+        weights /= np.maximum(weights.sum(1, keepdims=True), 1e-12)  # rows of zeros take their neighbours' weights
     weights[weights.sum(1) < 0.5, 0] = 1.0
     largest = np.sort(weights, 1)[:, -INFLUENCES][:, None]
     weights = np.where(weights >= largest, weights, 0)
     return (weights / weights.sum(1, keepdims=True)).astype(np.float32)
 
 
-def baked(
+def bake_texture(
     field: Field,
     surface: Surface,
     corner_uv: Float[Array, "f 3 2"],
     texture_px: int,
     meanwhile: Callable[[], None] = lambda: None,
 ) -> UInt8[Array, "h w 3"]:
-    """What the marcher sees along the normal of every texel, from outside; texels of no chart take the nearest's."""
+    """Bake a texture by marching inwards along each texel's normal; texels outside all charts copy the nearest one."""
     from scipy import ndimage
 
     raster = rasterise_uv(corner_uv, texture_px, texture_px)
@@ -152,7 +152,7 @@ def baked(
     for first in range(0, len(points), RAYS_AT_ONCE):
         some = slice(first, first + RAYS_AT_ONCE)
         starts = points[some] + OUTSIDE * normals[some]
-        colour[some], alpha[some] = look_along(field, starts, -normals[some], OUTSIDE + INSIDE, STEP)
+        colour[some], alpha[some] = march_rays(field, starts, -normals[some], OUTSIDE + INSIDE, STEP)
         meanwhile()
     seen = alpha > 0.1
     picture = np.zeros((texture_px, texture_px, 3), np.float32)
@@ -165,7 +165,7 @@ def baked(
 
 
 def vertex_normals(surface: Surface) -> Float64[Array, "v 3"]:
-    """Unit normals, faces weighted by area."""
+    """Area-weighted unit normals."""
     a, b, c = (surface.vertices[surface.faces[:, corner]] for corner in range(3))
     across = np.cross(b - a, c - a)
     total = np.zeros_like(surface.vertices)

@@ -1,4 +1,4 @@
-"""Mesh proxies as files: glTF and OBJ for other programs, npz and PNG for Blender."""
+"""Write mesh proxies: glTF and OBJ for other programs, npz and PNG for Blender."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ ARRAYS, TEXTURE = "proxy.npz", "proxy.png"
 
 
 def write_proxy_glb(path: str | Path, proxy: MeshProxy, provenance: Mapping[str, Any]) -> None:
-    """One .glb: mesh, texture, skin and skeleton; y up, facing z, as glTF wants it. Raises OSError."""
+    """Write one .glb: mesh, texture, skin and skeleton; y up, facing z, as glTF requires. Raises OSError."""
     with written_whole(path) as unfinished:
         unfinished.write_bytes(glb(proxy.mesh(), proxy.skeleton, {"primdiffusion": dict(provenance)}))
 
 
 def write_proxy_obj(path: str | Path, proxy: MeshProxy) -> None:
-    """An .obj with its .mtl and .png beside it, all or none; without the skin, which OBJ does not know. OSError."""
+    """Write an .obj, its .mtl and .png, all or none; OBJ has no skinning. Raises OSError."""
     path = Path(path)
     name = path.stem
     normals = vertex_normals(Surface(proxy.vertices, proxy.faces))
@@ -44,7 +44,7 @@ def write_proxy_obj(path: str | Path, proxy: MeshProxy) -> None:
 
 
 def write_proxy_arrays(folder: Path, proxy: MeshProxy) -> None:
-    """ARRAYS and TEXTURE, for Blender.
+    """Write ARRAYS and TEXTURE for Blender.
 
     vertices [V,3], faces [F,3], uv_corner [F,3,2] (v up), skin_weights [V,24], joints [24,3], joint_names [24]; metres,
     y up, facing z. Raises OSError.

@@ -1,4 +1,4 @@
-"""Triangle meshes made coarser and unwrapped; imports no torch, so that a process for it starts at once."""
+"""Simplify and unwrap triangle meshes; does not import torch, so that its process starts quickly."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from numpy import ndarray as Array
 SEAM = 4
 """Texels between charts."""
 CHART_COST = 8.0
-"""xatlas's largest cost of a chart: its 2 cuts a noisy surface into many more."""
+"""Maximum cost of a chart; xatlas's default of 2 cuts noisy surfaces into many more charts."""
 
 
 class NoUnwrapping(ValueError):
-    """This Python lacks what unwraps meshes; the message says what to do."""
+    """xatlas is not available for this Python."""
 
 
 def simplified(
     vertices: Float64[Array, "v 3"], faces: Int64[Array, "f 3"], triangles: int
 ) -> tuple[Float64[Array, "w 3"], Int64[Array, "g 3"]]:
-    """A closed mesh with at most `triangles` triangles, by quadric edge collapses (libigl)."""
+    """Simplify a closed mesh to at most `triangles` triangles by quadric edge collapse (libigl)."""
     if len(faces) <= triangles:
         return vertices, faces
     import igl  # slow to load
@@ -29,13 +29,13 @@ def simplified(
 
 
 def unwrapped(vertices: Float64[Array, "v 3"], faces: Int64[Array, "f 3"], texture_px: int) -> Float64[Array, "f 3 2"]:
-    """Texture coordinates of every corner, in charts that do not overlap (xatlas). Raises NoUnwrapping."""
+    """Compute texture coordinates of every corner in non-overlapping charts (xatlas). Raises NoUnwrapping."""
     try:
         import xatlas
     except ModuleNotFoundError as error:  # it has no package for Python 3.14 or Linux on ARM
         raise NoUnwrapping(
-            "a textured mesh cannot be made here: xatlas, which unwraps it, has no package for this Python and "
-            "machine; use Blender with Python 3.11 or 3.13 on x86-64 or Apple Silicon, or export as Gaussians or VDB"
+            "textured meshes need xatlas, which has no package for this Python and machine: use Python 3.11 or 3.13 "
+            "on x86-64 or Apple Silicon, or export Gaussians or VDB"
         ) from error
 
     atlas, charts, packing = xatlas.Atlas(), xatlas.ChartOptions(), xatlas.PackOptions()

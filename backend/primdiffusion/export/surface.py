@@ -1,4 +1,4 @@
-"""A person's outside as triangles: the opacity isosurface of their boxes, without what nobody sees."""
+"""Extract the outer surface of a human: an isosurface of density, without hidden cavities."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from numpy import ndarray as Array
 from primdiffusion.export.field import Field, density_at
 
 LEVEL = 12.0
-"""Density at which a person begins, 1/m: then the silhouettes of mesh and marched picture have the same area. It is
-that low because rays that graze somebody are long."""
+"""Isosurface density, 1/m: gives mesh and marched image silhouettes of equal area. It is low because grazing rays are
+long."""
 SMALLEST_PIECE = 5e-5
-"""Volume below which a loose piece is dropped, cubic metres."""
+"""Volume below which a disconnected piece is dropped, cubic metres."""
 GAP = 0.012
-"""Openings narrower than this are closed before the inside is filled, metres."""
+"""Openings narrower than this are closed before cavities are filled, metres."""
 POINTS_AT_ONCE = 2**19
-THIN = "nothing of this person is dense enough to have a surface: generate them again"
+THIN = "this human is nowhere dense enough to have a surface: generate it again"
 
 
 class NoSurface(ValueError):
-    """A person of whom nothing is dense enough to have a surface."""
+    """The density never reaches the isosurface level."""
 
 
 class Surface(NamedTuple):
@@ -44,12 +44,11 @@ class DensityGrid(NamedTuple):
 
 
 def outside_surface(field: Field, spacing: float, meanwhile: Callable[[], None] = lambda: None) -> Surface:
-    """The surface that is seen from outside, as fine as the grid; cavities are filled, crumbs dropped.
+    """Extract the outer surface by marching cubes (libigl); cavities are filled, small pieces dropped.
 
-    Marching cubes (libigl's) on a grid of `spacing` metres. `meanwhile` is called now and then, and what it raises ends
-    the work. Raises NoSurface.
+    `spacing` is the grid's in metres. `meanwhile` is called regularly; exceptions it raises cancel. Raises NoSurface.
     """
-    import igl  # 16 MB, and only this needs it
+    import igl  # large, and used only here
 
     grid = density_grid(field, spacing, meanwhile)
     solid = filled(grid.density > LEVEL, spacing)
@@ -65,7 +64,7 @@ def outside_surface(field: Field, spacing: float, meanwhile: Callable[[], None] 
 
 
 def density_grid(field: Field, spacing: float, meanwhile: Callable[[], None] = lambda: None) -> DensityGrid:
-    """The field on a grid around all of it, three empty points on every side."""
+    """Sample the field on a grid around all boxes, padded by three empty points on every side."""
     margin = 3 * spacing
     reach = np.abs(np.linalg.inv(field.to_local)).sum(-1)
     low = (field.position - reach).min(0) - margin
@@ -81,16 +80,16 @@ def density_grid(field: Field, spacing: float, meanwhile: Callable[[], None] = l
 
 
 def filled(solid: Bool[Array, "x y z"], spacing: float) -> Bool[Array, "x y z"]:
-    """The solid with its cavities, also those with openings narrower than GAP."""
+    """Fill cavities, including those with openings narrower than GAP."""
     from scipy import ndimage
 
     closed = np.asarray(ndimage.binary_closing(solid, iterations=max(round(GAP / 2 / spacing), 1)))
     inside = np.asarray(ndimage.binary_fill_holes(closed))
-    return solid | (inside & np.logical_not(closed))  # what only the closing has added is a gap of the person's own
+    return solid | (inside & np.logical_not(closed))  # gaps that only the closing filled stay open
 
 
 def depth_below(field: Field, points: Float64[Array, "n 3"], spacing: float = 0.008) -> Float64[Array, "n"]:
-    """How far points are from the nearest place outside, metres, to within `spacing`; 0 outside."""
+    """Depth of points below the outer surface, metres, accurate to `spacing`; 0 outside."""
     from scipy import ndimage
 
     grid = density_grid(field, spacing)
@@ -100,7 +99,7 @@ def depth_below(field: Field, points: Float64[Array, "n 3"], spacing: float = 0.
 
 
 def _cubes_across(solid: Array) -> tuple[Int64[Array, "n"], Int64[Array, "c 8"]]:
-    """Flat indices of the grid points of cubes that the surface crosses, and these cubes in libigl's corner order."""
+    """Flat grid indices of the corners of cubes that the surface crosses, and the cubes in libigl's corner order."""
     inner = tuple(size - 1 for size in solid.shape)
     count = np.zeros(inner, np.int8)
     offsets = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
@@ -113,7 +112,7 @@ def _cubes_across(solid: Array) -> tuple[Int64[Array, "n"], Int64[Array, "c 8"]]
 
 
 def _large_pieces(vertices: Array, faces: Array) -> Surface:
-    """Without pieces of less than SMALLEST_PIECE, cavities among them: their volume is negative."""
+    """Drop pieces smaller than SMALLEST_PIECE, and cavities, whose volume is negative."""
     from scipy import sparse
     from scipy.sparse import csgraph
 

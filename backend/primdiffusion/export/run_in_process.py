@@ -1,7 +1,6 @@
-"""Work of libraries that keep Python to themselves, in a process of its own.
+"""Run a function in a separate process, for libraries that hold the GIL.
 
-igl and xatlas hold the interpreter's lock for seconds: nobody could cancel meanwhile, and the serving child would look
-dead to its parent.
+igl and xatlas hold it for seconds: calls could not be cancelled, and the serving child would look dead to its parent.
 """
 
 from __future__ import annotations
@@ -13,18 +12,18 @@ from typing import Any
 
 from primdiffusion.worker_process import end_with_parent
 
-GLANCE_S = 0.2
+POLL_S = 0.2
 
 
-class EndedEarly(RuntimeError):
-    """The process died without an answer."""
+class ProcessDied(RuntimeError):
+    """The process exited without returning a result."""
 
 
-def apart(function: Callable[..., Any], *arguments: Any, meanwhile: Callable[[], None]) -> Any:
-    """What `function`, of a module that is quick to import, returns; arguments and answer are pickled on the way.
+def run_in_process(function: Callable[..., Any], *arguments: Any, meanwhile: Callable[[], None]) -> Any:
+    """Return `function(*arguments)`, computed in a spawned process; arguments and result are pickled.
 
-    `meanwhile` is called every GLANCE_S; what it raises ends the process at once. Raises what the function does, or
-    EndedEarly.
+    The process imports the function's module, so that module should import quickly. `meanwhile` is called every
+    POLL_S; an exception it raises kills the process. Raises the function's own exceptions, and ProcessDied.
     """
     context = multiprocessing.get_context("spawn")
     answers, answering = context.Pipe(duplex=False)
@@ -32,11 +31,11 @@ def apart(function: Callable[..., Any], *arguments: Any, meanwhile: Callable[[],
     process.start()
     answering.close()
     try:
-        while not answers.poll(GLANCE_S):
+        while not answers.poll(POLL_S):
             meanwhile()
         done, answer = answers.recv()
     except EOFError as e:
-        raise EndedEarly(f"{function.__name__} ended without an answer, perhaps for want of memory: try again") from e
+        raise ProcessDied(f"the process of {function.__name__} died, perhaps out of memory: try again") from e
     finally:
         process.kill()
         process.join()

@@ -1,4 +1,4 @@
-"""Generated people before the judge: stored people's portraits, copies told from new people, the command."""
+"""Generated humans compared with a reference set: cached portraits, detection of copies, the command."""
 
 import json
 
@@ -8,7 +8,7 @@ from diffusion_people import write_people
 from primdiffusion.evaluation import command
 from primdiffusion.evaluation.attribute_network import features_of
 from primdiffusion.evaluation.gallery import made_gallery, payload_of, read_attributes, stored_gallery
-from primdiffusion.evaluation.generation import COLUMNS, floor, liken, open_judge, table
+from primdiffusion.evaluation.generation import COLUMNS, compare, open_reference_set, real_vs_real, table
 from primdiffusion.evaluation.neighbours import nearest_stored
 from primdiffusion.evaluation.portraits import PORTRAITS, SIDE, camera_of
 from primdiffusion.people.payloads import rest_frames
@@ -34,14 +34,14 @@ def people(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def judge_folder(tmp_path_factory):
+def reference_folder(tmp_path_factory):
     return tmp_path_factory.mktemp("judge")
 
 
 @pytest.fixture(scope="module")
-def judge(people, judge_folder):
+def reference(people, reference_folder):
     train, held = split_people(find_people(people), 0.34, 0)
-    return open_judge(train, held, judge_folder, read_person)
+    return open_reference_set(train, held, reference_folder, read_person)
 
 
 def test_cameras_see_the_parts_they_are_named_for():
@@ -86,37 +86,37 @@ def test_stored_portraits_are_of_the_stored_payload(people, tmp_path):
 
 def test_a_file_without_attributes_is_named(tmp_path):
     (tmp_path / "person.npz").write_bytes(b"nothing")
-    with pytest.raises(ValueError, match=r"person\.npz is no person's payload"):
+    with pytest.raises(ValueError, match=r"person\.npz"):
         read_attributes(tmp_path / "person.npz", 1)
 
 
-def test_copies_of_training_people_are_told_from_new_people(judge):
-    copies = liken(judge, judge.train_features)
+def test_copies_of_training_samples_are_told_from_new_ones(reference):
+    copies = compare(reference, reference.train_features)
     assert copies.nearest_ratio == pytest.approx(0, abs=1e-6)
-    assert liken(judge, judge.held_features).nearest_ratio == pytest.approx(1)
-    assert floor(judge, 8).nearest_ratio > 0.05
+    assert compare(reference, reference.held_features).nearest_ratio == pytest.approx(1)
+    assert real_vs_real(reference, 8).nearest_ratio > 0.05
 
 
-def test_people_far_from_all_real_ones_are_far_and_not_precise(judge):
-    real = floor(judge, 8)
-    strange = liken(judge, judge.held_features + 100 * judge.train_features.std())
+def test_people_far_from_all_real_ones_are_far_and_not_precise(reference):
+    real = real_vs_real(reference, 8)
+    strange = compare(reference, reference.held_features + 100 * reference.train_features.std())
     assert strange.frechet > 10 * real.frechet
     assert strange.kernel > real.kernel
     assert strange.precision == 0
 
 
-def test_judge_is_read_back_from_its_folder(people, judge, judge_folder):
+def test_reference_set_is_read_back_from_its_folder(people, reference, reference_folder):
     def unread(path):
         raise AssertionError(path)
 
     train, held = split_people(find_people(people), 0.34, 0)
-    again = open_judge(train, held, judge_folder, unread)
-    assert torch.equal(judge.held_features, again.held_features)
+    again = open_reference_set(train, held, reference_folder, unread)
+    assert torch.equal(reference.held_features, again.held_features)
     assert torch.equal(features_of(again.network, again.train.pictures), again.train_features)
 
 
-def test_table_has_a_row_for_each_set(judge):
-    lines = table({"one": liken(judge, judge.held_features)}).splitlines()
+def test_table_has_a_row_for_each_set(reference):
+    lines = table({"one": compare(reference, reference.held_features)}).splitlines()
     assert len({line.count("|") for line in lines}) == 1
     assert lines[0].count("|") == len(COLUMNS) + 2
     assert lines[2].startswith("| one | 4 |")
@@ -131,7 +131,7 @@ def test_nearest_stored_person_of_a_stored_person_is_that_person(people):
     assert float(found.distance.max()) == pytest.approx(0, abs=1e-3)
     without = nearest_stored(queries, [*paths[:2], paths[3], paths[5]], read_person, model.encode)
     assert float(without.distance.min()) > 1e-3
-    with pytest.raises(ValueError, match="no people"):
+    with pytest.raises(ValueError, match="payload files"):
         nearest_stored(queries, [], read_person, model.encode)
 
 
@@ -139,15 +139,15 @@ def stage_two():
     return command.StageTwo(lambda path: tiny_model(), find_people, split_people, read_person)
 
 
-def test_command_compares_generated_people_and_writes_figures(people, judge, judge_folder, tmp_path, capsys):
-    line = ["generation", "--people", str(people), "--judge", str(judge_folder), "--holdout", "0.34"]
+def test_command_compares_generated_people_and_writes_figures(people, reference, reference_folder, tmp_path, capsys):
+    line = ["generation", "--people", str(people), "--judge", str(reference_folder), "--holdout", "0.34"]
     line += ["--count", "5", "--steps", "2", "--json", str(tmp_path / "new" / "figures.json")]
     command.run(line, lambda path: None, stage_two)
     assert "| generated | 5 |" in capsys.readouterr().out
     figures = json.loads((tmp_path / "new" / "figures.json").read_text())
     assert set(figures["people"]) == {"generated", "trained on"}
     assert set(figures["people"]["generated"]) == set(COLUMNS)
-    assert figures["feature_accuracy"] == judge.held_accuracies
+    assert figures["feature_accuracy"] == reference.held_accuracies
 
 
 def test_command_refuses_too_few_people_before_it_works(people, tmp_path):
