@@ -70,7 +70,7 @@ def test_only_the_layers_asked_for_are_computed(weights):
 
 def test_a_file_of_another_network_is_refused(tmp_path):
     torch.save(PictureFeatures(VGG16, ["relu5_3"]).state_dict(), tmp_path / "vgg16.pth")
-    with pytest.raises(WeightsFileError, match=r"vgg16\.pth has .*give a file of torchvision's VGG19"):
+    with pytest.raises(WeightsFileError, match=r"vgg16\.pth has .*VGG19"):
         load_perceptual(tmp_path / "vgg16.pth")
 
 
@@ -78,7 +78,7 @@ def test_weights_that_are_not_finite_are_refused(weights, tmp_path):
     state = torch.load(weights, weights_only=True)
     state["features.0.bias"][0] = torch.nan
     torch.save(state, tmp_path / "nan.pth")
-    with pytest.raises(WeightsFileError, match=r"NaN or infinite values in 'features\.0\.bias'"):
+    with pytest.raises(WeightsFileError, match=r"features\.0\.bias.* has NaN"):
         load_perceptual(tmp_path / "nan.pth")
 
 

@@ -79,9 +79,9 @@ def test_damaged_people_are_made_anew_and_whole_ones_kept(assets, two):
 
 
 def test_other_sets_of_people_are_refused(assets, two):
-    with pytest.raises(OtherPeopleError, match="holds 2 people from seed 3, but 2 people from seed 4 were asked for"):
+    with pytest.raises(OtherPeopleError, match="2 samples from seed 3, but 2 from seed 4"):
         list(make_people(assets, PeopleSet(two, 4, 2), 1))
-    with pytest.raises(OtherPeopleError, match="holds person_000004"):
+    with pytest.raises(OtherPeopleError, match="person_000004"):
         list(make_people(assets, PeopleSet(two, 3, 1), 1))
 
 

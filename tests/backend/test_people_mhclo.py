@@ -59,9 +59,7 @@ def test_proxy_vertex_is_hidden_only_if_all_its_references_are():
     assert parse_mhclo(MHCLO).hidden_by(hidden).tolist() == [False, True, False]
 
 
-@pytest.mark.parametrize(
-    ("text", "words"), [("name x\nverts 0\n", "lists no vertices"), ("verts 0\n1 2 3 4\n", "4 val")]
-)
+@pytest.mark.parametrize(("text", "words"), [("name x\nverts 0\n", "no vertices"), ("verts 0\n1 2 3 4\n", "4 val")])
 def test_damaged_mhclo_is_refused_with_what_is_wrong(text, words):
     with pytest.raises(ProxyFileError, match=words):
         parse_mhclo(text)
@@ -81,5 +79,5 @@ def test_faces_that_name_missing_vertices_are_refused():
 def test_files_of_different_size_are_refused_with_both_counts(tmp_path):
     (tmp_path / "a.mhclo").write_text(MHCLO)
     (tmp_path / "a.obj").write_text(OBJ)
-    with pytest.raises(ProxyFileError, match=r"places 3 vertices.*has 4"):
+    with pytest.raises(ProxyFileError, match=r"3 vertices.*has 4"):
         read_pair(tmp_path / "a.mhclo", tmp_path / "a.obj")

@@ -162,7 +162,7 @@ def test_a_cancel_ends_an_edit_within_a_step_and_leaves_nothing(child, people, a
         ("inpaint", {"region": [1]}, INVALID_PARAMS, None, "give a list of names of parts"),
         ("inpaint", {"region": {"vertices": "x"}}, INVALID_PARAMS, None, "give a list of names of parts"),
         ("inpaint", {"region": "top"}, INVALID_PARAMS, None, "inpaint.region"),
-        ("inpaint", {"region": ["hat"]}, DOMAIN_ERROR, "bad_input", "no part of the body 'hat'"),
+        ("inpaint", {"region": ["hat"]}, DOMAIN_ERROR, "bad_input", "part of the body 'hat'"),
         ("inpaint", {"region": ["clothes", "skin", "hair"]}, DOMAIN_ERROR, "bad_input", "the whole person"),
         ("inpaint", {"region": {"weights": "/no.npz"}}, DOMAIN_ERROR, "missing_file", "/no.npz"),
         ("transfer", {"what": "soul"}, INVALID_PARAMS, None, "transfer.what"),

@@ -1,4 +1,4 @@
-"""Dressed people from a MakeHuman asset folder: what the networks are trained on."""
+"""Generate dressed, rigged humans from MakeHuman assets: the training data."""
 
 from primdiffusion.people.assets import Assets, AssetsMissingError, open_assets
 from primdiffusion.people.base_mesh import BaseMesh, load_base_mesh

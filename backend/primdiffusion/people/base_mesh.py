@@ -1,7 +1,7 @@
-"""MakeHuman's whole base mesh (hm08), at the default body's betas: what clothes, hair and eyes are fitted to.
+"""MakeHuman's full base mesh (hm08) as a function of the default body's betas; clothes, hair and eyes are fitted to it.
 
-Asset files (.mhclo) refer to its 19,158 vertices by number; the visible body is a part of it, the rest is reference
-geometry around it. Rest pose, axes and betas are the default body's (`body.model.default_body`).
+Asset files (.mhclo) refer to its 19,158 vertices by index; part of them is the visible body, the rest are helper
+vertices around it. Rest pose, axes and betas are the default body's (`body.model.default_body`).
 """
 
 from __future__ import annotations
@@ -16,35 +16,35 @@ from jaxtyping import Float, Int
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BaseMesh:
-    """A linear model of the base mesh. Its arrays are shared: never write to them."""
+    """A linear shape model of the base mesh. Its arrays are shared: never write to them."""
 
     template: Float[np.ndarray, "19158 3"]
-    """At zero betas, metres, float64."""
+    """Vertices at zero betas, metres, float64."""
     shape_basis: Float[np.ndarray, "19158 3 10"]
-    """What a unit of each beta adds, metres; within 0.1 mm of the default body's at any plausible betas."""
+    """Displacement per unit of each beta, metres; within 0.1 mm of the default body's at plausible betas."""
     joint_index: Int[np.ndarray, "19158 4"]
-    """The joints (of 24) that move a vertex."""
+    """Joints (of 24) that move each vertex."""
     joint_weight: Float[np.ndarray, "19158 4"]
-    """Their weights; each row sums to one."""
+    """Skin weights of these joints; rows sum to one."""
     faces: Int[np.ndarray, "F 3"]
-    """The visible body only, in base mesh numbers and in the order of the default body's faces."""
+    """Faces of the visible body, indexing the base mesh, in the order of the default body's faces."""
     uv: Float[np.ndarray, "T 2"]
-    """The skin textures' coordinates, v up."""
+    """Texture coordinates of the skin, v up."""
     uv_faces: Int[np.ndarray, "F 3"]
-    """The texture coordinate of each face's corners."""
+    """Index into `uv` of each face's corners."""
     rest_from_native: Float[np.ndarray, "24 3 3"]
-    """Each joint's turn from MakeHuman's own pose (arms lowered) to the rest pose, world axes.
+    """Rotation of each joint from MakeHuman's own pose (arms lowered) to the rest pose, world axes.
 
-    Offsets in .mhclo files are vectors in MakeHuman's pose: turn them by the blend of these before adding them.
+    Offsets in .mhclo files are vectors in MakeHuman's pose: rotate them by the blend of these before adding them.
     """
     sample_betas: Float[np.ndarray, "N 10"]
-    """Betas of the adults the shape space was fitted to; mean 0, standard deviation 1 in each component."""
+    """Betas of the adults that the shape space was fitted to; mean 0, standard deviation 1 in each component."""
     sample_phenotypes: Float[np.ndarray, "N 11"]
-    """What they were made from, each in [0, 1]; columns named by `phenotype_names` (gender 1 is female)."""
+    """Their MakeHuman parameters in [0, 1]; columns named by `phenotype_names` (gender 1 is female)."""
     phenotype_names: tuple[str, ...]
 
     def vertices(self, betas: Float[np.ndarray, "10"]) -> Float[np.ndarray, "19158 3"]:
-        """The base mesh of a person, metres, float64."""
+        """Vertices at given betas, metres, float64."""
         return self.template + self.shape_basis[..., : len(betas)] @ np.asarray(betas, np.float64)
 
     @property
@@ -55,7 +55,7 @@ class BaseMesh:
 
 @functools.cache
 def load_base_mesh() -> BaseMesh:
-    """The base mesh that ships with the package."""
+    """Load the base mesh that ships with the package."""
     with (
         importlib.resources.as_file(importlib.resources.files("primdiffusion.people") / "data/hm08.npz") as path,
         np.load(path) as f,

@@ -1,10 +1,10 @@
-"""Skin under cloth: which of it never shows and is left out, and how far the rest of it steps back.
+"""Prevent skin from poking through clothes: hide covered skin, and sink the strip of it that remains at hems.
 
-Body and clothes are skinned apart, so where they lie close, a bend of the body pushes skin through cloth. Two remedies,
-found once for each garment on the average body and good for all bodies and poses:
+Body and clothes are skinned separately, so bending can push skin through cloth close to it. Two remedies, computed once
+for each garment on the average body and valid for all bodies and poses:
 
-- skin that lies under cloth and far from every hem (along the body's surface) is left out;
-- the strip that remains under the hem, so that one can look a little way into a sleeve, is sunk below the cloth.
+- skin under cloth and far from every hem (along the body's surface) is removed;
+- a strip of skin is kept under the hem, because sleeves can be looked into, and sunk below the cloth.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ from primdiffusion.people.base_mesh import BaseMesh
 from primdiffusion.people.fitting import fit_item
 
 REACH_OUT, REACH_IN = 0.045, 0.015
-"""Cloth this far outside of the skin, or inside of it, covers it; metres."""
+"""Largest distance of covering cloth outside the skin, and inside it, metres."""
 STRIP = 0.012
-"""Width of the strip of skin that is kept under a hem, metres."""
+"""Width of the strip of skin kept under a hem, metres."""
 GAP_SHARE = 1.0
-"""The strip is wider by this share of the gap between skin and cloth, since one sees further into wide openings."""
+"""Additional width of the strip per metre of gap between skin and cloth: wide openings reveal more."""
 SINK, CLEARANCE = 0.006, 0.003
-"""How far the strip is sunk at its inner edge, and below cloth that lies inside of the skin; metres."""
+"""How far the strip is sunk at its inner edge, and below cloth that lies inside the skin, metres."""
 GRID = 1e-4
-"""Distances are rounded to this many metres before they are compared, so that every machine decides alike."""
+"""Distances are rounded to this many metres before comparisons, so that results do not depend on the machine."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Cover:
-    """What one garment does to the skin of the base mesh."""
+    """Effect of one garment on the skin of the base mesh."""
 
     hidden: Bool[np.ndarray, " B"]
-    """Vertices that never show."""
+    """Vertices that are never visible."""
     sink: Float[np.ndarray, " B"]
-    """How far each vertex goes inwards, metres."""
+    """Inward displacement of each vertex, metres."""
 
 
 @functools.lru_cache(maxsize=32)
 def cover(assets: Assets, base: BaseMesh, path: str) -> Cover:
-    """What a garment covers, from rays along the skin's normals on the average body. Takes a second, once."""
+    """Find what a garment covers by casting rays along the skin's normals of the average body. Takes one second."""
     vertices = base.template
     _, mesh = assets.proxy(path)
     skin = np.unique(base.faces)
@@ -67,13 +67,13 @@ def cover(assets: Assets, base: BaseMesh, path: str) -> Cover:
 
 
 def sunk(vertices: Float[np.ndarray, "B 3"], base: BaseMesh, covers: tuple[Cover, ...]) -> Float[np.ndarray, "B 3"]:
-    """The body's vertices with what several garments cover sunk below them."""
+    """Sink the covered vertices of the body below its garments."""
     depth = np.max([garment.sink for garment in covers], axis=0)
     return vertices - depth[:, None] * normals(vertices, base.faces)
 
 
 def normals(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V 3"]:
-    """Outward unit normals of vertices, weighted by area; zero where no face is."""
+    """Area-weighted unit normals of vertices, outwards; zero for vertices without faces."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros_like(vertices)
@@ -83,7 +83,7 @@ def normals(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -
 
 
 def _distance(base: BaseMesh, vertices: Float[np.ndarray, "B 3"], bare: Bool[np.ndarray, " B"]) -> np.ndarray:
-    """The way along the skin's edges from each vertex to the nearest bare one, metres; inf where there is none."""
+    """Distance along edges from each vertex to the nearest bare one, metres; inf if unreachable."""
     edges = np.unique(np.sort(base.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
     graph = coo_matrix((length, (edges[:, 0], edges[:, 1])), shape=(len(vertices), len(vertices))).tocsr()
@@ -92,7 +92,7 @@ def _distance(base: BaseMesh, vertices: Float[np.ndarray, "B 3"], bare: Bool[np.
 
 @njit(cache=True)
 def _gaps(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray, out: float, inward: float) -> np.ndarray:
-    """The signed distance from each point along its direction to the nearest triangle, inf beyond the reaches."""
+    """Signed distance from each point along its direction to the nearest triangle; inf if out of range."""
     gap = np.full(len(origin), np.inf)
     middle = (corners[:, 0] + corners[:, 1] + corners[:, 2]) / 3
     for t in range(len(corners)):

@@ -1,4 +1,4 @@
-"""Eyes of natural colours: the pack's irises keep their pattern and get the hues that people's have."""
+"""Eye textures in natural colours: the pack's irises with their hue replaced."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from primdiffusion.people.colour import bytes_from_lab, lab_from_bytes
 SIZE = 256
 FOLDER = "eyes/materials"
 WHITE_CHROMA, IRIS_CHROMA = 9.0, 20.0
-"""Lab chroma up to which a texel counts as white of the eye, and from which as iris."""
+"""Lab chroma below which a texel is sclera, and above which it is iris."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Iris:
-    """One of the pack's pictures and what becomes of it."""
+    """Recolouring of one of the pack's iris images."""
 
     share: float
-    """How often light-skinned people have it."""
+    """Relative frequency with light skin."""
     hue: tuple[float, float]
-    """a and b (Lab) in the middle of the iris."""
+    """Median a and b (Lab) of the iris."""
     lightness: float
-    """Factor."""
+    """Factor on lightness."""
     dark: bool = False
-    """Dark-skinned people have it, too."""
+    """Whether it is equally frequent with dark skin."""
 
 
 IRISES = {
@@ -43,19 +43,19 @@ IRISES = {
 
 
 def draw_eyes(assets: Assets, tone: float, draws: np.random.Generator) -> str:
-    """The name of an iris; dark skin (tone near 1) goes with brown eyes."""
-    there = {name: iris for name, iris in IRISES.items() if assets.has_picture(picture_of(name))} or IRISES
-    shares = np.array([iris.share * (1 if iris.dark else (1 - tone) ** 2) for iris in there.values()])
-    return list(there)[draws.choice(len(there), p=shares / shares.sum())]
+    """Draw the name of an iris; dark skin (tone near 1) comes with brown eyes."""
+    available = {name: iris for name, iris in IRISES.items() if assets.has_picture(picture_of(name))} or IRISES
+    shares = np.array([iris.share * (1 if iris.dark else (1 - tone) ** 2) for iris in available.values()])
+    return list(available)[draws.choice(len(available), p=shares / shares.sum())]
 
 
 def picture_of(name: str) -> str:
-    """Where the picture of an iris is, without ending."""
+    """Path of an iris image, without extension."""
     return f"{FOLDER}/{name}_eye"
 
 
 def eye_texture(assets: Assets, name: str) -> UInt8[np.ndarray, "H W 4"]:
-    """The texture of both eyes."""
+    """Make the texture of both eyes."""
     iris, texture = IRISES[name], assets.picture(picture_of(name), SIZE).copy()
     lab = lab_from_bytes(texture[..., :3])
     chroma = np.hypot(lab[..., 1], lab[..., 2])

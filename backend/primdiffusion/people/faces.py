@@ -1,8 +1,8 @@
-"""Faces that differ: small smooth moves of the base mesh about features of the average face.
+"""Vary faces: small smooth displacements of the base mesh at facial features.
 
-The ten betas say how tall, heavy or old a body is and leave everybody the same features. Each move here is a
-bell-shaped displacement about a point and its mirror image, a few millimetres at most; eyes, brows and hair, which ride
-on the base mesh, follow. The mean of some moves is not zero: the pack's faces frown and their lips stand apart.
+The ten betas describe height, weight and age but do not vary facial features. Each move is a Gaussian displacement
+around a point and its mirror image, a few millimetres at most; eyes, brows and hair are fitted to the base mesh and
+follow. Some moves have a nonzero mean: the pack's neutral face frowns and its lips are parted.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from jaxtyping import Float
 from primdiffusion.people.base_mesh import BaseMesh
 
 MOUTH_HEIGHT = 0.4072
-"""Where the average face's lips meet, metres in the rest pose."""
+"""Height at which the average face's lips meet, metres in the rest pose."""
 LIP_REACH, LIP_WIDTH = 0.0045, 0.027
-"""How far from the rims closing them is felt, and half the width of the mouth; metres."""
+"""Falloff of the closing of the lips around their rims, and half the width of the mouth, metres."""
 LIMIT = 2.0
-"""No move is further from its mean than so many standard deviations."""
+"""Moves are clipped to this many standard deviations from their mean."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Move:
-    """One way in which faces differ, a standard deviation or mean of 1 being 1 mm or, for `stretch`, a share."""
+    """A displacement; `deviation` and `mean` are in millimetres, or relative for `stretch`."""
 
     at: tuple[float, float, float]
-    """On the average face's left half, metres."""
+    """Centre on the left half of the average face, metres."""
     radius: float
-    """Standard deviation of the bell, metres."""
+    """Standard deviation of the Gaussian, metres."""
     along: tuple[float, float, float]
     """Unit direction on the left; x is mirrored on the right."""
     deviation: float
     mean: float = 0.0
     stretch: bool = False
-    """Lengthens what is there about the face's middle plane and the point's height, instead of shifting it."""
+    """Scales the region about its centre (and mirrored centre) instead of shifting it."""
 
 
 MOVES = (
@@ -59,7 +59,7 @@ MOVES = (
 
 
 def draw_face(draws: np.random.Generator) -> Float[np.ndarray, " M"]:
-    """How much of each move a person has."""
+    """Draw the amount of each move."""
     deviation = np.array([move.deviation for move in MOVES])
     mean = np.array([move.mean for move in MOVES])
     return mean + deviation * np.clip(draws.standard_normal(len(MOVES)), -LIMIT, LIMIT)
@@ -68,14 +68,14 @@ def draw_face(draws: np.random.Generator) -> Float[np.ndarray, " M"]:
 def with_face(
     vertices: Float[np.ndarray, "B 3"], base: BaseMesh, amounts: Float[np.ndarray, " M"]
 ) -> Float[np.ndarray, "B 3"]:
-    """A person's base mesh with closed lips and features of their own."""
+    """Apply moves and close the lips of a base mesh."""
     fields, closing = _fields(base)
     return vertices + closing + np.einsum("m,mvc->vc", amounts, fields)
 
 
 @functools.lru_cache(maxsize=2)
 def _fields(base: BaseMesh) -> tuple[Float[np.ndarray, "M B 3"], Float[np.ndarray, "B 3"]]:
-    """What one unit of each move adds to the base mesh, and what closes the lips."""
+    """Displacement per unit of each move, and the displacement that closes the lips."""
     fields = [sum(_bell(move, base.template, side) for side in _sides(move)) for move in MOVES]
     return np.stack(fields), _closed_lips(base)
 
@@ -93,7 +93,7 @@ def _bell(move: Move, vertices: Float[np.ndarray, "B 3"], side: int) -> Float[np
 
 
 def _closed_lips(base: BaseMesh) -> Float[np.ndarray, "B 3"]:
-    """Both rims of the mouth, the open edges of the skin there, meet halfway; lips near them go along."""
+    """Displacement that moves both rims of the mouth (boundary edges of the skin) halfway, with a falloff around."""
     edges = np.sort(base.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     unique, count = np.unique(edges, axis=0, return_counts=True)
     rim = np.unique(unique[count == 1])
@@ -125,7 +125,7 @@ def _closed_lips(base: BaseMesh) -> Float[np.ndarray, "B 3"]:
 
 
 def _middle_line(rim: Float[np.ndarray, "R 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Places along x and the height halfway between the lips there."""
+    """Sample points along x, and the height halfway between the lips at each."""
     x = np.linspace(-LIP_WIDTH, LIP_WIDTH, 13)
     near = [np.abs(rim[:, 0] - at) < 0.004 for at in x]
     height = [(rim[here, 1].min() + rim[here, 1].max()) / 2 if here.any() else MOUTH_HEIGHT for here in near]

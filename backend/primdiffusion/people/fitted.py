@@ -1,8 +1,8 @@
-"""Payloads of a person that show in pictures what the mesh shows: `from_mesh`, then fitted to renders of the mesh.
+"""Fit payloads to renders of a textured mesh, starting from `from_mesh`.
 
-A voxel of `from_mesh` takes the colour of the nearest surface point, which blurs where boxes overlap: the marcher mixes
-some four of them at every point. Fitting lets them share the work. Cameras are the same for everybody, so the same
-person gives the same payload and similar people similar ones, which a network can learn.
+`from_mesh` gives each voxel the colour of the nearest surface point, which blurs because about four boxes overlap at
+every point. Fitting optimises the sum of the overlapping boxes instead. All samples use the same cameras, so that
+similar humans get similar payloads, which a network can learn.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from primdiffusion.raster.rasterise import rasterise_colourings
 from primdiffusion.render.inverse import InverseSettings, Target, fit_colours, fit_payload
 
 BODY_VIEWS, BODY_SIZE, BODY_FOV = 28, 176, math.radians(30)
-"""Pictures of the whole figure, their pixels a side, their field of view."""
+"""Full-body views: number, image size in pixels, field of view."""
 HEAD_VIEWS, HEAD_SIZE, HEAD_FOV = 20, 144, math.radians(12)
-"""Pictures of the head, denser from the front."""
+"""Views of the head, denser from the front."""
 HEAD_EXTENT, HEAD_BELOW_TOP = 0.42, 0.13
-"""Metres: side of the picture at the head, and how far below the top of the skull its middle is."""
+"""Extent of the head views, and depth of their centre below the top of the skull, metres."""
 BODY_PITCHES = (0, 10, -10, 25, 5, -5, 15)
 HEAD_PITCHES = (0, 10, -10, 20, -5)
-"""Degrees above the horizon, view after view."""
+"""Camera elevations in degrees, cycled over the views."""
 SUPERSAMPLE = 3
 SETTINGS = InverseSettings()
 
@@ -43,18 +43,18 @@ def fitted_payloads(
     settings: InverseSettings = SETTINGS,
     turn: float = 0.0,
 ) -> list[Payload]:
-    """The payloads of meshes that differ only in their textures, in the rest pose of the default body.
+    """Fit payloads to meshes that differ only in their textures, in the rest pose of the default body.
 
-    Density and the first colouring are fitted together, then the colours of all on that density. `turn` (0 to 1) moves
-    the cameras on towards their neighbours, to see how much of the result the cameras decide.
+    Density and the first colouring are fitted jointly, then all colours with that density fixed. `turn` (0 to 1)
+    rotates the cameras towards their neighbours, to measure how much the result depends on them.
 
-    Takes about 20 s of one core for the first colouring and 3 s for each further one.
+    Takes about 20 s on one core for the first colouring and 3 s for each further one.
 
     Raises:
-        UnusableMesh, ValueError: as `surface_field`; there are no colourings.
+        UnusableMesh, ValueError: as `surface_field`; no colourings are given.
     """
     if not colourings:
-        raise ValueError("there is no mesh to fit to: give at least one colouring")
+        raise ValueError("no mesh to fit to: give at least one colouring")
     field = surface_field(colourings[0], frames)
     starts = [colour(field, mesh) for mesh in colourings]
     targets = _targets(colourings, frames, betas, turn)
@@ -63,7 +63,7 @@ def fitted_payloads(
 
 
 def views_of(mesh: TexturedMesh, betas: Float[ndarray, "10"], turn: float = 0.0) -> list[tuple[Camera, float]]:
-    """Cameras around the figure and around its head, each with its weight: both groups count the same."""
+    """Cameras around the body and around the head, each with its weight; both groups have equal total weight."""
     views = []
     low, high = mesh.bounds
     extent = 1.1 * float((high - low).max())
@@ -82,7 +82,7 @@ def views_of(mesh: TexturedMesh, betas: Float[ndarray, "10"], turn: float = 0.0)
 
 
 def head_centre(betas: Float[ndarray, "10"]) -> Float[ndarray, "3"]:
-    """The middle of the head in the rest pose, metres: between the eyes and the back of the skull."""
+    """Centre of the head in the rest pose, between the eyes and the back of the skull, metres."""
     body = default_body()
     vertices = body.shape(torch.as_tensor(betas, dtype=body.template.dtype)).vertices.numpy()
     top = vertices[:, 1].max()
@@ -91,7 +91,7 @@ def head_centre(betas: Float[ndarray, "10"]) -> Float[ndarray, "3"]:
 
 
 def orbit_camera(middle: Float[ndarray, "3"], extent: float, yaw: float, pitch: float, fov: float, size: int) -> Camera:
-    """A square camera that looks at `middle` from `yaw` and `pitch` degrees; `extent` metres there fill its picture.
+    """A square camera looking at `middle` from `yaw` and `pitch` degrees; its view spans `extent` metres there.
 
     Yaw 0 sees the front (+z), 90 the left side (+x).
     """
@@ -103,7 +103,7 @@ def orbit_camera(middle: Float[ndarray, "3"], extent: float, yaw: float, pitch: 
 
 
 def _targets(colourings: Sequence[TexturedMesh], frames: Frames, betas: ndarray, turn: float) -> list[list[Target]]:
-    """The pictures of each colouring, all from the same cameras."""
+    """Renders of each colouring, all from the same cameras."""
     targets: list[list[Target]] = [[] for _ in colourings]
     for camera, weight in views_of(colourings[0], betas, turn):
         for own, picture in zip(targets, rasterise_colourings(colourings, camera, SUPERSAMPLE), strict=True):

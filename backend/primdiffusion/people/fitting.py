@@ -1,4 +1,4 @@
-"""Meshes of the asset pack put on a body: fitted, rigged, and hidden where something covers them."""
+"""Fit and rig the pack's meshes on a body, and find the faces that others cover."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from primdiffusion.people.wardrobe import SKIRTS
 
 JOINTS = 24
 INFLUENCES = 4
-"""Joints that move a vertex."""
+"""Joints per vertex."""
 DRAPE, LOOSE = 6, 0.6
-"""How often a skirt's weights are averaged with their neighbours', each time by half; the lower share that is."""
+"""Smoothing iterations of a skirt's weights, and the lower fraction of the skirt that is smoothed."""
 OVERLAP = 0.012
-"""How far socks reach up into trousers, metres."""
+"""Overlap of socks with trousers, metres."""
 
 
 @functools.lru_cache(maxsize=64)
 def item_skinning(
     assets: Assets, base: BaseMesh, path: str
 ) -> tuple[Int[np.ndarray, "V 4"], Float[np.ndarray, "V 4"], Float[np.ndarray, "V 3 3"]]:
-    """Joints, weights and turn of every vertex of a mesh: the base's, blended; the four strongest joints are kept."""
+    """Joints, weights and rotation of a mesh's vertices, blended from the base mesh; the four strongest joints."""
     proxy, mesh = assets.proxy(path)
     dense = np.zeros((len(base.template), JOINTS))
     np.add.at(dense, (np.arange(len(dense))[:, None], base.joint_index), base.joint_weight)
@@ -40,7 +40,7 @@ def item_skinning(
 
 
 def _draped(weight: Float[np.ndarray, "V J"], mesh: ObjMesh, pieces: tuple[int, ...]) -> Float[np.ndarray, "V J"]:
-    """Weights of skirts, averaged along the cloth: each half follows one thigh, and the middle would tear between."""
+    """Smooth a skirt's weights along the cloth: each half follows one thigh, and the middle would tear."""
     skirt = mesh.faces[np.isin(connected_faces(mesh.faces, len(weight)), pieces)]
     height = mesh.vertices[skirt, 1]
     edges = np.unique(np.sort(skirt[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
@@ -57,16 +57,16 @@ def _draped(weight: Float[np.ndarray, "V J"], mesh: ObjMesh, pieces: tuple[int, 
 def fit_item(
     assets: Assets, base: BaseMesh, path: str, base_vertices: Float[np.ndarray, "B 3"]
 ) -> Float[np.ndarray, "V 3"]:
-    """A mesh on a body in the base's rest pose, metres."""
+    """Fit a mesh to a body in the base's rest pose, metres."""
     return assets.proxy(path)[0].fit(base_vertices, item_skinning(assets, base, path)[2])
 
 
 def under_hat(
     hat: Float[np.ndarray, "H 3"], hair: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> np.ndarray:
-    """Which faces of the hair a hat covers: those whose middle lies above the plane of its brim ([F] bool).
+    """Find the hair faces under a hat ([F] bool): those whose centre is above the plane of its brim.
 
-    The brim is what is farthest from the hat's middle; hats sit askew, so its plane is fitted, not level.
+    The brim is the part farthest from the hat's centre; its plane is fitted, because hats are tilted.
     """
     middle = hat.mean(axis=0)
     radius = np.linalg.norm((hat - middle)[:, [0, 2]], axis=1)
@@ -80,18 +80,17 @@ def under_hat(
 def under_hem(
     outfit: Float[np.ndarray, "O 3"], socks: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> np.ndarray:
-    """Which faces of the socks trousers cover: those above the outfit's lowest point ([F] bool). Skirts cover none."""
+    """Find the sock faces under trousers ([F] bool): those above the outfit's lowest point. Skirts cover none."""
     return socks[faces].mean(axis=1)[:, 1] > outfit[:, 1].min() + OVERLAP
 
 
 def shown_faces(
     base: BaseMesh, proxies: dict[str, tuple[Proxy, Int[np.ndarray, "F 3"]]], covered: Bool[np.ndarray, " B"]
 ) -> dict[str, np.ndarray]:
-    """Which faces of the body ("body") and of every proxy are seen: [F] bool by name.
+    """Find the visible faces of the body ("body") and of every proxy: [F] bool by name.
 
-    From the outermost proxy inwards, each hides the base vertices it lists: on the body, and on what lies deeper.
-    A face goes when all of its vertices are hidden, so that a rim of it stays under the hem. The body also loses what
-    is `covered`.
+    From the outermost proxy inwards, each hides the base vertices it lists, on the body and on proxies below. A face is
+    hidden if all its vertices are, so that a rim remains under the hem. `covered` vertices of the body are hidden too.
     """
     hidden = np.zeros(len(base.template), bool)
     shown: dict[str, np.ndarray] = {}

@@ -1,10 +1,10 @@
-"""A folder of people as rigged glTF files: what captures are rendered from.
+"""Write humans as a folder of rigged glTF files, from which captures are rendered.
 
     manifest.json                    seed, count, people, and the licence of every asset used; written last
-    person_NNNNNN/person.glb         NNNNNN is the person's seed
+    person_NNNNNN/person.glb         NNNNNN is the seed
     person_NNNNNN/person.json        seed, betas, attributes, sources with licences, and the .glb's SHA-256
 
-A person's folder appears whole or not at all, so a killed run is taken up where it stopped.
+Each folder is written atomically, so that an interrupted run can be resumed.
 """
 
 from __future__ import annotations
@@ -38,63 +38,59 @@ FORMAT, VERSION = "primdiffusion-people", 1
 MANIFEST, GLB, CARD = "manifest.json", "person.glb", "person.json"
 BODY = "default"
 JOINT_GRID = 2.0**20
-"""Joints are rounded to 1 / JOINT_GRID m: sums in another order give the same file."""
+"""Joints are rounded to 1 / JOINT_GRID m, so that files do not depend on the order of summation."""
 PERSON = re.compile(r"person_\d{6,}")
 PARTIAL = re.compile(r"\.person_\d+\.(\d+)\.partial")
 
 
 class OtherPeopleError(ValueError):
-    """A folder that holds a different set of people."""
+    """The folder contains another set of samples."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PeopleSet:
-    """Which people a folder is to hold: those of seeds seed ... seed + count - 1."""
+    """The samples of a folder: seeds seed ... seed + count - 1."""
 
     root: Path
     seed: int
     count: int
 
     def __post_init__(self) -> None:
-        """Refuse a set without people.
-
-        Raises:
-            ValueError: count is not positive, or seed is negative.
-        """
+        """Raise ValueError if count is not positive or seed is negative."""
         if self.count < 1:
-            raise ValueError(f"count is {self.count}; ask for one person or more.")
+            raise ValueError(f"count is {self.count}: give 1 or more")
         if self.seed < 0:
-            raise ValueError(f"seed is {self.seed}; give 0 or more.")
+            raise ValueError(f"seed is {self.seed}: give 0 or more")
 
     @property
     def seeds(self) -> range:
-        """Each person's seed."""
+        """Seeds of all samples."""
         return range(self.seed, self.seed + self.count)
 
     def folder(self, seed: int) -> Path:
-        """Where a person is."""
+        """Folder of one sample."""
         return self.root / name_of(seed)
 
 
 def name_of(seed: int) -> str:
-    """The name of a person's folder."""
+    """Name of a sample's folder."""
     return f"person_{seed:06d}"
 
 
 def make_people(assets: Assets, people: PeopleSet, workers: int) -> Iterator[int]:
-    """Makes those who are not there yet, then the manifest; yields how many are done, first of all those kept.
+    """Write missing samples, then the manifest; yields the number of finished ones, starting with the existing.
 
-    A person takes about a second of one core. The same seed gives the same bytes, however many workers make them.
+    A sample takes about one second on one core. Files are deterministic for a seed, whatever the number of workers.
 
     Raises:
-        OtherPeopleError: the folder holds other people.
-        AssetsMissingError, ProxyFileError: the asset folder lacks files or has damaged ones.
+        OtherPeopleError: the folder contains other samples.
+        AssetsMissingError, ProxyFileError: asset files are missing or damaged.
         WorkerKilledError: a worker process was killed.
         OSError: a file cannot be written.
     """
     if workers < 1:
-        raise ValueError(f"workers is {workers}; it must be 1 or more.")
-    _refuse_others(people)
+        raise ValueError(f"workers is {workers}: give 1 or more")
+    _check_folder(people)
     people.root.mkdir(parents=True, exist_ok=True)
     _remove_leftovers(people.root)
     missing = [seed for seed in people.seeds if not is_whole(people.folder(seed), seed)]
@@ -108,7 +104,7 @@ def make_people(assets: Assets, people: PeopleSet, workers: int) -> Iterator[int
 
 
 def write_person(assets: Assets, folder: Path, seed: int) -> None:
-    """Makes one person and stores it, whole or not at all; what was in the folder is replaced."""
+    """Generate one sample and write its folder, atomically; an existing folder is replaced."""
     person = make_person(assets, load_base_mesh(), seed)
     binary = glb(person.mesh, skeleton_of(person), {"primdiffusion": _identity(person, seed)})
     card = {
@@ -125,14 +121,14 @@ def write_person(assets: Assets, folder: Path, seed: int) -> None:
         shutil.rmtree(folder, ignore_errors=True)
         partial.replace(folder)
     except OSError as error:
-        # Python names no file where a disk is full.
+        # For a full disk, Python's error names no file.
         raise OSError(error.errno, error.strerror or "cannot be written", str(folder)) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
 
 def skeleton_of(person: Person) -> Skeleton:
-    """The default body's joints at a person's betas."""
+    """The default body's joints at the sample's betas."""
     body = default_body()
     vertices = body.template.double() + torch.einsum(
         "vcn,n->vc", body.shape_basis[..., : len(person.betas)].double(), torch.from_numpy(person.betas)
@@ -142,7 +138,7 @@ def skeleton_of(person: Person) -> Skeleton:
 
 
 def is_whole(folder: Path, seed: int) -> bool:
-    """Whether a folder holds this person undamaged."""
+    """Whether a folder contains this sample, undamaged."""
     card = _read_card(folder)
     try:
         return (
@@ -155,7 +151,7 @@ def is_whole(folder: Path, seed: int) -> bool:
 
 
 def unknown_licences(root: Path) -> list[str]:
-    """Assets in a folder's manifest whose licence is not known."""
+    """Assets in a folder's manifest whose licence is unknown."""
     manifest = json.loads((root / MANIFEST).read_text(encoding="utf-8"))
     return [asset["path"] for asset in manifest["assets"] if asset["licence"] == UNKNOWN]
 
@@ -164,25 +160,27 @@ def _identity(person: Person, seed: int) -> dict[str, Any]:
     return {"seed": seed, "betas": person.betas.tolist(), "body": BODY}
 
 
-def _refuse_others(people: PeopleSet) -> None:
-    """A folder's people are one set: same first seed, and nobody from outside the range."""
-    remedy = "choose another folder, or ask for the same seed and at least as many people"
-    asked = f"{people.count} people from seed {people.seed} were asked for"
+def _check_folder(people: PeopleSet) -> None:
+    """Raise OtherPeopleError if the folder has another first seed or samples outside the range."""
+    remedy = "choose another folder, or give the same --seed and at least the same --count"
+    requested = f"{people.count} from seed {people.seed} were requested"
     manifest = _read_json(people.root / MANIFEST)
     if manifest is not None and manifest.get("seed") != people.seed:
         raise OtherPeopleError(
-            f"{people.root} holds {manifest.get('count')} people from seed {manifest.get('seed')}, "
-            f"but {asked}; {remedy}."
+            f"{people.root} contains {manifest.get('count')} samples from seed {manifest.get('seed')}, "
+            f"but {requested}: {remedy}"
         )
     expected = {name_of(seed) for seed in people.seeds}
     found = [path.name for path in people.root.glob("person_*") if PERSON.fullmatch(path.name)]
-    strangers = sorted(set(found) - expected)
-    if strangers:
-        raise OtherPeopleError(f"{people.root} holds {strangers[0]} ({len(strangers)} such), but {asked}; {remedy}.")
+    unexpected = sorted(set(found) - expected)
+    if unexpected:
+        raise OtherPeopleError(
+            f"{people.root} contains {unexpected[0]} ({len(unexpected)} out of range), but {requested}: {remedy}"
+        )
 
 
 def _remove_leftovers(root: Path) -> None:
-    """Removes what killed processes were writing."""
+    """Remove partial folders of processes that no longer run."""
     for path in root.glob(".person_*.partial"):
         owner = PARTIAL.fullmatch(path.name)
         if owner and not psutil.pid_exists(int(owner[1])):
@@ -211,7 +209,7 @@ def _read_card(folder: Path) -> dict[str, Any] | None:
 
 
 def _read_json(path: Path) -> dict[str, Any] | None:
-    """A JSON object, None where there is none or a damaged one."""
+    """Read a JSON object; None if the file is missing or damaged."""
     with contextlib.suppress(OSError, ValueError):
         value = json.loads(path.read_text(encoding="utf-8"))
         return value if isinstance(value, dict) else None

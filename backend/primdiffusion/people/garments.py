@@ -1,4 +1,4 @@
-"""Clothes in new colours: the texture's light and shade stay, its colours are replaced piece by piece."""
+"""Recolour clothes: replace the colours of each piece and keep the texture's shading."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ from primdiffusion.people.texel_map import connected_faces, texel_map, uv_island
 from primdiffusion.people.wardrobe import Garment, Kind, Piece, stream
 
 SIZE = 512
-"""Texels of a garment's side: about 3 mm of cloth each."""
+"""Texture size; a texel covers about 3 mm of cloth."""
 ORIGINAL_SHARE: dict[str, float] = {"denim": 0.3, "shoe": 0.5, "overall": 0.2, "top": 0.06, "sock": 1.0}
-"""How often a piece keeps the pack's own colours."""
+"""Probability that a piece keeps the pack's own colours."""
 PLAIN_TRIM_SHARE = 0.5
-"""How often edgings and prints take the colour of their piece; a suit's shirt and tie never do."""
+"""Probability that trim takes the colour of its piece; never for the shirt and tie of a suit."""
 TRIM_DISTANCE = 24.0
-"""Lab distance from a piece's own colour beyond which a texel is trim."""
+"""Lab distance from a piece's main colour beyond which a texel is trim."""
 
 
 RIM = 2
-"""Texels at an island's edge that are taken to be mixed with what is outside."""
+"""Width of the border of an island that is mixed with the background, texels."""
 CREASE_SPREADS, CREASE_DEPTHS = (14, 1), (0.06, 0.03)
-"""Size (texels) and depth (share of the light) of creases and of weave drawn on cloth without a texture."""
+"""Size (texels) and relative depth of creases and weave for cloth without a texture."""
 SKIN_DISTANCE, TRIES = 22.0, 8
-"""Lab distance that cloth keeps from its wearer's skin, and how often a colour is drawn for it."""
+"""Smallest Lab distance between cloth and skin, and the attempts to draw such a colour."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Cloth:
-    """What of a garment's texture stays when its colours change."""
+    """The parts of a garment's texture that recolouring keeps."""
 
     original: UInt8[np.ndarray, "H W 4"] | None
-    """The pack's texture; None where the pack has none."""
+    """The pack's texture; None if it has none."""
     piece: UInt8[np.ndarray, "H W"]
     trim: np.ndarray
     """[H, W] bool."""
     shade: Float[np.ndarray, "H W"]
-    """Light and shade, 1 in the middle."""
+    """Shading, with median 1."""
     position: Float[np.ndarray, "H W 3"]
     """Rest position on the average body, metres."""
 
@@ -63,7 +63,7 @@ class Paint:
 
 @functools.lru_cache(maxsize=24)
 def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
-    """Read a garment's texture apart: pieces, trim, shading, position. Takes about a quarter of a second, once."""
+    """Decompose a garment's texture into pieces, trim, shading and position. Takes about 0.25 s, then cached."""
     _, mesh = assets.proxy(garment.path)
     texels = texel_map(mesh.corner_uv, SIZE)
     pieces = uv_islands(mesh.corner_uv) if garment.by_island else connected_faces(mesh.faces, len(mesh.vertices))
@@ -101,7 +101,7 @@ def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
 def paint_garment(
     garment: Garment, draws: np.random.Generator, skin: UInt8[np.ndarray, "3"] | None = None
 ) -> tuple[Paint, ...]:
-    """Draw colours for every piece; pieces of one kind in a garment go together, and none has the colour of `skin`."""
+    """Draw colours for every piece; pieces of one kind share them, and none is close to `skin`."""
     by_kind: dict[Kind, Paint] = {}
     for piece in garment.pieces:
         for _ in range(TRIES):
@@ -111,7 +111,7 @@ def paint_garment(
 
 
 def coloured(fabric: Cloth, paints: tuple[Paint, ...]) -> UInt8[np.ndarray, "H W 4"]:
-    """The garment's texture in new colours."""
+    """Make the garment's texture in new colours."""
     main = np.stack([paint.main for paint in paints]).astype(np.float64)
     trim = np.stack([paint.trim for paint in paints]).astype(np.float64)
     target = np.where(fabric.trim[..., None], trim[fabric.piece], main[fabric.piece])
@@ -137,7 +137,7 @@ def _is_skin(colour: Float[np.ndarray, "3"], skin: UInt8[np.ndarray, "3"]) -> bo
 
 
 def _paint(piece: Piece, draws: np.random.Generator) -> Paint:
-    """Colours for a kind of piece: tops may be patterned, all else is of one colour."""
+    """Draw the colours of a piece; only tops may be patterned."""
     kind = piece.kind
     main = palette.garment_colour(kind, draws)
     partner = "shirt" if kind == "suit" else "top"
@@ -154,9 +154,9 @@ def _paint(piece: Piece, draws: np.random.Generator) -> Paint:
 
 
 def _inner_texels(inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column of the texel each takes its shade from: at the rim of an island, one a little further in.
+    """Row and column of the texel that each texel takes its shading from: an inner one for those at an island's border.
 
-    Rims are mixed with what the pack's picture has between islands, and would show as dark seams.
+    Borders are mixed with the background between islands and would show as dark seams.
     """
     inner = np.asarray(binary_erosion(inside, iterations=RIM), bool)
     nearest = np.asarray(distance_transform_edt(np.logical_not(inner), return_distances=False, return_indices=True))
@@ -167,13 +167,13 @@ def _inner_texels(inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _blurred(light: Float[np.ndarray, "H W"], seen: np.ndarray) -> Float[np.ndarray, "H W"]:
-    """The broad shading of the seen texels, with none of their fine stripes."""
+    """Low-frequency shading of the `seen` texels, without fine stripes."""
     weight = gaussian_filter(seen.astype(np.float64), 8) + 1e-6
     return gaussian_filter(np.where(seen, light, 0).astype(np.float64), 8) / weight
 
 
 def _creases(path: str) -> Float[np.ndarray, "H W"]:
-    """Light on cloth whose texture the pack lacks: shallow creases and a little weave, 1 in the middle."""
+    """Shading for cloth without a texture: shallow creases and weave, with mean 1."""
     light = np.ones((SIZE, SIZE))
     for spread, depth in zip(CREASE_SPREADS, CREASE_DEPTHS, strict=True):
         field = gaussian_filter(stream(0, f"creases of {spread} on {path}").standard_normal((SIZE, SIZE)), spread)
@@ -182,7 +182,7 @@ def _creases(path: str) -> Float[np.ndarray, "H W"]:
 
 
 def _occlusion(assets: Assets, garment: Garment) -> Float[np.ndarray, "H W"] | np.float64:
-    """Folds from the pack's ambient occlusion picture, softened; one where it has none."""
+    """The pack's ambient occlusion, softened; 1 if it has none."""
     name = f"{garment.path}_ao"
     if not assets.has_picture(name):
         return np.float64(1)

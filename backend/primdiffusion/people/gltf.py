@@ -1,7 +1,7 @@
-"""A dressed person as one glTF 2.0 file (.glb): meshes, skin, skeleton and textures in one binary.
+"""Write a skinned, textured mesh as one glTF 2.0 file (.glb).
 
-Written by hand because the writers among our packages (trimesh, Blender aside) write no skins. Coordinates are glTF's
-own: metres, y up, facing +z. The file depends on the mesh alone, down to its bytes.
+Written by hand because trimesh does not write skins. Coordinates are glTF's: metres, y up, facing +z. The file's bytes
+are a deterministic function of the mesh.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
 FLOAT, BYTE, SHORT, INT = 5126, 5121, 5123, 5125
 VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
 OPAQUE = 128
-"""Alpha from which a texel is there; glTF's cutoff of 0.5 says the same of bytes."""
+"""Alpha from which a texel is opaque, as with glTF's cutoff of 0.5."""
 NORMAL_STEPS = 4096
-"""Normals are rounded to a part in so many, so that sums in another order give the same file."""
+"""Normals are rounded to 1 / NORMAL_STEPS, so that files do not depend on the order of summation."""
 JPEG_QUALITY = 92
 
 
 class UnwritableMesh(ValueError):
-    """A mesh that no glTF file can hold."""
+    """A mesh that cannot be written as glTF."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Skeleton:
-    """Joints of a rest pose whose axes are the world's."""
+    """Joints of a rest pose, with axes parallel to the world's."""
 
     names: Sequence[str]
     parents: Sequence[int]
-    """Each joint's parent, -1 for the first."""
+    """Index of each joint's parent, -1 for the root."""
     positions: Float[np.ndarray, "J 3"]
     """Metres."""
 
 
 class _Binary:
-    """The file's binary chunk while it grows, with the views and accessors into it."""
+    """Builds the binary chunk, its buffer views and accessors."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -53,14 +53,14 @@ class _Binary:
         self.accessors: list[dict[str, Any]] = []
 
     def view(self, data: bytes, target: int | None = None) -> int:
-        """Appends bytes, padded to four; returns the number of their view."""
+        """Append bytes, padded to four; return the index of their buffer view."""
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data)}
         self.views.append(view if target is None else {**view, "target": target})
         self.data += data + b"\0" * (-len(data) % 4)
         return len(self.views) - 1
 
     def accessor(self, array: np.ndarray, kind: str, component: int, target: int | None, bounded: bool = False) -> int:
-        """Appends an array; returns the number of its accessor."""
+        """Append an array; return the index of its accessor."""
         entry: dict[str, Any] = {
             "bufferView": self.view(np.ascontiguousarray(array).tobytes(), target),
             "componentType": component,
@@ -74,15 +74,15 @@ class _Binary:
 
 
 def glb(mesh: TexturedMesh, skeleton: Skeleton, extras: Mapping[str, Any]) -> bytes:
-    """The file of a mesh in the skeleton's rest pose: one mesh node a part, one skin.
+    """Encode a mesh in the skeleton's rest pose: a mesh node for each part, one skin.
 
     Args:
-        mesh: parts moved by at most four joints a vertex; parts without faces are left out.
-        skeleton: what their `skin_index` counts.
-        extras: JSON values, kept in the asset's and the scene's `extras` (Blender shows the scene's).
+        mesh: parts with at most four joints per vertex; parts without faces are left out.
+        skeleton: the joints that their `skin_index` refers to.
+        extras: JSON values for `extras` of the asset and of the scene (Blender shows the scene's).
 
     Raises:
-        UnwritableMesh: no part has a face, or a number is NaN or infinite.
+        UnwritableMesh: no part has a face, or a value is NaN or infinite.
     """
     parts = [part for part in mesh.parts if len(part.faces)]
     _check(parts, skeleton)
@@ -116,7 +116,7 @@ def glb(mesh: TexturedMesh, skeleton: Skeleton, extras: Mapping[str, Any]) -> by
 
 def _check(parts: list[TexturedPart], skeleton: Skeleton) -> None:
     if not parts:
-        raise UnwritableMesh("The mesh has no faces; a person needs at least one.")
+        raise UnwritableMesh("the mesh has no faces: give at least one")
     arrays = {"the joints' positions": skeleton.positions}
     for part in parts:
         arrays |= {
@@ -125,7 +125,7 @@ def _check(parts: list[TexturedPart], skeleton: Skeleton) -> None:
     for what, array in arrays.items():
         if not np.isfinite(array).all():
             bad = int((~np.isfinite(array)).sum())
-            raise UnwritableMesh(f"{bad} numbers among {what} are NaN or infinite; check the betas.")
+            raise UnwritableMesh(f"{bad} values of {what} are NaN or infinite: check the betas")
 
 
 def _joint_nodes(skeleton: Skeleton) -> list[dict[str, Any]]:
@@ -139,7 +139,7 @@ def _joint_nodes(skeleton: Skeleton) -> list[dict[str, Any]]:
 
 
 def _skin(skeleton: Skeleton, binary: _Binary) -> dict[str, Any]:
-    """The skin; its inverse bind matrices (column by column) only move joints to the origin."""
+    """The skin; its inverse bind matrices (column-major) are translations of the joints to the origin."""
     inverse = np.tile(np.eye(4, dtype=np.float32), (len(skeleton.names), 1, 1))
     inverse[:, 3, :3] = -skeleton.positions
     matrices = binary.accessor(inverse.reshape(-1, 16), "MAT4", FLOAT, None)
@@ -147,7 +147,7 @@ def _skin(skeleton: Skeleton, binary: _Binary) -> dict[str, Any]:
 
 
 def _primitive(part: TexturedPart, number: int, binary: _Binary) -> dict[str, Any]:
-    """Vertices split where their corners' texture coordinates differ."""
+    """A glTF primitive; vertices are split where texture coordinates differ."""
     keys = np.concatenate(
         [part.faces.reshape(-1, 1).astype(np.float32), part.corner_uv.reshape(-1, 2).astype(np.float32)], axis=1
     )
@@ -174,12 +174,12 @@ def _primitive(part: TexturedPart, number: int, binary: _Binary) -> dict[str, An
 
 
 def _four(array: np.ndarray) -> np.ndarray:
-    """Four columns, zero where there were fewer."""
+    """Pad to four columns with zeros."""
     return np.pad(array, ((0, 0), (0, 4 - array.shape[1])))
 
 
 def _normals(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float32[np.ndarray, "V 3"]:
-    """Smooth normals, of unit length to within their rounding; up where a vertex has no face of any area."""
+    """Smooth normals, of unit length up to rounding; up for vertices of degenerate faces only."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros_like(vertices)
@@ -201,7 +201,7 @@ def _cut_out(texture: UInt8[np.ndarray, "H W 4"]) -> bool:
 
 
 def _image(part: TexturedPart, binary: _Binary) -> dict[str, Any]:
-    """JPEG where opaque, without loss where there are holes or nothing to save."""
+    """Encode as JPEG if opaque, as PNG with transparency or if tiny."""
     file = io.BytesIO()
     if _cut_out(part.texture):
         mime = "image/png"

@@ -1,4 +1,4 @@
-"""Hair, brows and lashes in natural colours: the strands' light and shade from the pack's texture or drawn here."""
+"""Textures of hair, brows and lashes: natural colours times shading from the pack's texture, or a procedural one."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from primdiffusion.people.wardrobe import hair_path, stream
 SIZE = 512
 CURLY = ("afro01",)
 OPAQUE = 128
-"""Alpha from which a texel is there (the alpha test of the rasteriser)."""
+"""Alpha from which a texel is opaque, as in the rasteriser's alpha test."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Strands:
-    """A hair mesh's texture without its colour."""
+    """The texture of a hair mesh without colour."""
 
     shade: Float[np.ndarray, "H W"]
-    """Light and shade, 1 in the middle."""
+    """Shading, with median 1."""
     alpha: UInt8[np.ndarray, "H W"]
 
 
 @functools.lru_cache(maxsize=16)
 def strands(assets: Assets, name: str) -> Strands:
-    """The strands of a hair mesh: from its texture, or drawn where the pack has none."""
+    """Get the strands of a hair mesh: from its texture, or procedural if the pack has none."""
     picture = f"{hair_path(name)}_diffuse"
     if not assets.has_picture(picture):
         corner_uv = assets.proxy(hair_path(name))[1].corner_uv
@@ -44,13 +44,13 @@ def strands(assets: Assets, name: str) -> Strands:
 
 
 def coloured_strands(hair: Strands, colour: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, "H W 4"]:
-    """Strands of one linear colour."""
+    """Colour strands with one linear colour."""
     rgb = bytes_from_linear(np.clip(hair.shade[..., None] * colour.astype(np.float64), 0, 1))
     return np.concatenate([rgb, hair.alpha[..., None]], axis=-1)
 
 
 def tinted_cutout(picture: UInt8[np.ndarray, "H W 4"], colour: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, "H W 4"]:
-    """Brows or lashes: the picture's alpha, thickened to pass an alpha test, in one linear colour."""
+    """Colour brows or lashes with one linear colour; alpha is increased so that they pass the alpha test."""
     texture = np.empty_like(picture)
     texture[..., :3] = bytes_from_linear(colour.astype(np.float64))
     texture[..., 3] = np.minimum(picture[..., 3].astype(np.int32) * 3 // 2, 255).astype(np.uint8)
@@ -58,7 +58,7 @@ def tinted_cutout(picture: UInt8[np.ndarray, "H W 4"], colour: Float[np.ndarray,
 
 
 def _straight(texels: TexelMap, name: str) -> Strands:
-    """Strands that run down the texture and end raggedly where an island ends below."""
+    """Procedural strands along the texture's columns, with ragged ends at the bottom of each island."""
     draws = stream(0, f"strands of {name}")
     noise = draws.standard_normal((3, SIZE, SIZE)).astype(np.float64)
     shade = sum(
@@ -73,22 +73,22 @@ def _straight(texels: TexelMap, name: str) -> Strands:
         above[row] = np.where(texels.inside[row], above[row - 1] + 1, 0)
     reach = np.abs(_unit(gaussian_filter(draws.standard_normal((SIZE, SIZE)).astype(np.float64), (40, 0.8))))
     ragged = below > 0.06 * (below + above) * reach
-    # Sideways across island borders, or sheets that meet there would let light through.
-    there = binary_dilation(ragged, np.ones((1, 5), bool))
-    return Strands(np.exp(0.22 * shade).astype(np.float64), np.where(there, 255, 0).astype(np.uint8))
+    # Dilated sideways across island borders, or gaps would open between adjacent sheets.
+    opaque = binary_dilation(ragged, np.ones((1, 5), bool))
+    return Strands(np.exp(0.22 * shade).astype(np.float64), np.where(opaque, 255, 0).astype(np.uint8))
 
 
 def _curls(texels: TexelMap, island: Int[np.ndarray, " F"]) -> Strands:
-    """Small curls without a direction; the two large islands, a cap, are solid, the tufts around it have gaps."""
+    """Procedural isotropic curls: the two largest islands, a cap, are opaque; the tufts around it have gaps."""
     draws = stream(0, "curls")
     noise = draws.standard_normal((2, SIZE, SIZE)).astype(np.float64)
     curls, tufts = _unit(gaussian_filter(noise[0], 2.0)), _unit(gaussian_filter(noise[1], 7.0))
     edge = gaussian_filter(texels.inside.astype(np.float64), 5)
-    there = (island < 2)[texels.face] | (curls + tufts + 6 * (edge - 0.6) > 0)
+    opaque = (island < 2)[texels.face] | (curls + tufts + 6 * (edge - 0.6) > 0)
     shade = _unit(gaussian_filter(noise[0], 1.2)) + 0.6 * curls + 0.8 * tufts
-    return Strands(np.exp(0.2 * shade).astype(np.float64), np.where(there, 255, 0).astype(np.uint8))
+    return Strands(np.exp(0.2 * shade).astype(np.float64), np.where(opaque, 255, 0).astype(np.uint8))
 
 
 def _unit(field: np.ndarray) -> np.ndarray:
-    """A field of mean 0 and standard deviation 1."""
+    """Normalise to mean 0 and standard deviation 1."""
     return (field - field.mean()) / field.std()

@@ -1,8 +1,8 @@
-"""Under which licence each file of an asset folder is: what the file says itself, or a LICENSES.txt that lists it.
+"""Find the licence of each asset file, from its header or a LICENSES.txt.
 
-MakeHuman's text files (.mhclo, .obj, .mhmat) open with comments that name their release. Pictures cannot; they are
-listed in a LICENSES.txt in or above the folder (a table `path | ... | licence | ...`), or else named by a
-material beside them that states its own.
+MakeHuman's text files (.mhclo, .obj, .mhmat) begin with comments that state their licence. Images are listed in a
+LICENSES.txt in or above the folder (a table `path | ... | licence | ...`), or referenced by a material in the same
+folder that states its own.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 UNKNOWN = "unknown"
 LIST = "LICENSES.txt"
 LEVELS = 3
-"""Folders in which a list is looked for: the asset folder and those above it."""
+"""Number of folders searched for a list: the asset folder and its parents."""
 HEADER_BYTES = 4096
 STATED = (
     (re.compile(r"\b(?:released as|licen[cs]ed? (?:under|is|:)?)\s*\W{0,3}(?:CC0\b|CC-0\b)", re.IGNORECASE), "CC0-1.0"),
@@ -22,15 +22,15 @@ STATED = (
     (re.compile(r"\bA?GPL[- ]?v?\d(?:\.\d)?", re.IGNORECASE), ""),
     (re.compile(r"\bCC0\b"), "CC0-1.0"),
 )
-"""What a header may say, and the name of that licence; where that is empty, the words themselves."""
+"""Patterns of licence statements and the licences' names; an empty name stands for the matched text."""
 
 
 def licence_of(root: Path, path: str) -> str:
-    """The licence of a file of the asset folder, "unknown" where none is stated.
+    """Return the licence of an asset file, "unknown" if none is stated.
 
     Args:
         root: the asset folder.
-        path: the file's place in it, with "/".
+        path: path relative to it, with "/".
     """
     listed = _listed(root)
     if path in listed:
@@ -38,7 +38,7 @@ def licence_of(root: Path, path: str) -> str:
     file = root / path
     if file.suffix in (".mhclo", ".obj", ".mhmat"):
         return _stated(file)
-    # The material may name the picture as it was before it was stored in another format.
+    # The image may have been converted to another format since the material was written.
     named = re.compile(rf"(?<![\w-]){re.escape(file.stem)}\.\w+")
     for material in sorted(file.parent.glob("*.mhmat")):
         if named.search(_head(material)):
@@ -48,7 +48,7 @@ def licence_of(root: Path, path: str) -> str:
 
 @functools.lru_cache(maxsize=4)
 def _listed(root: Path) -> dict[str, str]:
-    """Licences by path in the asset folder, from the lists in and above it; the nearest list has the last word."""
+    """Licences by relative path, from the lists in and above the asset folder; the nearest list takes precedence."""
     licences: dict[str, str] = {}
     for folder in reversed((root, *root.parents)[:LEVELS]):
         if (folder / LIST).is_file():
@@ -60,7 +60,7 @@ def _listed(root: Path) -> dict[str, str]:
 
 
 def _table(text: str) -> dict[str, str]:
-    """The columns "path" and "licence" of a table with a heading, cells parted by "|"."""
+    """Parse the columns "path" and "licence" of a table with a header row and cells separated by "|"."""
     licences: dict[str, str] = {}
     columns: list[str] = []
     for line in text.splitlines():
@@ -77,7 +77,7 @@ def _table(text: str) -> dict[str, str]:
 
 @functools.lru_cache(maxsize=1024)
 def _stated(file: Path) -> str:
-    """The licence that a text file's opening comments name."""
+    """The licence stated in a text file's opening comments."""
     comments = " ".join(line.lstrip("# ") for line in _head(file).splitlines() if line.startswith("#"))
     for pattern, name in STATED:
         found = pattern.search(comments)

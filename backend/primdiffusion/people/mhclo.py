@@ -1,11 +1,11 @@
-"""MakeHuman's proxy files: a mesh (.obj) and how it rides on the base mesh (.mhclo).
+"""Read MakeHuman's proxies: a mesh (.obj) and its binding to the base mesh (.mhclo).
 
-A vertex of the proxy is a blend of three base vertices plus an offset in the base's own size,
+A vertex of the proxy is a blend of three base vertices plus a scaled offset,
 
     p_i = sum_k w_ik v(r_ik) + R_i (scale * o_i),    scale_axis = |v(a) - v(b)|_axis / denominator,
 
-so clothes follow any body. R_i is the identity in the pose the files were written in; the base mesh of this package
-stands in T-pose, so the caller gives the turn of each vertex's limb.
+so that clothes fit any body. R_i is the identity in the pose that the files were made for; the base mesh of this
+package is in T pose, so the caller passes the rotation of each vertex's limb.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 
 
 class ProxyFileError(ValueError):
-    """A .mhclo or .obj file that does not say what it must."""
+    """A damaged or incomplete .mhclo or .obj file."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class ObjMesh:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scale:
-    """The size of the base along one axis: the distance of two of its vertices over the file's own measure."""
+    """Size of the base along one axis: the distance of two of its vertices, divided by the denominator."""
 
     first: int
     second: int
@@ -41,33 +41,33 @@ class Scale:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Proxy:
-    """How one mesh rides on the base mesh."""
+    """Binding of one mesh to the base mesh."""
 
     name: str
     reference: Int[np.ndarray, "V 3"]
     weight: Float[np.ndarray, "V 3"]
     offset: Float[np.ndarray, "V 3"]
     scales: tuple[Scale | None, Scale | None, Scale | None]
-    """For x, y and z; None where the file gives none, and the offset is then taken in the base's unit."""
+    """For x, y and z; None leaves the offset in the base's unit."""
     z_depth: int
-    """Larger is further out: what it hides is hidden on the body and on proxies of smaller depth."""
+    """Layer, larger is further out: hidden vertices are hidden on the body and on proxies of smaller depth."""
     delete_vertices: Int[np.ndarray, " D"]
     """Base vertices that the proxy hides."""
 
     def fit(
         self, base_vertices: Float[np.ndarray, "B 3"], turn: Float[np.ndarray, "V 3 3"] | None = None
     ) -> Float[np.ndarray, "V 3"]:
-        """The proxy's vertices on a base mesh, in the base's unit; `turn` rotates each vertex's offset."""
+        """Fit the proxy's vertices to a base mesh, in the base's unit; `turn` rotates each vertex's offset."""
         return self.anchor(base_vertices) + self.displacement(base_vertices, turn)
 
     def anchor(self, base_vertices: Float[np.ndarray, "B 3"]) -> Float[np.ndarray, "V 3"]:
-        """Where the proxy's vertices touch the base: the blend of three vertices, without the offset."""
+        """Blend the base vertices, without the offset."""
         return np.einsum("vk,vkc->vc", self.weight, base_vertices[self.reference])
 
     def displacement(
         self, base_vertices: Float[np.ndarray, "B 3"], turn: Float[np.ndarray, "V 3 3"] | None = None
     ) -> Float[np.ndarray, "V 3"]:
-        """The offsets in the base's unit, turned."""
+        """Scale and rotate the offsets, in the base's unit."""
         size = np.ones(3)
         for axis, scale in enumerate(self.scales):
             if scale is not None:
@@ -77,19 +77,19 @@ class Proxy:
         return scaled if turn is None else np.einsum("vij,vj->vi", turn, scaled)
 
     def blend(self, per_vertex: Float[np.ndarray, "B C"]) -> Float[np.ndarray, "V C"]:
-        """A quantity of the base mesh carried to the proxy by the same blend."""
+        """Blend a quantity of the base mesh to the proxy's vertices."""
         return np.einsum("vk,vkc->vc", self.weight, per_vertex[self.reference])
 
     def hidden_by(self, hidden_base: np.ndarray) -> np.ndarray:
-        """Which vertices of the proxy ride on hidden base vertices only ([B] bool -> [V] bool)."""
+        """Find the proxy's vertices bound to hidden base vertices only ([B] bool -> [V] bool)."""
         return hidden_base[self.reference].all(axis=1)
 
 
 def parse_obj(text: str) -> ObjMesh:
-    """Read vertices, texture coordinates and faces; polygons are cut into fans; corners without uv get (0, 0).
+    """Parse vertices, texture coordinates and faces; polygons become triangle fans; missing uv are (0, 0).
 
     Raises:
-        ProxyFileError: a face names a vertex that is not there.
+        ProxyFileError: a face refers to a vertex that does not exist.
     """
     vertices: list[list[float]] = []
     coordinates: list[list[float]] = [[0.0, 0.0]]
@@ -111,22 +111,22 @@ def parse_obj(text: str) -> ObjMesh:
                 faces.append((index[0], index[k], index[k + 1]))
                 face_coordinates.append((uv_index[0], uv_index[k], uv_index[k + 1]))
     if not faces or not vertices:
-        raise ProxyFileError("The .obj has no faces or no vertices; give a Wavefront mesh of an asset pack.")
+        raise ProxyFileError("the .obj has no faces or no vertices: give a mesh of an asset pack")
     face_array = np.array(faces, np.int32)
     uv_array = np.array(face_coordinates)
     if face_array.min() < 0 or face_array.max() >= len(vertices) or uv_array.max() >= len(coordinates):
         raise ProxyFileError(
-            f"The .obj names vertices outside its {len(vertices)} vertices and {len(coordinates) - 1} texture "
-            "coordinates; the file is damaged or uses relative indices, which asset packs do not."
+            f"face indices of the .obj are outside its {len(vertices)} vertices and {len(coordinates) - 1} texture "
+            "coordinates: the file is damaged or uses relative indices, which are not supported"
         )
     return ObjMesh(np.array(vertices, np.float64), face_array, np.array(coordinates, np.float64)[uv_array])
 
 
 def parse_mhclo(text: str) -> Proxy:
-    """Read a .mhclo file; keys this package has no use for are passed over.
+    """Parse a .mhclo file; unknown keys are ignored.
 
     Raises:
-        ProxyFileError: no vertices, or a line with the wrong number of values.
+        ProxyFileError: no vertices, or a line with a wrong number of values.
     """
     reference: list[tuple[int, int, int]] = []
     weight: list[list[float]] = []
@@ -149,7 +149,7 @@ def parse_mhclo(text: str) -> Proxy:
             z_depth = int(words[1])
         elif key.isdigit() and section == "verts":
             if len(words) not in (1, 6, 9):
-                raise ProxyFileError(f"A vertex line of {name or 'the .mhclo'} has {len(words)} values, not 1, 6 or 9.")
+                raise ProxyFileError(f"a vertex line of {name or 'the .mhclo'} has {len(words)} values, not 1, 6 or 9")
             index = [int(word) for word in words[:3]] if len(words) > 1 else [int(key)] * 3
             reference.append((index[0], index[1], index[2]))
             weight.append([float(word) for word in words[3:6]] if len(words) > 1 else [1.0, 0.0, 0.0])
@@ -157,7 +157,7 @@ def parse_mhclo(text: str) -> Proxy:
         elif key.isdigit() and section == "delete_verts":
             deleted.extend(_vertex_ranges(words))
     if not reference:
-        raise ProxyFileError(f"{name or 'The .mhclo'} lists no vertices after its line 'verts'; the file is damaged.")
+        raise ProxyFileError(f"{name or 'the .mhclo'} has no vertices after its line 'verts': the file is damaged")
     return Proxy(
         name=name,
         reference=np.array(reference),
@@ -170,7 +170,7 @@ def parse_mhclo(text: str) -> Proxy:
 
 
 def _vertex_ranges(words: list[str]) -> list[int]:
-    """Vertex numbers of a line such as `3 7 - 9`: a range includes both of its ends."""
+    """Parse vertex indices such as `3 7 - 9`; ranges are inclusive."""
     numbers: list[int] = []
     in_range = False
     for word in words:
@@ -185,10 +185,10 @@ def _vertex_ranges(words: list[str]) -> list[int]:
 
 
 def read_pair(mhclo: Path, obj: Path) -> tuple[Proxy, ObjMesh]:
-    """A proxy and its mesh from disk.
+    """Read a proxy and its mesh.
 
     Raises:
-        ProxyFileError: damaged files, or files that do not belong together; the message names them.
+        ProxyFileError: the files are damaged or do not belong together.
     """
     try:
         proxy = parse_mhclo(mhclo.read_text(encoding="utf-8", errors="replace"))
@@ -196,9 +196,9 @@ def read_pair(mhclo: Path, obj: Path) -> tuple[Proxy, ObjMesh]:
     except ProxyFileError as error:
         raise ProxyFileError(f"{mhclo}: {error}") from error
     except (ValueError, IndexError) as error:
-        raise ProxyFileError(f"{mhclo} or {obj} has a line that cannot be read ({error}); fetch it again.") from error
+        raise ProxyFileError(f"{mhclo} or {obj} has an unreadable line ({error}): fetch both again") from error
     if len(proxy.reference) != len(mesh.vertices):
         raise ProxyFileError(
-            f"{mhclo} places {len(proxy.reference)} vertices but {obj} has {len(mesh.vertices)}; fetch both again."
+            f"{mhclo} binds {len(proxy.reference)} vertices but {obj} has {len(mesh.vertices)}: fetch both again"
         )
     return proxy, mesh

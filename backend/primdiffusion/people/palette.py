@@ -1,4 +1,4 @@
-"""The colours people and their clothes come in, drawn as linear RGB."""
+"""Random colours of hair and clothes, in linear RGB."""
 
 from __future__ import annotations
 
@@ -38,24 +38,24 @@ HAIR: dict[str, str] = {
     "white": "cfccc6",
 }
 CLOTHES_SPREAD, SOBER_SPREAD, HAIR_SPREAD = (5.0, 4.0, 4.0), (4.0, 1.5, 2.0), (2.5, 0.7, 1.2)
-"""Standard deviations in Lab of colours about their palette entries."""
+"""Standard deviations of colours around their palette entries, Lab."""
 
 
 def garment_colour(kind: str, draws: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """A linear colour that suits a kind of garment."""
+    """Draw a linear colour for a kind of garment."""
     codes = CLOTHES[kind].split()
     spread = SOBER_SPREAD if kind in SOBER else CLOTHES_SPREAD
     return _near(codes[draws.integers(len(codes))], draws, spread)
 
 
 def contrasting(colour: Float[np.ndarray, "3"], kind: str, draws: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """The colour, of four that suit the kind, that is farthest from `colour` in lightness and hue."""
+    """Draw four colours for a kind of garment and return the one farthest from `colour`."""
     options = [garment_colour(kind, draws) for _ in range(4)]
     return max(options, key=lambda option: float(np.abs(np.sqrt(option) - np.sqrt(colour)).sum()))
 
 
 def hair_colour(tone: float, old: bool, draws: np.random.Generator) -> tuple[str, Float[np.ndarray, "3"]]:
-    """A hair colour's name and linear value; dark skin (tone near 1) goes with dark hair, age with grey."""
+    """Draw a hair colour's name and linear value; dark skin (tone near 1) comes with dark hair, old age with grey."""
     light = (0.16, 0.2, 0.2, 0.13, 0.06, 0.05, 0.08, 0.09, 0.02, 0.01)
     dark = (0.62, 0.22, 0.08, 0.01, 0.01, 0.0, 0.0, 0.01, 0.04, 0.01)
     darkness = min(1.0, 1.6 * tone)
@@ -68,7 +68,7 @@ def hair_colour(tone: float, old: bool, draws: np.random.Generator) -> tuple[str
 
 
 def _near(code: str, draws: np.random.Generator, spread: tuple[float, float, float]) -> Float[np.ndarray, "3"]:
-    """A linear colour about a hexadecimal one."""
+    """Draw a linear colour around a hexadecimal one."""
     lab = lab_from_bytes(np.frombuffer(bytes.fromhex(code), np.uint8))
     moved = lab + draws.normal(0, spread).astype(np.float64)
     moved[0] = np.clip(moved[0], 3, 97)

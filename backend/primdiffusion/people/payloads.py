@@ -1,11 +1,11 @@
-"""People as files of primitives: the training set of the diffusion model.
+"""Write payload files: the training set of the diffusion model.
 
-A file `person_NNNNNN.npz` holds one geometry in several colourings: `voxels` uint8 [variants, K, 8, 8, 8, 4] (axes D,
-H, W; sRGB-encoded colour and density * 255 / full_density), `betas` [10], `attributes` (JSON: those of the first
-colouring, and under "variants" those of each), `full_density` (1/m) and `seed`. People whose boxes are not as large as
-the anchors' have `delta_scale` float16 [variants, K, 3] too; those of meshes say in `making` how they were made; those
-of captures have `source` (JSON: which pictures, which encoder) and may have no seed. Files are written whole or not at
-all; a second run keeps the whole ones.
+A file `person_NNNNNN.npz` contains one geometry in several colourings: `voxels` uint8 [variants, K, 8, 8, 8, 4] (axes
+D, H, W; sRGB-encoded colour and density * 255 / full_density), `betas` [10], `attributes` (JSON: those of the first
+colouring, and under "variants" those of each), `full_density` (1/m) and `seed`. Samples whose boxes differ from the
+rest size also have `delta_scale` float16 [variants, K, 3]; those from meshes have `making`, their method and version;
+those from captures have `source` (JSON: images and encoder) and may have no seed. Files are written atomically;
+a second run skips complete ones.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from primdiffusion.primitives.primitives import Frames, K, Payload, S
 from primdiffusion.staging import written_whole
 
 VARIANT_STRIDE = 1 << 32
-"""Variant j of the person with seed s is coloured with seed s + j * VARIANT_STRIDE."""
+"""Variant j of seed s is coloured with seed s + j * VARIANT_STRIDE."""
 KEYS = ("voxels", "betas", "attributes", "full_density", "seed", "making")
 Making = Literal["fitted", "from_mesh"]
-"""fitted: to renders of the mesh (`fitted_payloads`); from_mesh: the nearest surface's colours alone, ten times
-quicker and softer."""
+"""fitted: to renders of the mesh (`fitted_payloads`); from_mesh: colours of the nearest surface point, ten times
+faster and blurrier."""
 VERSIONS: dict[Making, str] = {"fitted": "fitted 1", "from_mesh": "from_mesh 2"}
-"""What files say of their making: those of another version are made again."""
+"""Method and version stored in files; those of other versions are made again."""
 
 
 def make_payloads(
@@ -52,19 +52,19 @@ def make_payloads(
     making: Making = "fitted",
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Path]:
-    """Make the people of seeds seed ... seed + count - 1 into `out_dir`, those that are not there yet.
+    """Write the missing files of seeds seed ... seed + count - 1 to `out_dir`; return the paths of all.
 
-    A fitted person takes about 20 s of one core and each further variant 3 s (`from_mesh`: 1.5 s and 0.4 s). `report`
-    gets the number of finished people and the total.
+    A fitted sample takes about 20 s on one core and each further variant 3 s (`from_mesh`: 1.5 s and 0.4 s). `report`
+    receives the number of finished samples and the total.
 
     Raises:
-        ValueError: a count that is not positive.
-        AssetsMissingError, ProxyFileError: the asset folder lacks files or has damaged ones.
+        ValueError: a count is not positive.
+        AssetsMissingError, ProxyFileError: asset files are missing or damaged.
         WorkerKilledError: a worker process was killed.
     """
     for name, value in (("count", count), ("variants", variants), ("workers", workers)):
         if value < 1:
-            raise ValueError(f"{name} is {value}; it must be 1 or more.")
+            raise ValueError(f"{name} is {value}: give 1 or more")
     out_dir.mkdir(parents=True, exist_ok=True)
     paths = [out_dir / f"person_{person_seed:06d}.npz" for person_seed in range(seed, seed + count)]
     jobs = [
@@ -81,16 +81,16 @@ def make_payloads(
 
 
 def write_person(assets: Assets, path: Path, variants: int, seed: int, making: Making) -> None:
-    """Make one person in all colourings and store it, whole or not at all."""
+    """Generate one sample in all colourings and write its file, atomically."""
     person = make_person(assets, load_base_mesh(), seed)
-    people = [person, *(recolour(person, seed + number * VARIANT_STRIDE) for number in range(1, variants))]
-    meshes, frames = [variant.mesh for variant in people], rest_frames(person.betas)
+    colourings = [person, *(recolour(person, seed + number * VARIANT_STRIDE) for number in range(1, variants))]
+    meshes, frames = [variant.mesh for variant in colourings], rest_frames(person.betas)
     if making == "fitted":
         payloads = fitted_payloads(meshes, frames, person.betas)
     else:
         field = surface_field(person.mesh, frames)
         payloads = [colour(field, mesh) for mesh in meshes]
-    attributes = {**person.attributes, "variants": [variant.attributes for variant in people]}
+    attributes = {**person.attributes, "variants": [variant.attributes for variant in colourings]}
     entries = {
         "voxels": np.stack([voxels_from_payload(payload) for payload in payloads]),
         "betas": person.betas,
@@ -102,33 +102,33 @@ def write_person(assets: Assets, path: Path, variants: int, seed: int, making: M
 
 
 def store_person(path: Path, entries: Mapping[str, np.ndarray | str | int]) -> None:
-    """Write a person's file, whole or not at all; its `full_density` is ours. Raises OSError, which names it."""
+    """Write a payload file, atomically, with `full_density` added. Raises OSError, which names the file."""
     with (
         written_whole(path) as unfinished,
         zipfile.ZipFile(unfinished, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as z,
     ):
-        # Level 1: a person shrinks to a third; more effort gains little and takes longer than making the person.
+        # Level 1 compresses to a third; higher levels gain little and take longer than making the sample.
         for key, value in {**entries, "full_density": FULL_DENSITY}.items():
             with z.open(f"{key}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(value), allow_pickle=False)
 
 
 def rest_frames(betas: Float[np.ndarray, "10"]) -> Frames:
-    """The frames of the default body's primitives in its rest pose."""
+    """Frames of the default body's primitives in the rest pose."""
     body = default_body()
     vertices = body.shape(torch.as_tensor(betas, dtype=body.template.dtype)).vertices
     return attach(default_anchors(), vertices, body.faces)
 
 
 def voxels_from_payload(payload: Payload) -> UInt8[np.ndarray, "K 8 8 8 4"]:
-    """A payload as bytes: sRGB-encoded colour, and density of which 255 stands for FULL_DENSITY."""
+    """Quantise a payload to bytes: sRGB-encoded colour, and density with 255 for FULL_DENSITY."""
     encoded = encode_srgb(payload.rgb.clamp(0, 1)).movedim(1, -1)
     density = (payload.density / FULL_DENSITY).clamp(0, 1)[..., None]
     return (torch.cat([encoded, density], dim=-1) * 255).round().to(torch.uint8).numpy()
 
 
 def is_complete(path: Path, variants: int, seed: int, making: Making) -> bool:
-    """Whether a file is whole and holds this person, so made; damaged files are not an error, they are made again."""
+    """Whether a file contains this sample, made by this method; False for damaged files, which are made again."""
     if not path.is_file():
         return False
     try:

@@ -1,4 +1,4 @@
-"""A dressed person from a seed."""
+"""Generate a dressed human from a seed."""
 
 from __future__ import annotations
 
@@ -22,52 +22,52 @@ BROW_SIZE = 512
 GRID = 2.0**17
 """Vertices are rounded to 1 / GRID m, 8 micrometres."""
 CLOTHES = ("outfit", "shoes")
-"""Parts that hide what is under them. Outfits also list the base's eyes and hair, which must stay."""
+"""Parts that hide vertices of the body. Outfits also list the base's eyes and hair, which stay visible."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Person:
-    """A dressed, rigged person in the rest pose of the default body."""
+    """A dressed, rigged human in the rest pose of the default body."""
 
     mesh: TexturedMesh
     """Parts "body", "eyes", "eyebrows", "eyelashes", "outfit", "shoes" and, if worn, "hair" and "hat"."""
     betas: Float[np.ndarray, "10"]
     attributes: dict[str, str | float]
-    """What can be said of the person: sex, skin tone, garments and their colours."""
+    """Labels such as sex, skin tone, garments and colours."""
     sources: tuple[str, ...]
-    """Files of the asset folder that the person is made of, as paths in it."""
+    """Asset files that were used, as relative paths."""
     choice: Choice
     assets: Assets
     base: BaseMesh
 
 
 def make_person(assets: Assets, base: BaseMesh, seed: int) -> Person:
-    """A person drawn from a seed: body, clothes, hair and all colours; the same on any machine.
+    """Generate body, clothes, hair and colours from a seed; independent of the machine.
 
-    Takes about half a second once the process has decoded the files it needs.
+    Takes about half a second once asset files are cached.
 
     Raises:
-        AssetsMissingError, ProxyFileError: the asset folder lacks files or has damaged ones.
+        AssetsMissingError, ProxyFileError: asset files are missing or damaged.
     """
     choice = choose(seed, femininity(base))
     return _coloured(assets, base, choice, _geometry(assets, base, choice, faces.draw_face(stream(seed, "face"))), seed)
 
 
 def recolour(person: Person, seed: int) -> Person:
-    """The same person with other colours of skin, hair, eyes and clothes; geometry arrays are shared, not copied."""
+    """Return the person with other colours of skin, hair, eyes and clothes; geometry arrays are shared."""
     return _coloured(person.assets, person.base, person.choice, person.mesh, seed)
 
 
 @functools.lru_cache(maxsize=4)
 def femininity(base: BaseMesh) -> Float[np.ndarray, "10"]:
-    """The direction in betas from male to female: regression of gender on the bodies the base mesh was made from."""
+    """Direction in betas from male to female: linear regression of gender on the shape space's samples."""
     gender = base.sample_phenotypes[:, base.phenotype_names.index("gender")]
     design = np.column_stack([base.sample_betas, np.ones(len(gender))])
     return np.linalg.lstsq(design, gender, rcond=None)[0][:-1]
 
 
 def _geometry(assets: Assets, base: BaseMesh, choice: Choice, face: Float[np.ndarray, " M"]) -> TexturedMesh:
-    """All parts in place, with a plain texture; coordinates rounded so that every machine has the same."""
+    """Fit all parts, with plain textures; coordinates are rounded so that they do not depend on the machine."""
     vertices = faces.with_face(base.vertices(choice.betas), base, face)
     paths = {
         "outfit": choice.outfit.path,
@@ -111,7 +111,7 @@ def _geometry(assets: Assets, base: BaseMesh, choice: Choice, face: Float[np.nda
 
 
 def _compact(part: TexturedPart) -> TexturedPart:
-    """The part without vertices that no face uses, the others on a grid."""
+    """Remove unused vertices and round the others to GRID."""
     used, faces = np.unique(part.faces, return_inverse=True)
     return dataclasses.replace(
         part,
@@ -123,7 +123,7 @@ def _compact(part: TexturedPart) -> TexturedPart:
 
 
 def _coloured(assets: Assets, base: BaseMesh, choice: Choice, mesh: TexturedMesh, seed: int) -> Person:
-    """Draw all colours from a seed and put them on the geometry."""
+    """Draw all colours from a seed and texture the geometry."""
     complexion = skin.draw_skin(assets, choice.sex, stream(seed, "skin"))
     hair_name, hair_linear = palette.hair_colour(complexion.tone, complexion.age == "old", stream(seed, "hair colour"))
     iris = eyes.draw_eyes(assets, complexion.tone, stream(seed, "eye colour"))

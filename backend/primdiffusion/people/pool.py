@@ -1,4 +1,4 @@
-"""One person after another on several processes, which end with the one that gives them work."""
+"""Run jobs on several processes, which exit with their parent."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ THREAD_COUNTS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "
 
 
 class WorkerKilledError(ValueError):
-    """A process of ours was ended from outside."""
+    """A worker process was killed."""
 
 
 def each(work: Callable[..., object], jobs: Iterable[tuple[Any, ...]], workers: int) -> Iterator[None]:
-    """Calls `work(*job)` for every job, on this process or on `workers` others; yields after each that is done.
+    """Call `work(*job)` for every job, in this process or in `workers` others; yield after each finished job.
 
-    The first error ends it: jobs that have begun are finished, others are not begun. So does closing the iterator, or
-    Ctrl-C, which reaches this process alone.
+    The first error stops it: running jobs are finished, queued ones dropped. So does closing the iterator, and Ctrl-C,
+    which only this process receives.
 
     Raises:
-        WorkerKilledError: a process was killed, most often because memory ran out.
+        WorkerKilledError: a process was killed, usually out of memory.
         Exception: whatever `work` raises.
     """
     if workers == 1:
@@ -46,8 +46,8 @@ def each(work: Callable[..., object], jobs: Iterable[tuple[Any, ...]], workers: 
                     yield
         except BrokenProcessPool as error:
             raise WorkerKilledError(
-                f"One of {workers} worker processes was killed, perhaps because memory ran out; run the same command "
-                "again with fewer --workers: what is finished is kept."
+                f"one of {workers} worker processes was killed, perhaps out of memory: run the command again with "
+                "fewer --workers; finished files are skipped"
             ) from error
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
@@ -55,7 +55,7 @@ def each(work: Callable[..., object], jobs: Iterable[tuple[Any, ...]], workers: 
 
 @contextlib.contextmanager
 def _single_threaded_children() -> Iterator[None]:
-    """Processes started meanwhile keep numpy and numba to one thread: there are as many processes as cores."""
+    """Limit child processes to one numpy and numba thread: there are as many processes as cores."""
     before = {name: os.environ.get(name) for name in THREAD_COUNTS}
     os.environ.update(dict.fromkeys(THREAD_COUNTS, "1"))
     try:

@@ -1,9 +1,8 @@
-"""Skins of every tone for both sexes, from the few textures of the pack.
+"""Skin textures of any tone for both sexes, interpolated between the few textures of the pack.
 
-A skin of tone 0 is a light texture, one of tone 1 has the local mean colour (Lab) of a dark one; in between colours
-move in a straight line. Local means are used, because palms, soles and scalp differ between light and dark skin in
-other ways than the rest. Detail finer than the local mean stays that of the base texture, so a woman's skin can be dark
-although the pack's dark textures are men's.
+Tone 0 is a light texture, tone 1 has the local mean colour (Lab) of a dark one, with linear interpolation in between.
+Local means are used because palms, soles and scalp differ less between light and dark skin than the rest. Detail finer
+than the local mean is the base texture's, so that female skins can be dark although the pack's dark textures are male.
 """
 
 from __future__ import annotations
@@ -22,27 +21,27 @@ from primdiffusion.people.wardrobe import Sex
 
 SIZE = 1024
 COARSE = 256
-"""Texels of the local mean's side."""
+"""Resolution of the local mean, texels."""
 SPREAD = 6.0
 """Standard deviation of the local mean's window, texels of COARSE."""
 BROAD_SPREAD, EVENED = 16.0, (0.3, 0.6, 0.6)
-"""Limbs of another colour than the rest come this much (L, a, b) nearer to it; window in texels of COARSE."""
+"""Window (texels of COARSE) and strength (L, a, b) with which limbs are shifted towards the skin's median colour."""
 FOLDER = "skins/textures"
 LEFT_OUT = ("suit", "toon")
 
 
 @dataclasses.dataclass(frozen=True)
 class SkinColours:
-    """The skin of one person."""
+    """A skin: two textures, a tone between them, and a colour shift."""
 
     base: str
-    """Texture the detail comes from."""
+    """Texture that provides the detail."""
     other: str
-    """Texture of the opposite tone whose local means the base moves towards."""
+    """Texture of the opposite tone that provides the other local mean."""
     tone: float
     """0 light to 1 dark."""
     shift: tuple[float, float, float]
-    """Added in Lab."""
+    """Offset in Lab."""
 
     @property
     def age(self) -> str:
@@ -51,17 +50,17 @@ class SkinColours:
 
 
 def draw_skin(assets: Assets, sex: Sex, draws: np.random.Generator) -> SkinColours:
-    """Draw a skin: tones evenly over the range; the detail from a texture of the sex and, where there is one, the tone.
+    """Draw a skin: uniform tone; detail from a texture of the sex and, if available, of the tone.
 
     Raises:
-        AssetsMissingError: the folder lacks light skins of this sex or dark ones altogether.
+        AssetsMissingError: there are no light skins of this sex or no dark skins.
     """
     light = _textures(assets, f"lightskinned_{sex}")
     dark = _textures(assets, f"darkskinned_{sex}")
     any_dark = dark or _textures(assets, "darkskinned")
     if not light or not any_dark:
         raise AssetsMissingError(
-            f"The asset folder {assets.root} has no light {sex} skins or no dark skins in {FOLDER}; complete the pack."
+            f"no light {sex} skins or no dark skins in {assets.root / FOLDER}: fetch the whole asset pack"
         )
     tone = float(draws.random())
     light_pick, dark_pick = draws.integers(1 << 30, size=2)
@@ -72,7 +71,7 @@ def draw_skin(assets: Assets, sex: Sex, draws: np.random.Generator) -> SkinColou
 
 
 def skin_texture(assets: Assets, skin: SkinColours) -> UInt8[np.ndarray, "H W 4"]:
-    """The texture of a skin."""
+    """Make the texture of a skin."""
     distance = skin.tone if "lightskinned" in skin.base else 1 - skin.tone
     means = _local_mean(assets, skin.other) - _local_mean(assets, skin.base)
     move = distance * means + np.array(skin.shift)
@@ -89,7 +88,7 @@ def skin_texture(assets: Assets, skin: SkinColours) -> UInt8[np.ndarray, "H W 4"
 
 
 def _textures(assets: Assets, word: str) -> tuple[str, ...]:
-    """Skins whose file name contains a word, without those that paint clothes or cartoons."""
+    """Skins whose file name contains a word, without painted clothes and cartoons."""
     return tuple(
         name for name in assets.pictures(FOLDER, f"_{word}") if not any(left_out in name for left_out in LEFT_OUT)
     )
@@ -103,6 +102,6 @@ def _lab(assets: Assets, name: str) -> np.ndarray:
 
 @functools.lru_cache(maxsize=32)
 def _local_mean(assets: Assets, name: str) -> Float[np.ndarray, "COARSE COARSE 3"]:
-    """The local mean colour of a skin texture, Lab."""
+    """Local mean colour of a skin texture, Lab."""
     lab = lab_from_bytes(assets.picture(name, COARSE)[..., :3])
     return gaussian_filter(lab, (SPREAD, SPREAD, 0))

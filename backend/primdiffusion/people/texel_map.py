@@ -1,6 +1,6 @@
-"""Which point of a mesh lies under each texel: texture coordinates drawn as triangles into a picture.
+"""Map texels to points of a mesh by rasterising its texture coordinates.
 
-Row 0 of a map is the picture's top row, v points up (see geometry/textured_mesh.py).
+Row 0 of a map is the top row of the image; v points up (see geometry/textured_mesh.py).
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from scipy.sparse.csgraph import connected_components
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TexelMap:
-    """The mesh under each texel; texels between islands belong to the nearest island, so that seams do not bleed."""
+    """The mesh point of each texel; texels between islands map to the nearest one, so that seams do not bleed."""
 
     face: Int[np.ndarray, "H W"]
     barycentric: Float[np.ndarray, "H W 3"]
     """Clamped to the triangle for texels outside every island."""
     inside: np.ndarray
-    """[H, W] bool: the texel's centre lies in a triangle."""
+    """[H, W] bool: the texel's centre is inside a triangle."""
 
     def sample(self, per_vertex: Float[np.ndarray, "V C"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "H W C"]:
-        """A quantity of the vertices interpolated under each texel, float64."""
+        """Interpolate a vertex quantity at each texel, float64."""
         corners = per_vertex[faces[self.face]]
         return np.einsum("hwk,hwkc->hwc", self.barycentric, corners)
 
 
 @njit(cache=True)
 def _draw(corner_uv: np.ndarray, size: int, face: np.ndarray, barycentric: np.ndarray) -> None:
-    """Mark each texel centre with the last triangle that covers it."""
+    """Write the last triangle that covers each texel centre."""
     for f in range(corner_uv.shape[0]):
         x0, y0 = corner_uv[f, 0, 0] * size, (1 - corner_uv[f, 0, 1]) * size
         x1, y1 = corner_uv[f, 1, 0] * size, (1 - corner_uv[f, 1, 1]) * size
@@ -57,23 +57,23 @@ def _draw(corner_uv: np.ndarray, size: int, face: np.ndarray, barycentric: np.nd
 
 
 def texel_map(corner_uv: Float[np.ndarray, "F 3 2"], size: int) -> TexelMap:
-    """Draw a mesh's texture coordinates into a picture of `size` x `size` texels.
+    """Rasterise texture coordinates at `size` x `size` texels.
 
     Raises:
-        ValueError: no texel's centre lies in any triangle.
+        ValueError: no texel's centre is inside a triangle.
     """
     face = np.full((size, size), -1, np.int32)
     barycentric = np.zeros((size, size, 3), np.float32)
     _draw(np.ascontiguousarray(corner_uv, np.float64), size, face, barycentric)
     inside = face >= 0
     if not inside.any():
-        raise ValueError(f"No texel of a {size} x {size} picture is covered; the mesh has no texture coordinates.")
+        raise ValueError(f"no texel of {size} x {size} is covered: the mesh has no texture coordinates")
     nearest = np.asarray(distance_transform_edt(~inside, return_distances=False, return_indices=True))
     return TexelMap(face[tuple(nearest)], barycentric[tuple(nearest)], inside)
 
 
 def connected_faces(faces: Int[np.ndarray, "F 3"], vertex_count: int) -> Int[np.ndarray, " F"]:
-    """The number of the connected piece each face belongs to, largest piece first."""
+    """Index of each face's connected component, largest first."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     graph = coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(vertex_count, vertex_count))
     label = connected_components(graph, directed=False)[1][faces[:, 0]]
@@ -84,7 +84,7 @@ def connected_faces(faces: Int[np.ndarray, "F 3"], vertex_count: int) -> Int[np.
 
 
 def uv_islands(corner_uv: Float[np.ndarray, "F 3 2"]) -> Int[np.ndarray, " F"]:
-    """The number of the island of texture coordinates each face belongs to, largest island first."""
+    """Index of each face's UV island, largest first."""
     keys = np.rint(corner_uv.reshape(-1, 2) * 1e5).astype(np.int64)
     unique, index = np.unique(keys, axis=0, return_inverse=True)
     return connected_faces(index.reshape(-1, 3), len(unique))

@@ -1,7 +1,7 @@
-"""What there is to wear, and what a person of a given seed wears: names only, no files.
+"""Catalogue of garments and hair, and the random choice of an outfit; names only, no files.
 
-The tables name the meshes of the asset pack and say of each connected piece of a garment what it is (largest piece
-first), because that decides which colours and patterns suit it.
+The tables list the meshes of the asset pack and the kind of each connected piece of a garment (largest first), which
+determines its colours and patterns.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ class Piece:
 
     kind: Kind
     trim: bool = False
-    """The texture has parts of a clearly different colour (edgings, a shirt under a jacket) to be coloured apart."""
+    """The texture has parts of a clearly different colour (edgings, a shirt under a jacket), coloured separately."""
     smooth: bool = False
-    """The texture has fine stripes or writing, which primitives cannot show: keep its broad shading only."""
+    """The texture has fine stripes or text, which primitives cannot represent: only its smooth shading is used."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Garment:
-    """A mesh of the pack and what its pieces are."""
+    """A mesh of the pack and the kinds of its pieces."""
 
     name: str
     pieces: tuple[Piece, ...]
     by_island: bool = False
-    """Pieces are islands of the texture instead of connected parts of the mesh."""
+    """Pieces are UV islands instead of connected components of the mesh."""
 
     @property
     def path(self) -> str:
-        """Where its files are in the asset folder, without ending."""
+        """Path of its files in the asset folder, without extension."""
         return f"clothes/{self.name}/{self.name}"
 
 
@@ -56,7 +56,7 @@ UNISEX = (
     Garment("male_casualsuit06", (SMOOTHED_TOP, DENIM)),
     Garment("male_worksuit01", (Piece("overall"), PLAIN_TOP, DETAIL, DETAIL, DETAIL, DETAIL)),
 )
-"""Made for men, and worn by women too, of whose clothes the pack has few; they sit well on both."""
+"""Made for men and used for both sexes, because the pack has few women's clothes; they fit both."""
 OUTFITS: dict[Sex, tuple[Garment, ...]] = {
     "female": (
         Garment("female_casualsuit01", (TRIMMED_TOP, DENIM)),
@@ -79,7 +79,7 @@ SKIRTS = {
     for garment in garments
     if any(piece.kind == "skirt" for piece in garment.pieces)
 }
-"""Outfits with a skirt, and which of their pieces it is."""
+"""Outfits with a skirt, and the indices of its pieces."""
 
 _SHOE = (Piece("shoe"), Piece("shoe"), Piece("sock"), Piece("sock"))
 SHOES: tuple[Garment, ...] = (
@@ -104,7 +104,7 @@ HAIR: dict[Sex, dict[str, float]] = {
     },
     "male": {"short01": 0.22, "short02": 0.22, "short04": 0.22, "short03": 0.17, "afro01": 0.17},
 }
-"""Shares; the bobs hide an eye and stay few."""
+"""Probabilities; low for the bobs, which hide an eye."""
 HAT_HAIR: dict[Sex, dict[str, float]] = {
     "female": {"bob02": 0.3, "long01": 0.7},
     "male": {"short02": 0.5, "short04": 0.5},
@@ -112,7 +112,7 @@ HAT_HAIR: dict[Sex, dict[str, float]] = {
 EYEBROWS = tuple(f"eyebrows/eyebrow{number:03d}/eyebrow{number:03d}" for number in range(1, 13))
 EYELASHES = tuple(f"eyelashes/eyelashes{number:02d}/eyelashes{number:02d}" for number in range(1, 5))
 FEMALE_EYELASHES = 3
-"""The first so many; the last are stage make-up."""
+"""Number of natural-looking ones; the last is stage make-up."""
 FEMALE_EYEBROWS, MALE_EYEBROWS = (0, 1, 3, 5, 6, 9, 10), (0, 1, 2, 3, 4, 7, 9, 11)
 EYES = "eyes/low-poly/low-poly"
 
@@ -120,12 +120,12 @@ HAT_SHARE, BALD_SHARE = 0.08, 0.08
 LARGEST_BETA, BETA_DIGITS = 2.0, 6
 STATURE: dict[Sex, float] = {"female": -0.6, "male": 0.05}
 STATURE_SPREAD = 0.55
-"""The first beta is height, 14 cm a unit about 1.76 m: men are 1.77 +- 0.08 m tall, women 1.68 +- 0.08 m."""
+"""The first beta is height, 14 cm per unit around 1.76 m: men are 1.77 +- 0.08 m tall, women 1.68 +- 0.08 m."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Choice:
-    """The shape of a person: body and meshes, without colours."""
+    """Body and meshes of a human, without colours."""
 
     sex: Sex
     betas: Float[np.ndarray, "10"]
@@ -138,28 +138,28 @@ class Choice:
 
 
 def stream(seed: int, purpose: str) -> np.random.Generator:
-    """Random numbers of one purpose: what is drawn for one does not move what is drawn for another."""
+    """Random generator for one purpose, independent of the numbers drawn for others."""
     return np.random.default_rng([seed, zlib.crc32(purpose.encode())])
 
 
 def required_meshes() -> tuple[str, ...]:
-    """Every mesh a person may need, as paths without ending in the asset folder."""
+    """All meshes that may be used, as relative paths without extension."""
     clothes = [garment.path for outfits in OUTFITS.values() for garment in outfits] + [shoe.path for shoe in SHOES]
     hair = [hair_path(name) for names in HAIR.values() for name in names]
     return tuple(dict.fromkeys((*clothes, *HATS, *hair, *EYEBROWS, *EYELASHES, EYES)))
 
 
 def hair_path(name: str) -> str:
-    """Where the files of a hair mesh are, without ending."""
+    """Path of a hair mesh's files, without extension."""
     return f"hair/{name}/{name}"
 
 
 def choose(seed: int, femininity: Float[np.ndarray, "10"]) -> Choice:
-    """Draw a person's body and clothes; outfits are drawn evenly within a sex.
+    """Draw body and clothes; outfits are uniform within a sex.
 
     Args:
-        seed: same seed, same choice, on any machine.
-        femininity: the direction in betas along which bodies go from male to female.
+        seed: determines the choice, independent of the machine.
+        femininity: direction in betas from male to female.
     """
     betas, sex = draw_body(seed, femininity)
     wear = stream(seed, "wear")
@@ -184,10 +184,10 @@ def choose(seed: int, femininity: Float[np.ndarray, "10"]) -> Choice:
 
 
 def draw_body(seed: int, femininity: Float[np.ndarray, "10"]) -> tuple[Float[np.ndarray, "10"], Sex]:
-    """Betas of N(0, 1) within LARGEST_BETA, and the sex on whose side of the body shapes they fall.
+    """Draw betas of N(0, 1) within LARGEST_BETA, and the sex that they correspond to.
 
-    Bodies are moved off the middle between the sexes, where clothes of neither sit well, to at least half a standard
-    deviation along `femininity`.
+    Bodies are at least half a standard deviation along `femininity` from the midpoint of the sexes, where the clothes
+    of neither fit well.
     """
     draws = stream(seed, "body")
     betas = draws.standard_normal(10)
@@ -231,15 +231,15 @@ WORDS = {
     },
     "hat": {"fedora": "fedora", "fedora_cocked": "cocked fedora"},
 }
-"""What artists call the meshes of the pack; names that are not here stand for themselves."""
+"""Display names of the pack's meshes; other names are used as they are."""
 PLAIN = {"solid", "original"}
-"""Patterns that are none."""
+"""Values of `pattern` without a pattern."""
 
 
 def words_of(attributes: Mapping[str, object]) -> dict[str, str]:
-    """What can be asked for of a person with these attributes: sex, outfit, pattern, shoes, hair, hat.
+    """Convert attributes of `person.Person` to those that models are conditioned on; missing ones are left out.
 
-    Attributes are those of `person.Person`; which a person lacks are left out.
+    The result has sex, outfit, pattern, shoes, hair and hat.
     """
     words = {
         name: WORDS.get(name, {}).get(str(attributes[name]), str(attributes[name]))

@@ -1,1 +1,1 @@
-"""The authors' checkpoints, read, checked and converted at the border (SPEC 1, 3, 6)."""
+"""Read, validate and convert the authors' checkpoints (SPEC 1, 3, 6)."""

@@ -1,4 +1,4 @@
-"""What became of each tensor of a released checkpoint: nothing in the file is passed over in silence."""
+"""Report on each tensor of a released checkpoint, so that none is ignored silently."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 Fate = Literal["imported", "checked", "dropped"]
-"""imported: in the new file; checked: compared with what it must be, then not needed; dropped: not used by design."""
+"""imported: in the new file; checked: validated, then not needed; dropped: not used by design."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,21 +18,21 @@ class Entry:
     key: str
     """Its name in the file."""
     group: str
-    """Where it belongs: "schedule", "diffusion", or a module of the body decoder."""
+    """"schedule", "diffusion", or a module of the body decoder."""
     shape: tuple[int, ...]
     fate: Fate
     note: str
-    """What it was checked against, what it is called now, or why it is not used."""
+    """What it was checked against, its new name, or why it is not used."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Account:
-    """All tensors of a file, in its order."""
+    """All tensors of a file, in file order."""
 
     entries: tuple[Entry, ...]
 
     def groups(self) -> list[dict[str, Any]]:
-        """For each group and fate in the order of the file: how many tensors and values, and an example of the note."""
+        """Count tensors and values of each group and fate, in file order, with the first note."""
         rows: dict[tuple[str, str], list[Entry]] = collections.defaultdict(list)
         for entry in self.entries:
             rows[entry.group, entry.fate].append(entry)
@@ -48,7 +48,7 @@ class Account:
         ]
 
     def table(self) -> str:
-        """The groups as lines of text."""
+        """Format the groups as a text table."""
         rows = [
             (row["group"], row["fate"], str(row["tensors"]), f"{row['values']:,}", row["note"]) for row in self.groups()
         ]

@@ -1,7 +1,7 @@
-"""The imported checkpoint: a file like our own, made from the authors' and a body of the user's.
+"""Imported checkpoints: this package's format, made from the authors' checkpoint and the user's body files.
 
-It holds the denoiser's tensors and, of the body, numbers of faces, places on them and sizes of boxes; the body itself
-is named by path and fingerprint, and must be there, unchanged, to load it.
+The file contains the denoiser's tensors, and anchors and box sizes of the body. The body files are referenced by path
+and checksum, and must exist unchanged to load the checkpoint.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ from primdiffusion.released.schedule_buffers import SCHEDULE
 from primdiffusion.staging import write_atomically
 
 KIND = "released"
-"""Of the architecture in the file's metadata."""
+"""`kind` of the architecture in the file's metadata."""
 CHAINS = {"released": released_steps, "trailing": trailing_steps}
-"""Which steps a sampler visits, by the name in the file."""
+"""Timestep schedules by their names in the file."""
 Chain = Literal["released", "trailing"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Reference:
-    """The subject whose first frame sets the sizes of boxes (SPEC 2), and whose shape imported people have."""
+    """The subject whose first frame determines box sizes (SPEC 2), and whose betas generated humans get."""
 
     betas: Float[Tensor, "10"]
     pose: BodyPose
 
     @classmethod
     def template(cls) -> Reference:
-        """The mean body in the T pose, for those who do not have the dataset."""
+        """The mean body in T pose, for use without the dataset."""
         return cls(torch.zeros(BETAS), BodyPose.rest())
 
 
 def reference_extents(body_setup: BodySetup, reference: Reference) -> Float[Tensor, "k 3"]:
-    """Rest half extents (metres) as the released code computes them from its reference subject."""
+    """Compute rest half extents (metres) from a reference subject, as the released code does."""
     vertices = body_setup.body.shape(reference.betas).pose(reference.pose).vertices
     anchors = body_setup.anchors
     return rest_half_extent(surface_points(vertices, body_setup.body.faces, anchors.face, anchors.barycentric))
@@ -65,7 +65,7 @@ def write_imported(
     chain: Chain,
     card: Mapping[str, Any],
 ) -> None:
-    """Writes the file whole or not at all; `denoiser` has the names of `SlabUNet`. Raises OSError."""
+    """Write the file, atomically; `denoiser` uses the names of `SlabUNet`. Raises OSError."""
     tensors = {f"denoiser.{name}": value.float().contiguous() for name, value in denoiser.items()}
     tensors |= {
         "stand.face": body_setup.anchors.face,
@@ -93,7 +93,7 @@ def write_imported(
 def released_model(
     tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card: Mapping[str, Any], folder: Path
 ) -> DiffusionModel:
-    """The model in a file that `write_imported` made; `folder` is where the file lies.
+    """Build the model of a file from `write_imported`; `folder` is the folder of the file.
 
     Raises BodySetupError where the body it needs is gone or changed; KeyError, TypeError or RuntimeError where the file
     contradicts itself.
@@ -112,10 +112,8 @@ def released_model(
         torch.equal(anchors.face, tensors["stand.face"].long())
         and torch.allclose(anchors.barycentric, tensors["stand.barycentric"], atol=1e-5)
     ):
-        raise BodySetupError(
-            "the primitives lie elsewhere on the body than when the checkpoint was imported: import it again"
-        )
-    nothing = (
+        raise BodySetupError("the anchors differ from those that the checkpoint was imported with: import it again")
+    fixed_betas = (
         torch.zeros(BETAS, 0),
         tensors["stand.betas"],
         torch.zeros(BETAS, BETAS),
@@ -125,7 +123,7 @@ def released_model(
         denoiser=network,
         schedule=SCHEDULES[architecture["schedule"]](),
         codec=ReleasedSlab(),
-        shapes=ShapePrior(*nothing),
+        shapes=ShapePrior(*fixed_betas),
         full_density=float(architecture["full_density"]),
         card=card,
         chain=CHAINS[architecture["chain"]],

@@ -1,4 +1,4 @@
-"""The account of a whole released checkpoint: which tensors it has, and that they are all it should have (SPEC 6)."""
+"""Validate a whole released checkpoint: every tensor is known, and none is missing (SPEC 6)."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from primdiffusion.released.schedule_buffers import buffers, check_buffers
 
 @dataclasses.dataclass(frozen=True)
 class Inventory:
-    """A checkpoint that was accounted for."""
+    """A validated checkpoint."""
 
     account: Account
     unet: UNetConfig | None
-    """Size of its denoiser; None of a stage-1 file, which has none."""
+    """Configuration of its denoiser; None for a stage-1 file, which has none."""
 
 
 def take_inventory(weights: Mapping[str, Tensor]) -> Inventory:
-    """Accounts for each tensor of a checkpoint of both stages (475 of them as released), or of stage 1 alone (165).
+    """Validate each tensor of a checkpoint of both stages (475 in the released one), or of stage 1 alone (165).
 
-    Raises ReleasedFileError that names the first tensor which is unknown, missing, or other than it must be.
+    Raises ReleasedFileError, naming the first tensor that is unknown, missing or invalid.
     """
     prefixes = (stage_one.PREFIX, denoiser.PREFIX)
     if not any(key.startswith(prefixes) for key in weights):
         if not any(key.partition(".")[0] in stage_one.TENSORS for key in weights):
             names = ", ".join(map(repr, list(weights)[:4])) or "none"
             raise ReleasedFileError(
-                f"none of the {len(weights)} tensors is one of a released checkpoint (the first: {names}): give the "
+                f"none of the {len(weights)} tensors belongs to a released checkpoint (first: {names}): give the "
                 "authors' primdiffusion.pt"
             )
         return Inventory(Account(tuple(stage_one.account_stage_one(weights, prefix=""))), None)
     known = buffers()
     for key, value in weights.items():
         if key not in known and not key.startswith(prefixes):
-            raise ReleasedFileError(f"{key!r} {tuple(value.shape)} belongs to no part of a released checkpoint")
+            raise ReleasedFileError(f"unknown tensor {key!r} {tuple(value.shape)}: give the authors' primdiffusion.pt")
     entries = check_buffers({key: weights[key] for key in known if key in weights})
     entries += stage_one.account_stage_one(_under(weights, stage_one.PREFIX))
     unet, imported = denoiser.account_denoiser(_under(weights, denoiser.PREFIX))
@@ -53,5 +53,5 @@ def _under(weights: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 def _in_order(weights: Mapping[str, Tensor], entries: list[Entry]) -> tuple[Entry, ...]:
     by_key = {entry.key: entry for entry in entries}
-    assert by_key.keys() == weights.keys(), "every tensor has an entry, or an error was raised"
+    assert by_key.keys() == weights.keys(), "every tensor has an entry"
     return tuple(by_key[key] for key in weights)

@@ -1,4 +1,4 @@
-"""Reading a torch file of weights without running anything in it."""
+"""Read a torch checkpoint without executing pickled code."""
 
 from __future__ import annotations
 
@@ -13,39 +13,39 @@ import torch
 from torch import Tensor
 
 STATE = "model_state_dict"
-"""Top-level key under which the released code saves its weights; "optimizer" is beside it."""
+"""Top-level key of the weights in released checkpoints; the other is "optimizer"."""
 PICKLE_ERRORS = (
     pickle.UnpicklingError, RuntimeError, EOFError, ValueError, TypeError, LookupError, AttributeError, OverflowError,
     MemoryError, NotImplementedError, AssertionError, OSError, struct.error,
 )  # fmt: skip
-"""What torch raises for bytes that are no torch file; the restricted unpickler has no type of its own."""
+"""Exceptions that torch raises for invalid files; its restricted unpickler has no exception class of its own."""
 _ZIP_MAGIC = b"PK\x03\x04"
 
 
 class ReleasedFileError(ValueError):
-    """A file that is no checkpoint of the released code; the message names it, what is wrong and what to do."""
+    """A file that is not a checkpoint of the released code."""
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:
-    """The tensors of a released checkpoint in the file's order; mapped where the file allows: optimisers cost nothing.
+    """Read the tensors of a released checkpoint in file order, memory-mapped if possible, so optimisers are not loaded.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ReleasedFileError: it asks for code to be run, is truncated, or holds no dictionary of named tensors.
+        FileNotFoundError: the file does not exist.
+        ReleasedFileError: the file would execute code, is truncated, or is not a dictionary of named tensors.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"there is no checkpoint at {path}: give the path of the authors' primdiffusion.pt")
+        raise FileNotFoundError(f"no checkpoint at {path}: give the path of the authors' primdiffusion.pt")
     content = _load(path)
     state = content.get(STATE, content) if isinstance(content, Mapping) else content
     if not isinstance(state, Mapping):
         raise ReleasedFileError(
-            f"{path} holds a {type(state).__name__} where {STATE!r} belongs: give the authors' primdiffusion.pt"
+            f"{path} contains a {type(state).__name__} instead of {STATE!r}: give the authors' primdiffusion.pt"
         )
     for key, value in state.items():
         if not isinstance(key, str) or not isinstance(value, Tensor) or value.layout != torch.strided:
             raise ReleasedFileError(
-                f"{path}: {key!r} is a {type(value).__name__}, not an ordinary tensor: give the authors' "
-                f"primdiffusion.pt, whose top-level keys are {STATE!r}, a dictionary of tensors, and 'optimizer'"
+                f"{key!r} in {path} is a {type(value).__name__}, not a dense tensor: give the authors' "
+                f"primdiffusion.pt, with top-level keys {STATE!r} and 'optimizer'"
             )
     return dict(state)
 
@@ -55,17 +55,17 @@ def _load(path: Path) -> object:
         mappable = file.read(len(_ZIP_MAGIC)) == _ZIP_MAGIC
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of torch, about pickles that are then refused
+            warnings.simplefilter("ignore")  # torch warns about pickles that it then rejects
             return torch.load(path, map_location="cpu", weights_only=True, mmap=mappable)
     except PICKLE_ERRORS as error:
         asked = re.search(r"GLOBAL:? (\S+)|global (\S+)", str(error))
         if asked:
             raise ReleasedFileError(
-                f"{path} asks for {asked[1] or asked[2]} to be run when it is opened, which weights never need; "
-                "nothing in it was run: take the file from its publisher again"
+                f"{path} would execute {asked[1] or asked[2]} when loaded, which weights never need; nothing was "
+                "executed: download the file again from its publisher"
             ) from error
         raise ReleasedFileError(
-            f"{path} is truncated or no torch file ({_first_sentence(error)}): take it from its publisher again"
+            f"{path} is truncated or not a torch file ({_first_sentence(error)}): download it again"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""The twelve buffers that a DDPM of this family saves with its weights: all follow from the schedule (SPEC 1.4, 6)."""
+"""Validate the twelve DDPM buffers stored with the weights: all follow from the noise schedule (SPEC 1.4, 6)."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ from primdiffusion.released.reading import ReleasedFileError
 SCHEDULE = "sqrt_linear"
 """Name of the released schedule in `SCHEDULES`."""
 RELATIVE, ABSOLUTE = 1e-4, 1e-6
-"""Of differences that float32 makes, also where they were computed in it. The linear schedule differs by tens of per
-cent."""
+"""Tolerances for buffers computed in float32. The linear schedule differs by tens of per cent."""
 SMALLEST_VARIANCE = 1e-20
-"""Under the logarithm of the posterior variance, which is 0 at t = 0."""
+"""Lower bound of the posterior variance, which is 0 at t = 0, before taking its logarithm."""
 
 
 def buffers() -> dict[str, Tensor]:
-    """The twelve by their names (Ho et al. 2020, eq. 4 and 7; those of the latent-diffusion family), float64 [T]."""
+    """Compute the buffers (Ho et al. 2020, eq. 4 and 7) under latent-diffusion's names, float64 [T]."""
     alpha_bar = SCHEDULES[SCHEDULE]().alpha_bar
     before = torch.cat([alpha_bar.new_ones(1), alpha_bar[:-1]])
     alpha = alpha_bar / before
@@ -43,28 +42,28 @@ def buffers() -> dict[str, Tensor]:
 
 
 def check_buffers(found: Mapping[str, Tensor]) -> list[Entry]:
-    """Accounts for the twelve. Raises ReleasedFileError that names one which is missing, misshapen or different."""
+    """Validate the buffers. Raises ReleasedFileError, naming one that is missing or has a wrong shape or value."""
     entries = []
     for name, expected in buffers().items():
         if name not in found:
             raise ReleasedFileError(
-                f"the checkpoint lacks {name!r}, a buffer of its noise schedule: take it again whole"
+                f"{name!r}, a buffer of the noise schedule, is missing: download the checkpoint again"
             )
         given = found[name]
         if given.shape != expected.shape:
             raise ReleasedFileError(
-                f"{name!r} has shape {tuple(given.shape)}, not {tuple(expected.shape)}: the checkpoint is of another "
-                "schedule than the released one"
+                f"{name!r} has shape {tuple(given.shape)}, not {tuple(expected.shape)}: the checkpoint was trained "
+                "with another schedule"
             )
-        # A written-out form of the logarithm at t = 0 repeats that of t = 1 instead (Nichol and Dhariwal 2021).
+        # Some implementations set the logarithm at t = 0 to that of t = 1 (Nichol and Dhariwal 2021).
         given = given.double()
         if name == "posterior_log_variance_clipped" and torch.isclose(given[0], expected[1], rtol=RELATIVE):
             expected = torch.cat([expected[1:2], expected[1:]])
         if not torch.allclose(given, expected, rtol=RELATIVE, atol=ABSOLUTE):
             step = int((given - expected).abs().nan_to_num(torch.inf).argmax())
             raise ReleasedFileError(
-                f"{name!r} is {given[step]:.6g} at step {step} where the released schedule (square roots of beta even "
-                f"from 1e-4 to 2e-2) has {expected[step]:.6g}: the checkpoint was trained with another schedule"
+                f"{name!r} is {given[step]:.6g} at step {step}, not {expected[step]:.6g} as in the released schedule "
+                f"({SCHEDULE}, beta from 1e-4 to 2e-2): the checkpoint was trained with another schedule"
             )
         entries.append(Entry(name, "schedule", tuple(found[name].shape), "checked", f"equals {SCHEDULE}"))
     return entries

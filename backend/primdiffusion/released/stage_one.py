@@ -1,7 +1,7 @@
-"""The 165 tensors of stage 1 (`bodydecoder.*`): every one is accounted for, none is carried over.
+"""Validate the 165 tensors of stage 1 (`bodydecoder.*`); none is imported.
 
-SPEC 6 names groups and how many tensors each has, SPEC 2 the layers. That suffices to tell whether a file is what it
-should be, not to run it: over which axes weights are normalised is told neither there nor by any shape.
+SPEC 6 gives the groups and their numbers of tensors, SPEC 2 the layers. That is enough to validate a file but not to
+run it: neither states over which axes weights are normalised, and shapes do not determine it.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ TENSORS = {
     "decoder_geom": 12,
     "transformer": 46,
 }
-"""SPEC 6."""
+"""Number of tensors in each group (SPEC 6)."""
 NOT_USED = {
-    "lbs_fn": "the licensed SMPL model: yours is read instead",
-    "geo_fn": "the licensed SMPL model's UV: yours is read instead",
-    "decoder_geom": "no part of the released code uses it",
+    "lbs_fn": "the licensed SMPL model: read from your files instead",
+    "geo_fn": "the licensed SMPL model's UV: read from your files instead",
+    "decoder_geom": "unused by the released code",
 }
 NOT_CARRIED_OVER = "has the layers of the encoder 'released'; stage 1 is not imported"
 
 
 @dataclasses.dataclass(frozen=True)
 class Layer:
-    """A weight-normalised convolution with a bias for every place: three tensors (SPEC 2)."""
+    """A weight-normalised convolution with a bias per position: three tensors (SPEC 2)."""
 
     weight: tuple[int | None, ...]
-    """[out, in, k, k], or [in, out, k, k] of a transposed one; None where SPEC 2 does not say."""
+    """[out, in, k, k], or [in, out, k, k] if transposed; None where SPEC 2 does not specify it."""
     bias: tuple[int | None, ...]
     """[out, side, side]."""
 
@@ -75,22 +75,22 @@ LAYERS: dict[str, list[Layer]] = {
     "decoder_rgb": _up_thrice(3 * 8),
     "decoder_alpha": _up_thrice(8),
 }
-"""SPEC 2, the most definite first; the small U-Net halves 32 x 32 to 1 x 1 and back, its channels are not told."""
+"""Layers of SPEC 2, most specific first; the small U-Net goes from 32 x 32 to 1 x 1 and back, with unknown channels."""
 ATTENTION: list[tuple[int, ...]] = [(256, 96), (96, 256), *[(2048, 256), (256, 1024)] * 2]
-"""Matrices of the transformer that SPEC 2 tells: into 256 channels, back to 96, and two gated feed-forwards."""
+"""Matrices of the transformer in SPEC 2: to 256 channels, back to 96, and two gated feed-forwards."""
 
 
 def account_stage_one(tensors: Mapping[str, Tensor], prefix: str = PREFIX) -> list[Entry]:
-    """Accounts for all of them (names without `prefix`, which errors put back).
+    """Validate the tensors (names without `prefix`, which error messages include).
 
-    Raises ReleasedFileError that names a tensor which is unknown or does not fit, or a group that is not whole.
+    Raises ReleasedFileError, naming a tensor that is unknown or has a wrong shape, or an incomplete group.
     """
     groups: dict[str, dict[str, Tensor]] = {group: {} for group in TENSORS}
     for name, value in tensors.items():
         group = name.partition(".")[0]
         if group not in groups:
             raise ReleasedFileError(
-                f"'{prefix}{name}' {tuple(value.shape)} belongs to no part of a released checkpoint"
+                f"unknown tensor '{prefix}{name}' {tuple(value.shape)}: give the authors' primdiffusion.pt"
             )
         groups[group][f"{prefix}{name}"] = value
     for group, found in groups.items():
@@ -99,8 +99,8 @@ def account_stage_one(tensors: Mapping[str, Tensor], prefix: str = PREFIX) -> li
         if len(found) != TENSORS[group]:
             names = ", ".join(found) or "none"
             raise ReleasedFileError(
-                f"'{prefix}{group}' holds {len(found)} tensors, not {TENSORS[group]}: {names}; take the checkpoint "
-                "again whole"
+                f"'{prefix}{group}' has {len(found)} tensors, not {TENSORS[group]}: {names}; download the checkpoint "
+                "again"
             )
     _check_attention(groups["transformer"])
     return [
@@ -127,26 +127,26 @@ def _check_layers(group: str, found: Mapping[str, Tensor]) -> None:
         if not fitting:
             rest = "; ".join(f"{_written(layer.weight)} with {_written(layer.bias)}" for layer in left) or "none"
             raise ReleasedFileError(
-                f"{weight!r} {shapes[0]} with {bias!r} {shapes[1]} fits no layer of {group}; those still looked for: "
+                f"{weight!r} {shapes[0]} with {bias!r} {shapes[1]} matches no layer of {group}; unmatched layers: "
                 f"{rest}"
             )
         left.remove(fitting[0])
 
 
 def _weight_and_bias(module: str, found: Mapping[str, Tensor]) -> tuple[str, str]:
-    """The weight's and the bias' names of a convolution's three tensors; the third is the gain of each channel."""
+    """Names of the weight and bias among a convolution's three tensors; the third is the per-channel gain."""
     weights = [key for key, value in found.items() if value.ndim == 4 and value.numel() > max(value.shape)]
     biases = [key for key, value in found.items() if value.ndim == 3]
     gains = [key for key in found if key not in weights + biases]
     if not len(weights) == len(biases) == len(gains) == 1:
         given = ", ".join(f"{key!r} {tuple(value.shape)}" for key, value in found.items())
         raise ReleasedFileError(
-            f"{module!r} is no convolution with weight, gain and bias of every place: it has {given}"
+            f"{module!r} is not a convolution with weight, gain and bias per position: it has {given}"
         )
     channels = found[biases[0]].shape[0]
     if found[gains[0]].numel() != channels:
         raise ReleasedFileError(
-            f"{gains[0]!r} has shape {tuple(found[gains[0]].shape)}, not one number for each channel of {biases[0]!r} "
+            f"{gains[0]!r} has shape {tuple(found[gains[0]].shape)}, not one value per channel of {biases[0]!r} "
             f"{tuple(found[biases[0]].shape)}"
         )
     return weights[0], biases[0]
