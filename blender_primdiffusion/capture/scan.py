@@ -10,8 +10,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from ..motion.bones import BoneMap, map_bones
-from ..motion.rest_alignment import facing, rig_from_smpl
+from ..motion.rigs import BoneMap, facing, map_bones, rig_from_smpl
 from ..motion.rotation import to_axis_angle
 from ..scene.convention import matrix_to_quaternion, points_to_blender
 from .belongings import Belongings

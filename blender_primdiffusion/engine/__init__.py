@@ -1,4 +1,4 @@
-"""The render engine "PrimDiffusion": people drawn by the backend's marcher, in renders and in the viewport."""
+"""The render engine "PrimDiffusion": humans drawn by the backend's marcher, in renders and in the viewport."""
 
 from __future__ import annotations
 
@@ -9,39 +9,39 @@ import bpy
 from .engine import ENGINE, PRIMDIFFUSION_RenderEngine
 from .settings import PRIMDIFFUSION_PG_render
 
-LOOK_AFTER_S = 5.0
-"""Between two looks at a child that nothing is asked of: it is ended when it has been idle for long."""
+CHECK_S = 5.0
+"""Between checks on a child that may be idle, which is stopped after a while."""
 CLASSES = (PRIMDIFFUSION_PG_render, PRIMDIFFUSION_RenderEngine)
 
 
 def register() -> None:
-    """The engine and its settings; starts nothing."""
+    """Register the engine and its settings; starts nothing."""
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion_render = bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_render)
-    bpy.app.timers.register(_look_after, first_interval=LOOK_AFTER_S, persistent=True)
+    bpy.app.timers.register(_check_child, first_interval=CHECK_S, persistent=True)
 
 
 def unregister() -> None:
-    """All of `register` undone, the child ended; scenes that used the engine go back to Blender's default."""
-    if bpy.app.timers.is_registered(_look_after):
-        bpy.app.timers.unregister(_look_after)
+    """Undo `register` and stop the child; scenes that used the engine return to Blender's default."""
+    if bpy.app.timers.is_registered(_check_child):
+        bpy.app.timers.unregister(_check_child)
     for module, ending in (("viewport", "stop"), ("studio", "close")):
         if (drawn := sys.modules.get(f"{__package__}.{module}")) is not None:  # imported by the first picture
             getattr(drawn, ending)()
-    _leave_scenes()
+    _reset_scenes()
     del bpy.types.Scene.primdiffusion_render
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)
 
 
-def _look_after() -> float:
+def _check_child() -> float:
     if (studio := sys.modules.get(f"{__package__}.studio")) is not None:  # imported by the first picture
         studio.advance()
-    return LOOK_AFTER_S
+    return CHECK_S
 
 
-def _leave_scenes() -> None:
+def _reset_scenes() -> None:
     for scene in bpy.data.scenes:
         if scene.render.engine == ENGINE:
             scene.render.engine = bpy.types.RenderSettings.bl_rna.properties["engine"].default or "BLENDER_WORKBENCH"

@@ -1,4 +1,4 @@
-"""The scene's camera and the part of its picture that is wanted, as Blender's own renderers would have them."""
+"""The scene's camera and render border, as Blender's own renderers use them."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .view import View, view_from_matrices, without_scale
+from .view import PinholeView, view_from_matrices, without_scale
 
 
 def camera_view(
     camera: bpy.types.Object, depsgraph: bpy.types.Depsgraph, size: tuple[int, int], subject: NDArray
-) -> View:
-    """What a camera object sees in a picture of `size` (width, height), by Blender's own projection.
+) -> PinholeView:
+    """The view of a camera object in a picture of `size` (width, height), by Blender's own projection, which includes
+    lens, shift, sensor fit and pixel aspect.
 
-    So lens, shift, sensor fit and the pixels' aspect are Blender's. Raises ValueError for a panoramic camera, one
-    that is scaled to nothing and one that clips everything.
+    Raises ValueError for a panoramic camera, one that is scaled to zero and one that clips everything.
     """
     evaluated = camera.evaluated_get(depsgraph)
     data = evaluated.data

@@ -1,6 +1,6 @@
 """The render engine as Blender calls it.
 
-What draws is imported when something is drawn: Blender registers the engine at each start.
+Blender registers the engine at each start, without numpy; the modules that draw are imported by the first picture.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ ENGINE = "PRIMDIFFUSION"
 
 
 class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
-    """Draws people exactly, by marching rays through their primitives; and solid objects simply."""
+    """Draws people exactly, by marching rays through their primitives, and solid objects with simple shading."""
 
     bl_idname = ENGINE
     bl_label = "PrimDiffusion"
@@ -30,14 +30,14 @@ class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
         self._viewport: Viewport | None = None
 
     def update_render_passes(self, scene: bpy.types.Scene, renderlayer: bpy.types.ViewLayer) -> None:
-        """Combined always, Depth where the view layer asks for Z."""
+        """Combined always, Depth where the view layer has the Z pass."""
         self.register_pass(scene, renderlayer, "Combined", 4, "RGBA", "COLOR")
         if renderlayer.use_pass_z:
             self.register_pass(scene, renderlayer, "Depth", 1, "Z", "VALUE")
 
     def render(self, depsgraph: bpy.types.Depsgraph) -> None:
-        """One view layer of one frame; runs beside Blender's window, or in it under -b. An error ends the render."""
-        from . import final
+        """One view layer of one frame, in a thread of Blender's, in its main one under -b. Errors end the render."""
+        from . import final  # see the module's docstring
 
         try:
             final.render_layer(self, depsgraph)
@@ -48,24 +48,24 @@ class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
             raise
 
     def view_update(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
-        """The scene has changed."""
+        """Called when the scene has changed."""
         self._viewport = self._viewport or _new_viewport()
         self._viewport.update(context, depsgraph)
 
     def view_draw(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
-        """Draw the newest picture there is; never waits for one."""
+        """Draw the newest picture, without waiting for one."""
         if self._viewport is None:
             self._viewport = _new_viewport()
             self._viewport.update(context, depsgraph)
         self._viewport.draw(self, context, depsgraph)
 
-    def _fail(self, sentence: str) -> None:
-        sentence = f"PrimDiffusion: {sentence}"
-        self.update_stats("", sentence)
-        self.report({"ERROR"}, sentence)  # ends the render, animations too; error_set would let them go on
+    def _fail(self, message: str) -> None:
+        message = f"PrimDiffusion: {message}"
+        self.update_stats("", message)
+        self.report({"ERROR"}, message)  # ends animations too; after error_set they would continue
 
 
 def _new_viewport() -> Viewport:
-    from .viewport import Viewport
+    from .viewport import Viewport  # see the module's docstring
 
     return Viewport()

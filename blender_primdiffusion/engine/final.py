@@ -1,4 +1,4 @@
-"""F12, animations and renders from the command line: one view layer's picture, shown band by band as it comes."""
+"""Final renders (F12, animations, command line): one view layer's picture, shown band by band as it is drawn."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from ..worker.drawing import Drawing
 from . import studio
 from .camera import camera_view, wanted_region
 from .frames import Frame
-from .picture import picture_of, solids_file
-from .view import View, blender_depth
+from .picture import scene_content, solids_file
+from .view import PinholeView, blender_depth
 
 ANSWER_S = 0.1
-"""How often Blender is asked whether the user wants to stop."""
+"""Interval at which Blender is asked whether the user has cancelled."""
 SHOW_S = 0.2
-"""Between updates of the picture in the window: each copies it as a whole."""
+"""Between updates of the picture in the window, each of which copies all of it."""
 
 
 class RenderFailed(RuntimeError):
-    """No picture; the message is for the user."""
+    """The picture could not be drawn; the message is for the user."""
 
 
 def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph) -> Drawing:
-    """Draws one view layer into the engine's result; returns when it is there, or cancelled by the user.
+    """Draw one view layer into the engine's result; returns when it is finished or cancelled by the user.
 
     Raises RenderFailed, FileNotFoundError for a person without a file, and ValueError for what cannot be drawn.
     """
@@ -38,11 +38,11 @@ def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph)
     result = engine.begin_result(0, 0, width, height, layer=depsgraph.view_layer_eval.name)
     finished = False
     try:
-        picture = picture_of(depsgraph, solids_file(depsgraph, studio.frames.folder))
+        picture = scene_content(depsgraph, solids_file(depsgraph, studio.frames.folder))
         view = camera_view(camera, depsgraph, size, picture.subject)
         frame = studio.frames.take("final", width, height)
         if not bpy.app.background:
-            frame.clear()  # the rows that are still to come
+            frame.clear()  # rows that are not drawn yet
         params = {**picture.params(), **view.params(), "region": region, "frame": str(frame.path)}
         drawing = studio.drawing_child().draw(params)
         _follow(engine, drawing, result, frame, view)
@@ -56,7 +56,7 @@ def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph)
 
 
 def _follow(
-    engine: bpy.types.RenderEngine, drawing: Drawing, result: bpy.types.RenderResult, frame: Frame, view: View
+    engine: bpy.types.RenderEngine, drawing: Drawing, result: bpy.types.RenderResult, frame: Frame, view: PinholeView
 ) -> None:
     shown_rows, shown_at = 0, time.monotonic()
     while not drawing.finished:
@@ -82,8 +82,8 @@ def _stats(drawing: Drawing, height: int) -> str:
     return f"Row {drawing.rows} of {height}{left}"
 
 
-def _fill(result: bpy.types.RenderResult, frame: Frame, view: View) -> None:
-    """Copies what is in the frame into the passes."""
+def _fill(result: bpy.types.RenderResult, frame: Frame, view: PinholeView) -> None:
+    """Copy the frame into the passes."""
     for render_pass in result.layers[0].passes:
         if render_pass.name == "Combined":
             render_pass.rect.foreach_set(frame.combined)

@@ -1,4 +1,4 @@
-"""Pictures as the child leaves them: files in memory that both processes map; nothing is copied through a pipe."""
+"""Pictures from the child: files in shared memory that both processes map, so that nothing is copied."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FOLDER = "folder"
 
 
 class Frame:
-    """One picture in a file: rows from the bottom, as Blender's passes have them."""
+    """One picture in a file, bottom row first, as in Blender's passes."""
 
     def __init__(self, path: Path, width: int, height: int):
         self.path, self.width, self.height = path, width, height
@@ -36,19 +36,19 @@ class Frame:
         return self._values[self.width * self.height * 4 :]
 
     def clear(self) -> None:
-        """Nothing drawn yet."""
+        """Fill the picture with zeros."""
         self._values[:] = 0
 
 
 class Frames:
-    """A folder in shared memory for frames and what else the child reads; `close` removes it with all that is in it.
+    """A folder in shared memory for frames and other files that the child reads; `close` removes it.
 
-    For several threads, each with names of its own: a render and a viewport may both ask.
+    Several threads may use it, each with its own names: Blender renders in a thread while viewports draw.
     """
 
     def __init__(self) -> None:
         self._folders: dict[str, Path] = {}
-        """At most one; two threads that need it at once agree on it by `setdefault`, which is atomic."""
+        """At most one; two threads that need one at once agree by `setdefault`, which is atomic."""
         self._spare: dict[str, Frame] = {}
 
     @property
@@ -68,7 +68,7 @@ class Frames:
         return folder
 
     def take(self, name: str, width: int, height: int) -> Frame:
-        """The frame of this name; the one of last time if it has this size. OSError where there is no room for it."""
+        """The frame of this name, reused if it has this size. Raises OSError where there is no room for it."""
         frame = self._spare.get(name)
         if frame is None or (frame.width, frame.height) != (width, height) or not frame.path.exists():
             self.drop(name)
@@ -77,20 +77,20 @@ class Frames:
         return frame
 
     def drop(self, name: str) -> None:
-        """Removes the frame of this name; its last user still maps it."""
+        """Remove the frame of this name; its last user still maps it."""
         frame = self._spare.pop(name, None)
         if frame is not None:
             frame.path.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Removes the folder."""
+        """Remove the folder."""
         self._spare.clear()
         folder = self._folders.pop(_FOLDER, None)
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
 
     def _allocate(self, name: str, size: int) -> Path:
-        """A file of `size` bytes that has its room: a full memory file system would otherwise end the process later."""
+        """A file of `size` allocated bytes: otherwise a full memory file system would crash the process later."""
         try:
             return _reserve(self.folder / f"{name}_{size}.frame", size)
         except OSError:
@@ -121,7 +121,7 @@ def _reserve(path: Path, size: int) -> Path:
 
 
 def _sweep() -> None:
-    """Removes what a killed Blender left in shared memory, which only a restart would free."""
+    """Remove what a killed Blender left in shared memory, which would otherwise stay until a restart."""
     if os.name == "nt":
         return
     for folder in SHARED_MEMORY.glob(f"{_PREFIX}*_*"):

@@ -1,8 +1,9 @@
-"""What is in the picture, whoever looks: people, solids, background and settings, read from a dependency graph."""
+"""What is drawn: humans, solids, background and settings, read from a dependency graph."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,30 +11,60 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .people import Posed, posed_people
-from .solids import scene_solids, stored
+from ..formats.joints import JOINT_NAMES
+from ..scene.convention import transforms_to_backend
+from ..scene.files import person_file
+from ..scene.human import BETAS, MARK
+from .solids import scene_solids, stored, visible_instances
+
+SMALLEST_SCALE = 1e-4
+"""Animators hide objects by scaling them to zero: below this a human is smaller than the width of a hair."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Picture:
-    """All that the request `draw` wants to know but for the view and the frame."""
+class PosedHuman:
+    """A posed human as the child draws it; backend axes, metres."""
 
-    people: tuple[Posed, ...]
+    file: Path
+    object_to_world: NDArray[np.float64]
+    """[3, 4] of the armature object."""
+    joints: NDArray[np.float64]
+    """Transforms of SMPL's joints from rest to pose, in the armature's space [24, 3, 4]."""
+    betas: list[float] | None
+    """The body's shape; None for the file's."""
+    pelvis: NDArray[np.float64]
+    """Position [3] in Blender's world."""
+
+    def params(self) -> dict[str, object]:
+        """Parameters of the child's `draw`."""
+        return {
+            "human": str(self.file),
+            "object": self.object_to_world.tolist(),
+            "joints": self.joints.tolist(),
+            "betas": self.betas,
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneContent:
+    """What the child's `draw` needs of the scene, without view and frame."""
+
+    people: tuple[PosedHuman, ...]
     solids: Path | None
     background: tuple[float, float, float] | None
     """Linear; None for a transparent film."""
     shown: str
-    """What of the people: "colour", "depth", "alpha" or "boxes"."""
+    """What is drawn of the humans: "colour", "depth", "alpha" or "boxes"."""
     step: float
-    """Metres."""
+    """Between samples along a ray, metres."""
 
     @property
     def subject(self) -> NDArray[np.float64]:
-        """The middle of the people [3], Blender's world; the origin where nobody is."""
+        """The middle of the humans [3] in Blender's world; the origin where there are none."""
         return np.mean([person.pelvis for person in self.people], 0) if self.people else np.zeros(3)
 
     def params(self) -> dict[str, Any]:
-        """As the request `draw` wants it."""
+        """Parameters of the child's `draw`."""
         return {
             "people": [person.params() for person in self.people],
             "solids": str(self.solids) if self.solids else None,
@@ -43,17 +74,17 @@ class Picture:
         }
 
 
-def picture_of(
+def scene_content(
     depsgraph: bpy.types.Depsgraph, solids: Path | None, space: bpy.types.SpaceView3D | None = None
-) -> Picture:
-    """The scene as the dependency graph, or a viewport, shows it, with `solids_file`'s answer.
+) -> SceneContent:
+    """The scene as the dependency graph, or a viewport, shows it, with the file from `solids_file`.
 
-    Raises what `posed_people` raises.
+    Raises as `posed_humans` does.
     """
     scene = depsgraph.scene
     settings = scene.primdiffusion_render
-    return Picture(
-        tuple(posed_people(depsgraph, space)),
+    return SceneContent(
+        tuple(posed_humans(depsgraph, space)),
         solids,
         None if scene.render.film_transparent else world_colour(depsgraph),
         settings.view.lower(),
@@ -64,11 +95,11 @@ def picture_of(
 def solids_file(
     depsgraph: bpy.types.Depsgraph, folder: Path, space: bpy.types.SpaceView3D | None = None
 ) -> Path | None:
-    """The scene's solid objects as a file in `folder`; None where there are none or where they are to be ignored."""
-    wanted = depsgraph.scene.primdiffusion_render.solids
-    if wanted == "IGNORED":
+    """The scene's solid objects as a file in `folder`; None where there are none or they are ignored."""
+    mode = depsgraph.scene.primdiffusion_render.solids
+    if mode == "IGNORED":
         return None
-    return stored(scene_solids(depsgraph, wanted == "HOLDOUT", space), folder)
+    return stored(scene_solids(depsgraph, mode == "HOLDOUT", space), folder)
 
 
 def world_colour(depsgraph: bpy.types.Depsgraph) -> tuple[float, float, float]:
@@ -91,3 +122,59 @@ def world_colour(depsgraph: bpy.types.Depsgraph) -> tuple[float, float, float]:
             return (red * strength, green * strength, blue * strength)
     red, green, blue = world.color
     return (red, green, blue)
+
+
+def posed_humans(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None) -> list[PosedHuman]:
+    """All humans whose armature is visible, in a viewport where one is given; instances included.
+
+    An armature represents its human, which is hidden with it and drawn wherever it is instanced, unless scaled to zero.
+    Raises FileNotFoundError for a human whose file is missing, and ValueError for a shape that is no list of numbers or
+    a pose that holds NaN.
+    """
+    owners = dict(_armatures())
+    found = []
+    for instance in visible_instances(depsgraph, space):
+        obj = instance.object
+        owner = owners.get(obj.original) if obj.type == "ARMATURE" else None
+        matrix = np.array(instance.matrix_world, np.float64)
+        if owner is not None and not abs(np.linalg.det(matrix[:3, :3])) < SMALLEST_SCALE**3:
+            found.append(pose_of(obj, matrix, owner))
+    return found
+
+
+def _armatures() -> Iterator[tuple[bpy.types.Object, bpy.types.Collection]]:
+    """Each armature with SMPL's joints and its human's collection, in this file and in linked ones."""
+    for collection in bpy.data.collections:
+        if MARK not in collection:
+            continue
+        for obj in collection.objects:
+            if obj.type == "ARMATURE" and all(name in obj.data.bones for name in JOINT_NAMES):
+                yield obj, collection
+
+
+def pose_of(armature: bpy.types.Object, matrix: NDArray, owner: bpy.types.Collection) -> PosedHuman:
+    """A human as its armature is posed, with the object at `matrix` [4, 4]. Raises as `posed_humans` does."""
+    bones = armature.pose.bones
+    posed = np.array([bones[name].matrix for name in JOINT_NAMES], np.float64)
+    rest = np.array([bones[name].bone.matrix_local for name in JOINT_NAMES], np.float64)
+    if not (np.isfinite(posed).all() and np.isfinite(matrix).all()):
+        raise ValueError(f"the armature of {owner.name!r} holds NaN or infinite numbers: check its pose and drivers")
+    return PosedHuman(
+        person_file(owner),
+        transforms_to_backend(matrix),
+        transforms_to_backend(posed @ np.linalg.inv(rest)),
+        _betas(armature, owner.name),
+        (matrix @ posed[0])[:3, 3],
+    )
+
+
+def _betas(armature: bpy.types.Object, name: str) -> list[float] | None:
+    if BETAS not in armature:
+        return None
+    try:
+        return [float(value) for value in armature[BETAS]]
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"the custom property {BETAS!r} on the armature of {name!r} is {armature[BETAS]!r}; "
+            "make it a list of ten numbers, or delete it"
+        ) from error

@@ -1,4 +1,4 @@
-"""What the render tab asks the engine for; saved with the scene."""
+"""The engine's settings in the render tab, saved with the scene."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ..formats.requests import RAY_STEP
 
 
 def _redraw(settings: bpy.types.PropertyGroup, _context: bpy.types.Context) -> None:
-    """Blender tells viewports of changes to its own data only."""
+    """Blender notifies viewports only of changes to its own data."""
     settings.id_data.update_tag()
 
 

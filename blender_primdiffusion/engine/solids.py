@@ -1,10 +1,9 @@
-"""Ordinary objects in the picture: what the dependency graph shows of meshes and the like, as coloured triangles."""
+"""Solid objects in the picture: meshes and other surfaces of the dependency graph as coloured triangles."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,14 +11,14 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.capture_layout import replacing
 from ..scene.convention import points_to_backend
 from ..scene.human import BODY_MARK
 from ..scene.proxy import PROXY_MARK
-from .visible import visible_instances
 
 SOLID_TYPES = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})
-UNMOVED_BY_THESE = frozenset({"ARMATURE", "CAMERA", "VOLUME", "LIGHT", "LIGHT_PROBE", "SPEAKER"})
-"""Objects whose own change changes no solid; what hangs on them reports a change of its own."""
+UNRELATED_TYPES = frozenset({"ARMATURE", "CAMERA", "VOLUME", "LIGHT", "LIGHT_PROBE", "SPEAKER"})
+"""Types of objects that are no solids; their children report changes of their own."""
 _SOLID_DATA = (
     bpy.types.Mesh,
     bpy.types.Curve,
@@ -29,9 +28,9 @@ _SOLID_DATA = (
     bpy.types.Collection,
     bpy.types.Scene,
 )
-"""What else may change solids: their data, their colours, and who is visible."""
-_KEPT_FILES = 8
-"""Pictures that are still waiting, of several viewports, may want older ones."""
+"""Other data that may change solids: their geometry, their colours, and what is visible."""
+_MOST_FILES = 8
+"""Queued pictures of several viewports may still need older files."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,17 +42,17 @@ class Solids:
     colour: NDArray[np.float32]
     """[F, 3], linear."""
     holdout: NDArray[np.bool_]
-    """[F]: cuts a hole into the picture instead of being seen."""
+    """[F]: cuts a hole into the picture instead of being drawn."""
 
 
 def scene_solids(
     depsgraph: bpy.types.Depsgraph, everything_holdout: bool, space: bpy.types.SpaceView3D | None = None
 ) -> Solids:
-    """What is visible of meshes, curves, surfaces, texts, metaballs and their instances, except people's own bodies.
+    """Visible meshes, curves, surfaces, texts, metaballs and their instances, except the bodies of humans.
 
     A triangle has its material's base colour (see `base_colour`), or without a material the object's. Curves and the
-    like are taken as Blender tessellates them. `everything_holdout` makes all of it cut holes. Raises ValueError for an
-    object whose corners hold NaN.
+    like are tessellated by Blender. `everything_holdout` makes all triangles cut holes. Raises ValueError for an object
+    whose corners hold NaN.
     """
     parts = list(_parts(depsgraph, space))
     if not parts:
@@ -62,19 +61,35 @@ def scene_solids(
     return Solids(corners, colour, holdout | everything_holdout)
 
 
+def visible_instances(
+    depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None
+) -> Iterator[bpy.types.DepsgraphObjectInstance]:
+    """All visible objects of the dependency graph; in a viewport's local view, only those in it and their instances.
+
+    An instance is valid until the next one is requested.
+    """
+    local = space is not None and space.local_view is not None
+    for instance in depsgraph.object_instances:
+        if not instance.show_self:
+            continue
+        if local and not (instance.parent or instance.object).original.local_view_get(space):
+            continue
+        yield instance
+
+
 def changed_by(depsgraph: bpy.types.Depsgraph) -> bool:
-    """Whether the newest changes may concern solids; moving a camera or a pose does not."""
+    """Whether the newest changes may affect solids; moving a camera or posing does not."""
     return any(_concerns_solids(update.id) for update in depsgraph.updates)
 
 
 def _concerns_solids(changed: bpy.types.ID) -> bool:
     if isinstance(changed, bpy.types.Object):
-        return changed.type not in UNMOVED_BY_THESE
+        return changed.type not in UNRELATED_TYPES
     return isinstance(changed, _SOLID_DATA)
 
 
 def stored(solids: Solids, folder: Path) -> Path | None:
-    """The file of these solids for the child, named by its content; None where there are none. Older files go."""
+    """Write solids to a file for the child, named by its content, and remove old files; None where there are none."""
     if len(solids.corners) == 0:
         return None
     digest = hashlib.sha256()
@@ -83,10 +98,9 @@ def stored(solids: Solids, folder: Path) -> Path | None:
     path = folder / f"solids_{digest.hexdigest()[:16]}.npz"
     if path.exists():
         return path
-    unfinished = folder / f".{path.name}"
-    np.savez(unfinished, corners=solids.corners, colour=solids.colour, holdout=solids.holdout)
-    os.replace(unfinished, path)
-    for old in sorted(folder.glob("solids_*.npz"), key=lambda file: file.stat().st_mtime_ns)[:-_KEPT_FILES]:
+    with replacing(path) as partial:
+        np.savez(partial, corners=solids.corners, colour=solids.colour, holdout=solids.holdout)
+    for old in sorted(folder.glob("solids_*.npz"), key=lambda file: file.stat().st_mtime_ns)[:-_MOST_FILES]:
         old.unlink(missing_ok=True)
     return path
 
@@ -106,28 +120,28 @@ def _parts(
     """Corners, colours and holdout of each visible object or instance."""
     meshes: dict[object, tuple[NDArray, NDArray]] = {}
     for instance in visible_instances(depsgraph, space):
-        thing = instance.object
-        of_person = BODY_MARK in thing or PROXY_MARK in thing
-        if thing.type not in SOLID_TYPES or of_person or not thing.visible_camera:
+        obj = instance.object
+        of_human = BODY_MARK in obj or PROXY_MARK in obj
+        if obj.type not in SOLID_TYPES or of_human or not obj.visible_camera:
             continue
-        key = (thing.data.as_pointer(), thing.original.as_pointer())
+        key = (obj.data.as_pointer(), obj.original.as_pointer())
         if key not in meshes:
-            meshes[key] = _triangles(thing)
+            meshes[key] = _triangles(obj)
         local, colour = meshes[key]
         if len(local) == 0:
             continue
         matrix = np.array(instance.matrix_world, np.float64)
         world = points_to_backend(local @ matrix[:3, :3].T + matrix[:3, 3])
         if not np.isfinite(world).all():
-            raise ValueError(f"the object {thing.name!r} holds NaN or infinite numbers: repair its mesh, or hide it")
-        owner = (instance.parent or thing).original
-        holdout = thing.is_holdout or owner.holdout_get(view_layer=depsgraph.view_layer)
+            raise ValueError(f"the object {obj.name!r} holds NaN or infinite numbers: repair its mesh, or hide it")
+        owner = (instance.parent or obj).original
+        holdout = obj.is_holdout or owner.holdout_get(view_layer=depsgraph.view_layer)
         yield world.astype(np.float32), colour, np.full(len(local), holdout)
 
 
-def _triangles(thing: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+def _triangles(obj: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Corners [F, 3, 3] in the object's space and colours [F, 3] of an evaluated object."""
-    mesh = thing.data if thing.type == "MESH" else thing.to_mesh()
+    mesh = obj.data if obj.type == "MESH" else obj.to_mesh()
     if mesh is None:
         return np.zeros((0, 3, 3)), np.zeros((0, 3), np.float32)
     try:
@@ -139,10 +153,10 @@ def _triangles(thing: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray[np
         index = np.empty(len(triangles), np.int32)
         mesh.loop_triangles.foreach_get("material_index", index)
     finally:
-        if thing.type != "MESH":
-            thing.to_mesh_clear()
+        if obj.type != "MESH":
+            obj.to_mesh_clear()
     colours = [
-        base_colour(slot.material) if slot.material else tuple(thing.color)[:3] for slot in thing.material_slots
-    ] or [tuple(thing.color)[:3]]
+        base_colour(slot.material) if slot.material else tuple(obj.color)[:3] for slot in obj.material_slots
+    ] or [tuple(obj.color)[:3]]
     palette = np.array(colours, np.float32)
     return vertices[triangles].astype(np.float64), palette[np.minimum(index, len(palette) - 1)]

@@ -12,15 +12,15 @@ from ..scene.convention import BLENDER_FROM_BACKEND
 PARALLEL_M = 2000.0
 """An orthographic view is drawn by a pinhole this far from the person: over a body's thickness its scale then varies by
 a ten-thousandth. Farther away, float32 positions along a ray would be coarser than a tenth of a millimetre."""
-NOTHING_M = 1e10
-"""Depth where there is nothing, as Cycles writes it."""
+NO_SURFACE_M = 1e10
+"""Depth where a ray meets nothing, as Cycles writes it."""
 _FLIP = np.diag([1.0, -1.0, -1.0])
 """Blender's cameras look along -z with y up, OpenCV's along z with y down."""
 
 
 @dataclasses.dataclass(frozen=True)
-class View:
-    """One picture to be taken, for the whole picture whatever part of it is wanted; OpenCV, backend axes, metres."""
+class PinholeView:
+    """The camera of a whole picture, also where only a part is drawn; OpenCV convention, backend axes, metres."""
 
     intrinsics: NDArray[np.float64]
     """[3, 3], pixels; origin at the top left, pixel centres at +0.5."""
@@ -31,15 +31,15 @@ class View:
     width: int
     height: int
     depth_offset: float = 0.0
-    """What the pinhole stands behind the camera it stands for; to be taken off its depths."""
+    """Distance of the pinhole behind the camera that it replaces, to be subtracted from depths."""
 
-    def scaled(self, width: int, height: int) -> View:
-        """The same picture with other numbers of pixels."""
+    def scaled(self, width: int, height: int) -> PinholeView:
+        """The same view in another resolution."""
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return dataclasses.replace(self, intrinsics=scale @ self.intrinsics, width=width, height=height)
 
     def params(self) -> dict[str, object]:
-        """As the request `draw` wants it."""
+        """Parameters of the child's `draw`."""
         return {
             "intrinsics": self.intrinsics.tolist(),
             "world_to_camera": self.world_to_camera.tolist(),
@@ -55,7 +55,7 @@ def view_from_matrices(
     clip: tuple[float, float],
     size: tuple[int, int],
     subject: NDArray,
-) -> View:
+) -> PinholeView:
     """The pinhole that sees what an OpenGL projection [4, 4] and world-to-view matrix [4, 4], z up, show.
 
     A perspective projection has -1 in its last row and its principal point in the third column; a parallel one is taken
@@ -79,7 +79,7 @@ def view_from_matrices(
         clip = (max(clip[0] + offset, 0.0), clip[1] + offset)
     intrinsics = np.array([[scale[0], 0, centre[0]], [0, scale[1], centre[1]], [0, 0, 1]])
     world_to_camera = np.concatenate([rotation @ BLENDER_FROM_BACKEND, translation[:, None]], 1)
-    return View(intrinsics, world_to_camera, clip, width, height, offset)
+    return PinholeView(intrinsics, world_to_camera, clip, width, height, offset)
 
 
 def without_scale(matrix: NDArray) -> NDArray[np.float64]:
@@ -89,8 +89,8 @@ def without_scale(matrix: NDArray) -> NDArray[np.float64]:
     return matrix
 
 
-def blender_depth(depth: NDArray[np.float32], view: View) -> NDArray[np.float32]:
-    """The child's depths as Blender means them: from the camera's own plane, NOTHING_M where there is nothing."""
+def blender_depth(depth: NDArray[np.float32], view: PinholeView) -> NDArray[np.float32]:
+    """The child's depths as Blender defines them: from the camera's plane, NO_SURFACE_M where a ray meets nothing."""
     if view.depth_offset == 0.0:
         return depth
-    return np.where(depth < NOTHING_M / 2, depth - np.float32(view.depth_offset), np.float32(NOTHING_M))
+    return np.where(depth < NO_SURFACE_M / 2, depth - np.float32(view.depth_offset), np.float32(NO_SURFACE_M))

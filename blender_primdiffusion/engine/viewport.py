@@ -1,4 +1,4 @@
-"""The 3D view in Rendered mode: says what it would like to see, draws what has come; waits for nothing."""
+"""The 3D view in Rendered mode: requests pictures and draws the newest one, without waiting."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 from gpu_extras.presets import draw_texture_2d
 
 from . import studio
-from .picture import Picture, picture_of, solids_file
-from .refine import Refinement, Shown, Wish
+from .picture import SceneContent, scene_content, solids_file
+from .refine import Refinement, ShownPicture, ViewRequest
 from .solids import changed_by
 from .view import view_from_matrices
 
@@ -33,33 +33,33 @@ class Viewport:
             lambda params: studio.drawing_child().draw(params),
             lambda turn, width, height: studio.frames.take(names[int(turn)], width, height),
         )
-        self._picture: Picture | None = None
+        self._picture: SceneContent | None = None
         self._solids: Path | None = None
         self._known: tuple[str, bool] | None = None
-        """What the solids were read for: the setting, and whether the view is a local one."""
+        """The solids setting and whether the view is local, as of the last reading of solids."""
         self._error = ""
-        self._texture: tuple[Shown, gpu.types.GPUTexture] | None = None
+        self._texture: tuple[ShownPicture, gpu.types.GPUTexture] | None = None
         _viewports.add(self)
-        weakref.finalize(self, _leave, self._refinement, names)
+        weakref.finalize(self, _release, self._refinement, names)
 
     def update(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
-        """The scene has changed: read it while the dependency graph may be read."""
+        """Read the changed scene while the dependency graph may be read."""
         space = context.space_data
-        wanted = (depsgraph.scene.primdiffusion_render.solids, space.local_view is not None)
+        current = (depsgraph.scene.primdiffusion_render.solids, space.local_view is not None)
         try:
-            if wanted != self._known or changed_by(depsgraph):
-                self._solids, self._known = solids_file(depsgraph, studio.frames.folder, space), wanted
-            self._picture = picture_of(depsgraph, self._solids, space)
+            if current != self._known or changed_by(depsgraph):
+                self._solids, self._known = solids_file(depsgraph, studio.frames.folder, space), current
+            self._picture = scene_content(depsgraph, self._solids, space)
             self._error = ""
         except (ValueError, OSError) as error:
             self._picture, self._error = None, str(error)
 
     def draw(self, engine: bpy.types.RenderEngine, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
-        """Wish for what the region looks at now, and draw the newest picture over the whole of it."""
+        """Request what the region shows now, and draw the newest picture over all of it."""
         if self._known is not None and self._known[1] != (context.space_data.local_view is not None):
-            self.update(context, depsgraph)  # Blender does not tell
+            self.update(context, depsgraph)  # Blender reports no change
         if self._picture is not None:
-            self._refinement.want(_wish(self._picture, context, depsgraph))
+            self._refinement.want(_view_request(self._picture, context, depsgraph))
             studio.advance()
             self._refinement.advance()
             if not self._refinement.resting:
@@ -67,19 +67,19 @@ class Viewport:
         shown = self._refinement.shown
         if shown is not None:
             self._draw_picture(engine, shown, context, depsgraph)
-        engine.update_stats("", self._words())
+        engine.update_stats("", self._status())
 
     @property
     def resting(self) -> bool:
-        """Nothing will change by itself."""
+        """Whether no new picture is expected."""
         return self._refinement.resting
 
     def advance(self) -> bool:
-        """Follow the child; True when there is something new to draw."""
+        """Process the child's answers; True when there is something new to draw."""
         return self._refinement.advance()
 
-    def _words(self) -> str:
-        """What the region says in its corner."""
+    def _status(self) -> str:
+        """The text in the corner of the region."""
         if error := self._error or self._refinement.error:
             return f"PrimDiffusion: {error}"
         return STARTING if self._refinement.starting else ""
@@ -87,7 +87,7 @@ class Viewport:
     def _draw_picture(
         self,
         engine: bpy.types.RenderEngine,
-        shown: Shown,
+        shown: ShownPicture,
         context: bpy.types.Context,
         depsgraph: bpy.types.Depsgraph,
     ) -> None:
@@ -96,8 +96,8 @@ class Viewport:
             pixels = gpu.types.Buffer("FLOAT", len(frame.combined), frame.combined)
             self._texture = shown, gpu.types.GPUTexture((frame.width, frame.height), format="RGBA16F", data=pixels)
         x, y, width, height = 0, 0, context.region.width, context.region.height
-        if shown.wish.region is not None:
-            x, y, width, height = shown.wish.region
+        if shown.request.region is not None:
+            x, y, width, height = shown.request.region
         gpu.state.blend_set("ALPHA_PREMULT")
         engine.bind_display_space_shader(depsgraph.scene)
         draw_texture_2d(self._texture[1], (x, y), width, height)
@@ -105,14 +105,14 @@ class Viewport:
         gpu.state.blend_set("NONE")
 
 
-def _leave(refinement: Refinement, names: list[str]) -> None:
-    """A view has left Rendered mode, or was closed."""
+def _release(refinement: Refinement, names: list[str]) -> None:
+    """Free the resources of a view that left Rendered mode or was closed."""
     refinement.give_up()
     for name in names:
         studio.frames.drop(name)
 
 
-def _wish(picture: Picture, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> Wish:
+def _view_request(picture: SceneContent, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> ViewRequest:
     region, around, space = context.region, context.region_data, context.space_data
     size = (region.width, region.height)
     clip = _clip(around, space)
@@ -120,7 +120,7 @@ def _wish(picture: Picture, context: bpy.types.Context, depsgraph: bpy.types.Dep
     view = view_from_matrices(projection, to_view, clip, size, picture.subject)
     part = _border(context, depsgraph, size)
     params = picture.params()
-    return Wish((repr(params), repr(view.params()), part), params, view, part)
+    return ViewRequest((repr(params), repr(view.params()), part), params, view, part)
 
 
 def _clip(around: bpy.types.RegionView3D, space: bpy.types.SpaceView3D) -> tuple[float, float]:
@@ -168,20 +168,20 @@ def _camera_frame(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) ->
 
 
 def follow() -> None:
-    """See to it that answers are noticed, until every viewport rests."""
+    """Poll for answers until every viewport rests."""
     if not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=TICK_S, persistent=True)
 
 
 def stop() -> None:
-    """Notice nothing any more."""
+    """Stop polling."""
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)
 
 
 def _tick() -> float | None:
     studio.advance()
-    if any([viewport.advance() for viewport in _viewports]):  # each of them, not only up to the first with news
+    if any([viewport.advance() for viewport in _viewports]):  # a list: all of them must advance
         _redraw()
     return TICK_S if any(not viewport.resting for viewport in _viewports) else None
 

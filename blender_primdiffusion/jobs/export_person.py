@@ -11,7 +11,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..engine.people import posed
+from ..engine.picture import pose_of
 from ..motion.skeleton import unchain
 from ..scene.armature import pose_from_joint_rotations
 from ..scene.export_model import FrameRange, check_ready, scene_with_only
@@ -46,7 +46,7 @@ def posed_frames(
             if frame != scene.frame_current:
                 scene.frame_set(frame)
             evaluated = armature.evaluated_get(scene.view_layers[0].depsgraph)
-            found.append(posed(evaluated, np.array(evaluated.matrix_world, np.float64), person).params())
+            found.append(pose_of(evaluated, np.array(evaluated.matrix_world, np.float64), person).params())
     return found
 
 
@@ -111,8 +111,8 @@ class ExportGaussiansJob(Job):
 
     def params(self, folder: Path) -> dict[str, Any]:
         """Of the child's method."""
-        posed = {name: self.person[name] for name in ("object", "joints", "betas")}
-        return {"person": self.target.file_now(), **posed, "limit": self.limit, "out": str(folder / "gaussians.ply")}
+        pose = {name: self.person[name] for name in ("object", "joints", "betas")}
+        return {"person": self.target.file_now(), **pose, "limit": self.limit, "out": str(folder / "gaussians.ply")}
 
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Put the file in its place."""

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import bpy
 import numpy as np
 
-from ..engine.people import posed
+from ..engine.picture import pose_of
 from ..formats.joints import JOINT_NAMES
 from ..scene.attachment import set_attachment
 from ..scene.human import armature_of
@@ -39,7 +39,7 @@ class Moment:
         missing = [name for name in JOINT_NAMES if name not in armature.pose.bones]
         if missing:
             raise ValueError(f"the armature {armature.name!r} has no bone {missing[0]!r}: give it this name again")
-        pose = posed(armature, np.eye(4), person)
+        pose = pose_of(armature, np.eye(4), person)
         return cls(pose.params(), pose_digest(person, pose.joints, pose.betas))
 
 

@@ -1,4 +1,4 @@
-"""Motion made to fit: other rates, parts of it, kept in place, set on the floor, for longer legs."""
+"""Adjust motion: frame rate, range, place, floor, up axis, and length of the path for other legs."""
 
 from __future__ import annotations
 
@@ -10,31 +10,47 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from ..scene.convention import continuous_quaternions, matrix_to_quaternion
 from .motion import Motion
-from .rotation import from_quaternion
+from .rotation import between, from_quaternion, slerp
 from .skeleton import REST_JOINTS, joint_positions
 
 _FEET = [JOINT_NAMES.index(f"{side}_{part}") for side in ("left", "right") for part in ("ankle", "foot")]
 _STANDING_SHARE = 5.0
-"""Percentile of the feet's heights over a motion that counts as the floor: single frames may dip below it."""
+"""Percentile of the heights of feet that counts as the floor: single frames may dip below it."""
+_CLEAR = 0.6
+"""Least mean cosine between the pelvis' up direction and an axis for that axis to count as up."""
+_TRAVEL = 0.5
+"""Least length of the path, metres, from which feet are evaluated."""
+_STILL = 0.1
+"""Speed at which a foot counts as half still, m/s."""
+_STANDING = 0.5
+"""Least share of the time for which a foot must stand; on skates or treadmills it does not."""
+_FACTORS = np.arange(0.6, 1.6001, 0.02)
+_FINEST = 0.002
+_AS_IT_IS = 0.03
+"""Factors nearer to 1 count as 1: rolling heels and bending knees look like other legs."""
+_RATE = 25.0
+"""Samples per second: between frames of a fast camera, feet move less than their noise."""
+_MOST_SAMPLES = 3000
+"""The first samples of longer motions are enough."""
 
 
 def cut(motion: Motion, first: int = 1, last: int = 0, stride: int = 1) -> Motion:
-    """Frames `first` to `last` of the file, both included, counted from 1; every `stride`-th. 0 is the last there is.
+    """Every `stride`-th of the frames `first` to `last` of the file, inclusive, counted from 1; 0 is the last one.
 
     Raises ValueError where no frame is left.
     """
     end = len(motion) if last <= 0 else min(last, len(motion))
     if not 1 <= first <= end:
-        raise ValueError(f"frames {first} to {last or end} were wanted of {len(motion)}: choose frames that are there")
+        raise ValueError(f"there are no frames {first} to {last or end} in {len(motion)} frames: choose existing ones")
     if stride < 1:
-        raise ValueError(f"every {stride}th frame was wanted: give 1 or more")
+        raise ValueError(f"the stride is {stride}: give 1 or more")
     return dataclasses.replace(motion.frames(np.arange(first - 1, end, stride)), fps=motion.fps / stride)
 
 
 def resample(motion: Motion, fps: float) -> Motion:
-    """The same motion at another number of frames a second; rotations go the shortest way (slerp), places straight.
+    """The same motion at another frame rate; rotations are interpolated by slerp, translations linearly.
 
-    The last frame is the last whole one within the motion's time.
+    The last frame is the last one within the motion's duration.
     """
     if len(motion) < 2 or abs(motion.fps - fps) < 1e-9 * fps:
         return dataclasses.replace(motion, fps=fps)
@@ -49,39 +65,26 @@ def resample(motion: Motion, fps: float) -> Motion:
     return dataclasses.replace(motion, rotations=rotations, translations=places, fps=fps)
 
 
-def slerp(a: NDArray, b: NDArray, share: NDArray | float) -> NDArray[np.float64]:
-    """Unit quaternions [..., 4] on the way from `a` to `b`, the shorter one (Shoemake 1985); `share` [..., 1]."""
-    dot = (a * b).sum(-1, keepdims=True)
-    b = np.where(dot < 0, -b, b)
-    angle = np.arccos(np.clip(np.abs(dot), 0.0, 1.0))
-    sine = np.sin(angle)
-    near = sine < 1e-6
-    safe = np.where(near, 1.0, sine)
-    first = np.where(near, 1 - share, np.sin((1 - share) * angle) / safe)
-    second = np.where(near, share, np.sin(share * angle) / safe)
-    return first * a + second * b
-
-
 def scale_places(motion: Motion, factor: float) -> Motion:
-    """The whole body's path, longer or shorter."""
+    """The motion with its translations scaled."""
     return dataclasses.replace(motion, translations=motion.translations * factor)
 
 
 def in_place(motion: Motion) -> Motion:
-    """The person stays over where the skeleton rests; heights are kept."""
+    """The motion without horizontal translation."""
     return dataclasses.replace(motion, translations=motion.translations * [0.0, 1.0, 0.0])
 
 
 def from_origin(motion: Motion) -> Motion:
-    """The path begins over where the skeleton rests; heights are kept."""
+    """The motion with a path that begins at the origin; heights stay."""
     start = motion.translations[0] * [1.0, 0.0, 1.0]
     return dataclasses.replace(motion, translations=motion.translations - start)
 
 
 def on_floor(motion: Motion, rest: NDArray = REST_JOINTS) -> Motion:
-    """The whole motion raised or lowered at once, so that its lowest feet are where those of `rest` [24, 3] stand.
+    """The whole motion raised or lowered, so that its lowest feet are at the height of those of `rest` [24, 3].
 
-    Jumps stay jumps. For somebody who never stands (a swimmer) it means little.
+    Jumps remain. For a person who never stands (a swimmer) the result means little.
     """
     heights = joint_positions(motion.rotations, motion.translations, rest)[:, _FEET, 1] - rest[_FEET, 1]
     lowest = heights.min(-1)
@@ -90,8 +93,70 @@ def on_floor(motion: Motion, rest: NDArray = REST_JOINTS) -> Motion:
 
 
 def leg_ratio(rest: NDArray) -> float:
-    """How long the legs of a skeleton at rest [24, 3] are, seen against the average one's."""
+    """Length of the legs of a rest skeleton [24, 3], relative to the average skeleton."""
     return _legs(rest) / _legs(REST_JOINTS)
+
+
+def stride_ratio(motion: Motion, rest: NDArray) -> float | None:
+    """The factor on a motion's translations at which the feet of a rest skeleton [24, 3] slide least.
+
+    For motions scaled to average legs it is the ratio of the legs. The legs behind other motions are unknown (AMASS'
+    betas refer to bodies under a licence of their own) but follow from the feet: in a walk, at any time an ankle or a
+    ball of the foot stands still if the path fits the legs. None where the path is short or no factor makes feet stand.
+    """
+    if motion.detected.average_legs:
+        return leg_ratio(rest)
+    samples = slice(0, None, max(1, round(motion.fps / _RATE)))
+    rate = motion.fps / samples.step
+    rotations, places = (array[samples][:_MOST_SAMPLES] for array in (motion.rotations, motion.translations))
+    feet = np.diff(joint_positions(rotations, None, rest)[:, _FEET], axis=0) * rate
+    path = np.diff(places, axis=0)
+    if np.linalg.norm(path[:, [0, 2]], axis=-1).sum() < _TRAVEL:
+        return None
+    path = path[:, None] * rate
+
+    def sliding(factor: float) -> float:
+        square = ((feet + factor * path) ** 2).sum(-1).min(-1)
+        return float((square / (square + _STILL**2)).mean())
+
+    best = min(_FACTORS, key=sliding)
+    near = np.arange(best - _FACTORS[1] + _FACTORS[0], best + _FACTORS[1] - _FACTORS[0], _FINEST)
+    best = float(min(near, key=sliding))
+    if not _FACTORS[0] < best < _FACTORS[-1] or sliding(best) > 1 - _STANDING:
+        return None
+    return 1.0 if abs(best - 1) < _AS_IT_IS else best
+
+
+def find_up(pelvis: NDArray) -> str:
+    """The axis, such as "z" or "-y", along which pelvises [F, 3, 3] point up on average; "" where none is clear.
+
+    People stand, sit and walk more than they lie, so over a motion the mean is vertical.
+    """
+    mean = np.asarray(pelvis)[:, :, 1].mean(0)
+    return "" if np.abs(mean).max() < _CLEAR else axis_name(mean)
+
+
+def axis_name(direction: NDArray) -> str:
+    """The axis, such as "z" or "-y", nearest to a direction [3]."""
+    axis = int(np.abs(direction).argmax())
+    return ("-" if direction[axis] < 0 else "") + "xyz"[axis]
+
+
+def axis_direction(name: str) -> NDArray[np.float64]:
+    """The unit vector [3] of an axis such as "z" or "-y"."""
+    return np.eye(3)["xyz".index(name[-1])] * (-1 if name[0] == "-" else 1)
+
+
+def turn_y_up(rotations: NDArray, translations: NDArray, up: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Joint rotations [F, 24, 3, 3] and translations [F, 3] of a world in which `up` is up, turned to y up.
+
+    Translations as in SMPL's files: relative to a body whose pelvis is at its rest position, not at the origin.
+    """
+    turn = between(axis_direction(up), np.array([0.0, 1.0, 0.0]))
+    rotations = np.array(rotations, np.float64)
+    rotations[:, 0] = turn @ rotations[:, 0]
+    pelvis = REST_JOINTS[0]
+    return rotations, (np.asarray(translations) + pelvis) @ turn.T - pelvis
 
 
 def _legs(rest: NDArray) -> float:

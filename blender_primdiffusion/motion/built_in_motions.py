@@ -1,4 +1,4 @@
-"""Motions of our own: a walk, standing, a wave, a turn to the left."""
+"""Built-in motions: a walk, standing, a wave, a turn to the left."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from .legs import FootTrack, joint, reach
 from .motion import Detected, Motion
 from .poses import Arm, Leg, Pose
 from .rotation import about_axis
-from .skeleton import REST_JOINTS
+from .skeleton import REST_JOINTS, FootTrack, joint, reach
 from .walk import CYCLE_SECONDS, walk
 
 _TOES_OUT = np.radians(9.0)
@@ -25,23 +24,23 @@ class BuiltIn:
 
     label: str
     about: str
-    """What it is, a sentence for people."""
+    """Description for the menu."""
     seconds: float
-    """Of one round."""
+    """Duration of one round."""
     loops: bool
-    """Whether the end goes on into the beginning."""
+    """Whether the end continues into the beginning."""
     make: Callable[[int, float], Motion]
-    """Of a number of rounds and frames a second."""
+    """Makes the motion from a number of rounds and a frame rate."""
 
 
 def built_in_motion(name: str, rounds: int, fps: float) -> Motion:
-    """One of `MOTIONS`, `rounds` times in a row, on an average person with the feet on the floor. Raises KeyError."""
+    """One of `MOTIONS`, repeated `rounds` times, for the average skeleton standing on the floor. Raises KeyError."""
     motion = MOTIONS[name].make(rounds, fps)
     return dataclasses.replace(motion, detected=Detected(rig="built in", up="y", average_legs=True))
 
 
 def idle(rounds: int = 1, fps: float = 30.0) -> Motion:
-    """Standing: the weight goes from one leg to the other and back, the chest breathes twice; the feet stay."""
+    """Standing: the weight shifts from leg to leg and back, two breaths; the feet stay."""
     phase = _phase(rounds, _IDLE_SECONDS, fps)
     sway, breath = np.sin(2 * np.pi * phase), np.cos(4 * np.pi * phase)
     return _standing(
@@ -61,7 +60,7 @@ def idle(rounds: int = 1, fps: float = 30.0) -> Motion:
 
 
 def wave(rounds: int = 1, fps: float = 30.0) -> Motion:
-    """Standing, the right hand goes up, waves and comes down again."""
+    """Standing; the right hand goes up, waves and comes down."""
     phase = _phase(rounds, _WAVE_SECONDS, fps)
     share = phase - np.floor(np.minimum(phase, rounds - 1e-9))
     up = _ease(share / 0.25) * (1 - _ease((share - 0.75) / 0.25))
@@ -90,7 +89,7 @@ def wave(rounds: int = 1, fps: float = 30.0) -> Motion:
 
 
 def turn(rounds: int = 1, fps: float = 30.0) -> Motion:
-    """A quarter turn to the left on the spot, the left foot first; each round goes on from the one before."""
+    """A quarter turn to the left on the spot, left foot first; each round continues from the one before."""
     phase = _phase(rounds, _TURN_SECONDS, fps)
     quarter = np.pi / 2
     looking, going = (_steps(phase, *span) * quarter for span in ((0.02, 0.72), (0.1, 0.86)))
@@ -125,7 +124,7 @@ MOTIONS: dict[str, BuiltIn] = {
 
 
 def _phase(rounds: int, seconds: float, fps: float) -> NDArray[np.float64]:
-    """Rounds gone by at each frame [F], the first and the last whole."""
+    """Rounds at each frame [F]; the first and the last frame are whole numbers."""
     return np.arange(round(rounds * seconds * fps) + 1) / (seconds * fps)
 
 
@@ -142,18 +141,18 @@ def _standing(pose: Pose, place: NDArray, fps: float, name: str) -> Motion:
 
 
 def _ankle(side: str, sign: int) -> NDArray[np.float64]:
-    """Where a foot stands while its owner does."""
+    """Position of an ankle in a standing pose."""
     return joint(f"{side}_ankle") * [0, 1, 1] + [sign * 0.105, 0.0, 0.0]
 
 
 def _stepping(phase: NDArray, span: tuple[float, float], sign: int) -> FootTrack:
-    """A foot that goes a quarter circle about the pelvis in a part `span` of each round, and stands otherwise."""
-    gone = _steps(phase, *span)
-    angle = gone * np.pi / 2
+    """A foot that moves a quarter circle about the pelvis during `span` of each round, and stands otherwise."""
+    progress = _steps(phase, *span)
+    angle = progress * np.pi / 2
     centre = REST_JOINTS[0] * [1, 0, 1]
     arm = _ankle("left" if sign > 0 else "right", sign) - centre
     ankle = centre + np.einsum("fij,j->fi", about_axis(1, angle), arm)
-    share = gone - np.floor(gone)
+    share = progress - np.floor(progress)
     lift = np.sin(np.pi * share)
     ankle[:, 1] += 0.07 * lift
     return FootTrack(ankle, np.radians(-16) * lift, np.radians(8) * lift, angle + sign * _TOES_OUT)

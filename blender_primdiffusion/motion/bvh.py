@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
-from .bones import BoneMap, UnknownBonesError, chosen_bones, map_bones
 from .motion import Detected, Motion
-from .rest_alignment import facing, rig_from_smpl
+from .rigs import BoneMap, UnknownBonesError, chosen_bones, facing, map_bones, rig_from_smpl
 from .rotation import about_axis
 from .skeleton import REST_JOINTS, unchain
 
@@ -22,21 +21,21 @@ _UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.
 
 
 class BvhError(ValueError):
-    """A BVH file that cannot be used; one sentence that names the file."""
+    """A BVH file cannot be used; the message names the file."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Hierarchy:
-    """The skeleton of a BVH file at rest, and its numbers."""
+    """The skeleton and the channel values of a BVH file."""
 
     names: list[str]
-    """Of the joints, parents first; an end site has its joint's name and "_end"."""
+    """Names of the joints, parents first; an end site is named after its joint with "_end"."""
     parents: list[int]
     """Of each joint, -1 for the root."""
     offsets: NDArray[np.float64]
     """From the parent [n, 3], the file's units."""
     channels: list[list[str]]
-    """Of each joint, in the order of the numbers, which is also the order of the rotations."""
+    """Channels of each joint, in the order of the values, which is also the order of rotations."""
     values: NDArray[np.float64]
     """A row a frame [F, number of channels]."""
     frame_time: float
@@ -51,9 +50,9 @@ class Hierarchy:
         return places
 
     def world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Rotations in the world [F, n, 3, 3] and the root's places [F, 3].
+        """Rotations in the world [F, n, 3, 3] and positions of the root [F, 3].
 
-        A joint turns as its channels are written: the first is the outermost, R = R_1 R_2 R_3.
+        Rotations are composed in the order of the channels, the first outermost: R = R_1 R_2 R_3.
         """
         frames, column = len(self.values), 0
         rotations = np.tile(np.eye(3), (frames, len(self.names), 1, 1))
@@ -73,14 +72,12 @@ class Hierarchy:
 
 
 def read_bvh(path: Path, chosen: Mapping[str, str] | None = None) -> tuple[Motion, NDArray[np.float64]]:
-    """The motion of a BVH file on SMPL's skeleton, and the rotation [3, 3] out of the file's axes that it took.
+    """The motion of a BVH file on SMPL's skeleton, y up judging by the rest pose, and the rotation [3, 3] from the
+    file's axes.
 
-    y is up as far as the rest pose tells.
-
-    Each part turns in the world as the file's does; where the file's rest pose is not SMPL's T, the difference counts
-    as a turn (`rest_alignment`). The root's path is scaled by the length of the legs, so feet slip little. Places of
-    other joints than the root are left out. `chosen` says which bones are which of SMPL's joints; without it their
-    names do. Raises BvhError.
+    Each body part gets its rotation in the world; the difference between the file's rest pose and SMPL's T is added
+    (`rigs.rig_from_smpl`). The root's path is scaled by the length of the legs, so feet slide little. Positions of
+    joints other than the root are ignored. `chosen` maps SMPL's joints to bones; without it, names do. Raises BvhError.
     """
     hierarchy = parse_bvh(path)
     try:
@@ -92,12 +89,12 @@ def read_bvh(path: Path, chosen: Mapping[str, str] | None = None) -> tuple[Motio
 
 
 def bone_names(hierarchy: Hierarchy) -> list[str]:
-    """Of the file's joints, those at the ends of chains left out."""
+    """Names of the file's joints, without end sites."""
     return [name for name in hierarchy.names if not name.endswith("_end")]
 
 
 def parse_bvh(path: Path) -> Hierarchy:
-    """The hierarchy and the numbers of a BVH file as they are. Raises BvhError where it is none, or cut short."""
+    """Parse a BVH file. Raises BvhError where it is no BVH file or truncated."""
     if path.stat().st_size > LARGEST_BYTES:
         raise BvhError(f"{path} is larger than {LARGEST_BYTES // 2**20} MB: cut the motion into pieces")
     text = path.read_text("utf-8", errors="replace")
@@ -108,7 +105,7 @@ def parse_bvh(path: Path) -> Hierarchy:
         names, parents, offsets, channels = _parse_hierarchy(head.split("HIERARCHY", 1)[1].split())
         values, frame_time = _parse_motion(tail, sum(map(len, channels)))
     except (ValueError, IndexError, KeyError) as e:
-        raise BvhError(f"{path} is not a whole BVH file ({e}): export it again") from e
+        raise BvhError(f"{path} is not a complete BVH file ({e}): export it again") from e
     if not (np.isfinite(values).all() and np.isfinite(offsets).all()):
         raise BvhError(f"{path} holds NaN or infinite numbers: export the motion again")
     if not names:
@@ -163,7 +160,7 @@ def _parse_motion(text: str, columns: int) -> tuple[NDArray[np.float64], float]:
     frames, frame_time = int(words[frames_at + 1]), float(words[time_at + 1])
     numbers = np.array(words[time_at + 2 :], np.float64)
     if frames < 1 or numbers.size < frames * columns:
-        raise ValueError(f"{frames} frames of {columns} numbers are promised, {numbers.size} numbers are there")
+        raise ValueError(f"{frames} frames of {columns} numbers are announced, but there are {numbers.size} numbers")
     return numbers[: frames * columns].reshape(frames, columns), frame_time
 
 
@@ -193,28 +190,28 @@ def _retarget(hierarchy: Hierarchy, bones: BoneMap, path: Path) -> tuple[Motion,
     pelvis = _pelvis(hierarchy, turned, root, rest, index[bones.joints["pelvis"]]) @ backend_from_file.T
     fps, notes = 1 / hierarchy.frame_time if hierarchy.frame_time > 0 else 30.0, [f"bones as {bones.rig} names them"]
     if not hierarchy.frame_time > 0:
-        notes.append("tells no frame rate: 30 frames a second are assumed")
+        notes.append("states no frame rate: 30 frames per second are assumed")
     notes.append(f"lengths in {unit}, 1 taken as {metres:.4g} m so that the legs are an average person's")
-    told = fps if hierarchy.frame_time > 0 else 0.0
-    detected = Detected(bones.rig, "y", f"{unit} (1 = {metres:.4g} m)", told, bones.joints, average_legs=True)
+    stated = fps if hierarchy.frame_time > 0 else 0.0
+    detected = Detected(bones.rig, "y", f"{unit} (1 = {metres:.4g} m)", stated, bones.joints, average_legs=True)
     motion = Motion(unchain(world), pelvis * metres - REST_JOINTS[0], fps, path.stem, tuple(notes), detected)
     return motion, backend_from_file
 
 
 def _pelvis(hierarchy: Hierarchy, turned: NDArray, root: NDArray, rest: NDArray, pelvis: int) -> NDArray[np.float64]:
-    """Places of the pelvis [F, 3], which need not be the root."""
-    way = []
+    """Positions of the pelvis [F, 3], which may not be the root."""
+    chain = []
     while pelvis > 0:
-        way.append(pelvis)
+        chain.append(pelvis)
         pelvis = hierarchy.parents[pelvis]
     place = np.array(root)
-    for joint in reversed(way):
+    for joint in reversed(chain):
         place += turned[:, hierarchy.parents[joint]] @ hierarchy.offsets[joint]
     return place
 
 
 def _unit(heads: dict[str, NDArray]) -> tuple[float, str]:
-    """Metres that a unit of the file stands for on an average person, and the nearest unit's name."""
+    """Length of a unit of the file in metres, if the legs are average, and the name of the nearest unit."""
 
     def leg(place: dict[str, NDArray]) -> float:
         lengths = [
@@ -226,7 +223,7 @@ def _unit(heads: dict[str, NDArray]) -> tuple[float, str]:
 
     length = leg(heads)
     if not length > 0:
-        raise ValueError("the legs have no length: the rest pose is no person's")
+        raise ValueError("the legs have no length: this is no rest pose of a person")
     metres = leg(dict(zip(JOINT_NAMES, REST_JOINTS, strict=True))) / length
     nearest = min(_UNITS, key=lambda name: abs(np.log(_UNITS[name] / metres)))
     return metres, nearest if abs(np.log(_UNITS[nearest] / metres)) < 0.4 else "a unit of its own"

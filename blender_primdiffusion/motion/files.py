@@ -1,4 +1,4 @@
-"""Poses and motion from the files people have: AMASS, pose npz and npy, JSON, BVH."""
+"""Read poses and motion from AMASS, npz, npy, JSON and BVH files; write AMASS files."""
 
 from __future__ import annotations
 
@@ -12,44 +12,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.arrays import ArrayFileError, array_names, read_arrays, read_npy
+from ..formats.capture_layout import replacing
+from .adjust import axis_direction, axis_name, find_up, turn_y_up
 from .bvh import BvhError, read_bvh
 from .motion import Detected, Motion
-from .rotation import from_axis_angle, nearest
-from .up_axis import axis_direction, axis_name, find_up, turn_y_up
+from .rotation import about_axis, from_axis_angle, nearest, to_axis_angle
+from .skeleton import REST_JOINTS
 
 DEFAULT_FPS = 30.0
-"""Frames a second of a motion whose file does not tell."""
+"""Frame rate of motion whose file does not state it."""
 _POSES = ("poses", "pose", "theta", "fullpose")
 _ROOT, _REST = ("global_orient", "root_orient"), ("body_pose", "pose_body")
 _TRANSLATIONS = ("trans", "transl", "translation")
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate")
 POSE_KEYS = (*_POSES, *_ROOT, *_REST, *_TRANSLATIONS, *_RATES)
-"""What arrays of poses are called in the files that are read."""
+"""Names of arrays in pose files."""
 UP_AXES = ("", "x", "-x", "y", "-y", "z", "-z")
-"""What may be said to be up in a file; the first leaves it to be found out."""
+"""Axes that may point up in a file; the empty one stands for detection."""
 _BODIES = {24: "SMPL", 22: "SMPL without hands", 52: "SMPL-H", 55: "SMPL-X"}
 _BODY_JOINTS = 22
 """Joints before the hands, the same in SMPL, SMPL-H and SMPL-X."""
 
 
 class MotionFileError(ValueError):
-    """A file of poses that cannot be used; one sentence: what is wrong, and what to do."""
+    """A file of poses cannot be used; the message says what is wrong and what to do."""
 
 
 def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None = None) -> Motion:
     """The motion in a file, y up.
 
-    `up` is the file's axis that points up ("y", "-z", ...), found out where empty; `bones` says which of a .bvh's bones
-    are which of SMPL's joints, likewise.
+    `up` is the file's axis that points up ("y", "-z", ...), detected where empty; `bones` maps SMPL's joints to the
+    bones of a .bvh, likewise.
 
     - .npz of AMASS: `poses` [F, 72 | 156 | 165] (SMPL, SMPL-H, SMPL-X; fingers, jaw and eyes are left out), `trans`,
-      `mocap_framerate`, `mocap_frame_rate` or `fps`. Its z axis is up; which one really is, is found from the pelvis.
-    - .npz of poses, y up: `global_orient` with `body_pose`, or `pose`; axis-angle or matrices; `transl` if wanted.
+      `mocap_framerate`, `mocap_frame_rate` or `fps`. z should be up; the actual axis is detected from the pelvis.
+    - .npz of poses, y up: `global_orient` with `body_pose`, or `pose`; axis-angle or matrices; `transl` is optional.
     - .npy: [F, 72], [72], [F, 24, 3] or [F, 24, 3, 3]. .json: the same as lists, or an object with the names above.
-    - .bvh: any rig that `bones` knows.
+    - .bvh: any rig that `rigs` knows.
 
-    Without a rate it is `DEFAULT_FPS`, with a note. Raises MotionFileError where there is no such file, where it holds
-    pickles, NaN or something else.
+    Without a frame rate it is `DEFAULT_FPS`, with a note. Raises MotionFileError where there is no such file, or it
+    holds pickles, NaN or other data.
     """
     path = Path(path)
     if not path.is_file():
@@ -61,9 +63,9 @@ def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None 
     axes = np.eye(3)
     try:
         if suffix == ".bvh":
-            (motion, axes), tells_up = read_bvh(path, bones), True
+            (motion, axes), detect_up = read_bvh(path, bones), True
         elif suffix in readers:
-            motion, tells_up = readers[suffix](path)
+            motion, detect_up = readers[suffix](path)
         else:
             raise MotionFileError(f"{path} is no pose file: .npz, .npy, .json and .bvh files are")
     except (ArrayFileError, BvhError) as e:
@@ -72,18 +74,42 @@ def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None 
         raise MotionFileError(f"{path} cannot be read ({e.strerror or e}): check that it may be opened") from e
     if up:
         return _turned(motion, axis_name(axes @ axis_direction(up)), up)
-    return _upright(motion, axes) if tells_up else motion
+    return _upright(motion, axes) if detect_up else motion
+
+
+def write_amass(path: Path, motion: Motion, betas: NDArray, pelvis: NDArray = REST_JOINTS[0]) -> None:
+    """Write a motion in AMASS' format (72 numbers a frame, z up), with the body's shape [n] and rest pelvis [3].
+
+    As in AMASS, `trans` moves the body after its root has turned about the rest pelvis of its y-up body, so
+    pelvis + trans is the position of the pelvis. The file appears whole or not at all. Raises OSError.
+    """
+    up = about_axis(0, np.pi / 2)
+    turned = np.array(motion.rotations)
+    turned[:, 0] = up @ turned[:, 0]
+    places = (motion.translations + pelvis) @ up.T - pelvis
+    try:
+        with replacing(path) as partial, partial.open("wb") as stream:
+            np.savez(
+                stream,
+                poses=to_axis_angle(turned).reshape(len(turned), -1),
+                trans=places,
+                betas=np.asarray(betas, np.float64),
+                gender=np.array("neutral"),
+                mocap_framerate=np.array(motion.fps),
+            )
+    except OSError as error:
+        raise OSError(f"the motion could not be written to {str(path)!r} ({error.strerror or error})") from error
 
 
 def _read_npz(path: Path) -> tuple[Motion, bool]:
-    """The motion as it is in the file, and whether its up axis is to be found out."""
+    """The motion as it is in the file, and whether its up axis must be detected."""
     names = array_names(path)
     arrays = read_arrays(path, optional=POSE_KEYS)
     if "smpl" in names and not any(key in arrays for key in (*_POSES, *_REST)):
-        raise MotionFileError(f"{path} holds pickled objects, which are never read: use its twin of plain arrays")
+        raise MotionFileError(f"{path} holds pickled objects, which are never read: use the version with plain arrays")
     if not any(key in arrays for key in (*_POSES, *_REST)):
         raise MotionFileError(
-            f"{path} holds no poses: in it is {_listed(names)}, wanted are 'poses', or 'global_orient' and 'body_pose'"
+            f"{path} holds no poses: it holds {_listed(names)} and needs 'poses', or 'global_orient' and 'body_pose'"
         )
     return motion_from_arrays(arrays, path), _is_amass(arrays)
 
@@ -113,13 +139,13 @@ def _read_json(path: Path) -> tuple[Motion, bool]:
 
 
 def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
-    """A motion out of arrays with the names people use, axes as they are; `path` is what errors call it.
+    """A motion from arrays with the usual names, axes unchanged; errors name `path`.
 
     Raises MotionFileError where the arrays are no poses.
     """
     for key, array in arrays.items():
         if array.dtype.kind not in "iuf":
-            raise MotionFileError(f"{path}: {key!r} holds {array.dtype} where numbers are wanted")
+            raise MotionFileError(f"{path}: {key!r} holds {array.dtype} instead of numbers")
         if array.size == 0:
             raise MotionFileError(f"{path}: {key!r} holds no frame; export the motion again")
         if not np.isfinite(array).all():
@@ -145,19 +171,19 @@ def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
         raise MotionFileError(f"{path}: {frames} frames of poses but translations of shape {translations.shape}")
     translations = np.array(np.broadcast_to(translations.reshape(-1, 3), (frames, 3)))
     rate = _first(arrays, _RATES)
-    told = float(rate.ravel()[0]) if rate is not None and rate.size == 1 and float(rate.ravel()[0]) > 0 else 0.0
-    if not told and frames > 1:
-        notes.append(f"tells no frame rate: {DEFAULT_FPS:g} frames a second are assumed")
-    detected = Detected(rig=_BODIES.get(joints, f"{joints} joints"), up="y", fps=told)
-    return Motion(rotations, translations, told or DEFAULT_FPS, path.stem, tuple(notes), detected)
+    stated = float(rate.ravel()[0]) if rate is not None and rate.size == 1 and float(rate.ravel()[0]) > 0 else 0.0
+    if not stated and frames > 1:
+        notes.append(f"states no frame rate: {DEFAULT_FPS:g} frames per second are assumed")
+    detected = Detected(rig=_BODIES.get(joints, f"{joints} joints"), up="y", fps=stated)
+    return Motion(rotations, translations, stated or DEFAULT_FPS, path.stem, tuple(notes), detected)
 
 
 def _upright(motion: Motion, axes: NDArray) -> Motion:
-    """The motion with y up, whichever axis of its file was; `axes` turned it out of the file's own ones already."""
+    """The motion with its detected up axis turned to y; `axes` is the rotation from the file's axes so far."""
     up = find_up(motion.rotations[:, 0])
     if not up:
         unknown = dataclasses.replace(motion.detected, up="")
-        note = "does not tell which axis is up: y is assumed"
+        note = "does not state which axis is up: y is assumed"
         return dataclasses.replace(motion, notes=(*motion.notes, note), detected=unknown)
     return _turned(motion, up, axis_name(axes.T @ axis_direction(up)))
 
@@ -174,10 +200,10 @@ def _turned(motion: Motion, up: str, in_file: str) -> Motion:
 
 
 def _rotations(given: NDArray, path: Path, joints_before: int = 0) -> NDArray[np.float64]:
-    """Rotations [F, 24, 3, 3] of matrices [F, n, 3, 3] that lack the first `joints_before` joints; joints that are
-    missing do not turn.
+    """Rotations [F, 24, 3, 3] from matrices [F, n, 3, 3] without the first `joints_before` joints; missing joints get
+    the identity.
 
-    SMPL-H and SMPL-X have fingers where SMPL has its two hand joints, so of them only the body's 22 are taken.
+    SMPL-H and SMPL-X have fingers instead of SMPL's two hand joints, so only the body's 22 joints are used.
     """
     count = given.shape[1] + joints_before
     if count == 24:
@@ -186,7 +212,7 @@ def _rotations(given: NDArray, path: Path, joints_before: int = 0) -> NDArray[np
         taken = _BODY_JOINTS
     else:
         raise MotionFileError(
-            f"{path} holds poses of {count} joints (shape {given.shape}): wanted are SMPL's 24, 22 without hands, or "
+            f"{path} holds poses of {count} joints (shape {given.shape}): needed are SMPL's 24, 22 without hands, or "
             "those of SMPL-H or SMPL-X"
         )
     rotations = np.tile(np.eye(3), (len(given), 24, 1, 1))
@@ -208,7 +234,7 @@ def _matrices(values: NDArray, path: Path) -> NDArray[np.float64]:
         values = values.reshape(1, -1)  # one pose, a row a joint
     if values.ndim not in (2, 3) or values.shape[-1] % 3 or (values.ndim == 3 and values.shape[-1] != 3):
         raise MotionFileError(
-            f"{path} holds poses of shape {values.shape}: wanted are 72 axis-angle numbers a frame (24 joints x 3)"
+            f"{path} holds poses of shape {values.shape}: needed are 72 axis-angle numbers a frame (24 joints x 3)"
         )
     return from_axis_angle(values.reshape(len(values), -1, 3))
 

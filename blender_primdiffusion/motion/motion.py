@@ -1,4 +1,4 @@
-"""Motion: what the 24 joints do, frame by frame, whoever does it."""
+"""Motion: rotations of the 24 joints in each frame, for any body."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from .skeleton import joint_positions
 
 @dataclasses.dataclass(frozen=True)
 class Detected:
-    """What a file was found to hold, for people to see and to correct."""
+    """What was detected in a file, for the user to see and correct."""
 
     rig: str = ""
-    """SMPL, SMPL-H, SMPL-X, or the naming of the bones; empty where nothing was said."""
+    """SMPL, SMPL-H, SMPL-X, or the naming of the bones; empty where unknown."""
     up: str = ""
-    """The file's axis that points up, such as "z" or "-y"; empty where it was not to be found."""
+    """The file's axis that points up, such as "z" or "-y"; empty where it was not detected."""
     unit: str = "metres"
-    """Of lengths in the file."""
+    """Unit of lengths in the file."""
     fps: float = 0.0
-    """As the file tells; 0 where it does not."""
+    """Frame rate in the file; 0 where it states none."""
     bones: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """SMPL's joint -> the file's bone, of files with bones."""
+    """SMPL's joint -> the file's bone, for files with bones."""
     average_legs: bool = False
-    """Whether lengths were scaled so that the legs are an average person's: then they scale with whoever moves."""
+    """Whether lengths were scaled to average legs, so that they must be scaled to each body."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,11 +39,11 @@ class Motion:
     translations: NDArray[np.float64]
     """Of the whole body [F, 3], metres, after the rotations."""
     fps: float
-    """Frames a second; 1 for poses that are no motion."""
+    """Frames per second; 1 for single poses."""
     name: str
-    """Where it is from."""
+    """Name of the source."""
     notes: tuple[str, ...] = ()
-    """What was found out or assumed on reading, a sentence each."""
+    """What was detected or assumed when reading, a sentence each."""
     detected: Detected = dataclasses.field(default_factory=Detected)
 
     def __post_init__(self) -> None:
@@ -58,7 +58,7 @@ class Motion:
         return len(self.rotations)
 
     def axis_angle(self) -> NDArray[np.float64]:
-        """The rotations as SMPL's files hold them [F, 24, 3], radians."""
+        """The rotations as in SMPL's files [F, 24, 3], radians."""
         return to_axis_angle(self.rotations)
 
     def frames(self, indices: Sequence[int] | NDArray) -> Motion:
@@ -67,5 +67,5 @@ class Motion:
         return dataclasses.replace(self, rotations=self.rotations[chosen], translations=self.translations[chosen])
 
     def joints(self) -> NDArray[np.float64]:
-        """Where the joints of an average person are [F, 24, 3], metres."""
+        """Joint positions of the average skeleton [F, 24, 3], metres."""
         return joint_positions(self.rotations, self.translations)

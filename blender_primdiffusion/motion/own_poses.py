@@ -1,4 +1,7 @@
-"""The user's own poses: a JSON file each in a folder, so that they can be copied to another computer, and a picture."""
+"""The user's own poses: a folder with a JSON file and a picture for each, which can be copied to other computers.
+
+Panels import this file when Blender starts, so numpy is imported by the functions that need it.
+"""
 
 from __future__ import annotations
 
@@ -19,33 +22,33 @@ _LONGEST_NAME = 60
 
 
 class PoseFileError(ValueError):
-    """A pose that cannot be saved or read; one sentence."""
+    """A pose cannot be saved or read."""
 
 
 def own_poses(folder: Path) -> dict[str, Path]:
-    """Names of the poses in a folder and their files, sorted; a folder that is not there holds none."""
+    """The poses in a folder, sorted: name -> file; none where the folder does not exist."""
     return {path.name.removesuffix(SUFFIX): path for path in sorted(folder.glob(f"*{SUFFIX}"))}
 
 
 def picture_of(pose: Path) -> Path:
-    """The picture beside the file of a pose; one that came without has none."""
+    """Path of the picture beside the file of a pose, which need not exist."""
     return pose.with_name(pose.name.removesuffix(SUFFIX) + PICTURE_SUFFIX)
 
 
 def delete_pose(pose: Path) -> None:
     """Remove the file of a pose, with its picture. Raises OSError where the file stays."""
     pose.unlink()
-    with contextlib.suppress(OSError):  # nobody shows it without the pose
+    with contextlib.suppress(OSError):  # without the pose it is not shown
         picture_of(pose).unlink()
 
 
 def save_pose(folder: Path, name: str, pose: NDArray, translation: NDArray) -> Path:
     """Write a pose [24, 3] (axis-angle, radians) with its translation [3] (metres), both y up; returns the file.
 
-    Any pose-reading program of ours reads it too (`pose`, `transl`). Raises PoseFileError for a name that is empty or
-    no file's, or taken, and where the folder cannot be written to.
+    `files.read_motion` reads the file too (`pose`, `transl`). Raises PoseFileError for a name that is empty, taken or
+    no valid file name, and where the folder cannot be written to.
     """
-    import numpy as np  # not for those who ask for names alone: Blender starts without it
+    import numpy as np  # see the module's docstring
 
     name = name.strip()
     if not name or len(name) > _LONGEST_NAME or re.search(r'[\\/:*?"<>|\x00-\x1f]', name) or name.startswith("."):
@@ -69,7 +72,7 @@ def save_pose(folder: Path, name: str, pose: NDArray, translation: NDArray) -> P
 
 def load_pose(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The pose [24, 3] and the translation [3] in a file. Raises PoseFileError where there is none."""
-    import numpy as np
+    import numpy as np  # see the module's docstring
 
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""The pose library: built-in poses, and poses taken from and given to an armature with SMPL's joints."""
+"""The pose library: built-in poses, and reading and applying poses of an armature with SMPL's joints."""
 
 from __future__ import annotations
 
@@ -12,23 +12,22 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from ..scene.armature import bone_bases, rest_rotations
 from ..scene.convention import BLENDER_FROM_BACKEND, matrix_to_quaternion, points_to_backend
-from .adjust import leg_ratio, slerp
-from .library_poses import LIBRARY
-from .poses import grounding
-from .rotation import from_axis_angle, to_axis_angle
+from .adjust import leg_ratio
+from .poses import LIBRARY, grounding
+from .rotation import from_axis_angle, slerp, to_axis_angle
 
 _MIRROR = np.array([1.0, -1.0, -1.0])
-"""Of an axis-angle vector when left and right change places."""
+"""Signs of an axis-angle vector when left and right are swapped."""
 
 
 @functools.cache
 def builtin_poses() -> dict[str, NDArray[np.float64]]:
-    """Poses of our own by name: axis-angle vectors [24, 3], radians, y up, relative to the parents. Read only."""
+    """Built-in poses by name: axis-angle vectors [24, 3], radians, y up, relative to the parents. Do not modify."""
     return {name: to_axis_angle(pose.rotations()) for name, pose in LIBRARY.items()}
 
 
 def mirrored(pose: NDArray) -> NDArray[np.float64]:
-    """A pose [24, 3] with left and right changed."""
+    """A pose [24, 3] with left and right swapped."""
     names = [_other_side(name) for name in JOINT_NAMES]
     return np.asarray(pose, np.float64)[[JOINT_NAMES.index(name) for name in names]] * _MIRROR
 
@@ -51,9 +50,9 @@ def check_posable(armature: bpy.types.Object) -> None:
 
 
 def current_pose(armature: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Joint rotations [24, 3, 3] and the translation [3], metres, y up, as the bones are set; constraints do not count.
+    """Joint rotations [24, 3, 3] and translation [3], metres, y up, of the bones without constraints.
 
-    Raises ValueError where one of SMPL's joints lacks.
+    Raises ValueError where one of SMPL's joints is missing.
     """
     rest = rest_rotations(armature)
     bases = [armature.pose.bones[name].matrix_basis for name in JOINT_NAMES]
@@ -64,7 +63,7 @@ def current_pose(armature: bpy.types.Object) -> tuple[NDArray[np.float64], NDArr
 
 
 def standing(armature: bpy.types.Object, pose: NDArray) -> NDArray[np.float64]:
-    """The translation [3] that puts somebody of this armature's legs in a pose [24, 3] on the floor."""
+    """The translation [3] by which an armature in a pose [24, 3] stands on the floor."""
     return grounding(from_axis_angle(pose)[None])[0] * leg_ratio(rest_joints(armature))
 
 
@@ -77,8 +76,8 @@ def apply_pose(
 ) -> list[str]:
     """Give an armature a pose [24, 3] and, if given, a translation [3] (y up, metres); returns the bones changed.
 
-    `amount` from 0 to 1 goes from the pose it has to the new one, the shortest way. Only `joints` turn, only with the
-    pelvis among them the whole body moves, and bones all of whose rotation is locked stay. Raises ValueError as
+    `amount` from 0 to 1 blends from the current pose to the new one. Only `joints` are changed, the whole body is moved
+    only with the pelvis among them, and bones with fully locked rotation stay. Raises ValueError as
     `check_posable` does, and where the pose has another shape.
     """
     check_posable(armature)
@@ -88,9 +87,9 @@ def apply_pose(
     now, place = current_pose(armature)
     target = place if translation is None else np.asarray(translation, np.float64)
     rest = rest_rotations(armature)
-    wanted, _ = bone_bases(rest, from_axis_angle(pose), target)
-    had, _ = bone_bases(rest, now, place)
-    quaternions = slerp(had, wanted, amount)
+    target_bases, _ = bone_bases(rest, from_axis_angle(pose), target)
+    current, _ = bone_bases(rest, now, place)
+    quaternions = slerp(current, target_bases, amount)
     changed = []
     for name, quaternion in zip(JOINT_NAMES, quaternions, strict=True):
         bone = armature.pose.bones[name]
@@ -106,7 +105,7 @@ def apply_pose(
 
 
 def key_pose(armature: bpy.types.Object, frame: float, joints: Collection[str] = JOINT_NAMES) -> None:
-    """Keyframes of the pose as it is now. Raises ValueError as `check_posable` does."""
+    """Insert keyframes of the current pose. Raises ValueError as `check_posable` does."""
     check_posable(armature)
     for name in joints:
         bone = armature.pose.bones[name]

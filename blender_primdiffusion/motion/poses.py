@@ -1,4 +1,4 @@
-"""Twenty poses of our own, and poses chosen out of motion so that they differ much."""
+"""Built-in poses, as angles of limbs in degrees, and diverse poses picked from motion."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from .skeleton import FLOOR, REST_JOINTS, joint_positions
 X, Y, Z = 0, 1, 2
 _CLEARANCE = REST_JOINTS[:, 1] - FLOOR
 _TOUCHING = {"knee": 0.06, "elbow": 0.04, "wrist": 0.03, "hand": 0.03, "pelvis": 0.12, "head": 0.12}
-"""Metres from joints to the skin under them; ankles and feet stand as high as at rest."""
+"""Metres from joints to the skin below them; ankles and feet have their rest height."""
 _POOL = 1000
-"""Frames among which poses are chosen."""
+"""Number of frames from which poses are picked."""
 _NEAR_T_M = 0.08
-"""Mean distance of the joints from our own first pose up to which a frame counts as near T."""
+"""Mean distance of the joints from the first built-in pose up to which a frame counts as near T."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Arm:
-    """An arm in degrees, seen from the T pose, the same for both sides."""
+    """An arm in degrees relative to the T pose, the same for both sides."""
 
     down: float = 75.0
     """From level to the side; negative is up."""
@@ -47,7 +47,7 @@ class Arm:
 
 @dataclasses.dataclass(frozen=True)
 class Leg:
-    """A leg in degrees, seen from standing, the same for both sides."""
+    """A leg in degrees relative to standing, the same for both sides."""
 
     front: float = 0.0
     """The thigh raised to the front; negative to the back."""
@@ -210,22 +210,53 @@ BUILT_IN: dict[str, Pose] = {
         trunk=(0, 0, -4), head=(0, -6, 2), whole=(0, 0, -2),
     ),
 }  # fmt: skip
-"""Poses by name; the first is the one that captures begin with."""
+"""Poses for captures by name; captures begin with the first."""
+LIBRARY: dict[str, Pose] = {
+    "T": Pose(Arm(down=0, elbow=0), Arm(down=0, elbow=0), Leg(out=0, turn=0, knee=0), Leg(out=0, turn=0, knee=0)),
+    "A": BUILT_IN["A"],
+    "Relaxed": Pose(
+        Arm(down=75, elbow=18, swing=4, forearm=-10), Arm(down=76, elbow=12, swing=0, forearm=-10),
+        Leg(out=6, turn=14, front=4, knee=9, ankle=4), Leg(out=-1, turn=4), trunk=(1, 3, -4), head=(3, 8, 3),
+        whole=(0, -3, 3),
+    ),
+    "Contrapposto": BUILT_IN["standing"],
+    "Hands on Hips": BUILT_IN["hands on hips"],
+    "Arms Crossed": BUILT_IN["arms crossed"],
+    "Thinking": Pose(
+        Arm(down=70, swing=30, elbow=90, twist=62), Arm(down=70, swing=40, elbow=132, twist=40, wrist=8),
+        Leg(out=5, turn=12), Leg(out=4, turn=8), trunk=(3, 4, 0), head=(12, -8, -6),
+    ),
+    "Waving": BUILT_IN["waving"],
+    "Pointing": BUILT_IN["pointing"],
+    "Cheering": BUILT_IN["arms up"],
+    "Walking": BUILT_IN["walking"],
+    "Running": BUILT_IN["running"],
+    "Sitting": BUILT_IN["sitting"],
+    "Kneeling": Pose(
+        Arm(down=68, swing=34, elbow=40, twist=24), Arm(down=75, elbow=16, forearm=-10),
+        Leg(front=84, knee=86, ankle=2, out=6), Leg(front=-6, knee=94, ankle=-22, toes=60, out=3),
+        trunk=(4, 0, 0), head=(0, 6, 0), whole=(2, 0, 0),
+    ),
+    "Squatting": BUILT_IN["squatting"],
+    "Lunging": BUILT_IN["lunging"],
+    "Reaching": BUILT_IN["reaching"],
+    "Looking Back": BUILT_IN["looking back"],
+    "Dancing": BUILT_IN["dancing"],
+    "On One Leg": BUILT_IN["on one leg"],
+}  # fmt: skip
+"""The pose library: poses by the names in its menu. Those that captures use too are BUILT_IN."""
 
 
 def built_in_poses(count: int = len(BUILT_IN)) -> Motion:
-    """The first `count` of our own poses, feet on the floor. Raises ValueError where there are not as many."""
+    """The first `count` built-in poses, feet on the floor. Raises ValueError where there are fewer."""
     if not 1 <= count <= len(BUILT_IN):
-        raise ValueError(f"{count} built-in poses were wanted, there are 1 to {len(BUILT_IN)}: give files for more")
+        raise ValueError(f"there are 1 to {len(BUILT_IN)} built-in poses, not {count}: give files for more")
     rotations = np.array([pose.rotations() for pose in list(BUILT_IN.values())[:count]])
     return Motion(rotations, grounding(rotations), 1.0, "built-in")
 
 
 def grounding(rotations: NDArray) -> NDArray[np.float64]:
-    """Translations [F, 3] that leave the pelvis above its place and put an average body's lowest part on the floor.
-
-    The floor is where it stands at rest.
-    """
+    """Vertical translations [F, 3] that put the lowest part of the average body on its floor at rest."""
     joints = joint_positions(rotations)
     clearance = np.array(
         [
@@ -238,19 +269,21 @@ def grounding(rotations: NDArray) -> NDArray[np.float64]:
 
 
 def pick_poses(motions: Sequence[Motion], count: int, seed: int = 0) -> Motion:
-    """`count` poses out of the frames of all motions, near-T first, the others as unlike each other as can be.
+    """`count` poses from the frames of all motions, near-T first, the others as different as possible.
 
-    Each next pose is the one furthest from those chosen (farthest-point sampling over joint positions about the pelvis,
-    whatever way the person faces). Where no frame is near a T pose, our own is the first. People stay where they are:
-    poses are set on the floor and lose their place. The same seed picks the same poses.
+    Each next pose is the one farthest from those picked (farthest-point sampling over joint positions about the pelvis,
+    regardless of heading). Where no frame is near a T pose, the built-in one is the first. Poses are put on the floor
+    at the origin. The same seed picks the same poses.
 
     Raises ValueError where the motions have too few frames.
     """
     rotations = np.concatenate([motion.rotations for motion in motions]) if motions else np.zeros((0, 24, 3, 3))
     if len(rotations) < count - 1 or count < 1:
-        raise ValueError(f"{count} poses were wanted and the files hold {len(rotations)}: give more, or ask for fewer")
+        raise ValueError(
+            f"{count} poses cannot be picked from {len(rotations)} frames: give more files, or ask for fewer poses"
+        )
     first = built_in_poses(1).rotations
-    from_t = _apart(_about_pelvis(rotations), _about_pelvis(first)[0])
+    from_t = _distance(_about_pelvis(rotations), _about_pelvis(first)[0])
     has_t = len(rotations) >= count and from_t.min() < _NEAR_T_M
     if has_t:
         first = rotations[[int(from_t.argmin())]]
@@ -259,11 +292,11 @@ def pick_poses(motions: Sequence[Motion], count: int, seed: int = 0) -> Motion:
         rotations = rotations[np.sort(chosen)]
     rotations = np.concatenate([first, rotations])
     places, picked = _about_pelvis(rotations), [0]
-    distance = _apart(places, places[0])
+    distance = _distance(places, places[0])
     while len(picked) < count:
         distance[picked] = -1.0
         picked.append(int(distance.argmax()))
-        distance = np.minimum(distance, _apart(places, places[picked[-1]]))
+        distance = np.minimum(distance, _distance(places, places[picked[-1]]))
     poses = rotations[picked]
     names = ", ".join(dict.fromkeys(motion.name for motion in motions))
     notes = () if has_t else ("no frame is near a T pose: the first is built in",)
@@ -271,13 +304,13 @@ def pick_poses(motions: Sequence[Motion], count: int, seed: int = 0) -> Motion:
 
 
 def _about_pelvis(rotations: NDArray) -> NDArray[np.float64]:
-    """Joints [F, 24, 3] seen from the pelvis, the person facing +z as far as turning about the vertical does it."""
+    """Joints [F, 24, 3] relative to the pelvis, turned about the vertical to face +z."""
     front = rotations[:, 0, :, 2]
     unturned = np.array(rotations)
     unturned[:, 0] = about_axis(Y, -np.arctan2(front[:, 0], front[:, 2])) @ rotations[:, 0]
     return joint_positions(unturned) - REST_JOINTS[0]
 
 
-def _apart(places: NDArray, place: NDArray) -> NDArray[np.float64]:
+def _distance(places: NDArray, place: NDArray) -> NDArray[np.float64]:
     """Mean distance of the joints [F] between poses [F, 24, 3] and one pose [24, 3], metres."""
     return np.linalg.norm(places - place, axis=-1).mean(-1)

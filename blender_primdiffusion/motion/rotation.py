@@ -1,4 +1,4 @@
-"""Rotation matrices from and to the other ways of writing rotations; any batch shape, radians, column vectors."""
+"""Rotation matrices from and to other representations; any batch shape, radians, column vectors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def from_axis_angle(vector: NDArray) -> NDArray[np.float64]:
 
 
 def to_axis_angle(rotation: NDArray) -> NDArray[np.float64]:
-    """Axis-angle vectors [..., 3], at most half a turn long, of rotations [..., 3, 3]."""
+    """Axis-angle vectors [..., 3], of angles up to pi, of rotations [..., 3, 3]."""
     quaternion = matrix_to_quaternion(rotation)
     sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
     angle = 2 * np.arctan2(sine, quaternion[..., :1])
@@ -51,7 +51,7 @@ def between(start: NDArray, end: NDArray) -> NDArray[np.float64]:
     if sine < 1e-9:
         if cosine > 0:
             return np.eye(3)
-        axis = np.cross(a, np.eye(3)[int(np.abs(a).argmin())])  # half a turn about anything at right angles
+        axis = np.cross(a, np.eye(3)[int(np.abs(a).argmin())])  # half a turn about any perpendicular axis
         sine = float(np.linalg.norm(axis))
         return from_axis_angle(axis / sine * np.pi)
     return from_axis_angle(axis / sine * np.arctan2(sine, cosine))
@@ -63,6 +63,19 @@ def nearest(matrix: NDArray) -> NDArray[np.float64]:
     flip = np.ones((*left.shape[:-2], 3))
     flip[..., 2] = np.sign(np.linalg.det(left @ right))
     return (left * flip[..., None, :]) @ right
+
+
+def slerp(a: NDArray, b: NDArray, share: NDArray | float) -> NDArray[np.float64]:
+    """Unit quaternions [..., 4] between `a` and `b` along the shorter arc (Shoemake 1985); `share` [..., 1]."""
+    dot = (a * b).sum(-1, keepdims=True)
+    b = np.where(dot < 0, -b, b)
+    angle = np.arccos(np.clip(np.abs(dot), 0.0, 1.0))
+    sine = np.sin(angle)
+    near = sine < 1e-6
+    safe = np.where(near, 1.0, sine)
+    first = np.where(near, 1 - share, np.sin((1 - share) * angle) / safe)
+    second = np.where(near, share, np.sin(share * angle) / safe)
+    return first * a + second * b
 
 
 def _cross(vector: NDArray) -> NDArray[np.float64]:

@@ -1,41 +1,40 @@
-"""A walk of our own: feet first, then a pelvis that they can carry, then legs, trunk and arms."""
+"""The built-in walk: first the feet, then a pelvis that they can carry, then legs, trunk and arms."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .legs import FootTrack, joint, leg_length, reach
 from .motion import Motion
 from .poses import Arm, Leg, Pose
 from .rotation import about_axis
-from .skeleton import FLOOR, REST_JOINTS
+from .skeleton import FLOOR, REST_JOINTS, FootTrack, joint, leg_length, reach
 
 CYCLE_SECONDS = 1.1
 """Two steps."""
 STRIDE = 1.28
-"""Metres of two steps: 1.16 m/s."""
+"""Length of two steps in metres: 1.16 m/s."""
 _STANCE = 0.62
 """Share of the cycle for which a foot is on the floor."""
 _FLAT = (0.1, 0.38)
-"""Between these shares the whole sole is on the floor; before, the heel alone, afterwards the ball."""
+"""Between these shares the whole sole is on the floor; before, only the heel, afterwards only the ball."""
 _STRIKE, _PUSH = np.radians(17.0), np.radians(-50.0)
-"""Pitch of the foot as the heel comes down, and as the toes leave."""
+"""Pitch of the foot at heel strike, and at toe-off."""
 _AHEAD = 0.255
-"""How far ahead of the pelvis a foot is put down, of a stride."""
+"""Distance ahead of the pelvis at which a foot is put down, in strides."""
 _APART = 0.065
-"""From the middle to an ankle, metres: feet come down nearer to each other than they stand."""
+"""From the middle to an ankle, metres: walking feet are closer together than standing ones."""
 _TOES_OUT = np.radians(6.0)
 _HEEL, _BALL = np.array([-0.079, -0.052]), np.array([-0.079, 0.147])
 """Contacts of the sole from the ankle: up, forward, metres."""
 _CLEARANCE = 0.03
-"""How much higher a foot swings than the shortest way, metres: toes would graze the floor."""
+"""Additional height of a swinging foot in metres, since toes would touch the floor."""
 _STRETCH = 0.997
-"""Of the leg's length, how far it stretches while it carries."""
+"""Longest reach of a leg that carries, as a share of its length."""
 
 
 def walk(cycles: int = 2, fps: float = 30.0) -> Motion:
-    """A walk forward along +z at `fps` frames a second; the last frame is the first, `cycles` strides further on.
+    """A walk forward along +z at `fps` frames per second; the last frame is the first, `cycles` strides further on.
 
     Feet do not slide: legs reach for feet that stay where they were put down, on heel, sole and ball in turn.
     """
@@ -114,7 +113,7 @@ def _pitched(contact: NDArray, pitch: NDArray) -> NDArray[np.float64]:
 
 
 def _slope(share: float) -> NDArray[np.float64]:
-    """How fast `_stance` changes, per swing of the foot."""
+    """Derivative of `_stance`, per swing of the foot."""
     step = 1e-4
     before, after = (np.array(_stance(np.array(share + d))) for d in (-step, step))
     return (after - before) / (2 * step) * (1 - _STANCE)
@@ -131,7 +130,7 @@ def _smooth(t: NDArray) -> NDArray[np.float64]:
 
 
 def _carried(phase: NDArray, pelvis: NDArray, place: NDArray, feet: dict[str, FootTrack]) -> NDArray[np.float64]:
-    """Heights [F] of the pelvis over its rest: twice a cycle up and down, never higher than the legs stretch."""
+    """Heights [F] of the pelvis above its rest position: up and down twice a cycle, within reach of the legs."""
     highest = np.full(len(phase), np.inf)
     for side, foot in feet.items():
         hip = REST_JOINTS[0] + place + pelvis @ (joint(f"{side}_hip") - REST_JOINTS[0])

@@ -93,9 +93,9 @@ def look_at(filepath: str, up: str = "") -> Look:
 
 @functools.lru_cache(maxsize=8)
 def _look_at(path: str, up: str, _changed: int, _size: int) -> Look:
-    from ..motion.bones import UnknownBonesError, map_bones
     from ..motion.bvh import BvhError, bone_names, parse_bvh
     from ..motion.files import MotionFileError, read_motion
+    from ..motion.rigs import UnknownBonesError, map_bones
     from .motion_placing import facts
 
     bones: tuple[str, ...] = ()

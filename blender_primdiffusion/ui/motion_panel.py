@@ -152,7 +152,7 @@ class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operato
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
         """Sample the evaluated bones on every frame, write the file."""
-        from ..motion.amass_file import write_amass
+        from ..motion.files import write_amass
         from .motion_placing import sample_motion
 
         scene = context.scene

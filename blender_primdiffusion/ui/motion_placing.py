@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from ..motion.adjust import cut, from_origin, in_place, on_floor, resample, scale_places
+from ..motion.adjust import cut, from_origin, in_place, on_floor, resample, scale_places, stride_ratio
 from ..motion.motion import Motion
 from ..motion.pose_library import check_posable, rest_joints
 from ..motion.rotation import nearest
 from ..motion.skeleton import unchain
-from ..motion.stride import stride_ratio
 from ..scene.actions import last_key, push_to_strip
 from ..scene.armature import rest_rotations
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend

@@ -28,7 +28,7 @@ def poses_folder() -> Path:
 
 def pose_items(_self, _context: bpy.types.Context) -> list[tuple[str, str, str, int, int]]:
     """Built-in poses first, then the user's own."""
-    from ..motion.library_poses import LIBRARY
+    from ..motion.poses import LIBRARY
 
     own = own_poses(poses_folder())
     wanted = [*LIBRARY, *(name for name in own if name not in LIBRARY)]
@@ -48,11 +48,12 @@ def draw_picture(pose: Path, rotations: NDArray) -> None:
     """Draw the picture of a pose of the user's own, in joint rotations [24, 3, 3], beside its file. Raises OSError."""
     import numpy as np
 
+    from ..formats.picture_files import write_png
     from ..jobs.thumbnails import clay_figure
-    from ..motion.png_file import write_png
     from ..motion.skeleton import joint_positions
 
-    write_png(picture_of(pose), clay_figure(joint_positions(np.asarray(rotations))))
+    picture = clay_figure(joint_positions(np.asarray(rotations)))[::-1]  # PNG files begin with the top row
+    write_png(picture_of(pose), np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8))
 
 
 def look_again() -> None:

@@ -17,7 +17,7 @@ from primdiffusion.human import framing, generate, place
 from primdiffusion.render.image import to_png
 from primdiffusion.render.march import march
 
-from blender_primdiffusion.motion.library_poses import LIBRARY
+from blender_primdiffusion.motion.poses import LIBRARY
 
 OUT = Path(__file__).resolve().parents[2] / "blender_primdiffusion" / "motion" / "data" / "thumbnails"
 SEED, YAW, SIZE = 7, 0.45, 160

@@ -8,7 +8,7 @@ import pytest
 import synthetic
 import synthetic_shape
 
-from blender_primdiffusion.engine.people import posed_people
+from blender_primdiffusion.engine.picture import posed_humans
 from blender_primdiffusion.engine.solids import scene_solids
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import MODES, set_attachment
@@ -96,10 +96,10 @@ def test_the_engine_draws_the_person_alone_in_every_mode(person, tmp_path, mode)
     turns[16, 2] = 0.5
     pose_from_joint_rotations(armature_of(person), synthetic.axis_angle(turns))
     bpy.context.view_layer.update()
-    expected = posed_people(bpy.context.evaluated_depsgraph_get())[0].params()
+    expected = posed_humans(bpy.context.evaluated_depsgraph_get())[0].params()
     show_grid(person, box_grid(0.05, (-0.1, -0.1, 0.2), (0.1, 0.1, 0.4), 10.0, (0.5, 0.5, 0.5)), tmp_path)
     set_attachment(person, mode)
     bpy.context.view_layer.update()
     graph = bpy.context.evaluated_depsgraph_get()
-    assert [one.params() for one in posed_people(graph)] == [expected]
+    assert [one.params() for one in posed_humans(graph)] == [expected]
     assert len(scene_solids(graph, False).corners) == 0

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from blender_primdiffusion.engine.refine import COARSENESS, REST_S, Refinement, Wish
-from blender_primdiffusion.engine.view import View, view_from_matrices, without_scale
+from blender_primdiffusion.engine.refine import COARSENESS, REST_S, Refinement, ViewRequest
+from blender_primdiffusion.engine.view import PinholeView, view_from_matrices, without_scale
 from blender_primdiffusion.worker.drawing import Drawing
 from blender_primdiffusion.worker.request import RequestError
 
@@ -18,9 +18,9 @@ pytestmark = pytest.mark.any_blender
 SIZE = (101, 80)
 
 
-def wish(key: object, region=None) -> Wish:
-    view = View(np.diag([100.0, 100.0, 1.0]), np.eye(4)[:3], (0.1, 100.0), *SIZE)
-    return Wish(key, {"people": []}, view, region)
+def wish(key: object, region=None) -> ViewRequest:
+    view = PinholeView(np.diag([100.0, 100.0, 1.0]), np.eye(4)[:3], (0.1, 100.0), *SIZE)
+    return ViewRequest(key, {"people": []}, view, region)
 
 
 @pytest.fixture
@@ -139,7 +139,7 @@ def test_a_child_that_died_is_replaced_once_before_the_user_is_told(bench):
     bench.refinement.advance()
     answer(bench)
     bench.refinement.advance()
-    assert bench.refinement.shown.wish.key == "b"
+    assert bench.refinement.shown.request.key == "b"
     bench.refinement.want(wish("c"))
     bench.refinement.advance()
     answer(bench, "failed", error=RequestError("the child has died", "", "died"))

@@ -15,7 +15,7 @@ import synthetic_shape
 from oracle import evaluated_matrices
 from test_missing_volumes import write_person
 
-from blender_primdiffusion.engine.people import posed_people
+from blender_primdiffusion.engine.picture import posed_humans
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_files
@@ -70,7 +70,7 @@ def whole(person, where=None) -> bool:
     assert not [one.summary() for one in missing_files()]
     assert all(volume.grids.load() for volume in volumes)
     assert person_file(person).is_file()
-    files = [one.file.resolve() for one in posed_people(bpy.context.evaluated_depsgraph_get())]
+    files = [one.file.resolve() for one in posed_humans(bpy.context.evaluated_depsgraph_get())]
     assert person_file(person).resolve() in files
     if where is not None:
         np.testing.assert_allclose(places(person), where, atol=1e-6)

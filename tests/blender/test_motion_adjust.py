@@ -8,10 +8,10 @@ import scan_fixtures
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from test_motion_bvh import motion_of, write_bvh
 
-from blender_primdiffusion.motion.adjust import cut, from_origin, in_place, leg_ratio, on_floor, resample, slerp
+from blender_primdiffusion.motion.adjust import cut, from_origin, in_place, leg_ratio, on_floor, resample
 from blender_primdiffusion.motion.files import MotionFileError, read_motion
 from blender_primdiffusion.motion.motion import Motion
-from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, to_axis_angle
+from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, slerp, to_axis_angle
 from blender_primdiffusion.motion.skeleton import REST_JOINTS
 
 pytestmark = pytest.mark.any_blender
@@ -53,7 +53,7 @@ def test_cutting_counts_from_one_and_keeps_the_speed():
     np.testing.assert_array_equal(part.translations, motion.translations[[2, 5, 8]])
     assert part.fps == 10.0
     for wrong in ((11, 0, 1), (5, 4, 1), (1, 0, 0)):
-        with pytest.raises(ValueError, match=r"(were|was) wanted"):
+        with pytest.raises(ValueError, match=r"frames|stride"):
             cut(motion, *wrong)
 
 
@@ -118,5 +118,5 @@ def test_bones_chosen_by_hand_are_as_good_as_known_names(tmp_path):
     np.testing.assert_allclose(to_axis_angle(b.rotations[:, body]), to_axis_angle(a.rotations[:, body]), atol=1e-6)
     assert b.detected.rig == "chosen by hand"
     assert b.detected.bones == own
-    with pytest.raises(MotionFileError, match="'tail', which is none of SMPL's joints"):
+    with pytest.raises(MotionFileError, match="'tail', which is no joint of SMPL"):
         read_motion(strange, bones={**own, "tail": "bone 1"})

@@ -7,9 +7,8 @@ import pytest
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 
 from blender_primdiffusion.motion.built_in_motions import MOTIONS, built_in_motion
-from blender_primdiffusion.motion.legs import FootTrack, joint, reach
 from blender_primdiffusion.motion.rotation import to_axis_angle
-from blender_primdiffusion.motion.skeleton import FLOOR, REST_JOINTS, chain, joint_positions
+from blender_primdiffusion.motion.skeleton import FLOOR, REST_JOINTS, FootTrack, chain, joint, joint_positions, reach
 
 pytestmark = pytest.mark.any_blender
 

@@ -62,7 +62,7 @@ def test_amass_without_a_rate_gets_the_default_and_a_note(tmp_path):
     np.savez(tmp_path / "m.npz", **amass(156))
     motion = read_motion(tmp_path / "m.npz")
     assert motion.fps == DEFAULT_FPS
-    assert "tells no frame rate: 30 frames a second are assumed" in motion.notes
+    assert "states no frame rate: 30 frames per second are assumed" in motion.notes
 
 
 def test_smplx_by_parts_is_read(tmp_path):
@@ -144,12 +144,12 @@ def test_one_translation_serves_all_frames(tmp_path):
         ({"poses": np.zeros((3, 60))}, "poses of 20 joints"),
         ({"poses": np.zeros((3, 71))}, "72 axis-angle numbers"),
         ({"poses": np.zeros((0, 72))}, "holds no frame"),
-        ({"poses": np.array(["a"] * 72)[None]}, "where numbers are wanted"),
+        ({"poses": np.array(["a"] * 72)[None]}, "instead of numbers"),
         ({"poses": np.zeros((3, 72)), "trans": np.zeros((4, 3))}, "translations of shape"),
         ({"poses": np.array([{"a": 1}], object)}, "pickled Python objects"),
         ({"body_pose": np.zeros((3, 69)), "global_orient": np.zeros((2, 3))}, "2 frames of global_orient but 3"),
         ({"body_pose": np.ones((3, 23, 3, 3))}, "no rotations"),
-        ({"marker_data": np.zeros((3, 72))}, "in it is 'marker_data', wanted are 'poses'"),
+        ({"marker_data": np.zeros((3, 72))}, "it holds 'marker_data' and needs 'poses'"),
     ],
 )
 def test_arrays_that_are_no_poses_are_named(tmp_path, arrays, message):

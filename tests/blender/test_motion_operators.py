@@ -88,7 +88,7 @@ def test_every_source_frame_can_be_kept_and_the_rate_corrected(addon, armature, 
 def test_part_of_a_file_and_every_second_frame(addon, armature, tmp_path):
     ops.import_motion(filepath=amass(tmp_path / "m.npz"), timing="SOURCE", first=11, last=20, stride=3)
     assert len(action_curves(armature)[0].keyframe_points) == 4
-    with pytest.raises(RuntimeError, match="frames 40 to 31 were wanted of 31"):
+    with pytest.raises(RuntimeError, match="frames 40 to 31 in 31"):
         ops.import_motion(filepath=amass(tmp_path / "m.npz"), first=40)
 
 
@@ -213,7 +213,7 @@ def test_export_counts_constraints_and_refuses_where_it_cannot_write(addon, arma
     assert np.abs(turn).max() < 1e-4
     with pytest.raises(RuntimeError, match="could not be written"):
         ops.export_motion(filepath=str(tmp_path / "none" / "m.npz"), first=1, last=1)
-    with pytest.raises(RuntimeError, match="frames 5 to 2 were wanted"):
+    with pytest.raises(RuntimeError, match="frames 5 to 2"):
         ops.export_motion(filepath=str(tmp_path / "m.npz"), first=5, last=2)
 
 

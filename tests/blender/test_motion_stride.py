@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 
-from blender_primdiffusion.motion.adjust import scale_places
-from blender_primdiffusion.motion.amass_file import write_amass
+from blender_primdiffusion.motion.adjust import scale_places, stride_ratio
 from blender_primdiffusion.motion.built_in_motions import built_in_motion
-from blender_primdiffusion.motion.files import read_motion
+from blender_primdiffusion.motion.files import read_motion, write_amass
 from blender_primdiffusion.motion.motion import Detected, Motion
 from blender_primdiffusion.motion.skeleton import REST_JOINTS, joint_positions
-from blender_primdiffusion.motion.stride import stride_ratio
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.ui.motion_armatures import FACTS

@@ -16,7 +16,7 @@ from blender_primdiffusion.formats.joints import JOINT_NAMES
 
 from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.capture.scan import Scan, ScanError, find_scans, load_scan
-from blender_primdiffusion.motion.bones import RIGS, UnknownBonesError, map_bones
+from blender_primdiffusion.motion.rigs import RIGS, UnknownBonesError, map_bones
 from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle
 
 BODY = read_body()

@@ -28,7 +28,7 @@ ENGLISH = WORDS["de_DE"].keys()
 def composed() -> set[str]:
     """Labels that are put together where they are shown, and choices that a checkpoint or a folder offers."""
     from blender_primdiffusion.jobs.remedies import _REMEDIES
-    from blender_primdiffusion.motion.library_poses import LIBRARY
+    from blender_primdiffusion.motion.poses import LIBRARY
     from blender_primdiffusion.ui.attributes import CATEGORIES, menu
     from blender_primdiffusion.ui.shape_panel import _SHOWN
     from blender_primdiffusion.ui.variations_operators import _BUILD_ALL

@@ -1,4 +1,4 @@
-"""Bones of other rigs as SMPL's joints, by their names."""
+"""Other rigs as SMPL's skeleton: which bone is which joint, and how the rest pose differs from SMPL's T."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
-from ..formats.joints import JOINT_NAMES
+import numpy as np
+from numpy.typing import NDArray
+
+from ..formats.joints import JOINT_NAMES, PARENTS
+from .rotation import about_axis, between
+from .skeleton import REST_JOINTS
 
 _SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist", "hand")
 RIGS: dict[str, dict[str, str]] = {
@@ -71,20 +76,22 @@ RIGS: dict[str, dict[str, str]] = {
         "wrist": "{left}wrist|{left}hand",
     },
 }  # fmt: skip
-"""Rigs people have: SMPL's part of the body -> the bone's name without separators, lower case; `{l}` and `{left}` stand
-for the side, `|` between alternatives. A `tip` shows where the hand points and is not turned itself."""
-
+"""Common rigs: SMPL's body part -> the bone's name without separators, lower case; `{l}` and `{left}` stand for the
+side, `|` separates alternatives. A `tip` gives the direction of the hand and is not posed."""
 NEEDED = (
     "pelvis", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle", "left_shoulder",
     "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
 )  # fmt: skip
-"""Without these a rig cannot be posed; of the spine, the neck and the head one bone is enough."""
+"""A rig needs these to be posed, and one bone of spine, neck and head."""
 BY_HAND = "chosen by hand"
 _TRUNK = ("spine1", "spine2", "spine3", "neck", "head")
+_LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist", "wrist": "hand"}
+"""Parts whose direction towards the next part gives their rotation."""
+_SHORTEST = 1e-6
 
 
 class UnknownBonesError(ValueError):
-    """Bones whose names are those of no rig that is known; one sentence that names what lacks."""
+    """Bone names that match no known rig; the message names the missing joints."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,15 +101,15 @@ class BoneMap:
     rig: str
     """A key of `RIGS`, or `BY_HAND`."""
     joints: dict[str, str]
-    """SMPL's joint -> the bone's name; all of `NEEDED`, and those of the others that are there."""
+    """SMPL's joint -> the bone's name; all of `NEEDED`, and other joints that the rig has."""
     tips: dict[str, str]
-    """left_wrist and right_wrist -> a bone towards which the hand points, where there is one."""
+    """left_wrist and right_wrist -> a bone to which the hand points, where there is one."""
 
 
 def map_bones(names: Iterable[str]) -> BoneMap:
-    """The rig whose names fit best, with any prefix that its bones share.
+    """The bones as the rig whose names fit best, with any prefix that they share.
 
-    Raises UnknownBonesError where no rig has all that is needed; it names the joints that lack and some of the bones.
+    Raises UnknownBonesError where no rig matches; it names the missing joints and some of the bones.
     """
     bones = list(names)
     plain = {}
@@ -110,48 +117,98 @@ def map_bones(names: Iterable[str]) -> BoneMap:
         plain.setdefault(_plain(bone), bone)
     found = [_match(rig, prefix, plain) for rig in RIGS for prefix in _prefixes(rig, plain)]
     best = max(found, key=lambda m: (len(m.joints), len(m.tips)), default=BoneMap("SMPL", {}, {}))
-    lacking = _lacking(best.joints)
-    if lacking:
+    missing = _missing_joints(best.joints)
+    if missing:
         raise UnknownBonesError(
-            f"no bone is known to be {_listed(lacking)} (nearest rig: {best.rig}); the bones are {_listed(bones)}: "
+            f"no bone is known to be {_listed(missing)} (nearest rig: {best.rig}); the bones are {_listed(bones)}: "
             "name them as in SMPL, Mixamo, Unreal, Rigify or RenderPeople"
         )
     return best
 
 
 def chosen_bones(names: Iterable[str], joints: Mapping[str, str]) -> BoneMap:
-    """The map that somebody chose, SMPL's joint -> bone; empty bones count as not chosen.
+    """A bone map chosen by the user, SMPL's joint -> bone; empty bones count as not chosen.
 
-    Raises UnknownBonesError for a joint that SMPL does not have, a bone that is not among `names`, and where one that
-    is needed is not chosen.
+    Raises UnknownBonesError for a joint that SMPL does not have, a bone that is not among `names`, and a joint of
+    `NEEDED` without a bone.
     """
     bones = list(names)
     chosen = {joint: bone for joint, bone in joints.items() if bone}
     for joint, bone in chosen.items():
         if joint not in JOINT_NAMES:
-            raise UnknownBonesError(
-                f"the bone map names {joint!r}, which is none of SMPL's joints: correct or remove it"
-            )
+            raise UnknownBonesError(f"the bone map names {joint!r}, which is no joint of SMPL: correct or remove it")
         if bone not in bones:
             raise UnknownBonesError(
-                f"the bone map wants {bone!r} for {joint}, which the file does not have; its bones are "
+                f"the bone map has {bone!r} for {joint}, which is not in the file; its bones are "
                 f"{_listed(bones)}: choose one of them"
             )
-    lacking = _lacking(chosen)
-    if lacking:
-        raise UnknownBonesError(f"the bone map has no bone for {_listed(lacking)}: choose one for each")
+    missing = _missing_joints(chosen)
+    if missing:
+        raise UnknownBonesError(f"the bone map has no bone for {_listed(missing)}: choose one for each")
     return BoneMap(BY_HAND, chosen, {})
 
 
-def _lacking(joints: Mapping[str, str]) -> list[str]:
-    lacking = [joint for joint in NEEDED if joint not in joints]
-    return lacking if any(joint in joints for joint in _TRUNK) else [*lacking, "spine1"]
-
-
 def expected_names(part: str, rig: str, side: str) -> list[str]:
-    """Plain names that a rig has for a part of the body (`hip`, `tip`, ...) on the side `left` or `right`."""
+    """Normalized names of a body part (`hip`, `tip`, ...) in a rig, on the side `left` or `right`."""
     pattern = RIGS[rig].get(part, "")
     return [name.format(l=side[0], left=side) for name in pattern.split("|") if name]
+
+
+def facing(heads: Mapping[str, NDArray]) -> NDArray[np.float64]:
+    """Rotation [3, 3] whose columns are left, up and front of a person in the rig's axes.
+
+    `heads` are joint positions by SMPL's names. Rest poses stand upright, so up is snapped to the nearest axis unless
+    it is far off, and left where it nearly is an axis. Raises ValueError where the joints lie on a line.
+    """
+    hips = (heads["left_hip"] + heads["right_hip"]) / 2
+    shoulders = (heads["left_shoulder"] + heads["right_shoulder"]) / 2
+    ankles = (heads["left_ankle"] + heads["right_ankle"]) / 2
+    left = heads["left_hip"] - heads["right_hip"] + heads["left_shoulder"] - heads["right_shoulder"]
+    up = (shoulders - hips) + (hips - ankles)
+    height = np.linalg.norm(up)
+    up = _towards_axis(up / max(float(height), 1e-30), 30.0)
+    left = left - up * (left @ up)
+    width = np.linalg.norm(left)
+    if height < _SHORTEST or width < 1e-3 * height:
+        raise ValueError("hips, shoulders and ankles lie on a line: this is no rest pose of a person")
+    left = _towards_axis(left / width, 5.0)
+    left = left - up * (left @ up)
+    left /= np.linalg.norm(left)
+    return np.stack([left, up, np.cross(left, up)], -1)
+
+
+def rig_from_smpl(
+    heads: Mapping[str, NDArray], tips: Mapping[str, NDArray], rest: NDArray = REST_JOINTS
+) -> NDArray[np.float64]:
+    """Rotations [24, 3, 3] of each body part from SMPL's rest pose to the rig's.
+
+    `heads` are the rig's joints at rest by SMPL's names, `tips` where its hands point, both y up and facing +z; `rest`
+    [24, 3] are the body's joints. Limbs are turned the shortest way, each going on from its parent, so an arm that
+    hangs carries its hand along. Feet stand flat at both rests: they turn about the vertical alone, whatever the shoes.
+    The trunk counts as upright at both: spines differ in shape and say nothing of the pose.
+    """
+    turned = np.tile(np.eye(3), (len(JOINT_NAMES), 1, 1))
+    for joint, name in enumerate(JOINT_NAMES):
+        side, _, part = name.partition("_")
+        parent = PARENTS[joint]
+        if part == "ankle":
+            turned[joint] = _heading(heads, side, rest)
+        elif part and part != "collar":
+            turned[joint] = turned[parent]
+        target = f"{side}_{_LIMBS[part]}" if part in _LIMBS else ""
+        end = heads.get(target, tips.get(name)) if target else None
+        if end is None or name not in heads:
+            continue
+        here = end - heads[name]
+        there = turned[joint] @ (rest[JOINT_NAMES.index(target)] - rest[joint])
+        if np.linalg.norm(here) > _SHORTEST:
+            turned[joint] = between(there, here) @ turned[joint]
+    return turned
+
+
+def _missing_joints(joints: Mapping[str, str]) -> list[str]:
+    missing = [joint for joint in NEEDED if joint not in joints]
+    return missing if any(joint in joints for joint in _TRUNK) else [*missing, "spine1"]
 
 
 def _plain(bone: str) -> str:
@@ -164,9 +221,9 @@ def _part(joint: str) -> tuple[str, str]:
 
 
 def _prefixes(rig: str, plain: dict[str, str]) -> list[str]:
-    """What stands before the rig's names in many of the bones: a file's or a character's name. Commonest first."""
-    wanted = {name for joint in NEEDED for part, side in [_part(joint)] for name in expected_names(part, rig, side)}
-    counts = Counter(bone.removesuffix(name) for bone in plain for name in wanted if bone.endswith(name))
+    """Prefixes of the rig's names in the bones, such as a character's name, the most common first."""
+    expected = {name for joint in NEEDED for part, side in [_part(joint)] for name in expected_names(part, rig, side)}
+    counts = Counter(bone.removesuffix(name) for bone in plain for name in expected if bone.endswith(name))
     return [prefix for prefix, _ in counts.most_common(3)]
 
 
@@ -189,3 +246,22 @@ def _match(rig: str, prefix: str, plain: dict[str, str]) -> BoneMap:
 def _listed(names: list[str]) -> str:
     shown = ", ".join(repr(name) for name in names[:8])
     return shown if len(names) <= 8 else f"{shown} and {len(names) - 8} more"
+
+
+def _towards_axis(direction: NDArray, degrees: float) -> NDArray[np.float64]:
+    """The nearest axis, where it is within `degrees` of a unit vector [3]; else the vector."""
+    axis = np.zeros(3)
+    largest = int(np.abs(direction).argmax())
+    axis[largest] = np.sign(direction[largest])
+    return axis if axis @ direction > np.cos(np.radians(degrees)) else direction
+
+
+def _heading(heads: Mapping[str, NDArray], side: str, rest: NDArray) -> NDArray[np.float64]:
+    toe = heads.get(f"{side}_foot")
+    if toe is None:
+        return np.eye(3)
+    here = toe - heads[f"{side}_ankle"]
+    there = rest[JOINT_NAMES.index(f"{side}_foot")] - rest[JOINT_NAMES.index(f"{side}_ankle")]
+    if np.hypot(here[0], here[2]) < 0.2 * np.linalg.norm(here):  # the foot hangs: its heading is not to be seen
+        return np.eye(3)
+    return about_axis(1, np.arctan2(here[0], here[2]) - np.arctan2(there[0], there[2]))
