@@ -246,7 +246,7 @@ def test_another_number_of_processes_is_told(captures, begun, caplog):
     (begun.run / RUN).write_text(json.dumps(about))
     with caplog.at_level(logging.WARNING):
         fit(settings(captures, begun.run, steps=2))
-    assert "1 processes, before 4: other batches follow" in caplog.text
+    assert "resuming on 1 processes instead of 4" in caplog.text
 
 
 def test_a_polite_kill_asks_to_stop_and_a_second_ctrl_c_stops_at_once(monkeypatch):

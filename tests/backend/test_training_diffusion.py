@@ -17,7 +17,7 @@ from primdiffusion.training.config import PhaseConfig, PriorConfig, check_resuma
 from primdiffusion.training.interrupt import Interrupt
 from primdiffusion.training.latents import LatentSet, split_people
 from primdiffusion.training.losses import (
-    asked_of,
+    blend_conditions,
     blends,
     closed_form,
     level_weight,
@@ -297,6 +297,8 @@ def test_blends_are_asked_for_by_what_both_people_have():
     words = AttributeVocabulary({"sex": ("female", "male"), "pattern": ("patterned", "plain")}, {})
     people = LatentSet(torch.zeros(2, 1, 32, 32), torch.zeros(2, dtype=torch.int64), torch.zeros(1, 10), condition)
     indices, weights = torch.tensor([[0, 1], [0, 1]]), torch.tensor([[0.6, 0.4], [1.0, 0.0]])
-    asked = [asked_of(people, indices, weights, words, 0.0, torch.Generator().manual_seed(s)) for s in range(200)]
+    asked = [
+        blend_conditions(people, indices, weights, words, 0.0, torch.Generator().manual_seed(s)) for s in range(200)
+    ]
     most = torch.stack(asked).amax(0)
     assert torch.equal(most, torch.tensor([[1.0, 0, 0, 0], [1.0, 0, 1, 0]]))

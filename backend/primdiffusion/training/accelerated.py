@@ -1,4 +1,4 @@
-"""What a training on any number of devices needs to go on exactly where it stopped, and to stop together."""
+"""Training state on any number of processes: exact resumption, and stopping together."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from torch import Tensor, nn
 from primdiffusion.training.state import OptimiserConfig, TrainingState
 
 PATIENCE = datetime.timedelta(hours=3)
-"""How long processes wait for the first one, which alone measures, draws and prepares."""
+"""How long processes wait for the main one, which alone evaluates, draws and prepares data."""
 
 
 def accelerator_of(mixed_precision: str = "no") -> Accelerator:
-    """This process' place among those of the launch; on processors where there is no graphics card."""
+    """Return the accelerator of this process; on the CPU where there is no GPU."""
     patience = InitProcessGroupKwargs(timeout=PATIENCE)
     return Accelerator(mixed_precision=mixed_precision, cpu=not torch.cuda.is_available(), kwargs_handlers=[patience])
 
@@ -50,8 +50,8 @@ class AcceleratedState(TrainingState):
 
 
 def agreed(accelerator: Accelerator, stop: bool) -> bool:
-    """Whether any process wants to stop: all must leave a loop after the same step."""
+    """Return whether any process asks to stop: all must leave a loop after the same step."""
     if accelerator.num_processes == 1:
         return stop
-    wishes = accelerator.gather(torch.tensor([stop], device=accelerator.device))
-    return bool(torch.as_tensor(wishes).any())
+    requests = accelerator.gather(torch.tensor([stop], device=accelerator.device))
+    return bool(torch.as_tensor(requests).any())

@@ -1,4 +1,4 @@
-"""Captured people as training payloads: what the frozen encoder makes of their pictures, refined where asked for."""
+"""Encode captured people as training payloads with the frozen encoder, optionally refined."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ class EncodeSettings:
     """How captures become payloads."""
 
     views: int = 8
-    """Pictures that the encoder is given, of one frame, spread around the person; all where there are fewer."""
+    """Pictures of one frame given to the encoder, spread around the person; all where there are fewer."""
     looks: int = 1
-    """Frames, evenly spaced from the first on, of each of which one payload is made."""
+    """Frames to encode, one payload each, evenly spaced from the first."""
     refine_steps: int = 0
-    """Steps of refinement on all pictures of all frames; 0: as the encoder gives them."""
+    """Refinement steps on all pictures of all frames; 0 keeps the encoder's payload."""
     refine_size: int = 256
-    """Pixels a side, at most, of the pictures that are refined on."""
+    """Largest side of the pictures used for refinement, pixels."""
     seed: int = 0
-    """Of the order of pictures in refining."""
+    """Seed of the order of pictures in refinement."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for settings that cannot be."""
+        """Raises ValueError for values out of range."""
         for name, least in (("views", 1), ("looks", 1), ("refine_steps", 0), ("refine_size", 1), ("seed", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be {least} or more")
@@ -57,10 +57,10 @@ def encode_people(
     settings: EncodeSettings = EncodeSettings(),
     cards: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Iterator[Outcome]:
-    """Write NAME.npz of every captured person into `out`; yields each outcome. One that fails leaves the others alone.
+    """Write NAME.npz of every captured person into `out`; yields each outcome and continues after failures.
 
-    The files are those of `primdiffusion payloads`, with delta scales and where they come from. A file of the same
-    source is kept ("skipped"). `cards` holds attributes and seeds of people by name (`read_cards`).
+    The files are those of `primdiffusion payloads`, with delta scales and their source. A file of the same source is
+    not written again ("skipped"). `cards` holds attributes and seeds of people by name (`read_cards`).
 
     Raises OSError where `out` cannot be written to.
     """
@@ -74,7 +74,7 @@ def encode_people(
         card = (cards or {}).get(name, {})
         path = out / f"{name}.npz"
         source = json.dumps({"captured": name, **about}, sort_keys=True)
-        if _is_kept(path, source, card.get("attributes", {})):
+        if _is_current(path, source, card.get("attributes", {})):
             yield Outcome(name, "skipped")
             continue
         try:
@@ -92,7 +92,7 @@ def encode_people(
 def looks_of(
     model: EncoderModel, captures: Captures, name: str, settings: EncodeSettings
 ) -> tuple[list[Payload], Float[Tensor, "10"]]:
-    """A person's payloads, on the CPU, and the betas of the body that their boxes sit on.
+    """Return a person's payloads, on the CPU, and the betas of the body that their boxes are placed on.
 
     Raises:
         FileNotFoundError, ConditioningError, CaptureFileError, ArrayFileError, BodyFileError: captures are missing,
@@ -122,11 +122,11 @@ def frames_of_looks(frames: int, looks: int) -> list[int]:
 
 
 def read_cards(people: Path) -> dict[str, Mapping[str, Any]]:
-    """What `primdiffusion people` noted of everybody in a folder, by name: betas, attributes, seed.
+    """Return the cards that `primdiffusion people` wrote into a folder, by name: betas, attributes, seed.
 
     Raises:
-        FileNotFoundError: there is nobody in it.
-        ValueError: somebody's card is damaged.
+        FileNotFoundError: the folder holds no people.
+        ValueError: a card is damaged.
     """
     cards = {}
     for name, path in find_people(people).items():
@@ -140,7 +140,7 @@ def read_cards(people: Path) -> dict[str, Mapping[str, Any]]:
 
 
 def _digest(model: EncoderModel) -> str:
-    """Of the weights, so that what another encoder made is not taken for this one's."""
+    """Digest of the weights: payloads of another encoder are encoded again."""
     digest = hashlib.sha256()
     for value in model.encoder.state_dict().values():
         digest.update(value.detach().cpu().contiguous().numpy().tobytes())
@@ -158,8 +158,8 @@ def _store(path: Path, payloads: list[Payload], betas: Tensor, source: str, card
     store_person(path, entries if card.get("seed") is None else {**entries, "seed": int(card["seed"])})
 
 
-def _is_kept(path: Path, source: str, attributes: Mapping[str, Any]) -> bool:
-    """Whether a file is whole and holds what would be written again; a damaged one is made anew."""
+def _is_current(path: Path, source: str, attributes: Mapping[str, Any]) -> bool:
+    """Return whether a file is intact and of the same source and attributes."""
     try:
         read_person(path)
         with np.load(path, allow_pickle=False) as file:

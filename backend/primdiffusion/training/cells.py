@@ -31,7 +31,7 @@ PREPARED = "prepared.safetensors"
 
 @dataclasses.dataclass(frozen=True)
 class Prepared:
-    """Everything a run computes in closed form before it trains."""
+    """Closed-form parts of a run, computed before training."""
 
     train: LatentSet
     held: LatentSet
@@ -43,7 +43,7 @@ class Prepared:
 
 
 def prepare(config: TrainingConfig, people: PersonDataset, train: Sequence[int], held: Sequence[int]) -> Prepared:
-    """Codec, latents, prior and body shapes of the run's people; read back from the run folder when they are there.
+    """Return codec, latents, prior and shape prior of a run; loaded from the run folder if they are saved there.
 
     Raises ValueError for a person's file, or prepared ones, that are damaged; OSError.
     """
@@ -62,7 +62,7 @@ def prepare(config: TrainingConfig, people: PersonDataset, train: Sequence[int],
 
 
 class CellTrainee:
-    """A `PersonDenoiser`: its network over person components, then the one over the grid."""
+    """Trains a `PersonDenoiser`: first its network over person components, then the one over the grid."""
 
     def __init__(self, config: TrainingConfig, prepared: Prepared, device: torch.device) -> None:
         torch.manual_seed(config.seed)
@@ -83,7 +83,7 @@ class CellTrainee:
         return getattr(self.denoiser, name)
 
     def put(self, name: str, network: nn.Module) -> None:
-        """Lets it compute, in its phase's precision."""
+        """Install a network, in the precision of its phase."""
         setattr(self.denoiser, name, network)
         self.denoiser.network_dtype = torch.bfloat16 if self.phases[name].bfloat16 else torch.float32
 
@@ -94,11 +94,11 @@ class CellTrainee:
         return self._objectives[name].loss(generator)
 
     def errors(self) -> Mapping[int, float]:
-        """On everybody held out, in units of latents."""
+        """x0 errors on the held-out set, in units of latents."""
         return x0_errors({"rms": self.denoiser}, self.denoiser.schedule, self.held.latents)["rms"]
 
     def errors_beside_closed_forms(self) -> dict[str, dict[int, float]]:
-        """Likewise, with those of the prior as one Gaussian and as the mixture that it is, on the same noise."""
+        """As `errors`, with those of the prior as a single Gaussian and as a mixture, on the same noise."""
         guesses = {
             "gaussian": closed_form(self.denoiser, single=True),
             "mixture": closed_form(self.denoiser, single=False),
@@ -107,7 +107,7 @@ class CellTrainee:
         return x0_errors(guesses, self.denoiser.schedule, self.held.latents)
 
     def model(self) -> DiffusionModel:
-        """What is in place, without a card."""
+        """Return the model with the installed networks, without a card."""
         codec, denoiser = CellCodec(self.codec), self.denoiser
         return DiffusionModel(
             denoiser, denoiser.schedule, codec, self.shapes, self.full_density, {}, self.vocabulary,
@@ -155,4 +155,4 @@ def _load_prepared(path: Path) -> Prepared:
             float(about["full_density"]),
         )
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is damaged ({error}): remove it, then it is made again") from error
+        raise ValueError(f"{path} is damaged ({error}): remove it to compute it again") from error

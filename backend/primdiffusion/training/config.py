@@ -78,7 +78,7 @@ class PhaseConfig:
     """Forward and backward of the network in bfloat16, where the device multiplies it faster."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for settings that cannot be."""
+        """Raises ValueError for values out of range."""
         for name in ("steps", "batch", "evaluate_every"):
             _check(name, getattr(self, name), getattr(self, name) >= 1, "1 or more")
         for name in ("learning_rate", "gradient_clip", "min_snr_gamma"):
@@ -106,7 +106,7 @@ class TrainingConfig:
     minutes: float | None = None
     """Stop after this time, to be resumed; None trains to the end."""
     seed: int = 0
-    """Of everything random."""
+    """Seed of all random numbers."""
     schedule: Literal["linear", "sqrt_linear", "fine_linear"] | None = None
     """Noise schedule over 1000 steps: linear (the paper's; None in the paper preset), fine_linear (the same from less
     noise on; None in the default preset) or sqrt_linear (the released code's)."""
@@ -116,7 +116,7 @@ class TrainingConfig:
     holdout: float = 0.05
     """Share of geometries, with all their colour variants, that is evaluated on and never trained on."""
     save_every: float = 60.0
-    """Seconds between saved states: what a kill can lose. 0 saves after every step."""
+    """Seconds between saved states: the most that a kill can lose. 0 saves after every step."""
     threads: int | None = None
     """Processor threads; None leaves torch's choice."""
     log_every: int = 50
@@ -147,7 +147,7 @@ class TrainingConfig:
     """The paper preset's only phase; the batch is that of each process."""
 
     def __post_init__(self) -> None:
-        """Fills in what follows from the preset; raises ValueError for settings that cannot be."""
+        """Fills in what follows from the preset; raises ValueError for values out of range."""
         usual = {"default": ("fine_linear", "dense"), "paper": ("linear", "trailing")}[self.preset]
         for name, value in zip(("schedule", "chain"), usual, strict=True):
             if getattr(self, name) is None:
@@ -190,12 +190,12 @@ MAY_CHANGE = frozenset(
         "loss.perceptual_weights",
     )
 )
-"""Settings that a resumed run may be given anew. None changes what a step does, but for `steps`: it stretches what is
-left of the learning rate's cosine."""
+"""Settings that may change when a run is resumed. None affects a step, except `steps`, which stretches the rest of the
+learning rate's cosine."""
 
 
 class RunConfig(Protocol):
-    """Any run's settings: a dataclass that says where its folder and its data are."""
+    """Settings of a run of either stage: a dataclass with its folder and its data."""
 
     @property
     def run(self) -> Path: ...
@@ -213,7 +213,7 @@ def check_resumable(saved: str, config: RunConfig) -> None:
     changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     if changed:
         differing = ", ".join(f"{key} ({before.get(key)}, not {now.get(key)})" for key in changed)
-        raise ValueError(f"the run in {config.run} was begun with another {differing}: give the same, or a new folder")
+        raise ValueError(f"the run in {config.run} began with another {differing}: give the same, or a new folder")
 
 
 def _comparable(tree: dict, prefix: str = "") -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""Asking a training loop to stop between two steps."""
+"""Stop a training loop between two steps."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from types import FrameType
 log = logging.getLogger(__name__)
 
 IMPATIENT = 2.0
-"""Seconds after the first Ctrl-C from which on another one stops at once: launchers pass the same one on again."""
+"""Seconds after the first Ctrl-C before a second one stops at once: launchers forward the first one twice."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupt:
-    """Asks loops to stop after the current step: at a deadline, on Ctrl-C or a polite kill, so that no step is torn.
+    """Stops loops after the current step: at a deadline, on SIGINT (Ctrl-C) or SIGTERM, so that no step is cut short.
 
     A second Ctrl-C, IMPATIENT seconds later, raises KeyboardInterrupt wherever the loop is.
     """
@@ -48,5 +48,5 @@ class Interrupt:
             raise KeyboardInterrupt
 
     def due(self) -> bool:
-        """Whether to stop now."""
+        """Return whether to stop now."""
         return self.pressed or time.monotonic() > self.deadline

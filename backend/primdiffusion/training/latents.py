@@ -1,4 +1,4 @@
-"""People on disk -> latents in memory: what the diffusion model is trained on."""
+"""Encode stored people as latents in memory, the training set of the diffusion model."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class LatentSet(TensorRecord):
     """Which geometry each has; those of one geometry lie together."""
     betas: Float[Tensor, "g 10"]
     condition: Float[Tensor, "n a"]
-    """All that is known of each person, as `AttributeVocabulary.encode` gives it."""
+    """All attributes of each person, as `AttributeVocabulary.encode`."""
 
     def __len__(self) -> int:
         return len(self.latents)
@@ -75,7 +75,7 @@ def encode_people(
 
 
 def _known(attributes: Attributes, vocabulary: AttributeVocabulary) -> Attributes:
-    """Those that the vocabulary has a word for: people that are held out may wear what nobody else does."""
+    """Drop attributes missing from the vocabulary: held-out people may have values that no training sample has."""
     return {
         name: value
         for name, value in attributes.items()
@@ -84,7 +84,7 @@ def _known(attributes: Attributes, vocabulary: AttributeVocabulary) -> Attribute
 
 
 def vocabulary_of(people: Iterable[Attributes]) -> AttributeVocabulary:
-    """What can be said of these people: all words that are, and mean and spread of all numbers."""
+    """Collect the vocabulary of these people: all values of categories, mean and standard deviation of numbers."""
     words: dict[str, set[str]] = {}
     numbers: dict[str, list[float]] = {}
     for attributes in people:

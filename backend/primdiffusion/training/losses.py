@@ -1,6 +1,6 @@
-"""Objectives of the default denoiser's two networks, weightings of errors, and the error that denoisers are judged by.
+"""Objectives of the default denoiser's two networks, weightings of errors, and the evaluation error.
 
-All random numbers are drawn where their generator lives, which must be where the people are.
+Random numbers are drawn on the device of their generator, which must be that of the samples.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def objective(
 
 @dataclasses.dataclass
 class PersonObjective:
-    """Loss of the network over person components: it needs no pictures, so a step costs little."""
+    """Loss of the network over person components: it needs no latent grids, so a step is cheap."""
 
     denoiser: PersonDenoiser
     coefficients: Float[Tensor, "n r"]
@@ -65,13 +65,13 @@ class PersonObjective:
 
     @property
     def network(self) -> nn.Module:
-        """What is trained."""
+        """The network to train."""
         return _present(self.denoiser.person)
 
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted x0 error of a random batch at random levels."""
         weights, indices = blends(self.people.geometry, self.config.batch, self.config.blend, generator)
-        condition = asked_of(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
+        condition = blend_conditions(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
         c = torch.einsum("bk,bkr->br", weights, self.coefficients[indices])
         flip = torch.rand(len(c), 1, generator=generator, device=generator.device) < 0.5
         c = torch.where(flip, c * self.denoiser.prior_parity, c)
@@ -85,7 +85,7 @@ class PersonObjective:
 
 @dataclasses.dataclass
 class RestObjective:
-    """Loss of the local network: what person components leave out, given those that the person network guesses."""
+    """Loss of the local network: the rest, given the person network's coefficients."""
 
     denoiser: PersonDenoiser
     people: LatentSet
@@ -95,13 +95,13 @@ class RestObjective:
 
     @property
     def network(self) -> nn.Module:
-        """What is trained."""
+        """The network to train."""
         return _present(self.denoiser.local)
 
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted x0 error of a random batch at random levels."""
         weights, indices = blends(self.people.geometry, self.config.batch, self.config.blend, generator)
-        condition = asked_of(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
+        condition = blend_conditions(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
         z = mixed(self.people.latents, weights, indices)
         flip = torch.rand(len(z), 1, 1, 1, generator=generator, device=generator.device)[:, 0, 0, 0] < 0.5
         z[flip] = self.codec.mirror(z[flip])
@@ -172,7 +172,7 @@ def mixed(
     return result
 
 
-def asked_of(
+def blend_conditions(
     people: LatentSet,
     indices: Int[Tensor, "b 2"],
     weights: Float[Tensor, "b 2"],
@@ -180,7 +180,7 @@ def asked_of(
     unasked: float,
     generator: torch.Generator,
 ) -> Float[Tensor, "b a"]:
-    """What is said of a batch of `blends`: what both people of a blend have, and of that only a part."""
+    """Return conditions of a batch of `blends`: attributes common to both samples, some of them dropped at random."""
     first, second = people.condition[indices].unbind(1)
     same = (first == second) | (weights[:, 1:] == 0)
     return vocabulary.forget(torch.where(same, first, 0.0), unasked, generator)

@@ -1,4 +1,4 @@
-"""Training one network of a diffusion model, from where it stopped to its last step; whatever the preset."""
+"""Train or resume one network of a diffusion model, for either preset."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from primdiffusion.training.state import NotFiniteError
 
 
 class Trainee(Protocol):
-    """A preset's model in the making."""
+    """A model in training."""
 
     @property
     def phases(self) -> Mapping[str, PhaseConfig]:
@@ -36,23 +36,23 @@ class Trainee(Protocol):
         ...
 
     def network(self, name: str) -> nn.Module:
-        """One of them as it begins."""
+        """One of them, as initialised."""
         ...
 
     def put(self, name: str, network: nn.Module) -> None:
-        """Lets a network compute in its place: as it is called in training, or its average."""
+        """Install a network under this name: the trained one, or its average."""
         ...
 
     def loss(self, name: str, generator: torch.Generator) -> Tensor:
-        """Of a random batch, for the network of this name."""
+        """Loss of the named network on a random batch."""
         ...
 
     def errors(self) -> Mapping[int, float]:
-        """Root mean square x0 error on held-out people, by level, of what is in place."""
+        """Root mean square x0 error on held-out people, by level, of the installed networks."""
         ...
 
     def model(self) -> DiffusionModel:
-        """What is in place, without a card."""
+        """Return the model with the installed networks, without a card."""
         ...
 
 
@@ -94,7 +94,7 @@ def train_phase(
 
 
 def step(config: TrainingConfig, trainee: Trainee, name: str, state: AcceleratedState) -> StepMetrics:
-    """One optimiser step. What it draws and drops follows from seed, phase, step and process alone."""
+    """Run one optimiser step; its random numbers depend on seed, phase, step and process alone."""
     device, phase = state.accelerator.device, trainee.phases[name]
     seed = step_seed(config.seed, name, state.step, state.accelerator.process_index)
     torch.manual_seed(seed)
@@ -121,7 +121,7 @@ def step_seed(seed: int, phase: str, step: int, process: int) -> int:
 
 
 def state_path(config: TrainingConfig, name: str) -> Path:
-    """Where the state of a phase lies."""
+    """Path of the saved state of a phase."""
     return config.run / f"{name}.state.safetensors"
 
 
@@ -133,7 +133,7 @@ class _Every:
 
 
 class PhaseRecorder(Recorder):
-    """Of a phase: held-out error, and people that the averaged weights generate."""
+    """Records a phase: held-out error, and people generated with the averaged weights."""
 
     def __init__(self, config: TrainingConfig, trainee: Trainee, name: str, state: AcceleratedState) -> None:
         phase = trainee.phases[name]
@@ -166,11 +166,11 @@ class PhaseRecorder(Recorder):
 
 @contextlib.contextmanager
 def _memory_named(name: str, phase: PhaseConfig) -> Iterator[None]:
-    """ValueError that says what to try, where memory runs out."""
+    """Raise ValueError with a remedy where memory runs out."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:
         if not out_of_memory(error):
             raise
         remedy = f"--{name}.batch {phase.batch // 2}" if phase.batch > 1 else "a smaller network, or another device"
-        raise ValueError(f"memory does not hold a batch of {phase.batch}: try {remedy} in a new run folder") from error
+        raise ValueError(f"out of memory for a batch of {phase.batch}: try {remedy} in a new run folder") from error

@@ -1,4 +1,4 @@
-"""What is seen of a run as it goes: lines of metrics, pictures, a bar."""
+"""Record a run: metrics, pictures and a progress bar."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from primdiffusion.training.state import TrainingState
 log = logging.getLogger(__name__)
 
 MEMORY = 25
-"""Steps over which the means of metrics.jsonl reach, about."""
+"""Approximate window of the running means in metrics.jsonl, steps."""
 
 
 @dataclasses.dataclass(frozen=True)
 class StepMetrics:
-    """One optimiser step."""
+    """Metrics of one optimiser step."""
 
     step: int
     terms: dict[str, float]
@@ -35,7 +35,7 @@ class StepMetrics:
 
 
 class StepTimer:
-    """Seconds between laps, with the device's work waited for."""
+    """Measures seconds between laps, synchronising the device."""
 
     def __init__(self, device: torch.device) -> None:
         self.device, self.seconds = device, {}
@@ -51,7 +51,7 @@ class StepTimer:
 
 
 class Every(Protocol):
-    """When a run is to be seen, in steps."""
+    """Intervals of logging, evaluation and pictures, in steps."""
 
     @property
     def log_every(self) -> int: ...
@@ -79,7 +79,7 @@ class Recorder(ABC):
         self.bar.close()
 
     def __call__(self, progress: StepMetrics) -> None:
-        """Takes note of a step. Raises OSError where there is no room."""
+        """Record a step. Raises OSError if the disk is full."""
         row = {**progress.terms, "gradient": progress.gradient}
         row |= {f"seconds_{name}": value for name, value in progress.seconds.items()}
         for name, value in row.items():
@@ -96,15 +96,15 @@ class Recorder(ABC):
 
     @abstractmethod
     def measured(self) -> dict[str, float]:
-        """How good the averaged weights are now."""
+        """Evaluate the averaged weights."""
 
     @abstractmethod
     def draw(self) -> None:
-        """Pictures of what they do."""
+        """Write pictures made with the averaged weights."""
 
     @abstractmethod
     def append(self, row: Mapping[str, float]) -> None:
-        """A line of metrics.jsonl."""
+        """Append a line to metrics.jsonl."""
 
     def _due(self, step: int, every: int) -> bool:
         return step % every == 0 or step == self.steps

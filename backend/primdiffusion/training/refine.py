@@ -1,12 +1,12 @@
-"""One person made to look like their pictures: gradient steps on what fills the boxes, through the marcher.
+"""Refine one person to match pictures: gradient descent on the payload, through the marcher.
 
     start = bare_body(betas)                        # or an encoder's, or from_mesh's, or any other person
     refined = refine(start, views).human            # views: pictures of one pose each, several poses
 
 Adam on three fields of the payload: colours as sRGB encodes them, density, and the logarithm of the boxes' sizes. The
-objective is that of stage 1 (paper sec. 3.2: L_rgb, L_sil), on random views. What no view shows has no gradient, and
-stays as it was, bit for bit. Nothing else holds the person back: a few views of one pose are fitted to excess, and from
-elsewhere the person gets worse; some tens of views in several poses do well.
+objective is that of stage 1 (paper sec. 3.2: L_rgb, L_sil), on random views. Values that no view shows have no
+gradient and stay unchanged, bit for bit. There is no other regulariser: a few views of one pose are overfitted and the
+person gets worse from other sides; some tens of views in several poses work well.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from primdiffusion.primitives.primitives import Payload
 from primdiffusion.training.refine_views import PosedView, drawn, psnr_of, scenes_of
 
 BETAS = (0.9, 0.99)
-"""Adam's memories. Short ones: a run is a few hundred steps."""
+"""Adam's decay rates; short averages, because a run is a few hundred steps."""
 WARM_UP = 10
 """Steps in which the rates rise to their full size: Adam's first steps are all of one length, whatever the gradient."""
 LARGEST_CHANGE = 3.0
@@ -76,7 +76,7 @@ class RefineSettings:
 
 
 class RefineStep(NamedTuple):
-    """What is known after a step."""
+    """Progress after a step."""
 
     number: int
     """From 1."""
@@ -109,10 +109,10 @@ def refine(
 
     `views` are records of one pose each, unbatched, pictures [v, H, W]; their poses are those of a body with the
     human's betas. The same input and settings give the same bits on the same device. `on_step` sees each step after it
-    is done; an exception it raises ends the work (that is how cancelling works).
+    is done; an exception that it raises ends the run (this is how cancelling works).
 
     Raises:
-        ValueError: there are no views, or they do not fit their cameras, or nobody is in a record's masks; the human
+        ValueError: there are no views, or they do not fit their cameras, or a record's masks are empty; the human
             is of another body, or holds NaN; the pictures lead to numbers that are not finite.
         PictureOutOfMemory: pictures of this size do not fit.
     """
@@ -133,7 +133,7 @@ def refine(
         loss = torch.stack(losses).mean() / covered
         value = float(loss.detach())
         if not math.isfinite(value):
-            raise ValueError(f"refining lost its way at step {number}, the loss is {value}: use smaller rates")
+            raise ValueError(f"refinement diverged at step {number} (loss {value}): use smaller rates")
         loss.backward()
         adam.step()
         fall.step()
@@ -152,7 +152,7 @@ def refine(
 
 
 class _Leaves(NamedTuple):
-    """What Adam moves."""
+    """The optimised tensors."""
 
     colour: Tensor
     """sRGB-encoded."""
@@ -180,7 +180,7 @@ class _Leaves(NamedTuple):
 
     @torch.no_grad()
     def result(self, start: Payload) -> Payload:
-        """The payload, with the start's very bits where nothing moved."""
+        """The payload, bit-identical to the start where nothing changed."""
         now, then = self.payload(start), _Leaves.of(start)
         return Payload(
             torch.where(self.colour == then.colour, start.rgb, now.rgb),
@@ -190,7 +190,7 @@ class _Leaves(NamedTuple):
 
 
 def _shuffled(scenes: Sequence[PosedView], seed: int) -> Iterator[PosedView]:
-    """Without end; each once before any comes again."""
+    """Shuffled views without end, epoch by epoch."""
     generator = torch.Generator().manual_seed(seed)
     while True:
         for place in torch.randperm(len(scenes), generator=generator).tolist():

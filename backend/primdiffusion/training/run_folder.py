@@ -1,4 +1,4 @@
-"""The folder of a run, of either stage: how a run begins or goes on in it, and what it notes of itself.
+"""The folder of a run, of either stage: starting, resuming and recording runs.
 
 config.json      the settings
 run.json         the people; of every start its step, processes, versions and commit
@@ -36,7 +36,7 @@ def begin(
     start: Mapping[str, Any],
     is_kept: Callable[[Mapping[str, Any]], bool],
 ) -> None:
-    """Settings, versions and whom it is trained on; or, in a run's folder, the proof that these are as before.
+    """Save settings, versions and names of the training set; when resuming, check that these are unchanged.
 
     `about` is noted beside the people; `start` says of this start where it begins and on how many "processes". Lines
     of metrics.jsonl for which `is_kept` is false belong to steps that a kill undid: they will be written again.
@@ -69,7 +69,7 @@ def append_metrics(run: Path, row: Mapping[str, Any]) -> None:
 
 
 def versions() -> dict[str, str]:
-    """What ran: Python, torch, accelerate, and of a checkout its commit, "-dirty" where files differ from it."""
+    """Return versions of Python, torch and accelerate, and a checkout's commit, "-dirty" where files differ from it."""
     found = {
         "python": platform.python_version(),
         "torch": torch.__version__,
@@ -94,11 +94,11 @@ def _earlier(config: RunConfig, people: Sequence[str], saved: str, processes: in
         raise ValueError(f"{config.run / RUN} is damaged ({error}): give a new folder") from error
     if known != list(people):
         raise ValueError(
-            f"the run in {config.run} was begun with other people than those of {config.data} ({len(known)} and "
+            f"the run in {config.run} began with other people than those of {config.data} ({len(known)} and "
             f"{len(people)} of them): give the same data, or a new folder"
         )
     if were != processes:
-        log.warning("%d processes, before %d: other batches follow", processes, were)
+        log.warning("resuming on %d processes instead of %d: batches will differ", processes, were)
     return starts
 
 
@@ -109,7 +109,7 @@ def _cut_metrics(path: Path, is_kept: Callable[[Mapping[str, Any]], bool]) -> No
 
 
 def _is_kept(line: str, is_kept: Callable[[Mapping[str, Any]], bool]) -> bool:
-    """False also for a line that a kill cut short."""
+    """Also False for a truncated line."""
     try:
         return is_kept(json.loads(line))
     except (ValueError, KeyError, TypeError):
@@ -117,7 +117,7 @@ def _is_kept(line: str, is_kept: Callable[[Mapping[str, Any]], bool]) -> bool:
 
 
 def _remove_leftovers(run: Path) -> None:
-    """What a process that was killed while it wrote left: `.NAME.PID.partial`."""
+    """Remove files that killed processes left while writing: `.NAME.PID.partial`."""
     for path in run.glob(".*.partial"):
         process = path.name.split(".")[-2]
         if process.isdecimal() and not psutil.pid_exists(int(process)):

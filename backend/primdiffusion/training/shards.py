@@ -1,4 +1,4 @@
-"""Many people in few files that training maps into memory, each with its checksum.
+"""Shards: many people in few memory-mapped files, each with a checksum.
 
     index.json                 format, full density; of every shard its SHA-256 and its people; written last
     shard_NNNN.safetensors     some tens of people: voxels uint8 [n, K, 8, 8, 8, 4], betas [people, 10] and, where boxes
@@ -47,7 +47,7 @@ def open_people(folder: Path) -> PersonDataset:
 
 
 def pack_people(folder: Path, out: Path, people_each: int = PEOPLE_EACH) -> Iterator[int]:
-    """Write the people of a folder as shards; yields how many are packed. A second run begins anew.
+    """Write the people of a folder as shards; yields how many are packed. A second run starts over.
 
     Raises:
         ValueError: `out` holds packed people already, or a person's file is damaged (it is named); no people a shard.
@@ -95,7 +95,7 @@ def digest_of(path: Path) -> str:
 
 
 def damaged_shards(folder: Path) -> list[str]:
-    """A sentence for each shard that is not as it was written; raises ShardError for a damaged index."""
+    """Return an error message for each damaged shard; raises ShardError for a damaged index."""
     people, found = PackedPeople(folder), []
     for number in range(len(people.paths)):
         try:
@@ -127,12 +127,12 @@ class PackedPeople:
         self._open: dict[int, Any] = {}
 
     def known(self, index: int) -> tuple[Attributes, ...]:
-        """What is known of each colouring of one of them. Raises what `person` does."""
+        """Attributes of each colouring of a person. Raises what `person` does."""
         shard, place, _ = self._rows(index)
         return attributes_of(self._stored[index], self._slice(shard, "betas")[place], self.variants[index])
 
     def person(self, index: int) -> PersonVariants:
-        """One of them. Raises ShardError that names the shard where it is damaged, OSError."""
+        """Read a person. Raises ShardError that names the shard where it is damaged, OSError."""
         shard, place, rows = self._rows(index)
         voxels, scale, betas = self._slice(shard, "voxels")[rows], self._scale(shard, rows), self._slice(shard, "betas")
         return PersonVariants(voxels, scale, betas[place], self.known(index), self.full_density)
@@ -144,7 +144,7 @@ class PackedPeople:
         return self._slice(shard, "voxels")[row][0], self._scale(shard, row)[0]
 
     def check(self, shard: int) -> None:
-        """Whether a shard is as it was written. Raises ShardError, FileNotFoundError."""
+        """Check a shard against its SHA-256. Raises ShardError, FileNotFoundError."""
         path = self.paths[shard]
         if not path.is_file():
             raise FileNotFoundError(f"there is no {path}, which {INDEX} names: pack the people again")

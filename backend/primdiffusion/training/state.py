@@ -1,4 +1,4 @@
-"""What a training run needs to go on exactly where it stopped."""
+"""State of a training run, saved so that it can be resumed exactly."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from primdiffusion.staging import write_atomically
 
 
 class OptimiserConfig(Protocol):
-    """What of a run's settings the optimiser needs; as in `PhaseConfig`."""
+    """Settings of the optimiser, as in `PhaseConfig`."""
 
     @property
     def steps(self) -> int: ...
@@ -33,7 +33,7 @@ class OptimiserConfig(Protocol):
 
 
 class NotFiniteError(FloatingPointError, ValueError):
-    """Training that diverged: one sentence that says where and what to do."""
+    """Training diverged; the message names the step and the remedy."""
 
 
 class TrainingState:
@@ -48,7 +48,7 @@ class TrainingState:
         self.generator = torch.Generator().manual_seed(seed)
         self.step, self.seconds = 0, 0.0
         self.place: dict[str, str] = {}
-        """What else belongs to the place in training: kept in the file, read back by `load`."""
+        """Further state of the run, saved in the file's metadata and restored by `load`."""
 
     def _groups(self) -> list[dict[str, object]]:
         """Parameters that learn at one rate, each with its factor on the configured one."""
@@ -90,14 +90,14 @@ class TrainingState:
         if bad := next((key for key, value in tensors.items() if not torch.isfinite(value).all()), None):
             raise NotFiniteError(
                 f"{bad} is not finite after step {self.step}: lower the learning rate in a new run folder; {path} "
-                "remains as it was"
+                "was not overwritten"
             )
         tensors |= {"random.data": self.generator.get_state(), "random.torch": torch.get_rng_state()}
         place = {"step": str(self.step), "seconds": repr(self.seconds), **self.place}
         write_atomically(path, save({k: v.detach().contiguous() for k, v in tensors.items()}, metadata=place))
 
     def load(self, path: Path) -> None:
-        """Go on from a saved file; ValueError if it belongs to another network or is damaged."""
+        """Restore a saved state; ValueError if it belongs to another network or is damaged."""
         try:
             with safe_open(path, framework="pt") as file:
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping

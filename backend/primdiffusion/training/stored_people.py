@@ -1,4 +1,4 @@
-"""People on disk as payloads in bytes: what stage 2 is trained on, from a folder of files or from shards."""
+"""Stored people, the training set of stage 2: payloads as bytes, in a folder of files or in shards."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from primdiffusion.people.wardrobe import words_of
 from primdiffusion.primitives.primitives import K, Payload, S
 
 _DAMAGED = (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile)
-_NO_PERSON = "{path} is no person's payload ({error}): make it again with `primdiffusion payloads`"
+_NO_PERSON = "{path} is not a payload file or is damaged ({error}): write it again with `primdiffusion payloads`"
 _VOXELS = (K, S, S, S, 4)
 
 
@@ -48,7 +48,7 @@ class PersonVariants:
 
 
 class PersonDataset(Protocol):
-    """People that are read when they are asked for; the same order for the same files."""
+    """A data set of people, read on demand, in an order that depends on the files alone."""
 
     @property
     def names(self) -> Sequence[str]:
@@ -70,7 +70,7 @@ class PersonDataset(Protocol):
         ...
 
     def person(self, index: int) -> PersonVariants:
-        """One of them. Raises ValueError that names the file where it is damaged, OSError."""
+        """Read a person. Raises ValueError that names the file where it is damaged, OSError."""
         ...
 
     def variant(self, index: int, number: int) -> tuple[UInt8[Tensor, "k 8 8 8 4"], Float[Tensor, "k 3"]]:
@@ -87,7 +87,7 @@ def payload_of_bytes(
 
 
 def attributes_of(stored: Mapping[str, Any], betas: Float[Tensor, "10"], count: int) -> tuple[Attributes, ...]:
-    """What can be said of each of `count` colourings, of what a file says and of the body's shape."""
+    """Return attributes of each of `count` colourings, from the file and the body's measures."""
     variants = stored.get("variants", [stored] * count)
     measures = measure(default_body().shape(betas))
     body = {"height": measures.height, "weight": measures.weight}
@@ -115,7 +115,7 @@ def read_person(path: Path) -> PersonVariants:
 
 @dataclasses.dataclass(frozen=True)
 class Outline:
-    """What a person's file holds, but for its voxels."""
+    """Contents of a person's file except its voxels."""
 
     variants: int
     betas: Float[Tensor, "10"]
@@ -129,7 +129,7 @@ class Outline:
 
 
 def read_outline(path: Path) -> Outline:
-    """What a person's file holds, but for its voxels; ValueError if it is damaged."""
+    """Read a person's file except its voxels; ValueError if it is damaged."""
     try:
         with np.load(path, allow_pickle=False) as file:
             return _outline_of(file)
@@ -173,11 +173,11 @@ class PersonFolder:
         self.full_density = one_density([outline.full_density for outline in self.outlines])
 
     def known(self, index: int) -> tuple[Attributes, ...]:
-        """What is known of each colouring of one of them."""
+        """Attributes of each colouring of a person."""
         return self.outlines[index].known()
 
     def person(self, index: int) -> PersonVariants:
-        """One of them. Raises ValueError where its file is damaged."""
+        """Read a person. Raises ValueError where its file is damaged."""
         return read_person(self.paths[index])
 
     def variant(self, index: int, number: int) -> tuple[Tensor, Tensor]:
@@ -197,7 +197,7 @@ def find_people(folder: Path) -> list[Path]:
 
 
 def one_density(densities: Sequence[float]) -> float:
-    """What all of them have; ValueError where they differ."""
+    """Return the common full density; ValueError if they differ."""
     if len(found := set(densities)) != 1:
         raise ValueError(
             f"people with full densities {sorted(found)} cannot be trained together: regenerate them with one"
