@@ -141,7 +141,7 @@ def test_paint_of_another_body_is_refused_with_the_number_of_vertices(line, fold
     np.savez(folder / "other_body.npz", weights=np.ones(6890, np.float32))
     with pytest.raises(SystemExit):
         cli.main(line("inpaint", "--weights", "other_body.npz"))
-    assert "one number for each of the body's 12196 vertices" in capsys.readouterr().err
+    assert "12196 vertices" in capsys.readouterr().err
     np.savez(folder / "texts.npz", weights=np.array(["a", "b"]))
     with pytest.raises(SystemExit):
         cli.main(line("inpaint", "--weights", "texts.npz"))
