@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,7 @@ def write_amass(path: Path, motion: Motion, betas: NDArray, pelvis: NDArray = RE
     turned[:, 0] = up @ turned[:, 0]
     places = (motion.translations + pelvis) @ up.T - pelvis
     try:
+        os.stat(path.parent)  # a folder that is missing is a slip of the finger: `replacing` would make it
         with replacing(path) as partial, partial.open("wb") as stream:
             np.savez(
                 stream,

@@ -188,7 +188,7 @@ def test_names_that_cannot_be_are_refused(armature, name):
 
 
 def test_a_built_in_pose_cannot_be_deleted(armature):
-    with pytest.raises(RuntimeError, match="'T' is no pose of your own"):
+    with pytest.raises(RuntimeError, match="'T'"):
         ops.delete_pose(pose_name="T")
 
 
