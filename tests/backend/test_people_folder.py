@@ -133,7 +133,7 @@ def test_licences_are_read_from_headers_lists_and_materials(tmp_path):
 
 
 def test_damaged_pictures_are_named(assets, tmp_path):
-    for room in assets_module.ROOMS:
+    for room in assets_module.SUBFOLDERS:
         (tmp_path / room).mkdir()
     source = next((assets.root / "skins/textures").glob("*.jpg"))
     (tmp_path / "skins/half.jpg").write_bytes(source.read_bytes()[:5000])
