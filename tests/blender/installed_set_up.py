@@ -39,7 +39,8 @@ if not wheels:
     report["seconds_generate"] = round(time.perf_counter() - started, 1)
     report["bones"] = [len(thing.data.bones) for thing in bpy.data.objects if thing.type == "ARMATURE"]
 started = time.perf_counter()
-report["repaired"] = sorted(bpy.ops.primdiffusion.repair_backend())
+repair = press if wheels else bpy.ops.primdiffusion.repair_backend  # without a network, from the folder again
+report["repaired"] = sorted(repair())
 report["seconds_repair"] = round(time.perf_counter() - started, 1)
 report["tested"] = sorted(bpy.ops.primdiffusion.test_backend())
 report["removed"] = sorted(bpy.ops.primdiffusion.remove_backend())
