@@ -18,6 +18,15 @@ if TYPE_CHECKING:
 
 R = TypeVar("R")
 AnyRequest = TypeVar("AnyRequest", bound="Request")
+AnyChecked = TypeVar("AnyChecked", bound="Checked")
+
+
+class Checked(Protocol):
+    """A record of a command line whose values can be out of range."""
+
+    def check(self) -> None:
+        """Raises ValueError, which names the field, for values that are out of range; reads no files."""
+        ...
 
 
 class Request(Protocol):
@@ -111,7 +120,7 @@ def _in_words(kind: Any) -> str:
     return _WORDS.get(typing.get_origin(kind) or kind, "a JSON object")
 
 
-def parse(record: type[AnyRequest], arguments: Sequence[str], command: str) -> AnyRequest:
+def parse(record: type[AnyChecked], arguments: Sequence[str], command: str) -> AnyChecked:
     """The request in a command line; ends the process with 2 for wrong usage. Raises ValueError where `check` does."""
     request = tyro.cli(record, args=arguments, prog=f"primdiffusion {command}")
     request.check()

@@ -93,7 +93,7 @@ class PersonDenoiser(nn.Module):
     ) -> Float[Tensor, "b c h w"]:
         """Denoise the rest, given denoised person coefficients."""
         guess, deviation, correction = self.rest_parts(rest, coefficients, t, condition)
-        return guess if correction is None else guess + deviation * correction
+        return guess + deviation * correction
 
     def rest_parts(
         self,
@@ -101,7 +101,7 @@ class PersonDenoiser(nn.Module):
         coefficients: Float[Tensor, "b r"],
         t: Int[Tensor, "b"],
         condition: Float[Tensor, "b a"] | None = None,
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the closed-form guess, its posterior standard deviation, and the correction in units of that."""
         signal, noise = self.schedule.levels(t, rest)
         prior = self.prior
@@ -110,7 +110,7 @@ class PersonDenoiser(nn.Module):
         total = total.sqrt()
         deviation = noise * prior.rest_variance.sqrt() / total
         if self.local is None:
-            return guess, deviation, None
+            return guess, deviation, torch.zeros_like(guess)
         picture = prior.picture(coefficients) / self.picture_std[:, None, None]
         with self._precision(rest):
             correction = self.local(rest / total, picture, coefficients / self.component_std, t, condition)

@@ -92,8 +92,15 @@ def linearise(
             break
         room *= 2
     start[segments] = entries
-    kept = (ray[:segments], start[: segments + 1], voxel[:entries], weight[:entries])
-    return rendering, PictureJacobian(box_start, *(array.copy() for array in kept), len(behind))
+    jacobian = PictureJacobian(
+        box_start,
+        ray[:segments].copy(),
+        start[: segments + 1].copy(),
+        voxel[:entries].copy(),
+        weight[:entries].copy(),
+        len(behind),
+    )
+    return rendering, jacobian
 
 
 def apply(

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -121,14 +121,7 @@ def fit_payload(
         held = ((z <= 0) & (gradient < 0)) | ((z >= limit) & (gradient > 0))
         penalty = _Penalty(unit, settings, diagonal, held)
 
-        def curvature(x: ndarray, views: Sequence[_View] = views) -> ndarray:
-            out, scaled = np.zeros_like(x), x * scale
-            for view in views:
-                pixels = view.weight * apply(view.jacobian, scaled, view.alpha_free)
-                add_transposed(view.jacobian, pixels, view.alpha_free, out)
-            return out * scale
-
-        z = z + scale * conjugate_gradients(curvature, penalty, gradient, settings.iterations)
+        z = z + scale * conjugate_gradients(_curvature(views, scale), penalty, gradient, settings.iterations)
     return _payload(z.clip(0, limit), start)
 
 
@@ -199,6 +192,19 @@ class _View:
         return cls(
             jacobian, residual.astype(np.float32), weight.astype(np.float32), (alpha[:, 0] < 1).astype(np.float32)
         )
+
+
+def _curvature(views: Sequence[_View], scale: ndarray) -> Callable[[ndarray], ndarray]:
+    """x -> J^T W J x over all views, in the units of `scale`."""
+
+    def product(x: ndarray) -> ndarray:
+        out, scaled = np.zeros_like(x), x * scale
+        for view in views:
+            pixels = view.weight * apply(view.jacobian, scaled, view.alpha_free)
+            add_transposed(view.jacobian, pixels, view.alpha_free, out)
+        return out * scale
+
+    return product
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

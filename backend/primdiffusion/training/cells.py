@@ -111,7 +111,7 @@ class CellTrainee:
         codec, denoiser = CellCodec(self.codec), self.denoiser
         return DiffusionModel(
             denoiser, denoiser.schedule, codec, self.shapes, self.full_density, {}, self.vocabulary,
-            CHAINS[self.config.chain],
+            CHAINS[str(self.config.chain)],
         )  # fmt: skip
 
     def _objective(self, name: str) -> PersonObjective | RestObjective:

@@ -70,7 +70,8 @@ class SlabTrainee:
         t = random_steps(self.schedule, len(slab), generator, self.config.levels)
         x = self.schedule.q_sample(slab, t, gaussian_noise(slab, generator))
         error = self._guess(x, t) - slab
-        return (level_weight(*self.schedule.levels(t, slab), self.config) * error.square()).mean()
+        signal, noise = self.schedule.levels(t, slab)
+        return (level_weight(signal, noise, self.config) * error.square()).mean()
 
     def errors(self) -> Mapping[int, float]:
         """On the first colourings of a few who are held out, in the slab's units."""
