@@ -19,7 +19,7 @@ def import_file(path: Path) -> list[bpy.types.Object]:
         importers[path.suffix.lower()](str(path))
     except Exception as e:  # importers written in Python let everything through, a damaged file's KeyError too
         raise ScanError(f"{path} cannot be imported: {_last_line(e)}; export it again") from e
-    return [thing for thing in bpy.data.objects if thing.session_uid not in before]
+    return [obj for obj in bpy.data.objects if obj.session_uid not in before]
 
 
 def _import_gltf(path: str) -> None:

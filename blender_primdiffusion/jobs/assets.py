@@ -32,7 +32,7 @@ POSE_TAG, HUMAN_TAG = "pose", "human"
 
 
 def mark(asset: bpy.types.ID, description: str, tags: Iterable[str], picture: NDArray) -> None:
-    """Make a data-block an asset, or renew what it is told of. Raises ValueError for one that is linked."""
+    """Make a data-block an asset, or update its description. Raises ValueError for one that is linked."""
     if asset.library is not None:
         raise ValueError(f"{asset.name!r} is linked from {asset.library.filepath!r}: mark it as an asset there")
     asset.asset_mark()
@@ -124,7 +124,7 @@ class PoseAssetJob(Job):
 
     @classmethod
     def of(cls, person: bpy.types.Collection, name: str) -> PoseAssetJob:
-        """Raises ValueError for somebody without the bones."""
+        """Raises ValueError for a rig that lacks the bones."""
         rotations, translation = current_pose(armature_of(person))
         frozen = tuple(tuple(map(tuple, rows)) for rows in rotations.tolist())
         return cls(Target.of(person), name, frozen, tuple(translation.tolist()))

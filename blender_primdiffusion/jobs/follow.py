@@ -145,7 +145,7 @@ def follow() -> float | None:
 
 
 def watch() -> float:
-    """The timer between works: a child that died is noticed, one that nobody has needed for long is ended."""
+    """The timer between jobs: notice a child that died, end one that has been idle for long."""
     if queue.busy:
         keep_following()
     elif queue.listen() or release_when_idle(time.monotonic()):

@@ -79,7 +79,7 @@ def _tick() -> float:
 
 @persistent
 def collect_before_saving(blend_path: str, *_: object) -> None:
-    """Handler of save_pre; what collects is imported once there is somebody."""
+    """Handler of save_pre; the collecting code is imported once there is a human."""
     if any_humans():
         from ..scene import collect
 

@@ -176,7 +176,7 @@ class PRIMDIFFUSION_OT_preview_rig(bpy.types.Operator):
 
 def remove_rig(collection: bpy.types.Collection) -> None:
     """Take the preview out of the file, and nothing that the user has put into its collection."""
-    ours = [thing for thing in collection.objects if thing.type == "CAMERA" and thing.name.startswith("Capture ")]
+    ours = [obj for obj in collection.objects if obj.type == "CAMERA" and obj.name.startswith("Capture ")]
     cameras = [thing.data for thing in ours]
     bpy.data.batch_remove([*ours, *cameras, collection])
 

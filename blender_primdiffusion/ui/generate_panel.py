@@ -124,7 +124,7 @@ class PRIMDIFFUSION_OT_random_seed(bpy.types.Operator):
 
 
 def _queued_seeds() -> set[int]:
-    """Of people who are asked for already: a second press of the button means somebody else."""
+    """Seeds of humans that are queued: a second press of the button means another human."""
     return {entry.job.seed for entry in queue.queued if entry.job.kind == "generate"}
 
 

@@ -104,8 +104,8 @@ def select(context: bpy.types.Context, person: bpy.types.Collection) -> None:
     if context.view_layer.objects.get(armature.name) != armature:
         raise ValueError(f"the armature of {person.name!r} is not in this view layer: enable their collection first")
     leave_mode(context)
-    for thing in context.view_layer.objects.selected:
-        thing.select_set(False)
+    for obj in context.view_layer.objects.selected:
+        obj.select_set(False)
     armature.select_set(True)
     context.view_layer.objects.active = armature
 

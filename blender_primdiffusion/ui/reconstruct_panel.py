@@ -90,7 +90,7 @@ class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
 
         asked = context.scene.primdiffusion_reconstruct
         folder = bpy.path.abspath(self.directory or asked.capture)
-        subject = self.subject or ("" if self.directory else asked.subject)  # the panel's is somebody of its folder
+        subject = self.subject or ("" if self.directory else asked.subject)  # the panel's belongs to its own folder
         if not folder:
             self.report({"ERROR"}, "choose the folder of captures first")
             return {"CANCELLED"}

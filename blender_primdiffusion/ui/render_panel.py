@@ -45,7 +45,7 @@ def _gain(person: bpy.types.Collection) -> float:
 def _set_gain(person: bpy.types.Collection, gain: float) -> None:
     try:
         set_density_gain(person, gain)
-    except ValueError as error:  # nobody listens to a property
+    except ValueError as error:  # a property has no report
         print(f"PrimDiffusion: {error}")
 
 
@@ -167,7 +167,7 @@ class _OfPerson(SidebarPanel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Only where somebody is."""
+        """Only if the scene has a human."""
         return bool(humans(context.scene))
 
     def draw(self, context: bpy.types.Context) -> None:

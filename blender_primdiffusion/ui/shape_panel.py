@@ -147,7 +147,7 @@ class _InHuman(SidebarPanel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Somebody is selected."""
+        """A human is selected."""
         try:
             selected_person(context)
         except ValueError:
@@ -226,7 +226,7 @@ def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
             f"{key} {value}" for key, value in edit.items() if key != "edit" and not isinstance(value, dict)
         )
         lines.append((f"Edit: {edit['edit']}", rest))
-    volumes = [thing for thing in person.all_objects if thing.type == "VOLUME"]
+    volumes = [obj for obj in person.all_objects if obj.type == "VOLUME"]
     memory = person_memory(person)
     try:
         most = str(current_overlap(person))

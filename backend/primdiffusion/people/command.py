@@ -50,7 +50,7 @@ class PayloadsCommand:
     seed: int = 0
     """Seed of the first person; the next has the next."""
     making: Making = "fitted"
-    """fitted: the primitives are fitted to renders of the mesh, about 25 s a person and core; from_mesh: each voxel
+    """fitted: the primitives are fitted to renders of the mesh, about 30 s a person and core; from_mesh: each voxel
     takes the colour of the nearest surface point, 2 s, blurred."""
     workers: int = os.cpu_count() or 1
     """Processes; each takes a core and about 1.5 GB."""

@@ -48,7 +48,7 @@ def fitted_payloads(
     Density and the first colouring are fitted jointly, then all colours with that density fixed. `turn` (0 to 1)
     rotates the cameras towards their neighbours, to measure how much the result depends on them.
 
-    Takes about 20 s on one core for the first colouring and 3 s for each further one.
+    Takes about 30 s on one core; further colourings add little, as they share marches and matrices.
 
     Raises:
         UnusableMesh, ValueError: as `surface_field`; no colourings are given.

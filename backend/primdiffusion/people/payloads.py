@@ -54,7 +54,7 @@ def make_payloads(
 ) -> list[Path]:
     """Write the missing files of seeds seed ... seed + count - 1 to `out_dir`; return the paths of all.
 
-    A fitted sample takes about 20 s on one core and each further variant 3 s (`from_mesh`: 1.5 s and 0.4 s). `report`
+    A fitted sample takes about 30 s on one core with all its variants (`from_mesh`: 2 s). `report`
     receives the number of finished samples and the total.
 
     Raises:

@@ -94,7 +94,7 @@ def fit_payload(
 ) -> Payload:
     """The payload near `start` that shows the targets: colours in [0, 1], densities from 0 to `full_density` (1/m).
 
-    Delta scales stay. Costs about 0.1 s a picture of 176 x 176 pixels and step, and 15 bytes a voxel that a ray sees.
+    Delta scales stay. Costs about 0.1 s and 15 MB per picture of 176 x 176 pixels in each step.
 
     Raises:
         ValueError: there are no targets, or the start is not one person's.

@@ -64,7 +64,7 @@ class Source:
 
 
 def sources(path: Path) -> list[Source]:
-    """Everybody whom `path` names, sorted by name. Raises ValueError where it names nobody."""
+    """All human files that `path` names, sorted by name. Raises ValueError if there are none."""
     path = path.resolve()
     if path.is_dir():
         found = sorted(_in_folder(path), key=lambda source: source.name)
