@@ -1,4 +1,5 @@
 import dataclasses
+import math
 import os
 import signal
 import threading
@@ -193,6 +194,16 @@ def test_log_uniform_levels_are_even_in_the_logarithm_of_noise_over_signal():
     assert torch.histc(ratio.float(), 8, 0, 1).min() > 0.1 * len(t)
     even = random_steps(schedule, 20_000, torch.Generator().manual_seed(0))
     assert (t < 50).float().mean() > 6 * (even < 50).float().mean()
+
+
+def test_log_normal_levels_surround_the_spread_and_leave_no_level_untrained():
+    schedule = fine_linear()
+    t = random_steps(schedule, 20_000, torch.Generator().manual_seed(0), "log_normal", spread=0.05)
+    clean, noise = schedule.levels(t, torch.empty(0, 1))
+    ratio = (noise / clean).flatten().log()
+    assert abs(float(ratio.median()) - math.log(2 * 0.05)) < 0.3
+    assert ((ratio > math.log(0.01)) & (ratio < math.log(1.0))).float().mean() > 0.75
+    assert (ratio > math.log(10.0)).float().mean() > 0.02
 
 
 def test_person_components_live_in_the_leading_channels_alone(prepared_once):

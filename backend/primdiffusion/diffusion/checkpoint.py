@@ -149,11 +149,13 @@ def build_model(
 
 
 def denoiser_config(tree: Mapping[str, Any]) -> DenoiserConfig:
-    """Parse a denoiser's configuration."""
+    """Parse a denoiser's configuration; files older than `end_kernel` have one of 3."""
     person, local = tree["person"], tree["local"]
     return DenoiserConfig(
         person=None if person is None else PersonNetworkConfig(**person),
-        local=None if local is None else LocalUNetConfig(**{**local, "widths": tuple(local["widths"])}),
+        local=None
+        if local is None
+        else LocalUNetConfig(**{"end_kernel": 3, **local, "widths": tuple(local["widths"])}),
     )
 
 

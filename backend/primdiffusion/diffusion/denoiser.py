@@ -49,7 +49,8 @@ class PersonDenoiser(nn.Module):
         channels, grid, components = prior.mean.shape[0], prior.mean.shape[-1], prior.basis.shape[0]
         asked = prior.kind.shape[-1]
         self.person = PersonNetwork(components, asked, config.person) if config.person else None
-        self.local = LocalUNet(channels, components, grid, asked, config.local) if config.local else None
+        drawn = -(-prior.basis.shape[1] // grid**2)  # channels that person components draw in
+        self.local = LocalUNet(channels, components, grid, asked, config.local, drawn) if config.local else None
         if self.local is not None:
             self.local = self.local.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 

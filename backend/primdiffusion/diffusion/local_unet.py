@@ -42,6 +42,8 @@ class LocalUNetConfig:
     """Features of the time and person embedding that modulate every block."""
     heads: int = 4
     """Heads of the self-attention at 8 and 16 cells a side."""
+    end_kernel: int = 1
+    """Kernel size of the first and last convolution. They have the most channels: 3 makes a step a third slower."""
 
 
 class PersonBlock(nn.Module):
@@ -139,14 +141,25 @@ class LocalStage(nn.ModuleList):
 class LocalUNet(nn.Module):
     """Correction of the closed-form guess of the rest, in standard deviations; starts at 0."""
 
-    def __init__(self, channels: int, components: int, grid: int, asked_width: int, config: LocalUNetConfig):
+    def __init__(
+        self,
+        channels: int,
+        components: int,
+        grid: int,
+        asked_width: int,
+        config: LocalUNetConfig,
+        picture_channels: int | None = None,
+    ):
+        """`picture_channels` are the leading channels that person components live in; None is all."""
         super().__init__()
         widths, condition_width = config.widths, config.condition_width
         self.time = TimeEmbedding(64, condition_width)
         self.asked = zeroed(nn.Linear(asked_width, condition_width, bias=False)) if asked_width else None
         self.person = nn.Linear(components, condition_width)
         self.position = nn.Parameter(0.5 * torch.randn(config.position_channels, grid, grid))
-        self.inner = nn.Conv2d(2 * channels + config.position_channels, widths[0], 3, padding=1)
+        self.picture_channels = channels if picture_channels is None else picture_channels
+        seen = channels + self.picture_channels + config.position_channels
+        self.inner = nn.Conv2d(seen, widths[0], config.end_kernel, padding="same")
         self.down, self.up, self.shrink, self.grow, self.attend = (nn.ModuleList() for _ in range(5))
         for level, width in enumerate(widths):
             last = level == len(widths) - 1
@@ -160,7 +173,10 @@ class LocalUNet(nn.Module):
             if not last:
                 self.shrink.append(nn.Conv2d(width, widths[level + 1], 2, stride=2))
                 self.grow.append(nn.Conv2d(widths[level + 1], width, 1))
-        self.norm, self.outer = nn.GroupNorm(8, widths[0]), zeroed(nn.Conv2d(widths[0], channels, 3, padding=1))
+        self.norm, self.outer = (
+            nn.GroupNorm(8, widths[0]),
+            zeroed(nn.Conv2d(widths[0], channels, config.end_kernel, padding="same")),
+        )
 
     def forward(
         self,
@@ -173,7 +189,11 @@ class LocalUNet(nn.Module):
         """Return the correction for a noisy rest, given denoised person components and their contribution `picture`."""
         condition = functional.silu(embedded(self.time(t), self.asked, condition) + self.person(person))
         position = self.position.expand(len(noisy), -1, -1, -1)
-        x = self.inner(torch.cat([noisy, picture, position], dim=1).contiguous(memory_format=torch.channels_last))
+        x = self.inner(
+            torch.cat([noisy, picture[:, : self.picture_channels], position], dim=1).contiguous(
+                memory_format=torch.channels_last
+            )
+        )
         skips = []
         for level, stage in enumerate(self.down):
             x = stage(x, condition)

@@ -12,7 +12,7 @@ from primdiffusion.diffusion.denoiser import DenoiserConfig
 from primdiffusion.diffusion.unet import PAPER, UNetConfig
 
 Weighting = Literal["whitened", "plain", "min_snr"]
-Levels = Literal["uniform", "log_uniform"]
+Levels = Literal["uniform", "log_uniform", "log_normal"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +65,8 @@ class PhaseConfig:
     error_power: float = 1.0
     """Whitened errors, in units of posterior std s, are weighted by s^power: 2 is the paper's error on one level."""
     levels: Levels = "uniform"
-    """Of noise that are trained: uniform in t, as the paper; log_uniform in noise over signal."""
+    """Of noise that are trained: uniform in t, as the paper; log_uniform in noise over signal; log_normal, most of them
+    about the spread of what is to be denoised (Karras et al. 2022), a fifth log_uniform."""
     min_snr_gamma: float = 5.0
     """Largest weight of a level with min_snr."""
     blend: float = 0.3
@@ -132,7 +133,7 @@ class TrainingConfig:
     """The default preset's network over person components, trained first."""
     local: PhaseConfig = dataclasses.field(
         default_factory=lambda: PhaseConfig(
-            steps=38_000, batch=16, blend=0.2, weight_decay=0.0, levels="log_uniform", bfloat16=True
+            steps=38_000, batch=16, blend=0.2, weight_decay=0.0, levels="log_normal", bfloat16=True
         )
     )
     """The default preset's network over the grid."""

@@ -6,6 +6,7 @@ Random numbers are drawn on the device of their generator, which must be that of
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 import torch
@@ -22,6 +23,10 @@ from primdiffusion.training.latents import LatentSet
 
 LEVELS = (50, 100, 300, 500, 700, 900)
 """Steps at which held-out error is reported."""
+LOG_NORMAL_CENTRE, LOG_NORMAL_WIDTH = 2.0, 1.4
+"""Median of noise over signal, in units of the samples' standard deviation, and standard deviation of its logarithm."""
+LOG_UNIFORM_SHARE = 0.2
+"""Share of log-uniform levels among log-normal ones: no level stays untrained."""
 
 
 def weighted_error(error: Float[Tensor, "b n"], std: Float[Tensor, "b n"], power: float) -> Tensor:
@@ -75,7 +80,8 @@ class PersonObjective:
         c = torch.einsum("bk,bkr->br", weights, self.coefficients[indices])
         flip = torch.rand(len(c), 1, generator=generator, device=generator.device) < 0.5
         c = torch.where(flip, c * self.denoiser.prior_parity, c)
-        t = random_steps(self.denoiser.schedule, len(c), generator, self.config.levels)
+        spread = float(self.denoiser.component_std.square().mean().sqrt())
+        t = random_steps(self.denoiser.schedule, len(c), generator, self.config.levels, spread)
         y = self.denoiser.schedule.q_sample(c, t, gaussian_noise(c, generator))
         signal, noise = self.denoiser.schedule.levels(t, c)
         std = self.denoiser.component_std
@@ -105,7 +111,8 @@ class RestObjective:
         z = mixed(self.people.latents, weights, indices)
         flip = torch.rand(len(z), 1, 1, 1, generator=generator, device=generator.device)[:, 0, 0, 0] < 0.5
         z[flip] = self.codec.mirror(z[flip])
-        t = random_steps(self.denoiser.schedule, len(z), generator, self.config.levels)
+        spread = float(self.denoiser.prior.rest_variance.mean().sqrt())
+        t = random_steps(self.denoiser.schedule, len(z), generator, self.config.levels, spread)
         x = self.denoiser.schedule.q_sample(z, t, gaussian_noise(z, generator))
         signal, noise = self.denoiser.schedule.levels(t, z)
         with torch.no_grad():
@@ -120,19 +127,25 @@ class RestObjective:
 
 
 def random_steps(
-    schedule: Schedule, count: int, generator: torch.Generator, levels: Levels = "uniform"
+    schedule: Schedule, count: int, generator: torch.Generator, levels: Levels = "uniform", spread: float = 1.0
 ) -> Int[Tensor, "b"]:
-    """Random steps: "uniform" in t (paper eq. 9), or "log_uniform" in noise over signal.
+    """Random steps: "uniform" in t (paper eq. 9), or as `Levels` says in noise over signal.
 
-    Uniform steps are nearly all so noisy that they drown what person components leave out.
+    `spread` is the standard deviation of the samples, which "log_normal" levels surround. Uniform steps are nearly all
+    so noisy that they drown what person components leave out.
     """
     if levels == "uniform":
         return torch.randint(schedule.length, (count,), generator=generator, device=generator.device)
     alpha_bar = schedule.alpha_bar.to(generator.device)
     noise_over_signal = 0.5 * ((1 - alpha_bar).log() - alpha_bar.log())
     low, high = noise_over_signal[0], noise_over_signal[-1]
-    drawn = torch.rand(count, generator=generator, device=generator.device, dtype=alpha_bar.dtype)
-    return torch.searchsorted(noise_over_signal, low + (high - low) * drawn).clamp_max(schedule.length - 1)
+    uniform, which = torch.rand(2, count, generator=generator, device=generator.device, dtype=alpha_bar.dtype)
+    drawn = low + (high - low) * uniform
+    if levels == "log_normal":
+        normal = torch.randn(count, generator=generator, device=generator.device, dtype=alpha_bar.dtype)
+        about = math.log(LOG_NORMAL_CENTRE * spread) + LOG_NORMAL_WIDTH * normal
+        drawn = torch.where(which < LOG_UNIFORM_SHARE, drawn, about.clamp(low, high))
+    return torch.searchsorted(noise_over_signal, drawn).clamp_max(schedule.length - 1)
 
 
 def _present(network: nn.Module | None) -> nn.Module:
