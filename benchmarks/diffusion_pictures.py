@@ -23,7 +23,7 @@ from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.attribute_network import features_of
 from primdiffusion.evaluation.distances import nearest
-from primdiffusion.evaluation.gallery import made_gallery, payload_of
+from primdiffusion.evaluation.gallery import made_gallery, payload_of, payload_sources
 from primdiffusion.evaluation.generation import ReferenceSet, open_reference_set
 from primdiffusion.evaluation.neighbours import nearest_stored
 from primdiffusion.evaluation.portraits import PORTRAITS, Portrait, camera_of
@@ -63,7 +63,13 @@ def main() -> None:
     model = load_checkpoint(arguments.checkpoint)
     train, held = split_people(find_people(arguments.people), arguments.holdout, arguments.seed)
     if arguments.neighbours is not None:
-        reference = open_reference_set(train, held, arguments.judge, read_person, progress("portraits"), epoch)
+        reference = open_reference_set(
+            payload_sources(train, read_person),
+            payload_sources(held, read_person),
+            arguments.judge,
+            progress("portraits"),
+            epoch,
+        )
         neighbours(reference, model, train, held, arguments.count).save(arguments.neighbours, optimize=True)
         print(arguments.neighbours)
     if arguments.comparison is not None:

@@ -7,11 +7,22 @@ import torch
 from diffusion_people import write_people
 from primdiffusion.evaluation import command
 from primdiffusion.evaluation.attribute_network import features_of
-from primdiffusion.evaluation.gallery import made_gallery, payload_of, read_attributes, stored_gallery
+from primdiffusion.evaluation.gallery import (
+    Source,
+    made_gallery,
+    mesh_sources,
+    open_gallery,
+    payload_of,
+    payload_sources,
+    read_attributes,
+    read_seed,
+)
 from primdiffusion.evaluation.generation import COLUMNS, compare, open_reference_set, real_vs_real, table
 from primdiffusion.evaluation.neighbours import nearest_stored
 from primdiffusion.evaluation.portraits import PORTRAITS, SIDE, camera_of
-from primdiffusion.people.payloads import rest_frames
+from primdiffusion.people.assets import AssetsMissingError, open_assets
+from primdiffusion.people.payloads import coloured_people, rest_frames
+from primdiffusion.primitives.from_mesh import colour, surface_field
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person
@@ -24,6 +35,14 @@ def _one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def assets():
+    try:
+        return open_assets()
+    except AssetsMissingError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +60,7 @@ def reference_folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def reference(people, reference_folder):
     train, held = split_people(find_people(people), 0.34, 0)
-    return open_reference_set(train, held, reference_folder, read_person)
+    return open_reference_set(payload_sources(train, read_person), payload_sources(held, read_person), reference_folder)
 
 
 def test_cameras_see_the_parts_they_are_named_for():
@@ -58,36 +77,53 @@ def test_cameras_see_the_parts_they_are_named_for():
 
 def test_portraits_of_stored_people_are_kept_and_not_drawn_again(people, tmp_path):
     paths = find_people(people)[:2]
-    first = stored_gallery(paths, tmp_path, read_person)
-
-    def unread(path):
-        raise AssertionError(path)
-
-    again = stored_gallery(paths, tmp_path, unread)
+    first = open_gallery(payload_sources(paths, read_person), tmp_path)
+    again = open_gallery([Source(path.name, never, never) for path in paths], tmp_path)
     assert torch.equal(first.pictures, again.pictures)
     assert first.geometry.tolist() == [0, 0, 1, 1]
     assert again.attributes[2] == {"outfit": "outfit1"}
 
 
+def never():
+    raise AssertionError("drawn again")
+
+
 def test_damaged_portraits_are_drawn_again(people, tmp_path):
     paths = find_people(people)[:1]
-    first = stored_gallery(paths, tmp_path, read_person)
+    sources = payload_sources(paths, read_person)
+    first = open_gallery(sources, tmp_path)
     (tmp_path / paths[0].name).write_bytes(b"half a file")
-    assert torch.equal(stored_gallery(paths, tmp_path, read_person).pictures, first.pictures)
+    assert torch.equal(open_gallery(sources, tmp_path).pictures, first.pictures)
 
 
 def test_stored_portraits_are_of_the_stored_payload(people, tmp_path):
     path = find_people(people)[3]
     person = read_person(path)
     drawn = made_gallery([Primitives.place(rest_frames(person.betas.numpy()), payload_of(person, 1))])
-    assert torch.equal(stored_gallery([path], tmp_path, read_person).pictures[1], drawn[0])
+    assert torch.equal(open_gallery(payload_sources([path], read_person), tmp_path).pictures[1], drawn[0])
     assert int((drawn[..., 3] > 128).sum()) > 500
+
+
+def test_portraits_of_meshes_and_of_their_payloads_show_the_same_people(assets, tmp_path):
+    drawn = open_gallery(mesh_sources(assets, [3], 2), tmp_path)
+    people = coloured_people(assets, 3, 2)
+    frames = rest_frames(people[0].betas)
+    payload = colour(surface_field(people[1].mesh, frames), people[1].mesh)
+    boxes = made_gallery([Primitives.place(frames, payload)])[0]
+    alphas = [pictures[..., 3] > 128 for pictures in (drawn.pictures[1], boxes)]
+    assert float((alphas[0] & alphas[1]).sum() / (alphas[0] | alphas[1]).sum()) > 0.9
+    seen = alphas[0] & alphas[1]
+    difference = (drawn.pictures[1].float() - boxes.float())[seen].abs().mean()
+    assert float(difference) < 16
+    assert drawn.attributes[1]["outfit"] == people[1].attributes["outfit"]
 
 
 def test_a_file_without_attributes_is_named(tmp_path):
     (tmp_path / "person.npz").write_bytes(b"nothing")
     with pytest.raises(ValueError, match=r"person\.npz"):
-        read_attributes(tmp_path / "person.npz", 1)
+        read_attributes(tmp_path / "person.npz")
+    with pytest.raises(ValueError, match=r"person\.npz"):
+        read_seed(tmp_path / "person.npz")
 
 
 def test_copies_of_training_samples_are_told_from_new_ones(reference):
@@ -106,11 +142,10 @@ def test_people_far_from_all_real_ones_are_far_and_not_precise(reference):
 
 
 def test_reference_set_is_read_back_from_its_folder(people, reference, reference_folder):
-    def unread(path):
-        raise AssertionError(path)
-
     train, held = split_people(find_people(people), 0.34, 0)
-    again = open_reference_set(train, held, reference_folder, unread)
+    again = open_reference_set(
+        *([Source(path.name, never, never) for path in paths] for paths in (train, held)), reference_folder
+    )
     assert torch.equal(reference.held_features, again.held_features)
     assert torch.equal(features_of(again.network, again.train.pictures), again.train_features)
 

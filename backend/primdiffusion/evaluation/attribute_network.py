@@ -1,7 +1,8 @@
 """A feature space for humans: the features of a small network that predicts known attributes from portraits.
 
 Networks pretrained on photographs need weights that are not always available. This one is trained within minutes on the
-diffusion model's training set; sets are compared by the features it learns to classify outfit, hair, age or pattern.
+diffusion model's training set; sets are compared by the features it learns to classify outfit, hair, age or pattern. It
+also learns to tell how much a portrait was blurred: attributes alone show through any blur.
 """
 
 from __future__ import annotations
@@ -27,11 +28,13 @@ SCALARS = ("skin_tone", "height")
 UNKNOWN = -100
 """Label of a value that is absent from the training set or not visible; ignored by loss and accuracy."""
 FEATURES = 96
-WIDTHS = (16, 32, 64, 96)
+WIDTHS = (16, 32, 64, 96, 96)
 POOLED = 3
 """Side of the last feature map after pooling."""
-SHIFT = 3
+SHIFT = 8
 """Largest random shift of portraits in training, pixels."""
+BLUR = (0.5, 4.0)
+"""Standard deviations, in pixels, of the Gaussian blur that half of the training portraits get."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +81,8 @@ def attribute_space(attributes: Sequence[Mapping[str, Any]]) -> AttributeSpace:
 
 
 class AttributeNetwork(nn.Module):
-    """Four convolutions on each portrait, a linear layer on all of them (the features), a linear head an attribute."""
+    """Convolutions on each portrait, a linear layer on all of them (the features), a linear head an attribute and one
+    for blur."""
 
     def __init__(self, space: AttributeSpace):
         super().__init__()
@@ -96,9 +100,10 @@ class AttributeNetwork(nn.Module):
         )
         sizes = {name: len(values) for name, values in space.categories.items()} | dict.fromkeys(space.scalars, 1)
         self.heads = nn.ModuleDict({name: nn.Linear(FEATURES, size) for name, size in sizes.items()})
+        self.blur = nn.Linear(FEATURES, 1)
 
-    def forward(self, pictures: UInt8[Tensor, "n v h w 4"]) -> Float[Tensor, "n 96"]:
-        """Features of portraits."""
+    def forward(self, pictures: UInt8[Tensor, "n v h w 4"] | Float[Tensor, "n v h w 4"]) -> Float[Tensor, "n 96"]:
+        """Features of portraits, of values 0 to 255."""
         values = pictures.movedim(-1, -3).flatten(0, 1).float() / 255 - 0.25
         return self.features(self.trunk(values).unflatten(0, pictures.shape[:2]).flatten(1))
 
@@ -137,9 +142,11 @@ def fit_attribute_network(
         for epoch in range(epochs):
             losses = []
             for chosen in torch.randperm(len(attributes), generator=generator).split(batch):
-                shifted = _shifted(pictures[chosen], generator)
-                predicted = network.predict(network(shifted))
+                seen, blur = _blurred(_shifted(pictures[chosen], generator), generator)
+                features = network(seen)
+                predicted = network.predict(features)
                 loss = _loss(predicted, {name: values[chosen] for name, values in labels.items()}, space)
+                loss = loss + (network.blur(functional.relu(features))[:, 0] - blur).square().mean()
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
@@ -155,6 +162,23 @@ def _shifted(pictures: Tensor, generator: torch.Generator) -> Tensor:
     padded = functional.pad(pictures, (0, 0, SHIFT, SHIFT, SHIFT, SHIFT))
     height, width = pictures.shape[2:4]
     return padded[:, :, SHIFT - down : SHIFT - down + height, SHIFT - right : SHIFT - right + width]
+
+
+def _blurred(pictures: Tensor, generator: torch.Generator) -> tuple[Float[Tensor, "n v h w 4"], Float[Tensor, "n"]]:
+    """Blur the first half of a batch by one random Gaussian; also each sample's standard deviation, pixels."""
+    half = len(pictures) // 2
+    sigma = BLUR[0] + (BLUR[1] - BLUR[0]) * float(torch.rand((), generator=generator))
+    offset = torch.arange(-round(3 * sigma), round(3 * sigma) + 1)
+    kernel = torch.exp(-0.5 * (offset / sigma) ** 2)
+    kernel = (kernel / kernel.sum()).expand(4, 1, 1, -1)
+    seen = pictures.float()
+    planes = seen[:half].movedim(-1, -3).flatten(0, 1)
+    planes = functional.conv2d(planes, kernel, padding="same", groups=4)
+    planes = functional.conv2d(planes, kernel.mT, padding="same", groups=4)
+    seen[:half] = planes.unflatten(0, (half, -1)).movedim(-3, -1)
+    blur = torch.zeros(len(pictures))
+    blur[:half] = sigma
+    return seen, blur
 
 
 def _loss(predicted: Mapping[str, Tensor], labels: Mapping[str, Tensor], space: AttributeSpace) -> Tensor:

@@ -116,6 +116,9 @@ class EvaluateGeneration:
     """Folder of the payloads that the model was trained on, those held out among them."""
     judge: Path
     """Folder for portraits and feature network; what is not there is made, which takes minutes."""
+    assets: Path | None = None
+    """MakeHuman's assets, if the people were made from them: they are compared as renders of their meshes, so that what
+    payloads lack counts too. Without it, as renders of their payloads."""
     checkpoint: Path | None = None
     """Model (.safetensors); without it the one that comes with the package."""
     count: int = 256
@@ -139,9 +142,10 @@ class EvaluateGeneration:
         """
         from primdiffusion.evaluation.attribute_network import features_of
         from primdiffusion.evaluation.distances import NEIGHBOURS
-        from primdiffusion.evaluation.gallery import made_gallery
+        from primdiffusion.evaluation.gallery import COLOURINGS, made_gallery, mesh_sources, payload_sources, read_seed
         from primdiffusion.evaluation.generation import compare, open_reference_set, real_vs_real, table
         from primdiffusion.human import generate, place
+        from primdiffusion.people.assets import open_assets
 
         if self.count <= NEIGHBOURS:
             raise ValueError(
@@ -149,12 +153,17 @@ class EvaluateGeneration:
             )
         train, held = stage_two.split_people(stage_two.find_people(self.people), self.holdout, self.seed)
         model = stage_two.load_model(self.checkpoint)
+        if self.assets is None:
+            real = [payload_sources(paths, stage_two.read_person) for paths in (train, held)]
+        else:
+            assets = open_assets(self.assets)
+            real = [mesh_sources(assets, [read_seed(path) for path in paths], COLOURINGS) for paths in (train, held)]
         with tqdm(unit="person", disable=None) as bar:
 
             def report(done: int, total: int) -> None:
                 bar.update(1)
 
-            reference = open_reference_set(train, held, self.judge, stage_two.read_person, report)
+            reference = open_reference_set(*real, self.judge, report)
         with tqdm(range(self.first_seed, self.first_seed + self.count), unit="person", disable=None) as seeds:
             made = made_gallery(place(generate(model, seed, self.steps)) for seed in seeds)
         rows = {

@@ -1,8 +1,9 @@
-"""Portraits of stored samples, cached in a folder, and of generated ones."""
+"""Portraits of stored payloads and of meshes, cached in a folder, and of generated samples."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
@@ -14,9 +15,10 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from primdiffusion.evaluation.portraits import PORTRAITS, SIDE, portraits
+from primdiffusion.evaluation.portraits import PORTRAITS, SIDE, mesh_portraits, portraits
 from primdiffusion.geometry.srgb import decode_srgb
-from primdiffusion.people.payloads import rest_frames
+from primdiffusion.people.assets import Assets
+from primdiffusion.people.payloads import coloured_people, rest_frames
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.staging import written_whole
 
@@ -50,6 +52,10 @@ Report = Callable[[int, int], None]
 """Progress callback: done, total."""
 
 
+COLOURINGS = 2
+"""Of each mesh in a gallery."""
+
+
 def silent(done: int, total: int) -> None:
     """Ignore progress."""
 
@@ -70,50 +76,93 @@ def payload_of(person: StoredPerson, colouring: int) -> Payload:
     return Payload(decode_srgb(voxels[:, :3]), voxels[:, 3] * person.full_density, person.delta_scale[colouring])
 
 
-def stored_gallery(paths: Sequence[Path], folder: Path, read: ReadPerson, report: Report = silent) -> Gallery:
-    """Portraits of all colourings of the files; cached in `folder`, rendered where they are missing or damaged."""
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """One geometry in n colourings to make portraits of."""
+
+    name: str
+    """Of its file in the cache."""
+    draw: Callable[[], UInt8[Tensor, "n v h w 4"]]
+    attributes: Callable[[], list[dict[str, Any]]]
+    """Of each colouring."""
+
+
+def payload_sources(paths: Sequence[Path], read: ReadPerson) -> list[Source]:
+    """Payload files, drawn by the marcher."""
+
+    def draw(path: Path) -> UInt8[Tensor, "n v h w 4"]:
+        person = read(path)
+        frames = rest_frames(person.betas.numpy())
+        return torch.stack(
+            [portraits(Primitives.place(frames, payload_of(person, number))) for number in range(len(person.voxels))]
+        )
+
+    return [
+        Source(path.name, functools.partial(draw, path), functools.partial(read_attributes, path)) for path in paths
+    ]
+
+
+def mesh_sources(assets: Assets, seeds: Sequence[int], colourings: int) -> list[Source]:
+    """Meshes of MakeHuman samples, rasterised: what payloads of these seeds are made from."""
+    people = functools.lru_cache(maxsize=1)(lambda seed: coloured_people(assets, seed, colourings))
+    return [
+        Source(
+            f"mesh_{seed:08d}.npz",
+            lambda seed=seed: mesh_portraits([person.mesh for person in people(seed)]),
+            lambda seed=seed: [dict(person.attributes) for person in people(seed)],
+        )
+        for seed in seeds
+    ]
+
+
+def open_gallery(sources: Sequence[Source], folder: Path, report: Report = silent) -> Gallery:
+    """Portraits of all sources; cached in `folder`, drawn where they are missing or damaged."""
     folder.mkdir(parents=True, exist_ok=True)
     pictures, attributes = [], []
-    for number, path in enumerate(paths):
-        pictures.append(_cached(folder / path.name) if (folder / path.name).is_file() else None)
-        if pictures[-1] is None:
-            pictures[-1] = _rendered(read(path))
-            with written_whole(folder / path.name) as unfinished, unfinished.open("wb") as file:
-                np.savez_compressed(file, pictures=pictures[-1].numpy())
-        known = read_attributes(path, len(pictures[-1]))
-        attributes += known
-        report(number + 1, len(paths))
+    for number, source in enumerate(sources):
+        path = folder / source.name
+        cached = _cached(path) if path.is_file() else None
+        if cached is None:
+            cached = source.draw(), source.attributes()
+            with written_whole(path) as unfinished, unfinished.open("wb") as file:
+                np.savez_compressed(file, pictures=cached[0].numpy(), attributes=json.dumps(cached[1]))
+        pictures.append(cached[0])
+        attributes += cached[1]
+        report(number + 1, len(sources))
     counts = torch.tensor([len(one) for one in pictures])
-    return Gallery(torch.cat(pictures), torch.arange(len(paths)).repeat_interleave(counts), tuple(attributes))
+    return Gallery(torch.cat(pictures), torch.arange(len(sources)).repeat_interleave(counts), tuple(attributes))
 
 
-def _rendered(person: StoredPerson) -> UInt8[Tensor, "n v h w 4"]:
-    frames = rest_frames(person.betas.numpy())
-    return torch.stack(
-        [portraits(Primitives.place(frames, payload_of(person, number))) for number in range(len(person.voxels))]
-    )
-
-
-def _cached(path: Path) -> Tensor | None:
-    """Pictures from an earlier run; None if they are damaged or of other views."""
+def _cached(path: Path) -> tuple[Tensor, list[dict[str, Any]]] | None:
+    """Pictures and attributes from an earlier run; None if they are damaged or of other views."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            pictures = torch.from_numpy(file["pictures"])
+            pictures, attributes = torch.from_numpy(file["pictures"]), json.loads(str(file["attributes"]))
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
         return None
-    return pictures if tuple(pictures.shape[1:]) == (len(PORTRAITS), SIDE, SIDE, 4) else None
+    fits = tuple(pictures.shape[1:]) == (len(PORTRAITS), SIDE, SIDE, 4) and len(attributes) == len(pictures)
+    return (pictures, attributes) if fits else None
 
 
-def read_attributes(path: Path, colourings: int) -> list[dict[str, Any]]:
+def read_attributes(path: Path) -> list[dict[str, Any]]:
     """Read the attributes of each colouring in a payload file. Raises ValueError if they are unreadable."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            stored = json.loads(str(file["attributes"]))
+            stored, colourings = json.loads(str(file["attributes"])), len(file["voxels"])
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(
             f"{path} is not a payload file ({error}): make it again with `primdiffusion payloads`"
         ) from error
     return list(stored.get("variants", [stored] * colourings))
+
+
+def read_seed(path: Path) -> int:
+    """Seed of the MakeHuman sample in a payload file. Raises ValueError for other samples and unreadable files."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return int(file["seed"])
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} was not made from MakeHuman's assets ({error}): compare without them") from error
 
 
 def made_gallery(samples: Iterable[Primitives]) -> UInt8[Tensor, "n v h w 4"]:

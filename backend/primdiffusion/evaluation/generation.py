@@ -23,7 +23,7 @@ from primdiffusion.evaluation.attribute_network import (
     save_attribute_network,
 )
 from primdiffusion.evaluation.distances import Nearest, frechet_distance, kernel_distance, nearest, precision_recall
-from primdiffusion.evaluation.gallery import Gallery, ReadPerson, Report, silent, stored_gallery
+from primdiffusion.evaluation.gallery import Gallery, Report, Source, open_gallery, silent
 
 NETWORK_FILE = "features.safetensors"
 PORTRAITS_FOLDER = "portraits"
@@ -46,10 +46,9 @@ class ReferenceSet:
 
 
 def open_reference_set(
-    train: Sequence[Path],
-    held: Sequence[Path],
+    train: Sequence[Source],
+    held: Sequence[Source],
     folder: Path,
-    read: ReadPerson,
     report: Report = silent,
     report_epoch: Callable[[int, float], None] = lambda epoch, loss: None,
 ) -> ReferenceSet:
@@ -57,7 +56,7 @@ def open_reference_set(
 
     Raises ValueError and FileNotFoundError for unreadable files.
     """
-    drawn, others = (stored_gallery(paths, folder / PORTRAITS_FOLDER, read, report) for paths in (train, held))
+    drawn, others = (open_gallery(sources, folder / PORTRAITS_FOLDER, report) for sources in (train, held))
     stored = folder / NETWORK_FILE
     if not stored.is_file():
         network = fit_attribute_network(drawn.pictures, drawn.attributes, report=report_epoch)

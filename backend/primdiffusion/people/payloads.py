@@ -25,7 +25,7 @@ from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.fitted import fitted_payloads
-from primdiffusion.people.person import make_person, recolour
+from primdiffusion.people.person import Person, make_person, recolour
 from primdiffusion.people.pool import each
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
@@ -82,8 +82,8 @@ def make_payloads(
 
 def write_person(assets: Assets, path: Path, variants: int, seed: int, making: Making) -> None:
     """Generate one sample in all colourings and write its file, atomically."""
-    person = make_person(assets, load_base_mesh(), seed)
-    colourings = [person, *(recolour(person, seed + number * VARIANT_STRIDE) for number in range(1, variants))]
+    colourings = coloured_people(assets, seed, variants)
+    person = colourings[0]
     meshes, frames = [variant.mesh for variant in colourings], rest_frames(person.betas)
     if making == "fitted":
         payloads = fitted_payloads(meshes, frames, person.betas)
@@ -99,6 +99,12 @@ def write_person(assets: Assets, path: Path, variants: int, seed: int, making: M
         "making": VERSIONS[making],
     }
     store_person(path, entries)
+
+
+def coloured_people(assets: Assets, seed: int, variants: int) -> list[Person]:
+    """A sample in `variants` colourings; the first is `make_person`'s."""
+    person = make_person(assets, load_base_mesh(), seed)
+    return [person, *(recolour(person, seed + number * VARIANT_STRIDE) for number in range(1, variants))]
 
 
 def store_person(path: Path, entries: Mapping[str, np.ndarray | str | int]) -> None:
