@@ -1,10 +1,12 @@
 """How good, how new and how fast generated people are: ours beside a Gaussian and the paper's voxel baseline.
 
-`python benchmarks/diffusion.py --people DIR --judge DIR --voxel voxel.safetensors --json F --table F` compares --count
-samples of each with the held-out set (the --holdout and --seed of `primdiffusion train`). The --judge folder caches
-portraits and the feature network, which take some minutes to make. Distances are Frechet distances of features;
-`distance_floor` is that of training samples, the best any model can be expected to reach. Without --people, --voxel,
---inception or --clip the figures that need them are null. Times are of two threads. --quick takes few samples of each.
+`python benchmarks/diffusion.py --assets DIR --people DIR --judge DIR --old OLD.safetensors --json F --table F` compares
+--count samples of each set with renders of held-out meshes. The --judge folder caches portraits and the feature
+network, which take some minutes to make. Distances are Frechet distances of features; `distance_floor` is that of
+other meshes, the best any model can be expected to reach; `from_mesh`, `payload` and `codec` are what stored people
+lose before any network. `attribute_hit_*` is how often the feature network reads what was asked for, by attribute, and
+`attribute_read_*` how often it reads it right on renders of held-out meshes. Figures that need an option that is not
+given are null. Times are of two threads. --quick takes few samples of each.
 """
 
 from __future__ import annotations
@@ -14,15 +16,27 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import torch
-from diffusion_sets import decoded, front, gaussian, generated, placed, seeds_of, stored, stored_voxels, voxels
+from diffusion_sets import (
+    asked,
+    decoded,
+    from_meshes,
+    front,
+    gaussian,
+    generated,
+    placed,
+    seeds_of,
+    stored,
+    stored_voxels,
+    voxels,
+)
 from march import from_script
 from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.diffusion.checkpoint import default_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.evaluation.attribute_network import features_of
+from primdiffusion.evaluation.attribute_network import category, features_of
 from primdiffusion.evaluation.clip_vision import load_clip_vision
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance
-from primdiffusion.evaluation.gallery import made_gallery, payload_of
+from primdiffusion.evaluation.gallery import COLOURINGS, made_gallery, mesh_sources, payload_of
 from primdiffusion.evaluation.generation import (
     Comparison,
     ReferenceSet,
@@ -34,6 +48,7 @@ from primdiffusion.evaluation.generation import (
 from primdiffusion.evaluation.inception import load_inception
 from primdiffusion.evaluation.neighbours import nearest_stored
 from primdiffusion.evaluation.voxel_baseline import load_voxel_model
+from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person
@@ -47,16 +62,23 @@ SPEED_FIGURES = (
 )  # fmt: skip
 NEED_MORE = ("nearest_neighbour_ratio_latent", "fid_ours", "kid_100_ours", "fid_clip_ours")
 """Figures that stay null without people or weights."""
-SETS = ("ours", "gaussian", "voxel", "floor", "codec", "voxel_people", "voxel_codec")
 TITLES = {
     "ours": "ours",
+    "old": "ours, the checkpoint before",
     "gaussian": "one Gaussian of the training people",
     "voxel": "diffusion on 64^3 voxels",
-    "floor": "training people",
-    "codec": "people held out, after our codec",
-    "voxel_people": "people held out, as 64^3 voxels",
-    "voxel_codec": "people held out, as 64^3 voxels after that codec",
+    "floor": "other meshes",
+    "payload": "training people, as fitted payloads",
+    "codec": "training people, after our codec",
+    "from_mesh": "people as payloads of `from_mesh`",
+    "old_codec": "those after the codec of the checkpoint before",
+    "voxel_people": "training people, as 64^3 voxels",
+    "voxel_codec": "training people, as 64^3 voxels after that codec",
 }
+SETS = tuple(TITLES)
+REAL_SEED, HELD_SEED, OTHER_SEED = 0, 10_000_000, 20_000_000
+"""First seeds of the meshes: the feature network's, those compared with, those that are made into payloads."""
+ASKED = ("sex", "outfit", "hair", "hat", "pattern")
 ATTRIBUTES = (
     "sex", "age", "outfit", "pattern", "shoes", "hair", "hair_colour", "hat", "skin_tone", "height"
 )  # fmt: skip
@@ -80,10 +102,17 @@ def main() -> None:
     figures |= from_script("diffusion_speed.py", SPEED_FIGURES, "--repeats", repeats, *given)
     rows: dict[str, Comparison] = {}
     reference = None
+    if arguments.assets is not None:
+        assets = open_assets(arguments.assets)
+        reference = open_reference_set(
+            mesh_sources(assets, seeds_of(arguments.meshes, REAL_SEED), COLOURINGS),
+            mesh_sources(assets, seeds_of(arguments.meshes // 2, HELD_SEED), COLOURINGS),
+            arguments.judge, progress("portraits"), epoch,
+        )  # fmt: skip
+        rows = comparisons(reference, model, assets, arguments)
+        figures |= attribute_hits(reference, model, 1 if arguments.quick else 6)
     if arguments.people is not None:
         train, held = split_people(find_people(arguments.people), arguments.holdout, arguments.seed)
-        reference = open_reference_set(train, held, arguments.judge, read_person, progress("portraits"), epoch)
-        rows = comparisons(reference, model, held, arguments)
         figures |= photograph_figures(model, held, arguments)
         figures["nearest_neighbour_ratio_latent"] = None if arguments.quick else latent_ratio(model, train, held)
     figures |= quality_figures(rows, reference)
@@ -96,6 +125,9 @@ def main() -> None:
 
 def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--assets", type=Path, help="MakeHuman's assets: meshes to compare with")
+    parser.add_argument("--meshes", type=int, default=300, help="geometries of the reference; half as many held out")
+    parser.add_argument("--old", type=Path, help="another checkpoint, to compare ours with")
     parser.add_argument("--people", type=Path, help="folder of the payloads that the model was trained on")
     parser.add_argument("--holdout", type=float, default=0.08, help="share of them that was held out")
     parser.add_argument("--seed", type=int, default=0, help="of the training run")
@@ -112,25 +144,59 @@ def parsed() -> argparse.Namespace:
 
 
 def comparisons(
-    reference: ReferenceSet, model: DiffusionModel, held: list[Path], arguments: argparse.Namespace
+    reference: ReferenceSet, model: DiffusionModel, assets: Assets, arguments: argparse.Namespace
 ) -> dict[str, Comparison]:
-    """Compare every available set with the held-out one."""
-    seeds = seeds_of(16 if arguments.quick else arguments.count)
-    some = held[:4] if arguments.quick else held
+    """Compare every available set with the held-out meshes."""
+    count = 16 if arguments.quick else arguments.count
+    seeds = seeds_of(count)
     sets: dict[str, Callable[[], Iterable[Primitives]]] = {
         "ours": lambda: placed(generated(model, seeds)),
         "gaussian": lambda: placed(gaussian(model, seeds)),
-        "codec": lambda: decoded(model, some),
-        "voxel_people": lambda: stored_voxels(some),
+        "from_mesh": lambda: from_meshes(assets, seeds_of(count, OTHER_SEED)),
     }
+    if arguments.old is not None:
+        old = load_checkpoint(arguments.old)
+        sets |= {
+            "old": lambda: placed(generated(old, seeds)),
+            "old_codec": lambda: from_meshes(assets, seeds_of(count, OTHER_SEED), old),
+        }
+    if arguments.people is not None:
+        some = split_people(find_people(arguments.people), arguments.holdout, arguments.seed)[0][:count]
+        sets |= {
+            "payload": lambda: stored(some, 1),
+            "codec": lambda: decoded(model, some, 1),
+            "voxel_people": lambda: stored_voxels(some, colourings=1),
+        }
+        if arguments.voxel is not None:
+            baseline = load_voxel_model(arguments.voxel)
+            sets |= {"voxel_codec": lambda: stored_voxels(some, baseline, 1)}
     if arguments.voxel is not None:
         baseline = load_voxel_model(arguments.voxel)
-        sets |= {"voxel": lambda: voxels(baseline, seeds), "voxel_codec": lambda: stored_voxels(some, baseline)}
-    rows = {"floor": real_vs_real(reference, len(seeds))}
+        sets |= {"voxel": lambda: voxels(baseline, seeds)}
+    rows = {"floor": real_vs_real(reference, count)}
     for name, make in sets.items():
         rows[name] = compare(reference, features_of(reference.network, made_gallery(make())))
         print(name, rows[name], flush=True)
     return {name: rows[name] for name in SETS if name in rows}
+
+
+def attribute_hits(reference: ReferenceSet, model: DiffusionModel, each: int) -> Figures:
+    """Shares of people in whom the feature network reads the value that was asked for, `each` of every value."""
+    network, figures = reference.network, {}
+    for name in ASKED:
+        values = model.vocabulary.categories.get(name, ())
+        labels = network.space.categories.get(name, ())
+        wanted = [(value, category({name: value}, name)) for value in values]
+        wanted = [(value, label) for value, label in wanted if label in labels]
+        hits = []
+        for number, (value, label) in enumerate(wanted):
+            made = made_gallery(placed(asked(model, seeds_of(each, 1000 + each * number), {name: value})))
+            read = network.predict(features_of(network, made))[name].argmax(-1)
+            hits.append(float((read == labels.index(label)).double().mean()))
+            print("asked for", name, value, hits[-1], flush=True)
+        figures[f"attribute_hit_{name}"] = round(sum(hits) / len(hits), 4) if hits else None
+    known = [value for value in figures.values() if value is not None]
+    return {**figures, "attribute_hit_min": min(known, default=None)}
 
 
 def photograph_figures(model: DiffusionModel, held: list[Path], arguments: argparse.Namespace) -> Figures:
@@ -175,16 +241,17 @@ def quality_figures(rows: Mapping[str, Comparison], reference: ReferenceSet | No
         row = rows.get(name)
         for figure, field in (("distance", "frechet"), ("kernel_distance", "kernel")):
             figures[f"{figure}_{name}"] = None if row is None else round(getattr(row, field), 5)
-    for name in ("ours", "gaussian", "voxel", "floor"):
+    ours, floor, old = (rows[name].frechet if name in rows else None for name in ("ours", "floor", "old"))
+    figures["distance_ratio_floor"] = round(ours / floor, 4) if ours and floor else None
+    figures["distance_ratio_old_checkpoint"] = round(ours / old, 4) if ours and old else None
+    for name in ("ours", "old", "gaussian", "voxel", "floor"):
         row = rows.get(name)
         suffix = "" if name == "ours" else f"_{name}"
         figures[f"nearest_neighbour_ratio{suffix}"] = None if row is None else round(row.nearest_ratio, 4)
         figures[f"precision{suffix}"] = None if row is None else round(row.precision, 4)
         figures[f"recall{suffix}"] = None if row is None else round(row.recall, 4)
     accuracy = {} if reference is None else reference.held_accuracies
-    figures |= {
-        f"feature_accuracy_{name}": round(accuracy[name], 4) if name in accuracy else None for name in ATTRIBUTES
-    }
+    figures |= {f"attribute_read_{name}": round(accuracy[name], 4) if name in accuracy else None for name in ATTRIBUTES}
     for name, gallery in (("train", reference and reference.train), ("held", reference and reference.held)):
         figures[f"people_{name}"] = None if gallery is None else len(gallery.pictures)
     return figures
@@ -193,7 +260,7 @@ def quality_figures(rows: Mapping[str, Comparison], reference: ReferenceSet | No
 def table_of(rows: Mapping[str, Comparison], reference: ReferenceSet | None) -> str:
     """Distances, and the accuracy of the feature network."""
     if reference is None:
-        return "No people were given (--people): distances are not measured."
+        return "No assets were given (--assets): distances are not measured."
     accuracy = reference.held_accuracies
     return "\n".join(
         [

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -14,7 +15,11 @@ from primdiffusion.evaluation.voxel_baseline import VoxelModel
 from primdiffusion.evaluation.voxel_grid import primitives_of, voxelise_payload
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, generate_batch, place
+from primdiffusion.people.assets import Assets
+from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.payloads import rest_frames
+from primdiffusion.people.person import make_person
+from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.march import march
 from primdiffusion.training.stored_people import read_person
@@ -40,6 +45,25 @@ def gaussian(model: DiffusionModel, seeds: Sequence[int]) -> Iterator[Human]:
         yield Human(model.decode(x0[0]), model.betas(x0, [seed])[0], {"seed": seed}).to("cpu")
 
 
+def asked(model: DiffusionModel, seeds: Sequence[int], attributes: Mapping[str, str]) -> Iterator[Human]:
+    """Ours with these attributes, at the default guidance."""
+    for first in range(0, len(seeds), TOGETHER):
+        yield from generate_batch(model, seeds[first : first + TOGETHER], attributes=attributes)
+
+
+def from_meshes(assets: Assets, seeds: Sequence[int], model: DiffusionModel | None = None) -> Iterator[Primitives]:
+    """Payloads of `from_mesh`, through their storage in bytes; of a model after its codec."""
+    for seed in seeds:
+        person = make_person(assets, load_base_mesh(), seed)
+        frames = rest_frames(person.betas)
+        payload = colour(surface_field(person.mesh, frames), person.mesh)
+        if model is not None:  # at the density that it learned
+            share = model.full_density / FULL_DENSITY
+            payload = dataclasses.replace(payload, density=payload.density * share)
+            payload = plain(model.decode(model.encode(payload)))
+        yield Primitives.place(frames, payload)
+
+
 def placed(people: Iterator[Human]) -> Iterator[Primitives]:
     return (place(human) for human in people)
 
@@ -48,12 +72,12 @@ def voxels(model: VoxelModel, seeds: Sequence[int]) -> Iterator[Primitives]:
     return (model.primitives(grid) for grid in model.sample(seeds))
 
 
-def decoded(model: DiffusionModel, paths: Sequence[Path]) -> Iterator[Primitives]:
+def decoded(model: DiffusionModel, paths: Sequence[Path], colourings: int | None = None) -> Iterator[Primitives]:
     """Stored people after the codec alone: what a perfect denoiser could at best make."""
     for path in paths:
         person = read_person(path)
         frames = rest_frames(person.betas.numpy())
-        for number in range(len(person.voxels)):
+        for number in range(len(person.voxels))[:colourings]:
             yield Primitives.place(frames, plain(model.decode(model.encode(payload_of(person, number)))))
 
 
@@ -62,21 +86,23 @@ def plain(payload: Payload) -> Payload:
     return payload.to("cpu").map(lambda tensor: tensor.clone())
 
 
-def stored(paths: Sequence[Path]) -> Iterator[Primitives]:
-    """People on disk in all colourings."""
+def stored(paths: Sequence[Path], colourings: int | None = None) -> Iterator[Primitives]:
+    """People on disk, in all colourings or the first ones."""
     for path in paths:
         person = read_person(path)
         frames = rest_frames(person.betas.numpy())
-        for number in range(len(person.voxels)):
+        for number in range(len(person.voxels))[:colourings]:
             yield Primitives.place(frames, payload_of(person, number))
 
 
-def stored_voxels(paths: Sequence[Path], model: VoxelModel | None = None) -> Iterator[Primitives]:
+def stored_voxels(
+    paths: Sequence[Path], model: VoxelModel | None = None, colourings: int | None = None
+) -> Iterator[Primitives]:
     """Stored people as grids of 64^3 voxels: what that representation can at best show; of a model after its codec."""
     for path in paths:
         person = read_person(path)
         frames = rest_frames(person.betas.numpy())
-        for number in range(len(person.voxels)):
+        for number in range(len(person.voxels))[:colourings]:
             grid = voxelise_payload(frames, payload_of(person, number), person.full_density)
             shown = grid.float() / 255 if model is None else model.codec.decode(model.codec.encode(grid))
             yield primitives_of(shown, person.full_density)
