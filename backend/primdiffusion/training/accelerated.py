@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from primdiffusion.training.state import OptimiserConfig, TrainingState
 
 PATIENCE = datetime.timedelta(hours=3)
-"""How long processes wait for the main one, which alone evaluates, draws and prepares data."""
+"""How long processes wait for the main process, which alone evaluates, renders and prepares data."""
 
 
 def accelerator_of(mixed_precision: str = "no") -> Accelerator:
@@ -30,7 +30,7 @@ class AcceleratedState(TrainingState):
         super().__init__(network.to(accelerator.device), config, seed)
         self.accelerator = accelerator
         self.prepared, self.optimiser = accelerator.prepare(self.network, self.optimiser)
-        """The network as it is called in training."""
+        """The network as called in training, wrapped by accelerate."""
 
     def _gradient(self, loss: Tensor) -> float:
         self.accelerator.backward(loss)
@@ -39,7 +39,7 @@ class AcceleratedState(TrainingState):
 
     @staticmethod
     def saved_step(path: Path) -> int:
-        """The step of a saved state; 0 where there is none. Raises ValueError for a damaged file."""
+        """The step of a saved state; 0 without one. Raises ValueError for a damaged file."""
         if not path.exists():
             return 0
         try:

@@ -94,11 +94,11 @@ class CellTrainee:
         return self._objectives[name].loss(generator)
 
     def errors(self) -> Mapping[int, float]:
-        """x0 errors on the held-out set, in units of latents."""
+        """RMS x0 errors on the held-out set, in units of latents."""
         return x0_errors({"rms": self.denoiser}, self.denoiser.schedule, self.held.latents)["rms"]
 
     def errors_beside_closed_forms(self) -> dict[str, dict[int, float]]:
-        """As `errors`, with those of the prior as a single Gaussian and as a mixture, on the same noise."""
+        """As `errors`, also for the prior as a single Gaussian and as a mixture, on the same noise."""
         guesses = {
             "gaussian": closed_form(self.denoiser, single=True),
             "mixture": closed_form(self.denoiser, single=False),

@@ -27,33 +27,33 @@ from primdiffusion.training.slabs import SlabTrainee
 from primdiffusion.training.stored_people import PersonDataset
 
 MODEL = "model.safetensors"
-DATA = "people dressed from MakeHuman's CC0 assets, in T-pose, as primitives made without a network"
+DATA = "humans dressed from MakeHuman's CC0 assets, in T pose, as primitives fitted to renders of their meshes"
 LIMITS = (
-    "The people are adults from MakeHuman's bodies, in their assets' outfits, shoes and hair styles, with colours and "
+    "The humans are adults from MakeHuman's bodies, in their assets' outfits, shoes and hair styles, with colours and "
     "patterns drawn at random: no robes, uniforms, beards, glasses, wheelchairs or children.",
     "Patterns of two garments can blend into one, and a garment can change its colour at the sleeves.",
     "Body shapes are drawn from a Gaussian given the person; they suit the clothes on average only.",
-    "Sampling in few steps makes people more alike than those trained on; more steps let them differ more.",
+    "Sampling in few steps makes humans more alike than the training set; more steps let them differ more.",
 )
-"""What a user of a model of such people should know; stated on its card."""
+"""Limits of a model trained on such humans; stated on its card."""
 CODEC_LIMIT = (
-    "Primitives are 6 to 17 mm a voxel and the codec keeps {channels} of {values} numbers: faces, stripes and prints "
+    "A voxel is 6 to 17 mm wide and the codec keeps {channels} of {values} numbers: fine stripes, prints and eyelashes "
     "are soft."
 )
 
 
 def train(config: TrainingConfig) -> DiffusionModel:
-    """Run or resume a training run; returns the model as far as it got, which is also in run/model.safetensors.
+    """Run or resume a training run; returns the model as trained so far, which is also in run/model.safetensors.
 
-    Under `accelerate launch` each process trains on its own batches, and gradients are averaged. Ctrl-C or a polite
-    kill stops after the step and saves.
+    Under `accelerate launch` each process trains on its own batches, and gradients are averaged. Ctrl-C and SIGTERM
+    stop after the current step and save.
 
     Raises:
-        ValueError: settings that cannot be, or others than those with which the run in this folder began; people of
-            several full densities, or others than before; loss or gradient that are not finite (NotFiniteError); too
-            little memory; a damaged file (ShardError among them).
+        ValueError: invalid settings, or settings or people other than those the run in this folder began with; people
+            of different full densities; a loss or gradient that is not finite (NotFiniteError); out of memory; a
+            damaged file (ShardError among them).
         FileNotFoundError: there are fewer than two people.
-        OSError: there is no room; the last whole state remains.
+        OSError: the disk is full; the last saved state remains.
     """
     if config.threads:
         torch.set_num_threads(config.threads)
@@ -75,7 +75,7 @@ def train(config: TrainingConfig) -> DiffusionModel:
 
 
 def _begin(config: TrainingConfig, people: PersonDataset, held: Sequence[int], accelerator: Accelerator) -> None:
-    """Notes the start in the run's folder, and cuts what a kill undid."""
+    """Record the start in the run folder, and drop metrics of steps that were lost in a kill."""
     names = ("person", "local", "slab")
     steps = {name: AcceleratedState.saved_step(state_path(config, name)) for name in names}
     begin(
@@ -103,7 +103,7 @@ def _card(
     trainee: CellTrainee | SlabTrainee,
     states: Mapping[str, AcceleratedState],
 ) -> dict[str, Any]:
-    """What the checkpoint says of itself: data, settings, and held-out errors."""
+    """The model card: data, settings and held-out errors."""
     processes = next(iter(states.values())).accelerator.num_processes if states else 1
     card = {
         "name": f"PrimDiffusion {config.preset}",
@@ -146,7 +146,7 @@ def _device_name(device: torch.device) -> str:
 
 
 def run(arguments: Sequence[str] | None = None) -> None:
-    """Parses and runs one line; prints where the model is. Raises what `train` does."""
+    """Parse a command line, train, and print the path of the model. Raises as `train` does."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     config = tyro.cli(TrainingConfig, args=arguments, prog="primdiffusion train")
     model = train(config)

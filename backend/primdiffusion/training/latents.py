@@ -24,12 +24,12 @@ Item = TypeVar("Item", int, Path)
 
 @dataclasses.dataclass(frozen=True)
 class LatentSet(TensorRecord):
-    """Latents of N people of G geometries."""
+    """Latents of N samples of G geometries."""
 
     latents: Float[Tensor, "n c 32 32"]
     """float16."""
     geometry: Int[Tensor, "n"]
-    """Which geometry each has; those of one geometry lie together."""
+    """Geometry of each sample; ascending."""
     betas: Float[Tensor, "g 10"]
     condition: Float[Tensor, "n a"]
     """All attributes of each person, as `AttributeVocabulary.encode`."""
@@ -39,7 +39,7 @@ class LatentSet(TensorRecord):
 
 
 def split_people(people: Sequence[Item], holdout: float, seed: int) -> tuple[list[Item], list[Item]]:
-    """Geometries to train on and to hold out (at least one each), the same for the same number and seed."""
+    """Geometries to train on and to hold out (at least one each); deterministic for a number and a seed."""
     shuffled = random.Random(seed).sample(list(people), len(people))
     held = min(max(1, round(holdout * len(people))), len(people) - 1)
     return sorted(shuffled[held:]), sorted(shuffled[:held])
@@ -48,7 +48,7 @@ def split_people(people: Sequence[Item], holdout: float, seed: int) -> tuple[lis
 def fit_codec_to(
     people: PersonDataset, indices: Sequence[int], config: CodecConfig, generator: torch.Generator
 ) -> LinearCodec:
-    """The codec of `config.people` random people among those of `indices`, one colouring each."""
+    """Fit the codec to `config.people` random geometries among `indices`, one colouring each."""
     chosen = torch.randint(len(indices), (config.people,), generator=generator).tolist()
     if config.people <= len(indices):
         chosen = torch.randperm(len(indices), generator=generator)[: config.people].tolist()
@@ -63,7 +63,7 @@ def fit_codec_to(
 def encode_people(
     people: PersonDataset, indices: Sequence[int], codec: LinearCodec, vocabulary: AttributeVocabulary
 ) -> LatentSet:
-    """Latents of every colouring of the people of `indices`."""
+    """Encode all colourings of the geometries `indices`."""
     latents, geometry, betas, conditions = [], [], [], []
     for place, index in enumerate(indices):
         person = people.person(index)

@@ -60,7 +60,7 @@ def objective(
 
 @dataclasses.dataclass
 class PersonObjective:
-    """Loss of the network over person components: it needs no latent grids, so a step is cheap."""
+    """Loss of the network over person components; cheap, as it needs no latent grids."""
 
     denoiser: PersonDenoiser
     coefficients: Float[Tensor, "n r"]
@@ -157,10 +157,10 @@ def _present(network: nn.Module | None) -> nn.Module:
 def blends(
     geometry: Int[Tensor, "n"], batch: int, share: float, generator: torch.Generator
 ) -> tuple[Float[Tensor, "batch 2"], Int[Tensor, "batch 2"]]:
-    """Weights and places of two people of one geometry each; a `share` of them mixed, the others the first alone.
+    """Weights and indices of pairs of samples of one geometry; a `share` of pairs is mixed, the others are not.
 
-    Colour variants of one geometry have the same density, so their mixture is a person again, of mixed colours. Weights
-    reach beyond 0 ... 1 so far that mixing keeps the variance of colours: E[p^2 + (1-p)^2] = 1.
+    Colourings of one geometry have the same density, so their mixture is a valid sample of mixed colours. Weights
+    exceed 0 ... 1 by so much that mixing preserves the variance of colours: E[p^2 + (1-p)^2] = 1.
     """
     first = torch.randint(len(geometry), (batch,), generator=generator, device=generator.device)
     which, mixed, chosen = torch.rand(3, batch, generator=generator, device=generator.device)
@@ -175,7 +175,7 @@ def blends(
 def mixed(
     samples: Float[Tensor, "n *s"], weights: Float[Tensor, "b 2"], indices: Int[Tensor, "b 2"]
 ) -> Float[Tensor, "b *s"]:
-    """The weighted sums of two samples each, in float32; those with weight 0 are not read."""
+    """Weighted sums of pairs of samples, in float32; samples of weight 0 are not read."""
     result = samples[indices[:, 0]].float()
     both = weights[:, 1] != 0
     if both.any():
@@ -224,6 +224,6 @@ def x0_errors(
 
 
 def closed_form(denoiser: PersonDenoiser, single: bool) -> Guess:
-    """The prior's own guess, of the single Gaussian or of the mixture that it holds."""
+    """The prior's closed-form guess, as a single Gaussian or as its mixture."""
     prior = denoiser.prior.gaussian() if single else denoiser.prior
     return lambda x, t: prior.denoise(x, *denoiser.schedule.levels(t, x))

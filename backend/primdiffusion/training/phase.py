@@ -36,7 +36,7 @@ class Trainee(Protocol):
         ...
 
     def network(self, name: str) -> nn.Module:
-        """One of them, as initialised."""
+        """One network, as initialised."""
         ...
 
     def put(self, name: str, network: nn.Module) -> None:
@@ -59,12 +59,12 @@ class Trainee(Protocol):
 def train_phase(
     config: TrainingConfig, trainee: Trainee, name: str, accelerator: Accelerator, interrupt: Interrupt
 ) -> AcceleratedState:
-    """Train one network until its last step or an interrupt, and leave its average in place.
+    """Train one network until its last step or an interrupt, and install its average.
 
     Raises:
-        ValueError: loss or gradient are not finite (NotFiniteError); too little memory (says what to try); the saved
-            state is damaged or of another network.
-        OSError: there is no room; the last whole state remains.
+        ValueError: loss or gradient are not finite (NotFiniteError); out of memory; the saved state is damaged or of
+            another network.
+        OSError: the disk is full; the last saved state remains.
     """
     phase, path = trainee.phases[name], state_path(config, name)
     state = AcceleratedState(trainee.network(name).requires_grad_(True), phase, config.seed, accelerator)
@@ -94,7 +94,7 @@ def train_phase(
 
 
 def step(config: TrainingConfig, trainee: Trainee, name: str, state: AcceleratedState) -> StepMetrics:
-    """Run one optimiser step; its random numbers depend on seed, phase, step and process alone."""
+    """Run one optimiser step; its random numbers depend only on seed, phase, step and process."""
     device, phase = state.accelerator.device, trainee.phases[name]
     seed = step_seed(config.seed, name, state.step, state.accelerator.process_index)
     torch.manual_seed(seed)
@@ -147,12 +147,12 @@ class PhaseRecorder(Recorder):
             return {f"rms_{level}": error for level, error in self.trainee.errors().items()}
 
     def draw(self) -> None:
-        """A few people side by side."""
+        """Render a few samples side by side."""
         with self._averaged():
             write_samples(self.run / PICTURES / f"{self.phase}_{self.state.step:07d}.png", self.trainee.model())
 
     def append(self, row: Mapping[str, float]) -> None:
-        """A line of metrics.jsonl, with the phase."""
+        """Append a line to metrics.jsonl, with the phase."""
         append_metrics(self.run, {"phase": self.phase, **row})
 
     @contextlib.contextmanager
@@ -166,7 +166,7 @@ class PhaseRecorder(Recorder):
 
 @contextlib.contextmanager
 def _memory_named(name: str, phase: PhaseConfig) -> Iterator[None]:
-    """Raise ValueError with a remedy where memory runs out."""
+    """Turn out-of-memory errors into a ValueError that suggests a batch size."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:

@@ -37,7 +37,7 @@ class NotFiniteError(FloatingPointError, ValueError):
 
 
 class TrainingState:
-    """A network with its optimiser, average of weights, random state and place; saved and loaded as one file."""
+    """A network with optimiser, weight average, random state and position; saved and loaded as one file."""
 
     def __init__(self, network: nn.Module, config: OptimiserConfig, seed: int):
         self.network, self.config = network, config
@@ -51,11 +51,14 @@ class TrainingState:
         """Further state of the run, saved in the file's metadata and restored by `load`."""
 
     def _groups(self) -> list[dict[str, object]]:
-        """Parameters that learn at one rate, each with its factor on the configured one."""
+        """Parameter groups, each with its factor on the configured learning rate."""
         return [{"params": list(self.network.parameters()), "factor": 1.0}]
 
     def update(self, loss: Tensor) -> float:
-        """One optimiser step and one step of the average; returns the gradient norm. NotFiniteError where it is not."""
+        """Take one optimiser step and update the average; returns the gradient norm.
+
+        Raises NotFiniteError if the gradient is not finite.
+        """
         rate = self.config.learning_rate * learning_rate_factor(self.step, self.config.steps)
         for group in self.optimiser.param_groups:
             group["lr"] = rate * group["factor"]
@@ -74,14 +77,14 @@ class TrainingState:
         return norm
 
     def _gradient(self, loss: Tensor) -> float:
-        """Of every parameter, clipped; returns its norm before that."""
+        """Compute and clip the gradient; returns its norm before clipping."""
         loss.backward()
         return float(nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip))
 
     def save(self, path: Path) -> None:
-        """Write everything to one safetensors file, whole or not at all.
+        """Write everything to one safetensors file, atomically.
 
-        Raises NotFiniteError rather than replace a good state by weights that are not finite, and OSError.
+        Raises NotFiniteError, leaving the file as it was, if a weight is not finite; OSError.
         """
         tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
         tensors |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
