@@ -13,11 +13,10 @@ import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.checkpoints import load_checkpoint
-from primdiffusion.export.proxy import vertex_normals
 from primdiffusion.export.surface import Surface
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
-from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, vertex_normals
 from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import from_mesh
@@ -62,7 +61,7 @@ def checkered_human(seed: int = 0, betas: Tensor | None = None, off_the_skin: fl
     texture[..., 3] = 255
     skin = TexturedPart(
         name="body",
-        vertices=suit.vertices + off_the_skin * vertex_normals(suit),
+        vertices=suit.vertices + off_the_skin * vertex_normals(*suit),
         faces=body.faces.int().numpy(),
         corner_uv=body.uv[body.uv_faces].double().numpy(),
         texture=texture,

@@ -17,7 +17,7 @@ from primdiffusion.export.surface import Surface, outside_surface
 from primdiffusion.formats import requests
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.srgb import encode_srgb
-from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, vertex_normals
 from primdiffusion.geometry.uv_atlas import rasterise_uv
 from primdiffusion.human import Human, body_of, place
 from primdiffusion.people.gltf import Skeleton
@@ -146,7 +146,7 @@ def bake_texture(
     row, column = np.nonzero(raster.covered)
     corners, share = surface.faces[raster.face[row, column]], raster.barycentric[row, column]
     points = np.einsum("nc,nci->ni", share, surface.vertices[corners])
-    normals = np.einsum("nc,nci->ni", share, vertex_normals(surface)[corners])
+    normals = np.einsum("nc,nci->ni", share, vertex_normals(*surface)[corners])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     colour, alpha = np.empty((len(points), 3), np.float32), np.empty(len(points), np.float32)
     for first in range(0, len(points), RAYS_AT_ONCE):
@@ -162,13 +162,3 @@ def bake_texture(
     nearest = np.asarray(ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True))
     picture = picture[tuple(nearest)][::-1]  # v points up, rows of a picture down
     return np.rint(picture * 255).astype(np.uint8)
-
-
-def vertex_normals(surface: Surface) -> Float64[Array, "v 3"]:
-    """Area-weighted unit normals."""
-    a, b, c = (surface.vertices[surface.faces[:, corner]] for corner in range(3))
-    across = np.cross(b - a, c - a)
-    total = np.zeros_like(surface.vertices)
-    for corner in range(3):
-        np.add.at(total, surface.faces[:, corner], across)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from primdiffusion.export.proxy import MeshProxy, vertex_normals
-from primdiffusion.export.surface import Surface
+from primdiffusion.export.proxy import MeshProxy
+from primdiffusion.geometry.textured_mesh import vertex_normals
 from primdiffusion.people.gltf import glb
 from primdiffusion.staging import staged, written_whole
 
@@ -28,7 +28,7 @@ def write_proxy_obj(path: str | Path, proxy: MeshProxy) -> None:
     """Write an .obj, its .mtl and .png, all or none; OBJ has no skinning. Raises OSError."""
     path = Path(path)
     name = path.stem
-    normals = vertex_normals(Surface(proxy.vertices, proxy.faces))
+    normals = vertex_normals(proxy.vertices, proxy.faces)
     lines = [f"mtllib {name}.mtl", "usemtl person"]
     lines += ["v {:.6f} {:.6f} {:.6f}".format(*vertex) for vertex in proxy.vertices]
     lines += ["vt {:.6f} {:.6f}".format(*corner) for corner in proxy.corner_uv.reshape(-1, 2)]

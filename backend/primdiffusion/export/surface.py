@@ -113,16 +113,13 @@ def _cubes_across(solid: Array) -> tuple[Int64[Array, "n"], Int64[Array, "c 8"]]
 
 def _large_pieces(vertices: Array, faces: Array) -> Surface:
     """Drop pieces smaller than SMALLEST_PIECE, and cavities, whose volume is negative."""
-    from scipy import sparse
-    from scipy.sparse import csgraph
+    import trimesh  # used only here
 
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    links = sparse.coo_array((np.ones(len(edges), bool), tuple(edges.T)), shape=(len(vertices),) * 2)
-    _, piece = csgraph.connected_components(links, directed=False)
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    volume = np.bincount(piece[faces[:, 0]], np.einsum("fi,fi->f", a, np.cross(b, c)) / 6)
-    kept = faces[volume[piece[faces[:, 0]]] >= SMALLEST_PIECE]
-    if not len(kept):
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    piece = trimesh.graph.connected_component_labels(mesh.edges, len(vertices))[faces[:, 0]]
+    volume = np.bincount(piece, np.linalg.det(mesh.triangles) / 6)
+    mesh.update_faces(volume[piece] >= SMALLEST_PIECE)
+    if not len(mesh.faces):
         raise NoSurface(THIN)
-    used, renumbered = np.unique(kept, return_inverse=True)
-    return Surface(vertices[used], renumbered.reshape(kept.shape).astype(np.int64))
+    mesh.remove_unreferenced_vertices()
+    return Surface(np.array(mesh.vertices), np.array(mesh.faces))

@@ -10,6 +10,8 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from trimesh.geometry import mean_vertex_normals
+from trimesh.triangles import cross
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -59,6 +61,11 @@ class TexturedPart:
         matrices = np.einsum("vm,vmij->vij", self.skin_weight, np.asarray(skinning, np.float64)[self.skin_index, :3])
         moved = np.einsum("vij,vj->vi", matrices[:, :, :3], self.vertices) + matrices[:, :, 3]
         return dataclasses.replace(self, vertices=moved)
+
+
+def vertex_normals(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V 3"]:
+    """Area-weighted unit normals, outwards; zero where there are no faces, or only degenerate ones."""
+    return mean_vertex_normals(len(vertices), faces, cross(vertices[faces]))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

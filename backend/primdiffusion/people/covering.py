@@ -13,11 +13,13 @@ import dataclasses
 import functools
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numba import njit
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
+from trimesh import Trimesh
 
+from primdiffusion.geometry.textured_mesh import vertex_normals
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import BaseMesh
 from primdiffusion.people.fitting import fit_item
@@ -50,7 +52,7 @@ def cover(assets: Assets, base: BaseMesh, path: str) -> Cover:
     vertices = base.template
     _, mesh = assets.proxy(path)
     skin = np.unique(base.faces)
-    normal = normals(vertices, base.faces)[skin]
+    normal = vertex_normals(vertices, base.faces)[skin]
     corners = fit_item(assets, base, path, vertices)[mesh.faces]
     gap = np.full(len(vertices), np.inf)
     gap[skin] = _gaps(vertices[skin], normal, corners, REACH_OUT, REACH_IN)
@@ -69,24 +71,13 @@ def cover(assets: Assets, base: BaseMesh, path: str) -> Cover:
 def sunk(vertices: Float[np.ndarray, "B 3"], base: BaseMesh, covers: tuple[Cover, ...]) -> Float[np.ndarray, "B 3"]:
     """Sink the covered vertices of the body below its garments."""
     depth = np.max([garment.sink for garment in covers], axis=0)
-    return vertices - depth[:, None] * normals(vertices, base.faces)
-
-
-def normals(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V 3"]:
-    """Area-weighted unit normals of vertices, outwards; zero for vertices without faces."""
-    corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(total, faces[:, corner], across)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+    return vertices - depth[:, None] * vertex_normals(vertices, base.faces)
 
 
 def _distance(base: BaseMesh, vertices: Float[np.ndarray, "B 3"], bare: Bool[np.ndarray, " B"]) -> np.ndarray:
     """Distance along edges from each vertex to the nearest bare one, metres; inf if unreachable."""
-    edges = np.unique(np.sort(base.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-    graph = coo_matrix((length, (edges[:, 0], edges[:, 1])), shape=(len(vertices), len(vertices))).tocsr()
+    mesh = Trimesh(vertices, base.faces, process=False)
+    graph = coo_matrix((mesh.edges_unique_length, mesh.edges_unique.T), shape=(len(vertices), len(vertices))).tocsr()
     return dijkstra(graph, directed=False, indices=np.flatnonzero(bare), min_only=True)
 
 

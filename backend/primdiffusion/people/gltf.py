@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 from PIL import Image
 
-from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, vertex_normals
 
 MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
 FLOAT, BYTE, SHORT, INT = 5126, 5121, 5123, 5125
@@ -180,13 +180,8 @@ def _four(array: np.ndarray) -> np.ndarray:
 
 def _normals(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float32[np.ndarray, "V 3"]:
     """Smooth normals, of unit length up to rounding; up for vertices of degenerate faces only."""
-    corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(total, faces[:, corner], across)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    unit = np.where(length > 1e-12, total / np.maximum(length, 1e-12), np.array([0.0, 1.0, 0.0]))
+    unit = vertex_normals(vertices, faces)
+    unit[np.linalg.norm(unit, axis=1) < 0.5] = (0.0, 1.0, 0.0)
     return (np.rint(unit * NORMAL_STEPS) / NORMAL_STEPS + 0.0).astype(np.float32)
 
 

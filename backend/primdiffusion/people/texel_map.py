@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 from scipy.ndimage import distance_transform_edt
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from trimesh.geometry import faces_to_edges
+from trimesh.graph import connected_component_labels
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -74,9 +74,7 @@ def texel_map(corner_uv: Float[np.ndarray, "F 3 2"], size: int) -> TexelMap:
 
 def connected_faces(faces: Int[np.ndarray, "F 3"], vertex_count: int) -> Int[np.ndarray, " F"]:
     """Index of each face's connected component, largest first."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    graph = coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(vertex_count, vertex_count))
-    label = connected_components(graph, directed=False)[1][faces[:, 0]]
+    label = connected_component_labels(faces_to_edges(faces), vertex_count)[faces[:, 0]]
     order = np.argsort(-np.bincount(label), kind="stable")
     rank = np.empty(len(order), np.int32)
     rank[order] = np.arange(len(order))
