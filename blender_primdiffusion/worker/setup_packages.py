@@ -144,7 +144,7 @@ def chosen_compute(machine: Machine, wish: str, available: Iterable[str]) -> tup
         raise ValueError(f"torch needs macOS {MACOS} or newer, and this is {machine.macos}: update the system")
     if machine.platform == "macos_x86_64":
         raise ValueError(
-            "PyTorch is no longer made for Macs with Intel chips (2.2 was the last, and 2.13 is needed): generate on "
+            "PyTorch is no longer made for Macs with Intel chips (2.2 was the last, and 2.6 is needed): generate on "
             "another computer; a .blend with people in it opens here and renders in Cycles"
         )
     if not available:

@@ -1,5 +1,6 @@
 """Files at the root of the checkout that repeat each other agree."""
 
+import itertools
 import json
 import re
 import subprocess
@@ -7,6 +8,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -31,6 +33,20 @@ def test_the_citation_has_the_projects_version_and_licence():
     citation = dict(re.findall(r"^(\w+): (.+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert (citation["version"], citation["license"]) == (project["version"], project["license"])
+
+
+def test_every_requirement_has_an_exact_version_in_the_lock_that_its_range_allows():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines = (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
+    locked = dict(line.split("==") for line in lines if not line.startswith("#"))
+    extras = [asked for name, asked in project["optional-dependencies"].items() if name != "bake"]
+    for requirement in map(Requirement, itertools.chain(project["dependencies"], *extras)):
+        assert requirement.specifier.contains(locked[requirement.name]), requirement
+
+
+def test_the_package_demands_no_exact_version():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert not [asked for asked in project["dependencies"] if "==" in asked]
 
 
 def test_help_lists_every_target_that_has_no_file():
