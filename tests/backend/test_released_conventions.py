@@ -12,8 +12,14 @@ from primdiffusion.primitives.anchors import attach, build_anchors
 from primdiffusion.primitives.body_setup import BodySetup, body_setup_from_files
 from primdiffusion.primitives.primitives import GRID, K, Payload, Primitives, S
 from primdiffusion.primitives.slab import RELEASED_FULL_DENSITY
-from primdiffusion.released.conventions import SMALLEST_DELTA_S, ReleasedSlab, released_steps, rest_half_extent
-from primdiffusion.released.imported import Reference, reference_extents
+from primdiffusion.released.imported import (
+    SMALLEST_DELTA_S,
+    Reference,
+    ReleasedSlab,
+    reference_extents,
+    released_steps,
+    rest_half_extent,
+)
 from primdiffusion.render.march import MarchSettings, march
 from released_files import save_body
 

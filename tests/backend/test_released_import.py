@@ -23,7 +23,7 @@ from primdiffusion.human_file import HumanFileError, load_human, save_human
 from primdiffusion.primitives.anchors import build_anchors
 from primdiffusion.primitives.body_setup import BodySetupError, body_setup_from_files
 from primdiffusion.primitives.primitives import K, Payload
-from primdiffusion.released.conventions import ReleasedSlab, released_steps
+from primdiffusion.released.imported import ReleasedSlab, released_steps
 from released_files import TINY, body_arrays, random_network, save_body, save_released, stage_one, state, template
 
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 from primdiffusion.diffusion.schedule import linear
 from primdiffusion.diffusion.unet import PAPER, PAPER_WITH_ATTENTION, SlabUNet
+from primdiffusion.released.imported import SCHEDULE
 from primdiffusion.released.inventory import take_inventory
 from primdiffusion.released.reading import ReleasedFileError, read_weights
-from primdiffusion.released.schedule_buffers import SCHEDULE
 from released_files import SMALL, T, blank, save_released, schedule_buffers, stage_one, state, template
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,12 +14,12 @@ from torch import Tensor
 
 from primdiffusion.body.model import BodyModel
 from primdiffusion.capture.smpl_parameters import read_smpl
+from primdiffusion.diffusion.checkpoint import file_hash, under
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.primitives.body_setup import BodySetup, body_setup_from_files
 from primdiffusion.primitives.primitives import K
-from primdiffusion.released.denoiser import PREFIX
 from primdiffusion.released.imported import Reference, write_imported
-from primdiffusion.released.inventory import Inventory, take_inventory
+from primdiffusion.released.inventory import PREFIX, Inventory, take_inventory
 from primdiffusion.released.reading import ReleasedFileError, read_weights
 from primdiffusion.released.stage_one import PREFIX as STAGE_ONE
 from primdiffusion.staging import write_atomically
@@ -69,7 +68,7 @@ class ImportReleased:
             raise ValueError(f"uv names {len(self.uv)} files: give one .obj or .npz, or the pair vt.npy ft.npy")
         body_setup = body_setup_from_files(self.smpl, self.uv)
         notes = [*_about_body(weights, body_setup.body), _about_layout(body_setup)]
-        denoiser = {key.removeprefix(PREFIX): value for key, value in weights.items() if key.startswith(PREFIX)}
+        denoiser = under(weights, PREFIX)
         card = _card(self.checkpoint, inventory, denoiser, self.reference)
         write_imported(self.out, denoiser, inventory.unet, body_setup, _reference(self.reference), self.chain, card)
         for note in notes:
@@ -113,12 +112,10 @@ def _about_layout(body_setup: BodySetup) -> str:
 
 
 def _card(path: Path, inventory: Inventory, denoiser: Mapping[str, Tensor], reference: Path | None) -> dict[str, Any]:
-    with open(path, "rb") as file:
-        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     return {
         "name": f"released {path.stem}",
         "source": path.name,
-        "source_sha256": sha256,
+        "source_sha256": file_hash(path),
         "source_tensors": len(inventory.account.entries),
         "parameters": sum(value.numel() for value in denoiser.values()),
         "sizes_from": "template" if reference is None else reference.name,

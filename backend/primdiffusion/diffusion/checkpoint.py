@@ -128,24 +128,28 @@ def build_model(
     """Build the model of a checkpoint trained here, on the CPU; raises what `mismatches_named` catches."""
     schedule = SCHEDULES[architecture["schedule"]]()
     config = architecture["config"]
-    weights = _under(tensors, "denoiser.")
+    weights = under(tensors, "denoiser.")
     if architecture["kind"] == "slab":
-        levels = {key: tuple(config[key]) for key in ("multipliers", "attention_levels")}
-        denoiser: torch.nn.Module = SlabUNet(UNetConfig(**{**config, **levels}))
+        denoiser: torch.nn.Module = SlabUNet(unet_config(config))
         codec, shapes = WholeSlab(), STANDARD_SHAPES
     else:
-        prior = PersonPrior(**_under(weights, "prior_"))
+        prior = PersonPrior(**under(weights, "prior_"))
         denoiser = PersonDenoiser(denoiser_config(config), prior, schedule)
-        codec = CellCodec(LinearCodec(**_under(tensors, "codec.")))
+        codec = CellCodec(LinearCodec(**under(tensors, "codec.")))
         if codec.shape != tuple(prior.mean.shape):
             raise RuntimeError(f"codec latents are {codec.shape}, the network expects {tuple(prior.mean.shape)}")
-        shapes = ShapePrior(**_under(tensors, "shapes."))
+        shapes = ShapePrior(**under(tensors, "shapes."))
     denoiser.load_state_dict(weights)
     denoiser.eval().requires_grad_(False)
     vocabulary = AttributeVocabulary.from_json(architecture["vocabulary"])
     chain = CHAINS[architecture.get("chain", "trailing")]
     density = float(architecture["full_density"])
     return DiffusionModel(denoiser, schedule, codec, shapes, density, card, vocabulary, chain)
+
+
+def unet_config(tree: Mapping[str, Any]) -> UNetConfig:
+    """Parse a U-Net's configuration."""
+    return UNetConfig(**{**tree, **{key: tuple(tree[key]) for key in ("multipliers", "attention_levels")}})
 
 
 def denoiser_config(tree: Mapping[str, Any]) -> DenoiserConfig:
@@ -194,7 +198,8 @@ def _is_halved(key: str, value: Tensor) -> bool:
     return key.startswith(_HALVED) and value.is_floating_point() and value.ndim > 1 and not key.endswith(_WHOLE)
 
 
-def _under(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+def under(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Select the tensors whose names begin with `prefix`, and remove it."""
     return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
 

@@ -1,17 +1,23 @@
-"""Read a torch checkpoint without executing pickled code."""
+"""Read a checkpoint of the authors without executing pickled code, and report on each of its tensors."""
 
 from __future__ import annotations
 
+import collections
+import dataclasses
+import math
 import pickle
 import re
 import struct
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+Fate = Literal["imported", "checked", "dropped"]
+"""imported: in the new file; checked: validated, then not needed; dropped: not used by design."""
 STATE = "model_state_dict"
 """Top-level key of the weights in released checkpoints; the other is "optimizer"."""
 PICKLE_ERRORS = (
@@ -20,6 +26,55 @@ PICKLE_ERRORS = (
 )  # fmt: skip
 """Exceptions that torch raises for invalid files; its restricted unpickler has no exception class of its own."""
 _ZIP_MAGIC = b"PK\x03\x04"
+
+
+@dataclasses.dataclass(frozen=True)
+class TensorEntry:
+    """One tensor."""
+
+    key: str
+    """Its name in the file."""
+    group: str
+    """"schedule", "diffusion", or a module of the body decoder."""
+    shape: tuple[int, ...]
+    fate: Fate
+    note: str
+    """What it was checked against, its new name, or why it is not used."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Account:
+    """All tensors of a file, in file order, so that none is ignored silently."""
+
+    entries: tuple[TensorEntry, ...]
+
+    def groups(self) -> list[dict[str, Any]]:
+        """Count tensors and values of each group and fate, in file order, with the first note."""
+        rows: dict[tuple[str, str], list[TensorEntry]] = collections.defaultdict(list)
+        for entry in self.entries:
+            rows[entry.group, entry.fate].append(entry)
+        return [
+            {
+                "group": group,
+                "fate": fate,
+                "tensors": len(entries),
+                "values": sum(math.prod(entry.shape) for entry in entries),
+                "note": entries[0].note,
+            }
+            for (group, fate), entries in rows.items()
+        ]
+
+    def table(self) -> str:
+        """Format the groups as a text table."""
+        rows = [
+            (row["group"], row["fate"], str(row["tensors"]), f"{row['values']:,}", row["note"]) for row in self.groups()
+        ]
+        rows.insert(0, ("group", "fate", "tensors", "values", "note"))
+        widths = [max(len(row[column]) for row in rows) for column in range(4)]
+        return "\n".join(
+            f"{row[0]:<{widths[0]}}  {row[1]:<{widths[1]}}  {row[2]:>{widths[2]}}  {row[3]:>{widths[3]}}  {row[4]}"
+            for row in rows
+        )
 
 
 class ReleasedFileError(ValueError):

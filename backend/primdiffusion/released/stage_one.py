@@ -12,8 +12,7 @@ from collections.abc import Mapping, Sequence
 
 from torch import Tensor
 
-from primdiffusion.released.account import Entry
-from primdiffusion.released.reading import ReleasedFileError
+from primdiffusion.released.reading import ReleasedFileError, TensorEntry
 
 PREFIX = "bodydecoder."
 TENSORS = {
@@ -80,7 +79,7 @@ ATTENTION: list[tuple[int, ...]] = [(256, 96), (96, 256), *[(2048, 256), (256, 1
 """Matrices of the transformer in SPEC 2: to 256 channels, back to 96, and two gated feed-forwards."""
 
 
-def account_stage_one(tensors: Mapping[str, Tensor], prefix: str = PREFIX) -> list[Entry]:
+def account_stage_one(tensors: Mapping[str, Tensor], prefix: str = PREFIX) -> list[TensorEntry]:
     """Validate the tensors (names without `prefix`, which error messages include).
 
     Raises ReleasedFileError, naming a tensor that is unknown or has a wrong shape, or an incomplete group.
@@ -104,7 +103,7 @@ def account_stage_one(tensors: Mapping[str, Tensor], prefix: str = PREFIX) -> li
             )
     _check_attention(groups["transformer"])
     return [
-        Entry(
+        TensorEntry(
             f"{prefix}{name}",
             group := name.partition(".")[0],
             tuple(value.shape),
