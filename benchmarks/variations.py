@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from PIL import Image
-from primdiffusion.commands.generate import GenerateRequest
+from primdiffusion.commands.generate import GenerateRequest, VariationsRequest
 from primdiffusion.commands.session import Session
-from primdiffusion.commands.variations import VariationsRequest
 from record import tell
 
 PICTURE_PX = 256

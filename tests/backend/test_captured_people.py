@@ -46,7 +46,7 @@ def outcomes(root, out, settings=AS_ENCODED, cards=None, model=None):
 
 def test_the_file_holds_what_the_encoder_makes_of_the_pictures(root, line, tmp_path, capsys):
     cli.main([*line, "--people", str(root / "people"), "--views", "3"])
-    assert capsys.readouterr().out.splitlines() == [f"{FIRST}  done", f"{SECOND}  done  their attributes are not known"]
+    assert capsys.readouterr().out.splitlines() == [f"{FIRST}  done", f"{SECOND}  done  attributes unknown"]
     stored = read_person(tmp_path / "out" / f"{FIRST}.npz")
     person = captured_person(root / "captures", FIRST, views=3)
     wanted = load_encoder(root / "tiny.safetensors").encode(person.views, person.betas)

@@ -5,8 +5,8 @@ import math
 from pathlib import Path
 
 import pytest
-from primdiffusion.commands.draw import DrawRequest
 from primdiffusion.commands.frame import PosedPerson
+from primdiffusion.commands.render import DrawRequest
 from primdiffusion.commands.request import read_request
 
 STILL = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from primdiffusion.diffusion.schedule import CLEAN, linear, trailing_steps
-from primdiffusion.editing.repaint import noised, renoised, repaint, resampling_path
+from primdiffusion.editing.inpaint import noised, renoised, repaint, resampling_path
 
 SCHEDULE = linear()
 

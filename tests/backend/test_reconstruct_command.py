@@ -11,9 +11,10 @@ import pytest
 import torch
 from capture_scenes import box, captured, save_person, small_job
 from PIL import Image
-from primdiffusion import cli, person_folder
+from primdiffusion import cli
 from primdiffusion.capture.conditioning import captured_person, choose_subject, conditioning_views
 from primdiffusion.capture.rasterised import render
+from primdiffusion.commands import output
 from primdiffusion.commands.reconstruct import ReconstructRequest
 from primdiffusion.commands.request import read_request
 from primdiffusion.commands.session import Session
@@ -189,7 +190,7 @@ def test_a_missing_damaged_or_foreign_checkpoint_is_named(dataset, checkpoint, t
 def test_the_encoder_stays_loaded_until_another_is_asked_for(dataset, checkpoint, tmp_path, monkeypatch):
     loaded = []
     load = load_encoder
-    monkeypatch.setattr(person_folder, "write_person", lambda *_: None)
+    monkeypatch.setattr(output, "write_human", lambda *_: None)
     counted = lambda path, device: loaded.append(path) or load(path, device)  # noqa: E731
     monkeypatch.setattr(encoder_checkpoint, "load_encoder", counted)
     other = save_tiny_encoder(tmp_path / "other.safetensors")

@@ -13,7 +13,7 @@ import torch
 from primdiffusion import cli
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.checkpoints import load_checkpoint
-from primdiffusion.commands.frame import Frame, PosedPerson
+from primdiffusion.commands.frame import FrameSpec, PosedPerson
 from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
 from primdiffusion.diffusion.checkpoint import CheckpointError, read_card
 from primdiffusion.drawing.draw import draw
@@ -114,7 +114,7 @@ def test_the_engines_frames_and_boxes_show_people_on_the_users_body(person, tmp_
     camera = framing(primitives, 0.4, 40, 56)
     for view, chart in (("colour", None), ("boxes", human.body_setup.anchors.chart)):
         np.full(40 * 56 * 5, np.nan, np.float32).tofile(tmp_path / "frame")
-        params = Frame(
+        params = FrameSpec(
             frame=tmp_path / "frame", width=40, height=56, view=view, intrinsics=camera.intrinsics.tolist(),
             world_to_camera=camera.world_to_camera.tolist(),
             people=[PosedPerson(tmp_path / "a.human.safetensors", still, [still] * 24)],

@@ -4,8 +4,7 @@ import itertools
 from pathlib import Path
 
 import pytest
-from primdiffusion import person_folder
-from primdiffusion.commands import progress, session
+from primdiffusion.commands import output, session
 from primdiffusion.commands.generate import GenerateRequest
 from primdiffusion.commands.session import Session
 from tiny_model import save_tiny_checkpoint
@@ -19,12 +18,12 @@ def checkpoint(tmp_path_factory) -> Path:
 @pytest.fixture
 def only_sampling(monkeypatch):
     """Leaves out files and pictures."""
-    monkeypatch.setattr(person_folder, "write_person", lambda *_: None)
+    monkeypatch.setattr(output, "write_human", lambda *_: None)
 
 
 def test_time_left_is_the_mean_of_the_warm_steps_times_the_steps_left(checkpoint, tmp_path, monkeypatch, only_sampling):
     clock = itertools.chain([0.0, 10.0, 12.0, 14.0, 20.0], itertools.count(30.0))  # start, 4 steps, the rest
-    monkeypatch.setattr(progress.time, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr("primdiffusion.commands.request.time.perf_counter", lambda: next(clock))
     reports = []
     request = GenerateRequest(seed=1, out_dir=tmp_path, steps=4, checkpoint=checkpoint)
     request.run(Session(), lambda *report: reports.append(report))

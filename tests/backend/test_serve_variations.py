@@ -8,10 +8,10 @@ import pytest
 import torch
 from PIL import Image
 from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.commands.generate import VariationsRequest
+from primdiffusion.commands.output import PreviewBudget
 from primdiffusion.commands.request import read_request
 from primdiffusion.commands.session import Session
-from primdiffusion.commands.step_pictures import Allowance
-from primdiffusion.commands.variations import VariationsRequest
 from primdiffusion.editing.vary import vary
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
@@ -65,7 +65,7 @@ def test_while_they_are_sampled_each_gets_its_picture_in_turn(checkpoint, model,
     save_human(person, generate(model, 3, 2))
     of_whom, out = {"person": person} if around else {}, tmp_path / "out"
     grants = itertools.cycle([True, True, False])
-    monkeypatch.setattr(Allowance, "granted", lambda _: next(grants))
+    monkeypatch.setattr(PreviewBudget, "granted", lambda _: next(grants))
     listener = Listener()
     how = {"steps": 4, "checkpoint": checkpoint, "size": 16, **of_whom}
     VariationsRequest(seeds=[1, 2, 3], out_dir=out, **how).run(Session(), listener)

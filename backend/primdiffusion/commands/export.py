@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from primdiffusion.commands.checks import check_betas, check_numbers, check_size
-from primdiffusion.commands.progress import Report
-from primdiffusion.commands.request import parse
+from primdiffusion.commands.request import ReportProgress, check_betas, check_numbers, check_size, parse
 from primdiffusion.formats import requests
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.staging import staged
@@ -43,7 +41,7 @@ class ProxyRequest:
         """See `Request`."""
         check_betas(self.betas)
 
-    def run(self, session: Session, report: Report) -> dict[str, Any]:
+    def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
         """Writes both files or none.
 
         Raises OSError before any work if the folder cannot be written to; what load_human and mesh_proxy raise.
@@ -98,7 +96,7 @@ class GaussiansRequest:
         if self.limit < 1:
             raise ValueError(f"{self.limit} Gaussians were asked for: choose 1 or more")
 
-    def run(self, session: Session, report: Report) -> dict[str, Any]:
+    def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
         """Raises OSError and what load_human does."""
         import torch  # late
 
@@ -137,18 +135,18 @@ class HumanNpzRequest:
         """See `Request`."""
         check_size(self.size)
 
-    def run(self, session: Session, report: Report) -> dict[str, Any]:
+    def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
         """Writes all files or none. Raises OSError and what load_human does."""
         # torch is loaded late
+        from primdiffusion.commands.output import FILES, write_human
         from primdiffusion.human_file import load_human
-        from primdiffusion.person_folder import FILES, write_person
 
         began = time.perf_counter()
         with staged(self.out_dir) as folder:
             report("load", 0, 1, None)
             human = load_human(self.person)
             report("write", 0, 1, None)
-            write_person(folder, human, self.size)
+            write_human(folder, human, self.size)
             report("write", 1, 1, 0.0)  # the last chance to cancel
         return {**FILES.in_folder(self.out_dir), "seconds": round(time.perf_counter() - began, 3)}
 

@@ -1,11 +1,11 @@
-"""A frame to draw: people in their poses, and the camera that sees them. Imports no torch."""
+"""A frame for the render engine or the viewport: posed humans and a camera. Imports no torch."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
 
-from primdiffusion.commands.checks import check_betas, check_numbers, check_sides
+from primdiffusion.commands.request import check_betas, check_numbers, check_sides
 from primdiffusion.drawing.steps import check_step
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import RAY_STEP, VIEWS, View
@@ -13,53 +13,53 @@ from primdiffusion.formats.requests import RAY_STEP, VIEWS, View
 
 @dataclasses.dataclass(frozen=True)
 class PosedPerson:
-    """A person as an armature poses them."""
+    """A human posed by an armature."""
 
     human: Path
     """A person.human.safetensors file."""
     object: list
     """[3][4] world matrix of the armature object; y up, metres."""
     joints: list
-    """[24][3][4] from rest to posed in the object's space, SMPL's joint order."""
+    """[24][3][4] rest to posed in object space, SMPL's joint order."""
     betas: list | None = None
-    """Shape coefficients; None for the file's."""
+    """Shape coefficients; None for those of the file."""
 
     def check(self) -> None:
-        """ValueError for arrays of another shape, and numbers that are not finite."""
+        """Raise ValueError for arrays of wrong shape and numbers that are not finite."""
         check_numbers("object", self.object, (3, 4))
         check_numbers("joints", self.joints, (len(JOINT_NAMES), 3, 4))
         check_betas(self.betas)
 
 
 @dataclasses.dataclass(frozen=True)
-class Frame:
-    """What to draw, and into which file."""
+class FrameSpec:
+    """A frame to draw: humans, camera, and the file to draw into."""
 
     frame: Path
-    """A file of (4 + 1) w h float32 that is mapped and filled: premultiplied linear RGBA, then depth; bottom row first.
-    w and h are the region's."""
+    """A file of (4 + 1) w h float32 to map and fill: premultiplied linear RGBA, then depth; bottom row first. w and h
+    are those of the region."""
     width: int
-    """Of the whole picture, as height."""
+    """Width and height of the whole image, pixels."""
     height: int
     intrinsics: list
-    """[3][3] of the whole picture, pixels from its top left corner, pixel centres at +0.5."""
+    """[3][3] of the whole image, in pixels from its top left corner, pixel centres at +0.5."""
     world_to_camera: list
     """[3][4], OpenCV; y up, metres."""
     people: list[PosedPerson]
     region: list | None = None
-    """[x, y, w, h], pixels from the left and from the bottom; None for the whole picture."""
+    """[x, y, w, h], pixels from the left and from the bottom; None for the whole image."""
     clip: list = dataclasses.field(default_factory=lambda: [0.0, 1e10])
     """[start, end], metres along the optical axis."""
     solids: Path | None = None
     """An npz of corners [F, 3, 3], colour [F, 3] and holdout [F]."""
     background: list | None = None
-    """[r, g, b], linear; None leaves the picture transparent."""
+    """[r, g, b], linear; None for a transparent background."""
     view: View = VIEWS[0]
     step: float = RAY_STEP
-    """Metres between samples of a ray through people of natural size; others are sampled in proportion to theirs."""
+    """Metres between samples of a ray through humans of natural size; scaled humans are sampled in proportion."""
 
     def check(self) -> None:
-        """ValueError, which names the field, for values that are out of range."""
+        """See `Request`."""
         for person in self.people:
             person.check()
         check_sides(self.width, self.height)
@@ -89,10 +89,10 @@ class Frame:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of what is drawn."""
+        """Width and height of the drawn region."""
         return (self.width, self.height) if self.region is None else (self.region[2], self.region[3])
 
     @property
     def corner(self) -> tuple[int, int]:
-        """The pixel of the whole picture, from its left and top, that is the region's top left one."""
+        """The region's top left pixel in the whole image, from the left and top."""
         return (0, 0) if self.region is None else (self.region[0], self.height - self.region[1] - self.region[3])

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from primdiffusion.body.model import BodyModel, default_body
-from primdiffusion.commands.frame import Frame
-from primdiffusion.commands.progress import Report
+from primdiffusion.commands.frame import FrameSpec
+from primdiffusion.commands.request import ReportProgress
 from primdiffusion.drawing.bands import BAND_SECONDS, FIRST_PIXELS, draw_in_bands
 from primdiffusion.drawing.scene import Look, Picture, Scene
 from primdiffusion.failures import PictureOutOfMemory, out_of_memory
@@ -58,7 +58,7 @@ class FrameDrawer:
         self._speed: dict[tuple[str, float, int], float] = {}
         """Pixels a second of the last picture, by view, step and number of people."""
 
-    def draw(self, frame: Frame, report: Report) -> dict[str, Any]:
+    def draw(self, frame: FrameSpec, report: ReportProgress) -> dict[str, Any]:
         """Fills the frame band by band from the top, with a report after each; returns what it took.
 
         Raises what load_human and place_skinned do, ValueError for a frame of the wrong size or solids that are none,
@@ -83,7 +83,7 @@ class FrameDrawer:
             "seconds_march": round(seconds, 6),
         }
 
-    def _scene(self, people: tuple[Numbers, ...], frame: Frame) -> Scene:
+    def _scene(self, people: tuple[Numbers, ...], frame: FrameSpec) -> Scene:
         solids = None if frame.solids is None else self._solids(_stamp(frame.solids))
         if not people:
             return Scene(None, solids)
@@ -118,7 +118,7 @@ class FrameDrawer:
     def _load(self, file: Stamp) -> Human:
         return load_human(file[0]).to(self._device)
 
-    def _fill(self, picture: Picture, scene: Scene, frame: Frame, report: Report) -> float:
+    def _fill(self, picture: Picture, scene: Scene, frame: FrameSpec, report: ReportProgress) -> float:
         """Draws into the frame; returns the seconds of the marcher."""
         look = Look(
             frame.view,
@@ -135,7 +135,7 @@ class FrameDrawer:
             report("draw", done.rows, height, round(left, 3))
         return seconds
 
-    def _camera(self, frame: Frame) -> Camera:
+    def _camera(self, frame: FrameSpec) -> Camera:
         intrinsics, view = torch.tensor(frame.intrinsics), torch.tensor(frame.world_to_camera)
         whole = Camera(intrinsics.float(), view.float(), frame.width, frame.height).to(self._device)
         return whole if frame.region is None else whole.crop(*frame.corner, *frame.size)
@@ -158,7 +158,7 @@ def map_frame(path: Path, width: int, height: int) -> Picture:
     return Picture(combined.reshape(height, width, 4)[::-1], depth.reshape(height, width)[::-1])
 
 
-def _first_guess(frame: Frame) -> float:
+def _first_guess(frame: FrameSpec) -> float:
     """Pixels a second of an unknown machine, on the safe side: work grows with samples and with people."""
     plain = FIRST_PIXELS / BAND_SECONDS
     return plain * min(1.0, frame.step / MarchSettings().step) / max(1, len(frame.people))

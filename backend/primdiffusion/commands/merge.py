@@ -13,10 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from primdiffusion.commands.checks import check_voxel
 from primdiffusion.commands.frame import PosedPerson
-from primdiffusion.commands.progress import Pace, Report
-from primdiffusion.commands.request import parse
+from primdiffusion.commands.request import Pace, ReportProgress, check_voxel, parse
 from primdiffusion.formats.requests import DENSITY_GAIN, VOXEL
 from primdiffusion.staging import written_whole
 
@@ -46,7 +44,7 @@ class MergeRequest:
         check_voxel(self.voxel)
         _check_people(self.people)
 
-    def run(self, session: Session, report: Report) -> dict[str, Any]:
+    def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
         """Returns the grid's path and shape. Raises what load_human, place_skinned and merge do."""
         began = time.perf_counter()
         report("merge", 0, 1, None)
@@ -73,7 +71,7 @@ class MergeFramesRequest:
         check_voxel(self.voxel)
         _check_people(self.people)
 
-    def run(self, session: Session, report: Report) -> dict[str, Any]:
+    def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
         """Writes the grids one by one, each of them whole, so that a program may take them in meanwhile.
 
         Returns their paths. Raises as `MergeRequest`; what is there by then stays.
@@ -105,7 +103,7 @@ class FitGainRequest:
         """See `Request`."""
         _check_people(self.people)
 
-    def run(self, session: Session, report: Report) -> dict[str, Any]:
+    def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
         """The gain, from views around the person (see `fit_gain`); also raises as it."""
         import numpy as np  # late
 

@@ -9,9 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from primdiffusion.commands.checks import check_size
-from primdiffusion.commands.progress import Report, progress_bar
-from primdiffusion.commands.request import OutDir, parse
+from primdiffusion.commands.request import OutDir, ReportProgress, check_size, parse, progress_bar
 from primdiffusion.formats import requests
 
 if TYPE_CHECKING:
@@ -52,15 +50,15 @@ class ReconstructRequest:
             raise ValueError(f"{self.views} views were asked for: the encoder needs one or more")
         check_size(self.size)
 
-    def run(self, session: Session, report: Report) -> dict[str, Any]:
+    def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
         """Writes the person, all files or none; returns their paths, what was seen and what it took.
 
         Raises OSError before any work if the folder cannot be written to; what captured_person and load_encoder raise.
         """
         # torch is loaded late
         from primdiffusion.capture.conditioning import captured_person
+        from primdiffusion.commands.output import FILES, write_human
         from primdiffusion.machine import peak_memory_gb
-        from primdiffusion.person_folder import FILES, write_person
         from primdiffusion.reconstruction import reconstruct
         from primdiffusion.staging import staged
 
@@ -75,7 +73,7 @@ class ReconstructRequest:
             human = reconstruct(model, person)
             encoded = time.perf_counter()
             report("write", 3, STEPS, None)
-            write_person(folder, human, self.size)
+            write_human(folder, human, self.size)
             report("write", STEPS, STEPS, 0.0)  # the last chance to cancel
         return {
             **FILES.in_folder(self.out_dir),

@@ -64,8 +64,8 @@ class RefineCommand:
         """
         # torch is loaded late
         from primdiffusion.capture.conditioning import choose_subject, conditioning_views, default_betas
+        from primdiffusion.commands.output import write_human
         from primdiffusion.machine import best_device
-        from primdiffusion.person_folder import write_person
         from primdiffusion.staging import staged
         from primdiffusion.training.refine import RefineSettings, refine
         from primdiffusion.training.refine_views import view_psnr
@@ -88,7 +88,7 @@ class RefineCommand:
                     bar.update()
 
                 refined = refine(human, views, settings, on_step)
-            write_person(folder, refined.human, self.size)
+            write_human(folder, refined.human, self.size)
         seconds = f"{refined.steps} steps, {refined.seconds:.1f} s"
         print(f"{self.out}  {name}, {person.frames} frames, {len(given)} cameras, {seconds}")
         print(f"given views     {refined.psnr_before:.2f} -> {refined.psnr_after:.2f} dB")

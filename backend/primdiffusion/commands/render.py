@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from primdiffusion.commands.checks import check_angle, check_sides
-from primdiffusion.commands.progress import Report
-from primdiffusion.commands.request import parse
+from primdiffusion.commands.frame import FrameSpec
+from primdiffusion.commands.request import ReportProgress, check_angle, check_sides, parse
 from primdiffusion.drawing.steps import check_step
 from primdiffusion.formats.requests import PICTURE_SIZE, RAY_STEP, VIEWS, View
 from primdiffusion.staging import written_whole
@@ -47,7 +46,7 @@ class RenderRequest:
         check_sides(self.width, self.height)
         check_angle("yaw", self.yaw, "radians")
 
-    def run(self, session: Session, report: Report) -> dict[str, Any]:
+    def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
         """Returns the picture's path. Raises what load_human and read_pose do, and OSError."""
         # torch is loaded late
         from primdiffusion.human import framing, place
@@ -73,6 +72,17 @@ class RenderRequest:
                 depth_to_png(files.enter_context(written_whole(self.depth)), rendering)
         depth = None if self.depth is None else str(self.depth)
         return {"out": str(self.out), "depth": depth, "seconds": round(time.perf_counter() - began, 3)}
+
+
+@dataclasses.dataclass(frozen=True)
+class DrawRequest(FrameSpec):
+    """Draw posed humans into a mapped file, for the render engine and viewport. Needs no checkpoint."""
+
+    def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
+        """See `FrameDrawer.draw`."""
+        from primdiffusion.commands.frame_drawer import FrameDrawer  # torch is loaded late
+
+        return session.cached(FrameDrawer).draw(self, report)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,77 +1,95 @@
-"""Requests: frozen records that are read from JSON or from a command line. Imports no torch."""
+"""Requests: frozen records read from JSON or a command line, their checks and progress. Imports no torch."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
+import time
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar
 
 import tyro
+from tqdm import tqdm
 
 if TYPE_CHECKING:
-    from primdiffusion.commands.progress import Report
     from primdiffusion.commands.session import Session
+    from primdiffusion.diffusion.samplers import SamplerStep
 
 R = TypeVar("R")
 AnyRequest = TypeVar("AnyRequest", bound="Request")
 AnyChecked = TypeVar("AnyChecked", bound="Checked")
+LARGEST_SEED = 2**63 - 1
+STEP_LIMIT = 1000
+"""The schedule's length: a sampler cannot take more steps."""
+LARGEST_PREVIEW = 1024
+"""Pixels a side: a larger one would delay sampling and cancelling."""
+LARGEST_NUMBER = 1e30
+"""Products of larger numbers overflow float32."""
 
 
 class Checked(Protocol):
-    """A record of a command line whose values can be out of range."""
+    """A record of a command line with values to check."""
 
     def check(self) -> None:
-        """Raises ValueError, which names the field, for values that are out of range; reads no files."""
+        """Raise ValueError, naming the field, for values out of range; reads no files."""
+        ...
+
+
+class ReportProgress(Protocol):
+    """Receives the progress of a running request."""
+
+    def __call__(self, stage: str, step: int, total: int, eta_s: float | None, /, **more: Any) -> None:
+        """`eta_s`: seconds left; `more`: `picture`, a preview's path, and `index`, its sample. May raise to cancel."""
         ...
 
 
 class Request(Protocol):
-    """What a program or a user asks for; the records of this package are such dataclasses."""
+    """A request of a program or a user; the records of this package are such dataclasses."""
 
     def check(self) -> None:
-        """Raises ValueError, which names the field, for values that are out of range; reads no files."""
+        """Raise ValueError, naming the field, for values out of range; reads no files."""
         ...
 
-    def run(self, session: Session, report: Report) -> dict[str, Any]:
-        """Does the work; the result is JSON-RPC's (docs/design/protocol.md). `report` may raise to stop."""
+    def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
+        """Run the request; the result is that of JSON-RPC (docs/design/protocol.md). `report` may raise to cancel."""
         ...
 
 
-class RequestError(ValueError):
-    """Parameters that are unknown, missing or of another type; the message names the first."""
+class ParameterError(ValueError):
+    """A parameter that is unknown, missing or of a wrong type; the message names it."""
 
 
 def read_request(record: type[AnyRequest], params: dict[str, Any], method: str) -> AnyRequest:
-    """The request in a JSON object. Raises RequestError, and ValueError where `check` does."""
+    """Read and check a request. Raises ParameterError for a wrong parameter and ValueError for values out of range."""
     request = read_record(record, params, method)
     request.check()
     return request
 
 
 def read_record(record: type[R], params: dict[str, Any], name: str) -> R:
-    """A dataclass of a JSON object's values; `name` is what errors call the object. Raises RequestError.
+    """Read a dataclass from a JSON object, called `name` in errors. Raises ParameterError.
 
-    Fields may be bool, int, float, str, Path (a text that is not empty), Literal, list (of anything), list[T],
-    tuple[T, ...], dict[str, T], dataclasses and unions of these. A dataclass that has `from_json` reads itself.
+    Fields may be bool, int, float, str, Path (a non-empty string), Literal, list (of anything), list[T],
+    tuple[T, ...], dict[str, T], dataclasses and unions of these. A dataclass with a method `from_json` reads itself.
     """
     fields = {field.name: field for field in dataclasses.fields(record)}  # type: ignore[arg-type]
     if unknown := sorted(set(params) - set(fields)):
         known = ", ".join(fields) or "none"
-        raise RequestError(f"{name!r} does not know the parameter {unknown[0]!r}: its parameters are {known}")
+        raise ParameterError(f"{name!r} does not know the parameter {unknown[0]!r}: its parameters are {known}")
     for field in fields.values():
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and field.name not in params:
-            raise RequestError(f"{name!r} needs the parameter {field.name!r}: it was not given")
+            raise ParameterError(f"{name!r} needs the parameter {field.name!r}: it was not given")
     hints = typing.get_type_hints(record)
     return record(**{key: _value(hints[key], value, f"{name}.{key}") for key, value in params.items()})
 
 
 def _value(kind: Any, value: Any, name: str) -> Any:
-    """`value` as the type `kind`. Raises RequestError."""
+    """Convert `value` to the type `kind`. Raises ParameterError."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (types.UnionType, typing.Union):
         return _one_of(arguments, value, name)
@@ -91,14 +109,14 @@ def _value(kind: Any, value: Any, name: str) -> Any:
         return value
     if kind in (bool, int, str, list, types.NoneType) and type(value) is kind:
         return value
-    raise RequestError(f"{name} must be {_in_words(kind)}: {value!r:.80} was given")
+    raise ParameterError(f"{name} must be {_in_words(kind)}: {value!r:.80} was given")
 
 
 def _one_of(kinds: Sequence[Any], value: Any, name: str) -> Any:
     for kind in kinds:
-        with contextlib.suppress(RequestError):
+        with contextlib.suppress(ParameterError):
             return _value(kind, value, name)
-    raise RequestError(f"{name} must be {' or '.join(map(_in_words, kinds))}: {value!r:.80} was given")
+    raise ParameterError(f"{name} must be {' or '.join(map(_in_words, kinds))}: {value!r:.80} was given")
 
 
 _WORDS = {
@@ -121,14 +139,14 @@ def _in_words(kind: Any) -> str:
 
 
 def parse(record: type[AnyChecked], arguments: Sequence[str], command: str) -> AnyChecked:
-    """The request in a command line; ends the process with 2 for wrong usage. Raises ValueError where `check` does."""
+    """Read and check a command line; exits with 2 for a usage error, raises ValueError for values out of range."""
     request = tyro.cli(record, args=arguments, prog=f"primdiffusion {command}")
     request.check()
     return request
 
 
 def _words_to_attributes(words: list[str]) -> dict[str, Any]:
-    """NAME=VALUE words by name; what is wrong with them `checks.check_attributes` says, as of other requests."""
+    """Parse NAME=VALUE arguments; `check_attributes` validates them, as those in JSON."""
     attributes: dict[str, Any] = {}
     for word in words:
         name, _, value = word.partition("=")
@@ -137,7 +155,7 @@ def _words_to_attributes(words: list[str]) -> dict[str, Any]:
 
 
 OutDir = Annotated[Path, tyro.conf.arg(name="out")]
-"""A folder that is `out_dir` in JSON and --out on the command line."""
+"""An output folder: `out_dir` in JSON, --out on the command line."""
 Attributes = Annotated[
     dict[str, str | float],
     tyro.constructors.PrimitiveConstructorSpec(
@@ -148,4 +166,123 @@ Attributes = Annotated[
         str_from_instance=lambda attributes: [f"{name}={value}" for name, value in attributes.items()],
     ),
 ]
-"""What a person shall be: an object in JSON, NAME=VALUE words on the command line."""
+"""Attributes of a human: an object in JSON, NAME=VALUE arguments on the command line."""
+
+
+class Pace:
+    """Estimates the time left from all steps but the first, which warms up."""
+
+    def __init__(self) -> None:
+        self._times: list[float] = []
+
+    def left(self, done: int, total: int) -> float | None:
+        """Return the seconds until `total`; call it after each step. None after the first."""
+        self._times.append(time.perf_counter())
+        if len(self._times) < 2:
+            return None
+        return round((self._times[-1] - self._times[0]) / (len(self._times) - 1) * (total - done), 3)
+
+
+def step_reporter(
+    report: ReportProgress, picture: Callable[[SamplerStep], str | None]
+) -> Callable[[SamplerStep], None]:
+    """Return a function that reports a step with the seconds left and the path of its preview, if it has one."""
+    pace = Pace()
+
+    def on_step(step: SamplerStep) -> None:
+        path = picture(step)
+        more = {} if path is None else {"picture": path}
+        done = step.index + 1
+        report("sample", done, step.total, pace.left(done, step.total), **more)
+
+    return on_step
+
+
+@contextlib.contextmanager
+def progress_bar(label: str | None = None) -> Iterator[ReportProgress]:
+    """Show the sampler's steps on stderr, if that is a terminal."""
+    with tqdm(desc=label, unit="step", disable=None) as bar:
+
+        def report(stage: str, step: int, total: int, _eta_s: float | None, /, **_more: Any) -> None:
+            if stage == "sample":
+                bar.total = total
+                bar.update(step - bar.n)
+
+        yield report
+
+
+def check_seed(seed: int) -> None:
+    """Raise ValueError outside 0 ... 2^63-1."""
+    if not 0 <= seed <= LARGEST_SEED:
+        raise ValueError(f"seed {seed} is outside 0 ... 2^63-1")
+
+
+def check_steps(steps: int) -> None:
+    """Raise ValueError outside 1 ... STEP_LIMIT."""
+    if not 1 <= steps <= STEP_LIMIT:
+        raise ValueError(f"{steps} steps were asked for: choose 1 to {STEP_LIMIT}")
+
+
+def check_size(size: int) -> None:
+    """Raise ValueError for an empty picture."""
+    if size < 1:
+        raise ValueError(f"pictures of {size} pixels a side: choose 1 or more")
+
+
+def check_sides(width: int, height: int) -> None:
+    """Raise ValueError for an empty picture."""
+    if min(width, height) < 1:
+        raise ValueError(f"a picture of {width} x {height} pixels: choose sides of 1 or more")
+
+
+def check_picture_px(picture_px: int) -> None:
+    """Raise ValueError outside 0 ... LARGEST_PREVIEW."""
+    if not 0 <= picture_px <= LARGEST_PREVIEW:
+        raise ValueError(f"picture_px is {picture_px}: choose 0, for no pictures, to {LARGEST_PREVIEW}")
+
+
+def check_attributes(attributes: dict[str, Any], guidance: float) -> None:
+    """Raise ValueError unless all values are strings or finite numbers; the model checks which of them it knows."""
+    for name, value in attributes.items():
+        if not name or value == "":
+            raise ValueError(f"{name or value!r} is no attribute: write NAME=VALUE, as in outfit=suit or height=1.8")
+        if isinstance(value, list):
+            raise ValueError(f"the attribute {name!r} is given twice: give it once")
+        number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        if not (isinstance(value, str) or number):
+            raise ValueError(f"the attribute {name!r} is {value!r:.40}: give a text or a number")
+    if not math.isfinite(guidance):
+        raise ValueError(f"guidance is {guidance}: give a number, 1 for none")
+
+
+def check_voxel(voxel: float) -> None:
+    """Raise ValueError unless this is a positive length."""
+    if not (math.isfinite(voxel) and voxel > 0):
+        raise ValueError(f"voxel is {voxel}: give the side of a voxel in metres, above zero")
+
+
+def check_angle(name: str, angle: float, unit: str) -> None:
+    """Raise ValueError for NaN and infinite angles."""
+    if not math.isfinite(angle):
+        raise ValueError(f"{name} is {angle}: give an angle in {unit}")
+
+
+def check_betas(betas: list | None) -> None:
+    """Raise ValueError unless this is None or a list of numbers."""
+    if betas is not None:
+        check_numbers("betas", betas, (len(betas),))
+
+
+def check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> None:
+    """Raise ValueError unless `value` holds numbers that fit into float32, in nested lists of this shape."""
+    if not shape:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError(f"{name} holds {value!r:.40} where a number should be")
+        if not -LARGEST_NUMBER <= value <= LARGEST_NUMBER:
+            raise ValueError(f"{name} holds {value!r:.40}: give finite numbers, of at most {LARGEST_NUMBER:g}")
+        return
+    if not isinstance(value, list) or len(value) != shape[0]:
+        given = f"{len(value)} entries" if isinstance(value, list) else f"{value!r:.40}"
+        raise ValueError(f"{name} holds {given} where {' x '.join(map(str, shape))} numbers should be")
+    for entry in value:
+        check_numbers(name, entry, shape[1:])

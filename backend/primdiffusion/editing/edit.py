@@ -14,7 +14,7 @@ from torch import Tensor
 from primdiffusion.diffusion.model import DiffusionModel, seeded
 from primdiffusion.diffusion.samplers import Denoise, SamplerStep
 from primdiffusion.diffusion.schedule import Schedule, trailing_steps
-from primdiffusion.editing.unit_interval import check_unit_interval
+from primdiffusion.formats.requests import check_unit_interval
 from primdiffusion.human import Human
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import Payload

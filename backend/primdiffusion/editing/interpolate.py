@@ -24,8 +24,8 @@ from primdiffusion.editing.edit import (
     run_sampler,
     with_edit,
 )
-from primdiffusion.editing.unit_interval import check_unit_interval
 from primdiffusion.formats import requests
+from primdiffusion.formats.requests import check_unit_interval
 from primdiffusion.human import Human, made_by
 from primdiffusion.primitives.primitives import Payload
 

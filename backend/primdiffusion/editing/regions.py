@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, default_body
+from primdiffusion.formats.arrays import read_arrays
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import PARTS, SIDED_PARTS
 from primdiffusion.geometry.surface import surface_points
@@ -62,6 +65,14 @@ _UNIONS = {
 """Names for several parts together."""
 DISJOINT = ("face", "hair", "neck", "torso", "hips", *SIDED_PARTS)
 """A partition of all primitives."""
+
+
+def read_weights(path: str | Path) -> Float[Tensor, "v"]:
+    """Read painted weights. Raises FileNotFoundError, and ValueError for a file without usable weights."""
+    weights = read_arrays(path, ("weights",))["weights"]
+    if weights.dtype.kind not in "fiub" or weights.ndim != 1:
+        raise ValueError(f"weights in {path} are {weights.dtype} {weights.shape}: give one number for each vertex")
+    return torch.from_numpy(weights.astype(np.float32))
 
 
 def region_of(names: Sequence[str], body_setup: BodySetup | None = None) -> Bool[Tensor, "k"]:

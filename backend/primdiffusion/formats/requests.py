@@ -1,4 +1,6 @@
-"""What requests may say, and their defaults: on the command line, in JSON-RPC and in the extension's panels."""
+"""Values and defaults of requests: on the command line, in JSON-RPC and in the extension's panels."""
+
+from __future__ import annotations
 
 from typing import Literal, get_args
 
@@ -6,11 +8,11 @@ Sampler = Literal["ddim", "dpmpp_2m", "ddpm"]
 SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
 """The first is the default."""
 Transfer = Literal["texture", "garment"]
-"""What one person can get from another: colours alone, or shape too."""
+"""What is copied from another human: colours, or shape too."""
 TRANSFERS: tuple[Transfer, ...] = get_args(Transfer)
 """The first is the default."""
 View = Literal["colour", "depth", "alpha", "boxes"]
-"""What is drawn of people: their colours, their distance in colours, their coverage in grey, their boxes."""
+"""Colours, depth in false colours, alpha in grey, or the primitives as boxes."""
 VIEWS: tuple[View, ...] = get_args(View)
 """The first is the default."""
 WHOLE_PARTS = (
@@ -21,34 +23,40 @@ SIDED_PARTS = (
     "left_upper_arm", "right_upper_arm", "left_forearm", "right_forearm", "left_hand", "right_hand",
     "left_thigh", "right_thigh", "left_shin", "right_shin", "left_foot", "right_foot",
 )  # fmt: skip
-"""Left and right are the person's own."""
+"""Left and right as seen by the human."""
 PARTS = (*WHOLE_PARTS, *SIDED_PARTS)
-"""Parts of the body, which make up regions."""
+"""Body parts that regions consist of."""
 
 STEPS = 30
-"""Of the sampler."""
+"""Sampler steps."""
 GUIDANCE = 1.5
-"""How strongly attributes are followed: 1 plainly, more at the cost of variety."""
+"""Weight of classifier-free guidance; 1 is plain conditioning, more costs variety."""
 AMOUNT = 0.5
-"""How far a variant may be from its person: 0 the same, 1 hardly anything in common."""
+"""Strength of a variation: 0 changes nothing, 1 leaves hardly anything in common."""
 FRACTION = 0.5
-"""Of the way from one person to another."""
+"""Position between two humans."""
 CAPTURE_VIEWS = 8
-"""Cameras that the encoder looks at."""
+"""Cameras whose images the encoder gets."""
 PICTURE_SIZE = 512
-"""Pixels a side."""
+"""Width and height of previews, pixels."""
 VARIATION_SIZE = 256
-"""Pixels a side."""
+"""Width and height of the previews of variations, pixels."""
 RAY_STEP = 0.004
 """Metres between samples of a ray."""
 DENSITY_GAIN = 1.6
 """Factor on density for renderers with exponential absorption."""
 VOXEL = 0.006
-"""Metres a side, of the grids that people are merged into and that proxies are found on. Half of it shows more of the
-primitives' own voxels (2 to 14 mm) at eight times the memory."""
+"""Voxel size of merged grids and of the grid for proxies, metres. Half of it resolves more of the primitives' own
+voxels (2 to 14 mm) at eight times the memory."""
 TRIANGLES = 20_000
-"""Of a proxy, at most."""
+"""Limit for a proxy."""
 TEXTURE_SIZE = 2048
-"""Of a proxy, pixels a side."""
+"""Width and height of a proxy's texture, pixels."""
 GAUSSIANS = 400_000
-"""At most."""
+"""Limit for an export."""
+
+
+def check_unit_interval(name: str, value: float) -> None:
+    """Raise ValueError unless `value` is in [0, 1]."""
+    if not 0 <= value <= 1:
+        raise ValueError(f"{name} is {value}: choose a number from 0 to 1")

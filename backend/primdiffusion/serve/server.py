@@ -22,19 +22,14 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn, TypeVar
 
 from primdiffusion import __version__
-from primdiffusion.commands.attributes import AttributesRequest
-from primdiffusion.commands.draw import DrawRequest
+from primdiffusion.commands.edit import InpaintRequest, InterpolateRequest, TransferRequest, VaryRequest
 from primdiffusion.commands.export import GaussiansRequest, HumanNpzRequest, ProxyRequest
-from primdiffusion.commands.generate import GenerateRequest
-from primdiffusion.commands.inpaint import InpaintRequest
-from primdiffusion.commands.interpolate import InterpolateRequest
+from primdiffusion.commands.generate import GenerateRequest, VariationsRequest
+from primdiffusion.commands.info import AttributesRequest
 from primdiffusion.commands.merge import FitGainRequest, MergeFramesRequest, MergeRequest
 from primdiffusion.commands.reconstruct import ReconstructRequest
-from primdiffusion.commands.render import RenderRequest
-from primdiffusion.commands.request import Request, RequestError, read_record, read_request
-from primdiffusion.commands.transfer import TransferRequest
-from primdiffusion.commands.variations import VariationsRequest
-from primdiffusion.commands.vary import VaryRequest
+from primdiffusion.commands.render import DrawRequest, RenderRequest
+from primdiffusion.commands.request import ParameterError, Request, read_record, read_request
 from primdiffusion.failures import Failure, describe
 from primdiffusion.machine import memory, share_processors
 from primdiffusion.serve.rpc import (
@@ -211,7 +206,9 @@ class Server:
     def _warm_up(self) -> Session | RpcError:
         """Imports torch and all that needs it; a broken environment becomes the error of every later request."""
         try:
-            from primdiffusion.commands.session import Session  # after `hello` can be answered
+            # after `hello` can be answered
+            from primdiffusion.commands import frame_drawer, output  # noqa: F401  loaded before the first request
+            from primdiffusion.commands.session import Session
 
             session = Session()
         except Exception as e:
@@ -264,7 +261,7 @@ def _parameters(read: Callable[[type[R], dict[str, Any], str], R], record: type[
     """The parameters of a message; ValueErrors of reading become RpcError(INVALID_PARAMS)."""
     try:
         return read(record, message.params, message.method)
-    except RequestError as e:
+    except ParameterError as e:
         raise RpcError(INVALID_PARAMS, str(e)) from e
     except ValueError as e:
         raise RpcError(INVALID_PARAMS, f"{message.method!r}: {e}") from e

@@ -6,15 +6,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from primdiffusion.commands import step_pictures as pictures
-from primdiffusion.commands.edit import Region
+from primdiffusion.commands import output
+from primdiffusion.commands.edit import InpaintRequest, InterpolateRequest, Region, TransferRequest, VaryRequest
 from primdiffusion.commands.generate import GenerateRequest
-from primdiffusion.commands.inpaint import InpaintRequest
-from primdiffusion.commands.interpolate import InterpolateRequest
+from primdiffusion.commands.output import PreviewBudget, PreviewFiles, draw_front_and_back, step_previews
 from primdiffusion.commands.session import Session
-from primdiffusion.commands.step_pictures import Allowance, PassingPictures, draw_front_and_back, step_pictures
-from primdiffusion.commands.transfer import TransferRequest
-from primdiffusion.commands.vary import VaryRequest
 from primdiffusion.diffusion.samplers import SamplerStep
 from tiny_model import save_tiny_checkpoint
 
@@ -22,7 +18,7 @@ FILES = ["depth.png", "front.png", "human.npz", "person.human.safetensors", "sid
 
 
 class Clock:
-    """Time that passes when it is told to."""
+    """A clock that the test advances."""
 
     def __init__(self):
         self.now = 0.0
@@ -34,7 +30,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch):
     clock = Clock()
-    monkeypatch.setattr(pictures.time, "perf_counter", clock)
+    monkeypatch.setattr(output.time, "perf_counter", clock)
     return clock
 
 
@@ -46,8 +42,8 @@ def checkpoint(tmp_path_factory) -> str:
 @pytest.fixture
 def always(monkeypatch):
     """Every step gets its picture."""
-    monkeypatch.setattr(pictures, "INTERVAL_S", 0.0)
-    monkeypatch.setattr(Allowance, "granted", lambda _: True)
+    monkeypatch.setattr(output, "INTERVAL_S", 0.0)
+    monkeypatch.setattr(PreviewBudget, "granted", lambda _: True)
 
 
 class Listener:
@@ -64,12 +60,12 @@ class Listener:
 
 
 def test_pictures_come_no_more_often_than_the_interval_and_take_a_quarter_of_the_time_at_most(clock):
-    allowance, times, spent = Allowance(0.4), [], 0.0
+    budget, times, spent = PreviewBudget(0.4), [], 0.0
     for _ in range(300):
         clock.now += 0.05
-        if allowance.granted():
+        if budget.granted():
             times.append(clock.now)
-            with allowance.spending():
+            with budget.spending():
                 clock.now += 0.3
             spent += 0.3
     gaps = [later - earlier - 0.3 for earlier, later in itertools.pairwise(times)]
@@ -78,21 +74,21 @@ def test_pictures_come_no_more_often_than_the_interval_and_take_a_quarter_of_the
 
 
 def test_quick_pictures_come_at_the_interval(clock):
-    allowance, drawn = Allowance(0.5), 0
+    budget, drawn = PreviewBudget(0.5), 0
     for _ in range(100):
         clock.now += 1 / 8
-        if allowance.granted():
+        if budget.granted():
             drawn += 1
-            with allowance.spending():
+            with budget.spending():
                 clock.now += 1 / 1024
     assert drawn == 25
 
 
 def test_at_most_the_last_two_pictures_are_there_and_none_in_the_end(tmp_path):
-    with PassingPictures(tmp_path, 2) as passing:
+    with PreviewFiles(tmp_path, 2) as files:
         names = []
         for _ in range(4):
-            names.append(passing.next())
+            names.append(files.next())
             names[-1].touch()
         assert sorted(tmp_path.iterdir()) == names[-2:]
         assert len(set(names)) == 4
@@ -100,12 +96,12 @@ def test_at_most_the_last_two_pictures_are_there_and_none_in_the_end(tmp_path):
 
 
 def test_without_pixels_nothing_is_drawn(tmp_path):
-    with step_pictures(tmp_path, 0, pytest.fail) as picture:
+    with step_previews(tmp_path, 0, pytest.fail) as picture:
         assert picture(SamplerStep(0, 2, 500, torch.zeros(1), torch.zeros(1))) is None
 
 
 def test_the_last_step_has_no_picture_for_the_result_follows(tmp_path, always):
-    with step_pictures(tmp_path, 16, pytest.fail) as picture:
+    with step_previews(tmp_path, 16, pytest.fail) as picture:
         assert picture(SamplerStep(1, 2, 500, torch.zeros(1), torch.zeros(1))) is None
 
 

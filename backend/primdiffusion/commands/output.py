@@ -1,0 +1,168 @@
+"""The files of a human in an output folder, and previews while it is sampled."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from primdiffusion.body.model import BodyPose
+from primdiffusion.diffusion.samplers import SamplerStep
+from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.human import Human, framing, place
+from primdiffusion.human_file import export_for_blender, save_human
+from primdiffusion.render.image import depth_to_png, rgba_to_png, to_png
+from primdiffusion.render.march import march
+
+INTERVAL_S = 0.4
+"""Seconds between two previews."""
+TIME_SHARE = 0.25
+"""Largest fraction of the time spent on previews."""
+PREVIEWS = 2
+"""Files at a time: one may still be being read when the next one appears."""
+THREE_QUARTERS = math.radians(20)
+ARMS_DOWN = math.radians(62)
+
+Decode = Callable[[Tensor], Human | None]
+"""Decodes an x0 guess [b, ...] of a sampler to a human; None if there is nothing to show yet."""
+
+
+@dataclasses.dataclass(frozen=True)
+class OutputFiles:
+    """File names in an output folder."""
+
+    blender: str = "human.npz"
+    human: str = "person.human.safetensors"
+    front: str = "front.png"
+    side: str = "side.png"
+    depth: str = "depth.png"
+
+    def in_folder(self, folder: Path) -> dict[str, str]:
+        """Return the paths by their names in responses."""
+        names = {"human": self.blender, "person": self.human, "preview": self.front, "side": self.side}
+        return {name: str(folder / file) for name, file in {**names, "depth": self.depth}.items()}
+
+
+FILES = OutputFiles()
+
+
+def write_human(folder: Path, human: Human, size: int) -> None:
+    """Write all FILES: the human for Blender and for this program, and previews of size x size pixels in the T pose.
+
+    The first preview on a machine takes some seconds longer: the marcher is compiled, and cached. Raises OSError.
+    """
+    export_for_blender(folder / FILES.blender, human)
+    save_human(folder / FILES.human, human)
+    primitives = place(human)
+    front = march(primitives, framing(primitives, 0.0, size, size))
+    to_png(folder / FILES.front, front)
+    depth_to_png(folder / FILES.depth, front)
+    to_png(folder / FILES.side, march(primitives, framing(primitives, math.pi / 2, size, size)))
+
+
+class PreviewBudget:
+    """Limits previews to one every `interval_s` seconds and to TIME_SHARE of the time."""
+
+    def __init__(self, interval_s: float = INTERVAL_S) -> None:
+        self._interval_s = interval_s
+        self._began = self._last = time.perf_counter()
+        self._spent, self._cost = 0.0, 0.0
+        self._drawn = 0
+
+    def granted(self) -> bool:
+        """Return whether a preview that takes as long as the last one may be drawn now."""
+        now = time.perf_counter()
+        affordable = self._spent + self._cost <= TIME_SHARE * (now - self._began + self._cost)
+        return now - self._last >= self._interval_s and affordable
+
+    @contextlib.contextmanager
+    def spending(self) -> Iterator[None]:
+        """Measure the drawing of a preview, except of the first, which loads and compiles the marcher."""
+        began = time.perf_counter()
+        yield
+        self._last = time.perf_counter()
+        if self._drawn:
+            self._cost = self._last - began
+            self._spent += self._cost
+        self._drawn += 1
+
+
+class PreviewFiles(contextlib.AbstractContextManager):
+    """Temporary files in `folder`: each has a new name, the last `count` stay, and all are removed at the end."""
+
+    def __init__(self, folder: Path, count: int) -> None:
+        self._folder, self._limit = folder, count
+        self._named: list[Path] = []
+        self._count = 0
+
+    def next(self) -> Path:
+        """Return the next name and remove the oldest file."""
+        self._count += 1
+        self._named.append(self._folder / f"passing_{self._count:04d}.png")
+        self._remove(self._named[: -self._limit])
+        self._named = self._named[-self._limit :]
+        return self._named[-1]
+
+    def __exit__(self, *_: object) -> None:
+        self._remove(self._named)
+
+    def _remove(self, paths: list[Path]) -> None:
+        for path in paths:
+            with contextlib.suppress(OSError):  # Windows keeps a file that is being read; it is removed with the folder
+                path.unlink()
+
+
+@contextlib.contextmanager
+def step_previews(folder: Path, px: int, decode: Decode) -> Iterator[Callable[[SamplerStep], str | None]]:
+    """Yield a function to call after each step: it may draw a preview of px x px pixels and returns its path, or None.
+
+    Earlier previews are removed. px = 0 draws none.
+    """
+    if px == 0:
+        yield lambda _step: None
+        return
+    budget = PreviewBudget()
+
+    def preview(step: SamplerStep) -> str | None:
+        if step.index + 1 == step.total or not budget.granted():  # the result follows the last step
+            return None
+        with budget.spending():
+            human = decode(step.x0)
+            if human is None:
+                return None
+            path = files.next()
+            draw_front(path, human, px)
+        return str(path)
+
+    with PreviewFiles(folder, PREVIEWS) as files:
+        yield preview
+
+
+def draw_front(path: Path, human: Human, px: int) -> None:
+    """Draw the human in the T pose from the front, px x px pixels with a transparent background."""
+    primitives = place(human)
+    to_png(path, march(primitives, framing(primitives, 0.0, px, px)), None)
+
+
+def draw_front_and_back(path: Path, human: Human, px: int) -> None:
+    """Draw the human with lowered arms, front and back side by side, px x px pixels with a transparent background."""
+    primitives = place(human, a_pose())
+    views = []
+    for yaw in (THREE_QUARTERS, THREE_QUARTERS + math.pi):
+        view = march(primitives, framing(primitives, yaw, px // 2, px))
+        views.append(torch.cat([view.rgb, view.alpha[..., None]], dim=-1))
+    rgba_to_png(path, torch.cat(views, dim=1), None)
+
+
+def a_pose() -> BodyPose:
+    """Return the pose with arms lowered to the sides, away from the body."""
+    theta = torch.zeros(len(JOINT_NAMES), 3)
+    theta[JOINT_NAMES.index("left_shoulder"), 2] = -ARMS_DOWN
+    theta[JOINT_NAMES.index("right_shoulder"), 2] = ARMS_DOWN
+    return BodyPose.from_axis_angle(theta.flatten())
