@@ -24,8 +24,7 @@ from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import Captures, open_captures
-from primdiffusion.encoder.checkpoint import load_encoder
-from primdiffusion.encoder.encode import EncoderModel
+from primdiffusion.encoder.model import EncoderModel, load_encoder
 from primdiffusion.evaluation.image_metrics import Lpips, load_lpips
 from primdiffusion.evaluation.reconstruction import EvaluationSettings, Means, evaluate, summary, table
 from primdiffusion.formats.camera_rig import Rig

@@ -18,8 +18,7 @@ from primdiffusion.capture.conditioning import conditioning_views, default_betas
 from primdiffusion.capture.reader import Captures, open_captures
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Look, Scene
-from primdiffusion.encoder.checkpoint import load_encoder
-from primdiffusion.encoder.encode import EncoderModel
+from primdiffusion.encoder.model import EncoderModel, load_encoder
 from primdiffusion.evaluation.reconstruction import picture
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb

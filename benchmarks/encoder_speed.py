@@ -14,7 +14,7 @@ from primdiffusion.capture.conditioning import captured_person
 from primdiffusion.capture.dataset import batches
 from primdiffusion.capture.reader import Captures
 from primdiffusion.encoder.config import PRESETS
-from primdiffusion.encoder.encode import EncoderModel, look_up
+from primdiffusion.encoder.model import EncoderModel, look_up
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import Payload, Primitives

@@ -34,8 +34,7 @@ from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.render.march import march
 from primdiffusion.training.refine import RefineSettings, refine
-from primdiffusion.training.refine_start import bare_body, meshed_person
-from primdiffusion.training.refine_views import view_psnr
+from primdiffusion.training.refine_views import bare_body, meshed_person, view_psnr
 from record import tell
 
 SEED = 30_000_000

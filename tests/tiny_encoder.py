@@ -3,9 +3,8 @@
 from pathlib import Path
 
 import torch
-from primdiffusion.encoder.checkpoint import save_encoder
 from primdiffusion.encoder.config import EncoderConfig
-from primdiffusion.encoder.encode import EncoderModel
+from primdiffusion.encoder.model import EncoderModel, save_encoder
 from primdiffusion.encoder.network import Encoder
 
 TINY = EncoderConfig(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from primdiffusion import __version__
 from primdiffusion.capture.conditioning import CapturedPerson
-from primdiffusion.encoder.encode import EncoderModel, betas_of_frames
+from primdiffusion.encoder.model import EncoderModel, betas_of_frames
 from primdiffusion.human import Human
 
 

@@ -1,4 +1,8 @@
-"""How a process of a pool starts: with one thread, and never outliving its parent."""
+"""Worker processes: one thread each, ending with their parent.
+
+A function may run in a process of its own: igl and xatlas hold the GIL for seconds, in which calls could not be
+cancelled and the child would look dead to its parent.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +10,18 @@ import multiprocessing
 import os
 import signal
 import threading
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+POLL_S = 0.2
 
 
 def begin_worker() -> None:
-    """One thread for torch, which ignores part of the environment; the process ends with its parent.
+    """Limit torch, which ignores part of the environment, to one thread, and end the process with its parent.
 
-    A pool's workers would outlive a parent that is killed, and stay on the processors. Ctrl-C is left to the parent,
-    which lets workers finish what they are doing.
+    The workers of a pool would outlive a killed parent and keep computing. Ctrl-C is left to the parent, which lets
+    workers finish.
     """
     import torch  # only in the worker
 
@@ -21,7 +30,7 @@ def begin_worker() -> None:
 
 
 def end_with_parent() -> None:
-    """What `begin_worker` does for a process without torch."""
+    """End with the parent and ignore Ctrl-C, in a process without torch."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -31,3 +40,42 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
+
+
+class ProcessDied(RuntimeError):
+    """The process exited without returning a result."""
+
+
+def run_in_process(function: Callable[..., Any], *arguments: Any, meanwhile: Callable[[], None]) -> Any:
+    """Return `function(*arguments)`, computed in a spawned process; arguments and result are pickled.
+
+    The process imports the function's module, so that module should import quickly. `meanwhile` is called every
+    POLL_S; an exception it raises kills the process. Raises the function's own exceptions, and ProcessDied.
+    """
+    context = multiprocessing.get_context("spawn")
+    answers, answering = context.Pipe(duplex=False)
+    process = context.Process(target=_answer, args=(answering, function, arguments), daemon=True)
+    process.start()
+    answering.close()
+    try:
+        while not answers.poll(POLL_S):
+            meanwhile()
+        done, answer = answers.recv()
+    except EOFError as e:
+        raise ProcessDied(f"the process of {function.__name__} died, perhaps out of memory: try again") from e
+    finally:
+        process.kill()
+        process.join()
+        answers.close()
+    if not done:
+        raise answer
+    return answer
+
+
+def _answer(answering: Connection, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    end_with_parent()
+    try:
+        answer = True, function(*arguments)
+    except Exception as e:
+        answer = False, e
+    answering.send(answer)

@@ -16,9 +16,9 @@ from primdiffusion.cli import main
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.failures import describe
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
-from primdiffusion.training import fit_pictures, fit_record
+from primdiffusion.training import fit_run
 from primdiffusion.training.fit_config import FitConfig
-from primdiffusion.training.fit_folder import MODEL, STATE
+from primdiffusion.training.fit_run import MODEL, STATE
 from primdiffusion.training.run_folder import METRICS
 from safetensors.torch import load_file
 from tiny_encoder import TINY
@@ -31,9 +31,9 @@ WHOLE = {"config.json", "run.json", METRICS, MODEL, STATE, "pictures"}
 def make_small(patch: pytest.MonkeyPatch) -> None:
     """The default encoder becomes a tiny one, and what is measured small."""
     patch.setitem(PRESETS, "default", dataclasses.replace(TINY, appearance="texels"))
-    patch.setattr(fit_pictures, "SIZE", 24)
-    patch.setattr(fit_record, "measure", functools.partial(fit_pictures.measure, people=1))
-    patch.setattr(fit_record, "write_pictures", functools.partial(fit_pictures.write_pictures, people=2))
+    patch.setattr(fit_run, "SIZE", 24)
+    patch.setattr(fit_run, "measure", functools.partial(fit_run.measure, people=1))
+    patch.setattr(fit_run, "write_pictures", functools.partial(fit_run.write_pictures, people=2))
     forget_processes()
 
 

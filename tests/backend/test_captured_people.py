@@ -10,7 +10,7 @@ from diffusion_people import write_people
 from primdiffusion import cli
 from primdiffusion.capture.conditioning import captured_person
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.encoder.checkpoint import load_encoder
+from primdiffusion.encoder.model import load_encoder
 from primdiffusion.formats.capture_layout import picture_path
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.training.captured_people import EncodeSettings, encode_people, frames_of_looks, read_cards

@@ -9,8 +9,8 @@ from primdiffusion.capture.conditioning import conditioning_views, default_betas
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.encoder.checkpoint import default_encoder, load_encoder
 from primdiffusion.encoder.config import PRESETS
+from primdiffusion.encoder.model import default_encoder, load_encoder
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.render.march import march

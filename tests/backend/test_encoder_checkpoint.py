@@ -6,8 +6,7 @@ import json
 import pytest
 import torch
 from primdiffusion.diffusion.checkpoint import CheckpointError
-from primdiffusion.encoder.checkpoint import load_encoder, save_encoder
-from primdiffusion.encoder.encode import EncoderModel
+from primdiffusion.encoder.model import EncoderModel, load_encoder, save_encoder
 from primdiffusion.encoder.network import Encoder
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file

@@ -7,7 +7,7 @@ import pytest
 import torch
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.dataset import Views, stack
-from primdiffusion.encoder.encode import encode, frames_of, look_up
+from primdiffusion.encoder.model import encode, frames_of, look_up
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.encoder.unproject import unproject_voxels
 from primdiffusion.geometry.camera import look_at

@@ -7,7 +7,7 @@ import torch
 from primdiffusion.body.model import BodyPose, J
 from primdiffusion.encoder.blocks import ConcatenatedAttention, CrossModalAttention, UntiedConv
 from primdiffusion.encoder.config import PRESETS, EncoderConfig
-from primdiffusion.encoder.encode import frames_of
+from primdiffusion.encoder.model import frames_of
 from primdiffusion.encoder.network import Encoder, clamp, fill, voxels
 from primdiffusion.encoder.unproject import Unprojected
 from primdiffusion.geometry.srgb import encode_srgb

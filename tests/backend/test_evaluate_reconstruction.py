@@ -10,9 +10,8 @@ from primdiffusion import cli
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.conditioning import ConditioningError, spread_cameras
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.encoder.checkpoint import save_encoder
 from primdiffusion.encoder.config import EncoderConfig
-from primdiffusion.encoder.encode import EncoderModel
+from primdiffusion.encoder.model import EncoderModel, save_encoder
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation import command
 from primdiffusion.evaluation.reconstruction import (

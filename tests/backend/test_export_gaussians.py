@@ -8,8 +8,7 @@ import splatter
 import torch
 from export_people import person
 from primdiffusion.body.model import BodyPose
-from primdiffusion.export.gaussian_file import PROPERTIES, write_gaussians
-from primdiffusion.export.gaussians import gaussians_of
+from primdiffusion.export.gaussians import PROPERTIES, gaussians_of, write_gaussians
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import framing, place
 from primdiffusion.render.march import march

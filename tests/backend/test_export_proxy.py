@@ -10,8 +10,15 @@ import trimesh
 from export_people import person
 from PIL import Image
 from primdiffusion.body.model import BodyPose
-from primdiffusion.export.proxy import ProxySettings, mesh_proxy
-from primdiffusion.export.proxy_files import ARRAYS, TEXTURE, write_proxy_arrays, write_proxy_glb, write_proxy_obj
+from primdiffusion.export.proxy import (
+    ARRAYS,
+    TEXTURE,
+    ProxySettings,
+    mesh_proxy,
+    write_proxy_arrays,
+    write_proxy_glb,
+    write_proxy_obj,
+)
 from primdiffusion.human import framing, place, pose_body
 from primdiffusion.raster.rasterise import rasterise
 from primdiffusion.render.march import march

@@ -15,20 +15,18 @@ from fit_scenes import WHOLE, files, flags, make_small, rows, sentence, settings
 from PIL import Image
 from primdiffusion.capture.dataset import ALONE, FIRST
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.encoder.checkpoint import load_encoder
 from primdiffusion.encoder.config import PRESETS
+from primdiffusion.encoder.model import load_encoder
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.training import fit as fit_module
 from primdiffusion.training import recorder as recorder_module
 from primdiffusion.training import run_folder
-from primdiffusion.training.fit import fit
-from primdiffusion.training.fit_command import run
+from primdiffusion.training.fit import fit, run
 from primdiffusion.training.fit_config import FitConfig, LossConfig
 from primdiffusion.training.fit_data import fit_batches, fit_dataset
-from primdiffusion.training.fit_folder import MODEL, STATE
 from primdiffusion.training.fit_losses import volume_loss
-from primdiffusion.training.fit_state import FitState
+from primdiffusion.training.fit_run import MODEL, STATE, FitState
 from primdiffusion.training.run_folder import METRICS, PICTURES
 from safetensors.torch import load_file
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 from capture_scenes import captured
 from fit_scenes import WHOLE, child_environment, files, flags, logged, make_small, settings
-from primdiffusion.encoder.checkpoint import load_encoder
+from primdiffusion.encoder.model import load_encoder
 from primdiffusion.training.fit import fit
-from primdiffusion.training.fit_folder import MODEL, STATE
+from primdiffusion.training.fit_run import MODEL, STATE
 from safetensors.torch import load_file
 
 SCRIPT = Path(__file__).with_name("fit_scenes.py")

@@ -14,13 +14,12 @@ import pytest
 import torch
 from capture_scenes import captured
 from fit_scenes import WHOLE, child_environment, files, logged, make_small, rows, same_tensors, sentence, settings
-from primdiffusion.encoder.checkpoint import load_encoder
 from primdiffusion.encoder.config import PRESETS
+from primdiffusion.encoder.model import load_encoder
 from primdiffusion.training import interrupt as interrupt_module
 from primdiffusion.training.fit import fit
 from primdiffusion.training.fit_config import LossConfig
-from primdiffusion.training.fit_folder import MODEL, STATE
-from primdiffusion.training.fit_state import FitState
+from primdiffusion.training.fit_run import MODEL, STATE, FitState
 from primdiffusion.training.interrupt import Interrupt
 from primdiffusion.training.run_folder import CONFIG, METRICS, RUN
 from primdiffusion.training.state import TrainingState

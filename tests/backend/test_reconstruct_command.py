@@ -18,9 +18,8 @@ from primdiffusion.commands import output
 from primdiffusion.commands.reconstruct import ReconstructRequest
 from primdiffusion.commands.request import read_request
 from primdiffusion.commands.session import Session
-from primdiffusion.encoder import checkpoint as encoder_checkpoint
-from primdiffusion.encoder.checkpoint import load_encoder
-from primdiffusion.encoder.encode import EncoderModel
+from primdiffusion.encoder import model as encoder_model
+from primdiffusion.encoder.model import EncoderModel, load_encoder
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.formats.capture_layout import LIST_FILE, SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE, picture_path
 from primdiffusion.geometry.textured_mesh import TexturedMesh
@@ -192,7 +191,7 @@ def test_the_encoder_stays_loaded_until_another_is_asked_for(dataset, checkpoint
     load = load_encoder
     monkeypatch.setattr(output, "write_human", lambda *_: None)
     counted = lambda path, device: loaded.append(path) or load(path, device)  # noqa: E731
-    monkeypatch.setattr(encoder_checkpoint, "load_encoder", counted)
+    monkeypatch.setattr(encoder_model, "load_encoder", counted)
     other = save_tiny_encoder(tmp_path / "other.safetensors")
     session = Session()
     for path in (checkpoint, checkpoint, other):

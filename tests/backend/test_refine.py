@@ -24,8 +24,7 @@ from primdiffusion.primitives.primitives import K, Payload, S
 from primdiffusion.render.march import march
 from primdiffusion.staging import STAGING_PREFIX
 from primdiffusion.training.refine import RefineSettings, refine
-from primdiffusion.training.refine_start import bare_body
-from primdiffusion.training.refine_views import view_psnr
+from primdiffusion.training.refine_views import bare_body, view_psnr
 
 QUICK = RefineSettings(steps=15, views=1, density_rate=0.01)
 """So few steps on so few pixels of random boxes: density, which is right at the start, must not run ahead of colour."""

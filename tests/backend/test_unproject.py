@@ -7,8 +7,7 @@ import pytest
 import torch
 from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
 from primdiffusion.capture.dataset import Views, stack
-from primdiffusion.encoder.sampling import COVERED, TOLERANCE
-from primdiffusion.encoder.unproject import SIDE, unproject_texels, unproject_voxels
+from primdiffusion.encoder.unproject import COVERED, SIDE, TOLERANCE, unproject_texels, unproject_voxels
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.surface import surface_points, vertex_normals

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from primdiffusion.checkpoints import load_checkpoint
-from primdiffusion.encoder.checkpoint import load_encoder
+from primdiffusion.encoder.model import load_encoder
 from primdiffusion.evaluation import command
 from primdiffusion.evaluation.command import StageTwo, TrainedReconstructor
 from primdiffusion.machine import best_device

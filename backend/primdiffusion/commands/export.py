@@ -47,8 +47,7 @@ class ProxyRequest:
         Raises OSError before any work if the folder cannot be written to; what load_human and mesh_proxy raise.
         """
         # torch is loaded late
-        from primdiffusion.export.proxy import ProxySettings, mesh_proxy
-        from primdiffusion.export.proxy_files import ARRAYS, TEXTURE, write_proxy_arrays
+        from primdiffusion.export.proxy import ARRAYS, TEXTURE, ProxySettings, mesh_proxy, write_proxy_arrays
 
         began = time.perf_counter()
         settings = ProxySettings(self.spacing, self.triangles, self.texture_px)
@@ -101,8 +100,7 @@ class GaussiansRequest:
         import torch  # late
 
         # torch is loaded late
-        from primdiffusion.export.gaussian_file import write_gaussians
-        from primdiffusion.export.gaussians import gaussians_of
+        from primdiffusion.export.gaussians import gaussians_of, write_gaussians
         from primdiffusion.human import place, place_skinned
 
         began = time.perf_counter()
@@ -210,8 +208,7 @@ def _writer(out: Path) -> Callable[[ExportCommand, Human], None]:
 
 def _write_mesh(asked: ExportCommand, human: Human) -> None:
     # torch is loaded late
-    from primdiffusion.export.proxy import ProxySettings, mesh_proxy
-    from primdiffusion.export.proxy_files import write_proxy_glb, write_proxy_obj
+    from primdiffusion.export.proxy import ProxySettings, mesh_proxy, write_proxy_glb, write_proxy_obj
 
     proxy = mesh_proxy(human, ProxySettings(triangles=asked.triangles, texture_px=asked.texture))
     if asked.out.suffix.lower() == ".glb":
@@ -222,8 +219,7 @@ def _write_mesh(asked: ExportCommand, human: Human) -> None:
 
 def _write_gaussians(asked: ExportCommand, human: Human) -> None:
     # torch is loaded late
-    from primdiffusion.export.gaussian_file import write_gaussians
-    from primdiffusion.export.gaussians import gaussians_of
+    from primdiffusion.export.gaussians import gaussians_of, write_gaussians
     from primdiffusion.human import place
     from primdiffusion.pose_file import read_pose
 

@@ -53,7 +53,7 @@ def _installation() -> dict[str, Any]:
     import torch
 
     from primdiffusion.diffusion.checkpoint import default_checkpoint, read_card
-    from primdiffusion.encoder.checkpoint import default_encoder
+    from primdiffusion.encoder.model import default_encoder
 
     cards = {
         name: read_card(path) if path.exists() else None

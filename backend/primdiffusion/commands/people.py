@@ -47,7 +47,7 @@ class EncodePayloads:
         """
         # torch is loaded late
         from primdiffusion.capture.reader import open_captures
-        from primdiffusion.encoder.checkpoint import load_encoder
+        from primdiffusion.encoder.model import load_encoder
         from primdiffusion.machine import best_device
         from primdiffusion.training.captured_people import EncodeSettings, encode_people, read_cards
 

@@ -106,7 +106,7 @@ class RefineCommand:
         """The person to begin with, on the captured body, whoever's they were."""
         # torch is loaded late
         from primdiffusion.human_file import load_human
-        from primdiffusion.training.refine_start import bare_body, meshed_person
+        from primdiffusion.training.refine_views import bare_body, meshed_person
 
         if self.start == BODY:
             human = bare_body(betas)
@@ -126,7 +126,7 @@ class RefineCommand:
     def _encoded(self, captures: Captures, name: str, betas: Tensor, given: Sequence[int]) -> Human:
         # torch is loaded late
         from primdiffusion.capture.conditioning import CapturedPerson, conditioning_views
-        from primdiffusion.encoder.checkpoint import load_encoder
+        from primdiffusion.encoder.model import load_encoder
         from primdiffusion.machine import best_device
         from primdiffusion.reconstruction import reconstruct
 

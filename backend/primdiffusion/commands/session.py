@@ -13,7 +13,7 @@ from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.machine import best_device, device_info
 
 if TYPE_CHECKING:
-    from primdiffusion.encoder.encode import EncoderModel
+    from primdiffusion.encoder.model import EncoderModel
 
 T = TypeVar("T")
 
@@ -40,7 +40,7 @@ class Session:
 
     def encoder(self, checkpoint: Path | None) -> EncoderModel:
         """Load an encoder (None: the default); the last one stays loaded."""
-        from primdiffusion.encoder.checkpoint import load_encoder  # children that only generate start sooner
+        from primdiffusion.encoder.model import load_encoder  # children that only generate start sooner
 
         if self._encoder is None or self._encoder[0] != checkpoint:
             self._encoder = None

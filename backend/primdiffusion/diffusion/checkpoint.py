@@ -28,7 +28,7 @@ from primdiffusion.staging import write_atomically
 
 FORMAT = "primdiffusion-checkpoint"
 ENCODER_FORMAT = "primdiffusion-encoder"
-"""Format of the files of `encoder.checkpoint`."""
+"""Format of the files of `encoder.model`."""
 FORMAT_VERSION = 2
 _READABLE = {FORMAT: str(FORMAT_VERSION), ENCODER_FORMAT: "1"}
 _HALVED = ("codec.mean", "codec.basis", "denoiser.")
@@ -74,7 +74,7 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
         "card": json.dumps(card),
     }
     contents = {key: value.detach().cpu().contiguous().clone() for key, value in halved.items()}
-    _check_finite(path, contents)
+    check_finite(path, contents)
     write_atomically(path, save(contents, metadata=metadata))
 
 
@@ -84,21 +84,27 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], dict
     Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
     format or version, or holds values that are not finite.
     """
-    metadata = read_metadata(path)
-    with safe_open(path, framework="pt") as file:
-        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
-    _check_finite(path, tensors)
+    tensors, metadata = read_tensors(path, (FORMAT,))
     with mismatches_named(path):
         architecture, card = json.loads(metadata["architecture"]), json.loads(metadata["card"])
-        return {key: value.float() for key, value in tensors.items()}, architecture, {**card, "sha256": file_hash(path)}
+        return tensors, architecture, {**card, "sha256": file_hash(path)}
+
+
+def read_tensors(path: Path, formats: Sequence[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Return tensors in float32 and metadata of a checkpoint or encoder; errors as in `read_checkpoint`."""
+    metadata = read_metadata(path, formats)
+    with safe_open(path, framework="pt") as file:
+        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
+    check_finite(path, tensors)
+    return {key: value.float() for key, value in tensors.items()}, metadata
 
 
 @contextlib.contextmanager
-def mismatches_named(path: Path) -> Iterator[None]:
-    """Raise CheckpointError for errors caused by tensors that contradict the file's own architecture."""
+def mismatches_named(path: Path, *also: type[Exception]) -> Iterator[None]:
+    """Raise CheckpointError for errors (and `also`) caused by tensors that contradict the file's own architecture."""
     try:
         yield
-    except (KeyError, TypeError, json.JSONDecodeError, RuntimeError) as error:
+    except (KeyError, TypeError, json.JSONDecodeError, RuntimeError, *also) as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
         raise CheckpointError(
             f"{path} does not match its own description ({reason}): download or train it again"
@@ -163,7 +169,7 @@ def denoiser_config(tree: Mapping[str, Any]) -> DenoiserConfig:
     )
 
 
-def read_metadata(path: Path, formats: Sequence[str] = (FORMAT,)) -> dict[str, str]:
+def read_metadata(path: Path, formats: Sequence[str]) -> dict[str, str]:
     """Return the metadata of a checkpoint or encoder; errors as in `read_checkpoint`."""
     if not path.is_file():
         raise FileNotFoundError(
@@ -178,7 +184,8 @@ def read_metadata(path: Path, formats: Sequence[str] = (FORMAT,)) -> dict[str, s
         ) from error
     if metadata.get("format") not in formats:
         raise CheckpointError(
-            f"{path} is a safetensors file of format {metadata.get('format')!r}, not {FORMAT!r}: choose another file"
+            f"{path} is a safetensors file of format {metadata.get('format')!r}, not "
+            f"{formats[0]!r}: choose another file"
         )
     if metadata.get("format_version") != _READABLE[metadata["format"]]:
         version, readable = metadata.get("format_version"), _READABLE[metadata["format"]]
@@ -188,7 +195,8 @@ def read_metadata(path: Path, formats: Sequence[str] = (FORMAT,)) -> dict[str, s
     return metadata
 
 
-def _check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:
+def check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Raise CheckpointError for NaN or infinite values."""
     for key, value in tensors.items():
         if not torch.isfinite(value).all():
             raise CheckpointError(f"{path}: weights {key!r} hold NaN or infinite values: download or train them again")

@@ -25,7 +25,7 @@ from primdiffusion.render.march import MarchSettings, Rendering, march
 
 
 class Reconstructor(Protocol):
-    """The interface of an evaluated encoder, such as `primdiffusion.encoder.encode.EncoderModel`."""
+    """The interface of an evaluated encoder, such as `primdiffusion.encoder.model.EncoderModel`."""
 
     def encode(self, views: Views, betas: Float[Tensor, "n"]) -> Payload:
         """Encode the subject in the views (unbatched, of one pose)."""

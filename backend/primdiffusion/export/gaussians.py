@@ -1,9 +1,18 @@
-"""Convert a human to 3D Gaussians (Kerbl et al. 2023), one for each visible voxel."""
+"""A human as 3D Gaussians (Kerbl et al. 2023), one for each visible voxel; and their PLY file.
+
+The file has the layout that viewers and trainers share: binary little endian, float32, one vertex per Gaussian: x y z,
+nx ny nz (zero), f_dc_0..2, opacity, scale_0..2, rot_0..3. `opacity` is a logit, `scale` the logarithm of standard
+deviations in metres, `rot` a quaternion w x y z. f_dc is (colour - 0.5) / C0 with sRGB-encoded colour: viewers display
+0.5 + C0 f_dc without a transfer function. There is no f_rest: colours do not depend on the view. Axes are y up, facing
++z; viewers that expect y down, as in scenes reconstructed from photographs, show the human upside down by default.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -12,7 +21,9 @@ from primdiffusion.export.field import pack_field
 from primdiffusion.export.surface import depth_below
 from primdiffusion.formats.requests import GAUSSIANS
 from primdiffusion.geometry.records import TensorRecord
+from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives
+from primdiffusion.staging import written_whole
 
 WIDTH = 1 / 6**0.5
 """Standard deviation of a voxel's trilinear kernel, in voxel spacings: the Gaussian has the kernel's own variance."""
@@ -23,6 +34,12 @@ DEEPEST = 0.025
 """Depth below the surface beyond which voxels are dropped as invisible, metres."""
 FAINTEST = 1 / 255
 """Opacity below which viewers skip a Gaussian."""
+C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+PROPERTIES = (
+    "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
+    "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,3 +118,20 @@ def _quaternions(rotation: Float[Tensor, "k 3 3"]) -> Float[Tensor, "k 4"]:
 
     turned = Rotation.from_matrix(rotation.detach().cpu().double().numpy()).as_quat()[:, [3, 0, 1, 2]]
     return torch.from_numpy(turned).to(rotation)
+
+
+def write_gaussians(path: str | Path, gaussians: Gaussians) -> None:
+    """Write the file, atomically. Raises OSError."""
+    columns = [
+        gaussians.position,
+        torch.zeros_like(gaussians.position),
+        (encode_srgb(gaussians.rgb) - 0.5) / C0,
+        torch.logit(gaussians.opacity)[:, None],
+        gaussians.scale.log(),
+        gaussians.rotation,
+    ]
+    rows = torch.cat(columns, -1).detach().cpu().numpy().astype("<f4")
+    names = "".join(f"property float {name}\n" for name in PROPERTIES)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{names}end_header\n"
+    with written_whole(path) as unfinished:
+        unfinished.write_bytes(header.encode() + np.ascontiguousarray(rows).tobytes())

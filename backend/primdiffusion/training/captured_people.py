@@ -18,7 +18,7 @@ from primdiffusion.capture.conditioning import conditioning_views, default_betas
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.rasterised import Outcome
 from primdiffusion.capture.reader import Captures
-from primdiffusion.encoder.encode import EncoderModel, betas_of_frames
+from primdiffusion.encoder.model import EncoderModel, betas_of_frames
 from primdiffusion.failures import describe
 from primdiffusion.human import Human
 from primdiffusion.people.folder import CARD

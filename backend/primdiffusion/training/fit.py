@@ -5,10 +5,13 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
+import tyro
+from accelerate import PartialState
 from accelerate.utils import set_seed
 from torch import Tensor
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -17,7 +20,7 @@ from primdiffusion import __version__
 from primdiffusion.capture.dataset import Position, Share
 from primdiffusion.capture.reader import Captures, open_captures
 from primdiffusion.encoder.config import PRESETS
-from primdiffusion.encoder.encode import EncoderModel
+from primdiffusion.encoder.model import EncoderModel
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.failures import out_of_memory
 from primdiffusion.geometry.srgb import encode_srgb
@@ -26,22 +29,29 @@ from primdiffusion.render.march import MarchSettings, Rendering, march
 from primdiffusion.training.accelerated import accelerator_of, agreed
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.fit_data import FitDataset, FitSample, betas_of, fit_batches, fit_dataset
-from primdiffusion.training.fit_folder import STATE, begin, save
 from primdiffusion.training.fit_losses import Features, loss_terms
 from primdiffusion.training.fit_perceptual import load_perceptual
-from primdiffusion.training.fit_record import FitRecorder
-from primdiffusion.training.fit_state import FitState
+from primdiffusion.training.fit_run import MODEL, STATE, FitRecorder, FitState, begin, save
 from primdiffusion.training.interrupt import Interrupt
 from primdiffusion.training.recorder import StepMetrics, StepTimer
 from primdiffusion.training.run_folder import versions
 from primdiffusion.training.state import NotFiniteError
 
 
-def fit(config: FitConfig) -> EncoderModel:
-    """Run or resume a run; returns the encoder as far as it got, which is also in run/encoder.safetensors.
+def run(arguments: Sequence[str]) -> None:
+    """Run a command line, also by `accelerate launch -m primdiffusion fit`, and print the path of the encoder."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    config = tyro.cli(FitConfig, args=arguments, prog="primdiffusion fit")
+    model = fit(config)
+    if PartialState().is_main_process:
+        print(f"{config.run / MODEL}  {model.card['steps']} of {config.steps} steps")
 
-    Under `accelerate launch` each process trains on its own batches, and gradients are averaged. Ctrl-C or a polite
-    kill stops after the step and saves.
+
+def fit(config: FitConfig) -> EncoderModel:
+    """Start or resume a run; returns the encoder, which is also saved as run/encoder.safetensors.
+
+    Under `accelerate launch` each process trains on its own batches, and gradients are averaged. Ctrl-C or SIGTERM
+    stops after the current step and saves.
 
     Raises:
         ValueError: settings that cannot be, or others than those with which the run in this folder began; captures

@@ -13,7 +13,7 @@ from primdiffusion.capture.conditioning import default_betas
 from primdiffusion.capture.dataset import CaptureDataset, Position, SampleSet, SampleSettings, Share, Views, batches
 from primdiffusion.capture.reader import Captures
 from primdiffusion.encoder.config import PRESETS, EncoderConfig
-from primdiffusion.encoder.encode import frames_of, look_up
+from primdiffusion.encoder.model import frames_of, look_up
 from primdiffusion.encoder.network import motion_of
 from primdiffusion.encoder.unproject import Unprojected
 from primdiffusion.geometry.records import TensorRecord

@@ -1,36 +1,42 @@
-"""Pictures to refine a person from: checked, each with its camera and the boxes' frames, and how well one is met."""
+"""Inputs of refinement: validated views with cameras and frames, and the humans to start from."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.dataset import Views
+from primdiffusion.capture.people_files import read_person
 from primdiffusion.evaluation.image_metrics import psnr
 from primdiffusion.failures import PictureOutOfMemory, out_of_memory
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.human import Human, pose_body
+from primdiffusion.people.payloads import rest_frames
 from primdiffusion.primitives.anchors import attach, default_anchors
+from primdiffusion.primitives.from_mesh import from_mesh
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
 
+GREY = (128, 128, 128, 255)
+"""sRGB-encoded."""
+
 
 def view_psnr(human: Human, views: Sequence[Views]) -> Float[Tensor, "n"]:
-    """PSNR of each whole picture, of sRGB-encoded colours over black, dB; the views in order.
-
-    Raises what `refine` does of its views and human.
-    """
+    """PSNR (dB) of each whole image, sRGB-encoded over black, in the order of the views. Raises as `refine`."""
     return psnr_of(scenes_of(human.validate(), views), human.payload)
 
 
 class PosedView(NamedTuple):
-    """One picture and where the boxes are in it."""
+    """An image with its camera and the frames of the primitives."""
 
     frames: Frames
     camera: Camera
@@ -39,9 +45,9 @@ class PosedView(NamedTuple):
 
 
 def scenes_of(human: Human, views: Sequence[Views]) -> list[PosedView]:
-    """Every picture as a scene on the human's device; their bodies are posed once.
+    """Return every image with camera and frames, on the human's device; each pose is computed once.
 
-    Raises ValueError where there are none, they do not fit their cameras, or the human is of another body.
+    Raises ValueError for no views, views that do not match their cameras, and a human on another body.
     """
     components = default_body().shape_basis.shape[-1]
     if len(human.betas) > components:
@@ -80,7 +86,7 @@ def _check(number: int, record: Views) -> None:
 
 @torch.no_grad()
 def psnr_of(scenes: Sequence[PosedView], payload: Payload) -> Float[Tensor, "n"]:
-    """As `view_psnr`."""
+    """See `view_psnr`."""
     found = []
     for scene in scenes:
         image = encode_srgb(drawn(scene, payload, MarchSettings().step).rgb.clamp(0, 1))
@@ -89,10 +95,44 @@ def psnr_of(scenes: Sequence[PosedView], payload: Payload) -> Float[Tensor, "n"]
 
 
 def drawn(scene: PosedView, payload: Payload, step: float) -> Rendering:
-    """The payload as the scene's camera sees it. Raises PictureOutOfMemory."""
+    """Render the payload for the scene's camera. Raises PictureOutOfMemory."""
     try:
         return march(Primitives.place(scene.frames, payload), scene.camera, MarchSettings(step=step))
     except (MemoryError, RuntimeError) as e:
         if out_of_memory(e):
             raise PictureOutOfMemory(scene.camera.width, scene.camera.height) from e
         raise
+
+
+def bare_body(betas: Float[Tensor, "n"]) -> Human:
+    """Return the default body with these betas, grey; takes about 3 s.
+
+    Raises ValueError for more betas than the body has.
+    """
+    body = default_body()
+    skin = TexturedPart(
+        name="body",
+        vertices=body.shape(betas).vertices.double().numpy(),
+        faces=body.faces.numpy().astype(np.int32),
+        corner_uv=body.uv[body.uv_faces].numpy(),
+        texture=np.array([[GREY]], np.uint8),
+        skin_index=np.zeros((len(body.template), 1), np.int32),
+        skin_weight=np.ones((len(body.template), 1)),
+    )
+    return _as_human(TexturedMesh((skin,)), betas, "the bare body")
+
+
+def meshed_person(path: str | Path) -> Human:
+    """Return a human of `primdiffusion people`, a .glb in the rest pose of the default body; takes about 3 s.
+
+    Raises:
+        FileNotFoundError, GlbError: as `read_person`.
+        UnusableMesh: the mesh is empty.
+    """
+    person = read_person(path)
+    return _as_human(person.mesh, torch.from_numpy(person.betas).float(), Path(path).name)
+
+
+def _as_human(mesh: TexturedMesh, betas: Float[Tensor, "n"], origin: str) -> Human:
+    payload = from_mesh(mesh, rest_frames(betas.double().numpy()))
+    return Human(payload, betas, {"start": origin}).validate()

@@ -1,22 +1,30 @@
-"""Encode views of a human to a payload with a trained encoder."""
+"""A trained encoder: from views of a human to a payload; and its file, with weights in half precision."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Float
+from safetensors.torch import save
 from torch import Tensor
 
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.capture.dataset import Views, stack
-from primdiffusion.encoder.config import EncoderConfig
+from primdiffusion.diffusion.checkpoint import ENCODER_FORMAT, check_finite, mismatches_named, read_tensors
+from primdiffusion.encoder.config import EncoderConfig, config_from_json
 from primdiffusion.encoder.network import Encoder, motion_of
 from primdiffusion.encoder.unproject import Unprojected, unproject_texels, unproject_voxels
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.staging import write_atomically
+
+FORMAT_VERSION = 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,3 +90,38 @@ def frames_of(config: EncoderConfig, betas: Float[Tensor, "n"], pose: BodyPose) 
 def betas_of_frames(config: EncoderConfig, betas: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     """The shape of the body that carries the boxes: the subject's, or the mean shape if `frames` is "template"."""
     return torch.zeros_like(betas) if config.frames == "template" else betas
+
+
+def default_encoder() -> Path:
+    """Return the path of the encoder in the package."""
+    return Path(str(resources.files("primdiffusion.weights") / "encoder.safetensors"))
+
+
+def save_encoder(path: Path, model: EncoderModel) -> None:
+    """Write an encoder, whole or not at all. Raises CheckpointError for weights that are not finite, OSError."""
+    tensors = {
+        name: value.detach().cpu().half().contiguous().clone() for name, value in model.encoder.state_dict().items()
+    }
+    check_finite(path, tensors)
+    metadata = {
+        "format": ENCODER_FORMAT,
+        "format_version": str(FORMAT_VERSION),
+        "config": json.dumps(dataclasses.asdict(model.config)),
+        "card": json.dumps(dict(model.card)),
+    }
+    write_atomically(path, save(tensors, metadata=metadata))
+
+
+def load_encoder(path: Path | str | None = None, device: torch.device | str = "cpu") -> EncoderModel:
+    """Load an encoder in float32 (without a path: the one in the package).
+
+    Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
+    format or version, does not match its own configuration or holds values that are not finite.
+    """
+    path = default_encoder() if path is None else Path(path)
+    tensors, metadata = read_tensors(path, (ENCODER_FORMAT,))
+    with mismatches_named(path, ValueError):
+        encoder = Encoder(config_from_json(json.loads(metadata["config"])))
+        encoder.load_state_dict(tensors)
+        card = json.loads(metadata["card"])
+    return EncoderModel(encoder.eval().requires_grad_(False).to(device), card)

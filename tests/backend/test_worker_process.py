@@ -5,7 +5,7 @@ import os
 import time
 
 import pytest
-from primdiffusion.export.run_in_process import ProcessDied, run_in_process
+from primdiffusion.worker_process import ProcessDied, run_in_process
 
 
 def nothing():
