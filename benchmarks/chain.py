@@ -66,7 +66,7 @@ from chain_sets import (
     stored,
     stored_fit,
 )
-from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.image_metrics import detail_energy
 from primdiffusion.people.assets import Assets, open_assets

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from PIL import Image
 from primdiffusion.body.model import BodyPose
-from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.evaluation.portraits import PORTRAITS, camera_of
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera

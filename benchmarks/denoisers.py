@@ -12,8 +12,7 @@ import time
 from pathlib import Path
 
 import torch
-from primdiffusion.checkpoints import load_checkpoint
-from primdiffusion.diffusion.checkpoint import default_checkpoint
+from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.unet import PAPER, PAPER_WITH_ATTENTION, SlabUNet

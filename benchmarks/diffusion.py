@@ -30,8 +30,7 @@ from diffusion_sets import (
     voxels,
 )
 from march import from_script
-from primdiffusion.checkpoints import load_checkpoint
-from primdiffusion.diffusion.checkpoint import default_checkpoint
+from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.attribute_network import category, features_of
 from primdiffusion.evaluation.clip_vision import load_clip_vision

@@ -19,7 +19,7 @@ import torch
 from diffusion import epoch, progress
 from diffusion_sets import gaussian, generated, placed, seeds_of, stored_voxels, voxels
 from PIL import Image, ImageDraw, ImageFont
-from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.attribute_network import features_of
 from primdiffusion.evaluation.distances import nearest

@@ -22,7 +22,7 @@ from itertools import pairwise  # noqa: E402
 from pathlib import Path  # noqa: E402
 
 import torch  # noqa: E402
-from primdiffusion.checkpoints import load_checkpoint  # noqa: E402
+from primdiffusion.diffusion.checkpoint import load_checkpoint  # noqa: E402
 from primdiffusion.diffusion.model import DiffusionModel  # noqa: E402
 from primdiffusion.human import generate, generate_batch  # noqa: E402
 from record import tell  # noqa: E402

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.export.surface import Surface
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.rotation import axis_angle_to_matrix

@@ -19,10 +19,10 @@ import numpy as np
 import psutil
 import torch
 from primdiffusion.body.model import BodyPose
-from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.commands.frame import PosedPerson
 from primdiffusion.commands.merge import FitGainRequest, MergeRequest
 from primdiffusion.commands.session import Session
+from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.formats.requests import DENSITY_GAIN
 from primdiffusion.human import body_of, generate, pose_body
 from primdiffusion.human_file import export_for_blender, load_human, save_human

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 from primdiffusion.body.model import BodyPose
-from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.human import framing, generate, place
 from primdiffusion.human_file import save_human
 from primdiffusion.render.image import to_png

@@ -128,9 +128,11 @@ def people_of(
 ) -> list[Human]:
     """Decode denoised samples x0 into humans on the CPU, without provenance or validation."""
     body = default_body() if model.body_setup is None else model.body_setup.body
+    wanted = measures_of(attributes)
     people = []
     for sample_of_one, betas in zip(x0, model.betas(x0, seeds), strict=True):
-        betas = betas_of_measures(betas.cpu(), model.shapes.scale.cpu(), body, *measures_of(attributes))
+        if wanted != (None, None):
+            betas = betas_of_measures(betas.cpu(), model.shapes.scale.cpu(), body, *wanted)
         people.append(Human(model.decode(sample_of_one), betas, {}, model.body_setup).to("cpu"))
     return people
 

@@ -25,6 +25,7 @@ import safetensors
 import safetensors.torch
 import torch
 
+from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.body.model import BodyModel
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.human import Human, body_of
@@ -40,8 +41,6 @@ FORMAT_VERSION_ON_FILES = 2
 """Of people who stand on a body of the user's files; readers reject a higher one."""
 BLENDER_FORMAT_VERSION = 2
 """Of human.npz."""
-LARGEST_BETA = 5.0
-"""Standard deviations of body shape; beyond, no body is a person's."""
 SHAPES = {"rgb": (K, 3, S, S, S), "density": (K, S, S, S), "delta_scale": (K, 3), "betas": (10,)}
 """What a .human.safetensors file holds."""
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from PIL import Image
 from primdiffusion.body.model import BodyPose
-from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.human import framing, generate, place
 from primdiffusion.render.image import to_png
 from primdiffusion.render.march import march

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 from primdiffusion.body.measures import betas_of_measures
 from primdiffusion.body.model import default_body
-from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, generate, render

@@ -5,10 +5,10 @@ import json
 import pytest
 import torch
 from diffusion_people import VOCABULARY, small_model
-from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.diffusion.checkpoint import (
     CheckpointError,
     default_checkpoint,
+    load_checkpoint,
     model_card,
     read_card,
     save_checkpoint,

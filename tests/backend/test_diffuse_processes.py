@@ -9,7 +9,7 @@ import pytest
 import torch
 from diffuse_runs import DEFAULT_FILES, child_environment, logged, make_small, settings
 from diffusion_people import write_people
-from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.training.cells import CellTrainee
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.diffuse import MODEL, train

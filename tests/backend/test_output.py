@@ -156,7 +156,7 @@ def test_every_edit_shows_its_guesses(checkpoint, tmp_path, always):
 
 
 def test_a_person_is_drawn_from_both_sides_in_halves_of_a_square(checkpoint, tmp_path):
-    from primdiffusion.checkpoints import load_checkpoint
+    from primdiffusion.diffusion.checkpoint import load_checkpoint
     from primdiffusion.human import generate
 
     human = generate(load_checkpoint(checkpoint, torch.device("cpu")), 3, 2)

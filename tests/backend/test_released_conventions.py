@@ -6,20 +6,14 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose
-from primdiffusion.diffusion.schedule import sqrt_linear
+from primdiffusion.diffusion.model import SMALLEST_DELTA_S, ReleasedSlab
+from primdiffusion.diffusion.schedule import released_steps, sqrt_linear
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.primitives.anchors import attach, build_anchors
 from primdiffusion.primitives.body_setup import BodySetup, body_setup_from_files
 from primdiffusion.primitives.primitives import GRID, K, Payload, Primitives, S
 from primdiffusion.primitives.slab import RELEASED_FULL_DENSITY
-from primdiffusion.released.imported import (
-    SMALLEST_DELTA_S,
-    Reference,
-    ReleasedSlab,
-    reference_extents,
-    released_steps,
-    rest_half_extent,
-)
+from primdiffusion.released.imported import Reference, reference_extents, rest_half_extent
 from primdiffusion.render.march import MarchSettings, march
 from released_files import save_body
 

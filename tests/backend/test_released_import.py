@@ -12,10 +12,11 @@ import safetensors.torch
 import torch
 from primdiffusion import cli
 from primdiffusion.body.smpl_files import load_body
-from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.commands.frame import FrameSpec, PosedPerson
 from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
-from primdiffusion.diffusion.checkpoint import CheckpointError, read_card
+from primdiffusion.diffusion.checkpoint import CheckpointError, load_checkpoint, read_card
+from primdiffusion.diffusion.model import ReleasedSlab
+from primdiffusion.diffusion.schedule import released_steps
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Look, Scene
 from primdiffusion.human import framing, generate, place, place_skinned
@@ -23,7 +24,6 @@ from primdiffusion.human_file import HumanFileError, load_human, save_human
 from primdiffusion.primitives.anchors import build_anchors
 from primdiffusion.primitives.body_setup import BodySetupError, body_setup_from_files
 from primdiffusion.primitives.primitives import K, Payload
-from primdiffusion.released.imported import ReleasedSlab, released_steps
 from released_files import TINY, body_arrays, random_network, save_body, save_released, stage_one, state, template
 
 

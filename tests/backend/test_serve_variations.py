@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from primdiffusion.checkpoints import load_checkpoint
 from primdiffusion.commands.generate import VariationsRequest
 from primdiffusion.commands.output import PreviewBudget
 from primdiffusion.commands.request import read_request
 from primdiffusion.commands.session import Session
+from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.editing.vary import vary
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human

@@ -128,9 +128,9 @@ def test_a_large_picture_comes_in_bands_from_the_top_and_stops_within_one(child,
 
 def test_drawing_needs_no_checkpoint(request_for):
     without = (
-        "import primdiffusion.checkpoints as c, primdiffusion.diffusion.checkpoint as d\n"
+        "import primdiffusion.diffusion.checkpoint as d\n"
         "def gone(*_): raise FileNotFoundError('no checkpoint here')\n"
-        "c.load_checkpoint = d.default_checkpoint = gone\n"
+        "d.load_checkpoint = d.default_checkpoint = gone\n"
         "import primdiffusion.serve.server as s; s.main()"
     )
     child = Conversation(("-c", without))

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 import tiny_model
-from primdiffusion.checkpoints import load_checkpoint
-from primdiffusion.diffusion.checkpoint import default_checkpoint
+from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint
 from primdiffusion.diffusion.samplers import SAMPLERS as BACKENDS_SAMPLERS
 from primdiffusion.editing.regions import parts_of, region_of
 from primdiffusion.formats.requests import PARTS, SAMPLERS

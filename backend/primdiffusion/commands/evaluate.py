@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from primdiffusion.checkpoints import load_checkpoint
+from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.evaluation import command
 from primdiffusion.evaluation.command import StageTwo, TrainedReconstructor

@@ -16,17 +16,29 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.diffusion.codec import LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkConfig
-from primdiffusion.diffusion.model import STANDARD_SHAPES, CellCodec, DiffusionModel, ShapePrior, WholeSlab
+from primdiffusion.diffusion.model import (
+    BETAS,
+    STANDARD_SHAPES,
+    CellCodec,
+    DiffusionModel,
+    ReleasedSlab,
+    ShapePrior,
+    WholeSlab,
+)
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
+from primdiffusion.primitives.body_setup import BodyFiles, BodySetupError, find_body_setup
 from primdiffusion.staging import write_atomically
 
 FORMAT = "primdiffusion-checkpoint"
+RELEASED = "released"
+"""Kind of the architecture in an imported checkpoint."""
 ENCODER_FORMAT = "primdiffusion-encoder"
 """Format of the files of `encoder.model`."""
 FORMAT_VERSION = 2
@@ -128,15 +140,29 @@ def read_card(path: Path | str | None = None) -> dict[str, Any]:
     return json.loads(metadata["card"]) | ({"attributes": known} if known else {})
 
 
-def build_model(
-    tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card: Mapping[str, Any]
-) -> DiffusionModel:
-    """Build the model of a checkpoint trained here, on the CPU; raises what `mismatches_named` catches."""
+def load_checkpoint(path: Path | str | None = None, device: torch.device | str = "cpu") -> DiffusionModel:
+    """Load a model in float32 (without a path: the default checkpoint), trained here or imported (`released`).
+
+    Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
+    format or version, does not match its own architecture or holds values that are not finite. An imported one raises
+    BodySetupError (a ValueError) if the user's body file that it needs is missing or changed.
+    """
+    path = default_checkpoint() if path is None else Path(path)
+    tensors, architecture, card = read_checkpoint(path)
+    with mismatches_named(path):
+        if architecture["kind"] == RELEASED:
+            model = _released_model(tensors, architecture, card, path.parent)
+        else:
+            model = _model(tensors, architecture, card)
+    return model.to(device)
+
+
+def _model(tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card: Mapping[str, Any]) -> DiffusionModel:
     schedule = SCHEDULES[architecture["schedule"]]()
     config = architecture["config"]
     weights = under(tensors, "denoiser.")
     if architecture["kind"] == "slab":
-        denoiser: torch.nn.Module = SlabUNet(unet_config(config))
+        denoiser: torch.nn.Module = SlabUNet(_unet_config(config))
         codec, shapes = WholeSlab(), STANDARD_SHAPES
     else:
         prior = PersonPrior(**under(weights, "prior_"))
@@ -153,7 +179,40 @@ def build_model(
     return DiffusionModel(denoiser, schedule, codec, shapes, density, card, vocabulary, chain)
 
 
-def unet_config(tree: Mapping[str, Any]) -> UNetConfig:
+def _released_model(
+    tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card: Mapping[str, Any], folder: Path
+) -> DiffusionModel:
+    """Build an imported model; `folder` is that of its file."""
+    with torch.device("meta"):
+        network = SlabUNet(_unet_config(architecture["config"]))
+    network.load_state_dict(under(tensors, "denoiser."), assign=True)
+    network.eval().requires_grad_(False)
+    body_setup = find_body_setup(BodyFiles.from_json(architecture["body"]), tensors["stand.rest_half_extent"], [folder])
+    anchors = body_setup.anchors
+    if not (
+        torch.equal(anchors.face, tensors["stand.face"].long())
+        and torch.allclose(anchors.barycentric, tensors["stand.barycentric"], atol=1e-5)
+    ):
+        raise BodySetupError("the anchors differ from those that the checkpoint was imported with: import it again")
+    fixed_betas = (
+        torch.zeros(BETAS, 0),
+        tensors["stand.betas"],
+        torch.zeros(BETAS, BETAS),
+        torch.full((BETAS,), LARGEST_BETA),
+    )
+    return DiffusionModel(
+        denoiser=network,
+        schedule=SCHEDULES[architecture["schedule"]](),
+        codec=ReleasedSlab(),
+        shapes=ShapePrior(*fixed_betas),
+        full_density=float(architecture["full_density"]),
+        card=card,
+        chain=CHAINS[architecture["chain"]],
+        body_setup=body_setup,
+    )
+
+
+def _unet_config(tree: Mapping[str, Any]) -> UNetConfig:
     """Parse a U-Net's configuration."""
     return UNetConfig(**{**tree, **{key: tuple(tree[key]) for key in ("multipliers", "attention_levels")}})
 

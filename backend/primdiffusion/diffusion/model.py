@@ -23,6 +23,11 @@ from primdiffusion.primitives.slab import CHANNELS_PER_LAYER, pack, unpack
 
 BETAS = 10
 """Shape coefficients of a sampled body."""
+SMALLEST_DELTA_S = 0.2
+"""Released values are never clamped (SPEC 1.13). Usual values are around 1; a box of five times its rest size is an
+outlier, and 0 has no reciprocal."""
+_B_AXIS = -2
+"""The voxels' axes D, H, W run along N, B, T."""
 
 
 class Codec(Protocol):
@@ -98,6 +103,32 @@ class WholeSlab:
     def cell_side(self) -> int:
         """8."""
         return S
+
+
+@dataclasses.dataclass(frozen=True)
+class ReleasedSlab(WholeSlab):
+    """A slab whose boxes have B = T x N, and delta_s that divides their size (SPEC 1.1, 1.8).
+
+    Conversion flips voxels along B, so that frames stay in SO(3), and delta_scale = 1 / delta_s.
+    """
+
+    def to_payload(self, x0: Float[Tensor, "*b c h w"], full_density: float) -> Payload:
+        """Unpack and clamp."""
+        payload = super().to_payload(x0, full_density)
+        return Payload(
+            payload.rgb.flip(_B_AXIS),
+            payload.density.flip(_B_AXIS),
+            1 / payload.delta_scale.clamp_min(SMALLEST_DELTA_S),
+        )
+
+    def from_payload(self, payload: Payload, full_density: float) -> Float[Tensor, "*b c h w"]:
+        """Pack; the inverse for boxes up to five times their rest size. Raises ValueError for boxes without size."""
+        if not (payload.delta_scale > 0).all():
+            raise ValueError(
+                "a delta scale is 0 or less, but released slabs store its reciprocal: refine this human again"
+            )
+        flipped = Payload(payload.rgb.flip(_B_AXIS), payload.density.flip(_B_AXIS), 1 / payload.delta_scale)
+        return super().from_payload(flipped, full_density)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -127,6 +127,18 @@ def leading_steps(length: int, steps: int, offset: int = 1) -> list[int]:
     return [i * (length // steps) + offset for i in reversed(range(steps))]
 
 
+def released_steps(length: int, steps: int) -> list[int]:
+    """Timesteps of the released sampler: 991, 981, ... 1 for 100 of 1000 (SPEC 3), or all of T-1 ... 0.
+
+    Raises ValueError between T / 2 and T: such a chain would begin far below the initial noise level.
+    """
+    if steps == length:
+        return list(reversed(range(length)))
+    if length // 2 < steps < length:
+        raise ValueError(f"steps is {steps}: the released chain takes up to {length // 2} steps, or all {length}")
+    return leading_steps(length, steps)
+
+
 def dense_steps(length: int, steps: int, power: float = 2.2) -> list[int]:
     """Descending t from T-1, denser at low noise: with evenly spaced steps all fine detail comes from the last one."""
     _check_steps(length, steps)
@@ -137,7 +149,7 @@ def dense_steps(length: int, steps: int, power: float = 2.2) -> list[int]:
     return chain
 
 
-CHAINS = {"trailing": trailing_steps, "dense": dense_steps}
+CHAINS = {"trailing": trailing_steps, "dense": dense_steps, "released": released_steps}
 """Timesteps that a sampler visits, by their name in checkpoints."""
 
 
