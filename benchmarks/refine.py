@@ -24,7 +24,7 @@ from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.commands.refine import dealt_cameras
+from primdiffusion.commands.reconstruct import split_cameras
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, place
@@ -64,7 +64,7 @@ def main() -> None:
         assert all(outcome.what == "done" for outcome in render(job))
         captures = open_captures(job.out)
         betas = default_betas(captures.subject(name))
-        held, given = dealt_cameras(CAMERAS, HELD)
+        held, given = split_cameras(CAMERAS, HELD)
         sets = [
             [conditioning_views(captures, name, frame, cameras) for frame in frames]
             for frames, cameras in ((range(POSES - 1), given), (range(POSES - 1), held), ((POSES - 1,), None))

@@ -26,7 +26,7 @@ COMMANDS = {
     "inpaint": ("commands.edit:run_inpaint", "Resample a region of a human: other clothes or hair"),
     "transfer": ("commands.edit:run_transfer", "Copy the appearance of a region from another human"),
     "reconstruct": ("commands.reconstruct:run", "Reconstruct a human from captures: images from several sides"),
-    "refine": ("commands.refine:run", "Optimise a captured human to match the images"),
+    "refine": ("commands.reconstruct:run_refine", "Optimise a captured human to match the images"),
     "render": ("commands.render:run", "Render a human in a pose"),
     "export": ("commands.export:run", "Export a human to other programs: .glb, .obj or .ply"),
     "merge": ("commands.merge:run", "Merge humans into one voxel grid: .vdb or .npz"),

@@ -14,7 +14,7 @@ from primdiffusion.capture.dataset import Views, stack
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.commands.refine import dealt_cameras
+from primdiffusion.commands.reconstruct import split_cameras
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
@@ -192,12 +192,12 @@ def test_pictures_too_large_for_memory_are_named(views, monkeypatch):
 
 
 def test_cameras_are_held_out_evenly():
-    assert dealt_cameras(12, 3)[0] == [2, 6, 10]
-    assert dealt_cameras(4, 0) == ([], [0, 1, 2, 3])
-    held, given = dealt_cameras(5, 4)
+    assert split_cameras(12, 3)[0] == [2, 6, 10]
+    assert split_cameras(4, 0) == ([], [0, 1, 2, 3])
+    held, given = split_cameras(5, 4)
     assert sorted(held + given) == [0, 1, 2, 3, 4]
     with pytest.raises(ValueError, match="0 to 3"):
-        dealt_cameras(4, 4)
+        split_cameras(4, 4)
 
 
 @pytest.fixture(scope="module")
@@ -311,7 +311,7 @@ def test_a_bare_body_takes_on_the_captured_one_s_colours(tmp_path):
               ("img", "mask"))  # fmt: skip
     assert {outcome.what for outcome in render(job)} == {"done"}
     captures = open_captures(job.out)
-    held, given = dealt_cameras(12, 3)
+    held, given = split_cameras(12, 3)
     shown = [conditioning_views(captures, "striped", frame, given) for frame in range(4)]
     start = bare_body(torch.zeros(10))
     refined = refine(start, shown, RefineSettings(steps=150)).human
