@@ -1,15 +1,15 @@
-"""People as files: `.human.safetensors` to keep and share, `human.npz` for Blender. No pickle in either.
+"""Files of a human: `.human.safetensors` to save and share, `human.npz` for Blender. Neither contains pickles.
 
-A `.human.safetensors` file holds rgb, density, delta_scale and betas as they are in memory, and in its metadata
-`format`, `format_version` and `provenance`: a JSON object that says where the person comes from. Of it are known
+A `.human.safetensors` file contains the tensors rgb, density, delta_scale and betas, and the metadata `format`,
+`format_version` and `provenance`, a JSON object with these entries, among others:
 
-    seed, steps, sampler, guidance, attributes      how it was sampled
-    checkpoint, checkpoint_sha256, full_density     by which model
-    version                                         by which PrimDiffusion
-    edits                                           what was done to it since, oldest first: objects with a name "edit"
+    seed, steps, sampler, guidance, attributes      how the human was sampled
+    checkpoint, checkpoint_sha256, full_density     the model
+    version                                         the version of PrimDiffusion
+    edits                                           later edits, oldest first: objects with a name "edit"
 
-and every other entry is saved as it is. A person on a body of the user's files has format version 2, the
-boxes' rest_half_extent, and in the metadata `body`: paths and fingerprints of these files, never what is in them.
+A human on a body of the user's files has format version 2, the tensor rest_half_extent, and the metadata `body`: paths
+and checksums of these files, never their content.
 """
 
 from __future__ import annotations
@@ -36,27 +36,27 @@ from primdiffusion.staging import written_whole
 
 FORMAT = "primdiffusion.human"
 FORMAT_VERSION = 1
-"""Of people who stand on the default body."""
+"""Version for humans on the default body."""
 FORMAT_VERSION_ON_FILES = 2
-"""Of people who stand on a body of the user's files; readers reject a higher one."""
+"""Version for humans on a body of the user's files; readers reject higher ones."""
 BLENDER_FORMAT_VERSION = 2
-"""Of human.npz."""
+"""Version of human.npz."""
 SHAPES = {"rgb": (K, 3, S, S, S), "density": (K, S, S, S), "delta_scale": (K, 3), "betas": (10,)}
-"""What a .human.safetensors file holds."""
+"""Tensors of a .human.safetensors file."""
 
 
 class HumanFileError(ValueError):
-    """A file that holds no person this version can read."""
+    """A file without a human that this version can read."""
 
 
 class NoPersonError(HumanFileError):
-    """A safetensors file of another kind."""
+    """A safetensors file without a human."""
 
 
 def save_human(path: str | Path, human: Human) -> None:
-    """Writes the person whole or not at all, every bit as it is in memory.
+    """Write the human atomically and losslessly.
 
-    Raises ValueError for NaN, betas out of range and a provenance that is no plain JSON; OSError.
+    Raises ValueError for NaN, betas out of range and a provenance that is not JSON; OSError.
     """
     _check_betas(human.validate())
     _check_provenance(human.provenance)
@@ -76,14 +76,14 @@ def save_human(path: str | Path, human: Human) -> None:
 
 
 def format_version(human: Human) -> int:
-    """The version of the file that this person is written to: the lowest that can hold them."""
+    """Return the lowest format version that can store this human."""
     return FORMAT_VERSION if human.body_setup is None else FORMAT_VERSION_ON_FILES
 
 
 def load_human(path: str | Path) -> Human:
-    """The person in a `.human.safetensors` file, validated.
+    """Read and validate a `.human.safetensors` file.
 
-    Raises FileNotFoundError, or HumanFileError (a ValueError) for a file that is damaged, newer or of another kind.
+    Raises FileNotFoundError, and HumanFileError (a ValueError) for a file that is damaged, newer or of another kind.
     """
     path = Path(path)
     if not path.is_file():
@@ -166,7 +166,7 @@ _KINDS: dict[str, tuple[str, Any]] = {
 
 
 def _check_provenance(provenance: Any) -> None:
-    """ValueError, naming the entry, where a known one is of another kind than this version writes."""
+    """Raise ValueError, naming the entry, for one of a wrong type."""
     if not isinstance(provenance, Mapping):
         raise ValueError(f"its provenance is no JSON object but {provenance!r:.60}: generate the person again")
     for name, (wanted, kind) in _KINDS.items():
@@ -201,15 +201,15 @@ def _reject(name: str, value: Any, wanted: str) -> NoReturn:
 
 
 def export_for_blender(path: str | Path, human: Human) -> None:
-    """Writes `human.npz`: the person in the T pose at their betas, and how all of it follows 24 joints.
+    """Write `human.npz`: the human in the T pose, with skinning to 24 joints.
 
     Plain arrays in metres, y up, facing z. Body: vertices [V,3], faces [F,3], uv_corner [F,3,2] (v up), skin_weights
     [V,24], joints [24,3], parents [24], joint_names [24]. Primitives: position [K,3], rotation [K,3,3] local to rest
     (columns T, B, N), half_extent [K,3] with the delta scale in it, primitive_weights [K,24], rgb [K,8,8,8,3] float16
     linear and density [K,8,8,8] (1/m, without the window), voxels in the order D, H, W = along N, B, T. meta: JSON.
 
-    Since format version 2 also what all of this is at other betas: template [V,3] and shape_basis [V,3,10] of the
-    surface, joint_template [24,3] and joint_basis [24,3,10], and what `attach` needs: face [K], barycentric [K,3],
+    Since format version 2 also the dependence on betas: template [V,3] and shape_basis [V,3,10] of the
+    surface, joint_template [24,3] and joint_basis [24,3,10], and the inputs of `attach`: face [K], barycentric [K,3],
     stencil_vertex [K,m], stencil_du [K,m], stencil_dv [K,m]. Half extents and weights do not depend on the shape.
     """
     human.validate()
@@ -244,7 +244,7 @@ def export_for_blender(path: str | Path, human: Human) -> None:
 
 
 def _shape_fields(body: BodyModel, anchors: Anchors, betas: int) -> dict[str, torch.Tensor]:
-    """How the body at rest and the frames on it follow `betas` shape coefficients."""
+    """Return the dependence of the rest body and its frames on the first `betas` shape coefficients."""
     basis = body.shape_basis[..., :betas]
     regressor = body.joint_regressor.double()
     return {

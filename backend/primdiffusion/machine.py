@@ -15,10 +15,10 @@ GB = 1e9
 
 
 def share_processors() -> None:
-    """Lets torch's threads sleep while they wait for each other; call before torch is imported. A user's setting stays.
+    """Let torch's threads sleep while waiting for each other, unless the user set it; call before importing torch.
 
-    By default they spin, and where another program (Blender) wants the same cores, each spins away its time slice: 30
-    steps of the default model took 9 s instead of 0.6 s on 2 cores with other processes at work.
+    By default they spin, and waste time slices that other programs (Blender) need: 30 steps of the default model took
+    9 s instead of 0.6 s on 2 busy cores.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
@@ -30,25 +30,25 @@ def memory() -> dict[str, float]:
 
 
 def peak_memory_gb() -> float:
-    """The most memory this process has held at once so far, GB (1e9 bytes)."""
+    """Peak memory of this process, GB (1e9 bytes)."""
     if sys.platform == "win32":
         return psutil.Process().memory_info().peak_wset / GB
-    import resource  # Windows has none
+    import resource  # not on Windows
 
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / GB
 
 
 def best_device() -> torch.device:
-    """CUDA where torch sees one, otherwise the CPU."""
-    import torch  # late: `memory` needs none
+    """Return CUDA if available, otherwise the CPU."""
+    import torch  # late: `memory` does not need it
 
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def device_info(device: torch.device) -> dict[str, Any]:
-    """The device as `hello` and the panel state it: its name, and its own memory where it has some."""
-    import torch  # late: `memory` needs none
+    """Name and memory of the device, for `hello` and the panel; None for the CPU's memory."""
+    import torch  # late: `memory` does not need it
 
     if device.type == "cuda":
         free, total = torch.cuda.mem_get_info(device)

@@ -20,16 +20,16 @@ BODY_NUMBERS = 66
 
 
 class PoseFileError(ValueError):
-    """A pose that cannot be understood."""
+    """A file without a valid pose."""
 
 
 def read_pose(path: str | Path, frame: int = 0) -> BodyPose:
-    """The pose in a .json or .npz file, from one `frame` where it holds several (AMASS: `poses` [F, 156], `trans`).
+    """Read the pose of a .json or .npz file, or one `frame` of several (AMASS: `poses` [F, 156], `trans`).
 
-    JSON: a list of 72 numbers or 24 rows of 3, or an object with one under "pose" and, if wanted, "translation" in
-    metres. Of SMPL-H and SMPL-X the body's 22 joints are taken (`body_theta`).
+    JSON: a list of 72 numbers or 24 rows of 3, or an object with such a "pose" and a "translation" in metres.
+    SMPL-H and SMPL-X give 22 joints (`body_theta`).
 
-    Raises FileNotFoundError or PoseFileError.
+    Raises FileNotFoundError and PoseFileError.
     """
     path = Path(path)
     if not path.is_file():
@@ -47,7 +47,7 @@ def read_pose(path: str | Path, frame: int = 0) -> BodyPose:
 
 
 def pose_from_numbers(content: Any, name: str, frame: int = 0) -> BodyPose:
-    """The pose in a list, or in a mapping with "pose" and "translation"; `name` is what an error calls it."""
+    """Parse a list, or a mapping with "pose" and "translation"; errors call it `name`. Raises PoseFileError."""
     pose, translation = content, [0.0, 0.0, 0.0]
     if isinstance(content, dict):
         pose = _first(content, POSE_KEYS, None)
@@ -72,9 +72,9 @@ def _first(content: dict[str, Any], keys: tuple[str, ...], default: Any) -> Any:
 
 
 def body_theta(values: NDArray) -> NDArray:
-    """SMPL's 72 numbers [..., 72] out of a pose's [..., n]: SMPL itself, 22 joints without hands, SMPL-H or SMPL-X.
+    """Convert poses [..., n] of SMPL, of 22 joints without hands, of SMPL-H or SMPL-X to SMPL's [..., 72].
 
-    SMPL-H and SMPL-X have jaw, eyes or fingers where SMPL has its two hand joints, which therefore stay at rest.
+    SMPL-H and SMPL-X have jaw, eyes or fingers in place of SMPL's two hand joints, which therefore stay at rest.
     Raises ValueError for another n.
     """
     count = values.shape[-1]
@@ -87,10 +87,10 @@ def body_theta(values: NDArray) -> NDArray:
 
 
 def _a_row_a_pose(values: NDArray) -> NDArray:
-    """A pose given as rows of joints in one row."""
+    """Flatten a pose given as rows of joints."""
     return values.reshape(-1) if values.ndim == 2 and values.shape[1] == 3 else values
 
 
 def _frame(values: NDArray, frame: int) -> NDArray:
-    """The numbers of one frame of several, or of the only one."""
+    """Select a frame, or return the only one."""
     return values[frame].reshape(-1) if values.ndim >= 2 else values

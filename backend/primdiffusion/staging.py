@@ -1,4 +1,4 @@
-"""All files of a request or none: they are written to a folder of their own and renamed into place together."""
+"""Atomic writing: files are written to a temporary folder or name, and renamed into place when complete."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from pathlib import Path
 import psutil
 
 STAGING_PREFIX = ".primdiffusion-partial-"
-"""Followed by the writing process' id; what a killed process leaves goes with the next one in the same folder."""
+"""Followed by the id of the process. The next request in the folder removes what a killed process left."""
 
 
 @contextlib.contextmanager
 def staged(folder: str | Path) -> Iterator[Path]:
-    """A folder to write into; on a good end its files move to `folder`, on an error all of it goes, a new `folder` too.
+    """Yield a temporary folder inside `folder`, to which its files move at the end, replacing files of the same names.
 
-    Yields a new folder inside `folder`, so that a folder that cannot be written to fails here, before any work.
-    Files of the same names in `folder` are replaced. Raises OSError.
+    After an error everything is removed, including a newly created `folder`. Raises OSError, at once if `folder` cannot
+    be written to.
     """
     target = Path(folder)
     made = _make(target)
@@ -42,7 +42,7 @@ def staged(folder: str | Path) -> Iterator[Path]:
 
 
 def _make(folder: Path) -> list[Path]:
-    """Creates `folder` and its missing parents; returns the created ones, innermost first."""
+    """Create `folder` and its missing parents; return the created ones, innermost first."""
     missing = []
     while not folder.exists():
         missing.append(folder)
@@ -53,7 +53,7 @@ def _make(folder: Path) -> list[Path]:
 
 
 def _unmake(created: list[Path]) -> None:
-    """Removes folders this process created, unless something else was put into them."""
+    """Remove the created folders, unless they are in use."""
     for path in created:
         try:
             path.rmdir()
@@ -70,14 +70,13 @@ def _remove_leftovers(folder: Path) -> None:
 
 @contextlib.contextmanager
 def written_whole(path: str | Path) -> Iterator[Path]:
-    """A temporary name beside `path` to write to; renamed on a good end, removed on an error.
+    """Yield a temporary name beside `path` to write to; it is renamed at the end, or removed after an error.
 
-    Raises OSError, which names `path` itself; PermissionError where it is a folder or a device, which renaming would
-    replace.
+    Raises OSError, naming `path`; PermissionError if it is a folder or a device, which renaming would replace.
     """
     path = Path(path)
     if path.exists() and not path.is_file():
-        raise PermissionError(errno.EPERM, "this is no ordinary file and will not be replaced", str(path))
+        raise PermissionError(errno.EPERM, "this is not a regular file and will not be replaced", str(path))
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield unfinished
@@ -91,7 +90,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """The whole file or none, and nothing beside it. Raises OSError, which names `path`."""
+    """Write a file atomically; creates its folder. Raises OSError, naming `path`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as unfinished:
         unfinished.write_bytes(content.encode() if isinstance(content, str) else content)

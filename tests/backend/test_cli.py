@@ -201,7 +201,7 @@ def test_a_picture_that_cannot_be_written_is_named_and_nothing_is(person, tmp_pa
     code, stderr = fails(capsys, "render", human, *small, "--out", tmp_path / "x.png", "--depth", tmp_path / "no" / "d")
     assert f"{tmp_path / 'no' / 'd'}: no such file" in stderr
     code, stderr = fails(capsys, "render", human, *small, "--out", tmp_path)
-    assert f"{tmp_path}: this is no ordinary file" in stderr
+    assert f"{tmp_path}: this is not a regular file" in stderr
     assert list(tmp_path.iterdir()) == []
 
 

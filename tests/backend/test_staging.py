@@ -87,6 +87,6 @@ def test_folders_and_devices_are_not_replaced(tmp_path):
     """Who may do anything, as the administrator may, would otherwise lose a device to a picture."""
     os.mkfifo(tmp_path / "pipe")
     for place in (tmp_path, tmp_path / "pipe"):
-        with pytest.raises(PermissionError, match="no ordinary file"), written_whole(place):
+        with pytest.raises(PermissionError, match="not a regular file"), written_whole(place):
             pass
     assert [entry.name for entry in tmp_path.iterdir()] == ["pipe"]

@@ -1,5 +1,5 @@
-"""A module a subcommand: its request as one frozen record, and the work that it asks for.
+"""Subcommands: each is a request, a frozen record with a method that runs it.
 
-JSON-RPC (`serve`) reads a record's fields by `request.read_request`; the command line reads the same record by tyro.
-Records import no torch: a child answers `hello`, and the command line --help, before it is loaded.
+JSON-RPC (`serve`) reads the record with `request.read_request`, the command line with tyro. Modules of records import
+torch only when a request runs, so that the child answers `hello`, and the command line --help, at once.
 """

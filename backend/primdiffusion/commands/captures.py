@@ -1,4 +1,4 @@
-"""The command `primdiffusion captures`: render, verify, info, pack, sheet, farm."""
+"""Multi-view captures: `primdiffusion captures` render, verify, info, pack, sheet and farm."""
 
 from __future__ import annotations
 
@@ -19,50 +19,50 @@ from primdiffusion.capture.rasterised import PASSES, Job, render
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
 
-DESCRIPTION = "Pictures of people from many sides, to train on."
+DESCRIPTION = "Multi-view captures, to train on."
 
 
 @dataclasses.dataclass(frozen=True)
 class RenderCaptures:
-    """Draw people of `primdiffusion people` in many poses from many sides, without light, by the fast rasteriser.
+    """Render humans of `primdiffusion people` in many poses from many sides, unlit, with the fast rasteriser.
 
-    What is there already is kept: the same command goes on where it was stopped.
+    Finished subjects are skipped: running the command again resumes it.
     """
 
     people: Path
-    """Folder of people."""
+    """Folder of humans."""
     out: Path
-    """Folder of the captures."""
+    """Output folder."""
     poses: tuple[Path, ...] = ()
-    """Motion files (AMASS and other .npz, .npy, .json); without any the built-in poses."""
+    """Motion files (AMASS and other .npz, .npy, .json); the default is the built-in poses."""
     pose_count: int = 20
-    """Poses of each person, the near-T pose first; 0: every frame of the motion files, in order, where it is."""
+    """Poses of each human, the near-T pose first; 0: all frames of one motion file, in order, with its translation."""
     cameras: int = 36
-    """Views of each pose."""
+    """Number of views of each pose."""
     size: int = 512
-    """Pixels a side."""
+    """Width and height of the images, pixels."""
     arrangement: Arrangement = "rings"
-    """Of the cameras."""
+    """Arrangement of the cameras."""
     elevations: tuple[float, ...] = (-10.0, 15.0, 40.0)
-    """Of rings, degrees above the horizon."""
+    """Elevations of the rings, degrees above the horizon."""
     passes: tuple[str, ...] = PASSES
-    """What to write."""
+    """Passes to write."""
     samples: int = 3
-    """Of a pixel's side: 3 are 9 samples a pixel. Odd."""
+    """Samples along each side of a pixel, an odd number: 3 gives 9 samples per pixel."""
     seed: int = 0
-    """Of the choice of poses."""
+    """Seed of the choice of poses."""
     workers: int = 1
-    """Processes; each takes a core and about 1 GB."""
+    """Number of processes; each uses a core and about 1 GB."""
     shard: str = "0/1"
-    """i/n: only every n-th person from the i-th on, i = 0 ... n - 1, for several machines."""
+    """i/n: only every n-th human from the i-th on, i = 0 ... n - 1, to share the work between machines."""
     released_reference: bool = False
-    """Draw the first person a second time under the name that the released code looks for."""
+    """Render the first human a second time, under the name that the released code expects."""
 
     def run(self) -> None:
-        """Renders, and prints what became of everybody.
+        """Render, and print a line for each human.
 
         Raises:
-            ValueError: settings are impossible, or somebody could not be rendered (see the report).
+            ValueError: settings are invalid, or a human could not be rendered (see the report).
         """
         index, count = parse_shard(self.shard)
         people = find_people(self.people)
@@ -84,8 +84,8 @@ class RenderCaptures:
             unread_poses=tuple(unread),
             part="report" if count == 1 else f"report-{index}-of-{count}",
         )
-        for why in unread:
-            print(f"poses  failed  {why}", flush=True)
+        for error in unread:
+            print(f"poses  failed  {error}", flush=True)
         outcomes = Counter()
         for outcome in tqdm(render(job, self.workers), total=len(names), unit="person", disable=None):
             outcomes[outcome.what] += 1
@@ -97,7 +97,7 @@ class RenderCaptures:
             )
 
     def _poses(self) -> tuple[BodyPose, list[str]]:
-        """The poses, and why some files of poses are left out. Raises MotionFileError where all of them are."""
+        """Return the poses, and the errors of unreadable motion files. Raises MotionFileError if all are."""
         if not self.pose_count:
             return read_motion(self.poses[0]), []
         motions, unread = read_motions(self.poses)
@@ -107,11 +107,7 @@ class RenderCaptures:
 
 
 def parse_shard(text: str) -> tuple[int, int]:
-    """i and n of "i/n".
-
-    Raises:
-        ValueError: it is something else, or i is not of 0 ... n - 1.
-    """
+    """Parse "i/n" to i and n. Raises ValueError unless 0 <= i < n."""
     try:
         index, count = (int(number) for number in text.split("/"))
     except ValueError:
@@ -123,22 +119,18 @@ def parse_shard(text: str) -> tuple[int, int]:
 
 @dataclasses.dataclass(frozen=True)
 class VerifyCaptures:
-    """Look for damaged, missing and unfinished files."""
+    """Find damaged, missing and unfinished files."""
 
     root: tyro.conf.Positional[Path]
-    """Folder of captures."""
+    """Folder of a capture dataset."""
     repair: bool = False
-    """Remove what is damaged, so that the command that rendered it makes it again."""
+    """Remove damaged files, so that the command that rendered them renders them again."""
     quick: bool = False
-    """Compare sizes, not checksums."""
+    """Compare sizes instead of checksums."""
 
     def run(self) -> None:
-        """Prints a line for each thing that is wrong.
-
-        Raises:
-            ValueError: something is wrong.
-        """
-        # of this subcommand alone
+        """Print a line for each finding; raises ValueError if there is any."""
+        # used by this subcommand alone
         from primdiffusion.capture.verify import repair, subject_folders, verify
 
         findings = verify(self.root, checksums=not self.quick)
@@ -156,14 +148,14 @@ class VerifyCaptures:
 
 @dataclasses.dataclass(frozen=True)
 class InfoOfCaptures:
-    """Say what a folder of captures holds, as JSON."""
+    """Describe a capture dataset, as JSON."""
 
     root: tyro.conf.Positional[Path]
-    """Folder of captures, of this program or in the released capture_layout."""
+    """Folder of a capture dataset, of this program or in the released layout."""
 
     def run(self) -> None:
-        """Prints one JSON object."""
-        # of this subcommand alone
+        """Print one JSON object."""
+        # used by this subcommand alone
         from primdiffusion.capture.pack import open_pack
         from primdiffusion.capture.reader import open_captures
 
@@ -185,14 +177,14 @@ class InfoOfCaptures:
 
 @dataclasses.dataclass(frozen=True)
 class PackCaptures:
-    """Store pictures and masks as one array a subject, which training maps into memory: large, but quick to read."""
+    """Pack images and masks into an array per subject that training maps into memory: large, but quick to read."""
 
     root: tyro.conf.Positional[Path]
-    """Folder of captures; the arrays go to its folder packed."""
+    """Folder of a capture dataset; the arrays go to its folder `packed`."""
 
     def run(self) -> None:
-        """Packs, and prints a line for each subject."""
-        # of this subcommand alone
+        """Pack, and print a line for each subject."""
+        # used by this subcommand alone
         from primdiffusion.capture.pack import pack
         from primdiffusion.capture.reader import open_captures
 
@@ -203,22 +195,22 @@ class PackCaptures:
 
 @dataclasses.dataclass(frozen=True)
 class SheetOfCaptures:
-    """Draw many views side by side, every other one with the joints on it."""
+    """Draw a contact sheet of views, every other one with the joints."""
 
     root: tyro.conf.Positional[Path]
-    """Folder of captures."""
+    """Folder of a capture dataset."""
     out: Path
-    """PNG to write."""
+    """Output PNG."""
     rows: int = 8
-    """People, each next one in the next pose."""
+    """Number of subjects, each in the next pose."""
     columns: int = 12
-    """Cameras, evenly spaced."""
+    """Number of cameras, evenly spaced."""
     size: int = 160
-    """Height of a picture on the sheet, pixels."""
+    """Height of an image on the sheet, pixels."""
 
     def run(self) -> None:
-        """Draws, and prints the sheet's path and the largest error of the joints' pixels."""
-        # of this subcommand alone
+        """Draw; print the path and the largest reprojection error of the joints, pixels."""
+        # used by this subcommand alone
         from primdiffusion.capture.reader import open_captures
         from primdiffusion.capture.sheet import draw_sheet
 
@@ -229,38 +221,34 @@ class SheetOfCaptures:
 
 @dataclasses.dataclass(frozen=True)
 class FarmCaptures:
-    """Render a dataset by a command of Blender's on a Ray cluster, a person a task (needs the extra `farm`).
+    """Render a dataset with Blender on a Ray cluster, one human per task (needs the extra `farm`).
 
     `primdiffusion captures farm --workers 4 -- blender -c primdiffusion capture --people scans --out captures`
     """
 
     command: tyro.conf.Positional[tuple[str, ...]]
-    """The renderer and its options; its paths must mean the same files on every machine."""
+    """The renderer and its options; paths must be the same on all machines."""
     address: str | None = None
-    """Of a Ray cluster; "auto": the one of this machine; without it one is started here."""
+    """Address of a Ray cluster; "auto" for the one of this machine; the default starts one here."""
     workers: int = 1
-    """Renderers at once, where the cluster is started here."""
+    """Renderers at a time, if the cluster is started here."""
     processors_each: float = 1
     """Cores of each renderer."""
     gpus_each: float = 0
-    """GPUs of each renderer; 0.5: two share one."""
+    """GPUs of each renderer; with 0.5 two share one."""
     attempts: int = 3
-    """Times a person is tried whose worker or renderer is killed."""
+    """Attempts for a human whose worker or renderer is killed."""
 
     def run(self) -> None:
-        """Renders, and prints how each person ended.
-
-        Raises:
-            FarmError: the farm cannot begin, or somebody is not finished.
-        """
-        # of this subcommand alone
+        """Render, and print a line for each human. Raises FarmError if the cluster cannot start or a human fails."""
+        # used by this subcommand alone
         from primdiffusion.capture.farm import Farm, FarmError, Outcome, render_on
 
-        def tell(outcome: Outcome, done: int, total: int) -> None:
+        def show(outcome: Outcome, done: int, total: int) -> None:
             print(f"{done}/{total}  {outcome.subject}  {outcome.error or f'{outcome.seconds:.0f} s'}", flush=True)
 
         farm = Farm(self.address, self.workers, self.processors_each, self.gpus_each, self.attempts)
-        outcomes = render_on(farm, self.command, tell)
+        outcomes = render_on(farm, self.command, show)
         failed = [outcome.subject for outcome in outcomes if outcome.exit_code]
         if failed:
             raise FarmError(f"{len(failed)} of {len(outcomes)} people are not finished: {', '.join(failed[:5])}")
@@ -277,5 +265,5 @@ Command = (
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parses and runs one line."""
+    """Run a command line; raises its errors."""
     tyro.cli(Command, args=arguments or ["--help"], prog="primdiffusion captures", description=DESCRIPTION).run()

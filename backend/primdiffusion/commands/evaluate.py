@@ -1,4 +1,4 @@
-"""How good trained models are: `primdiffusion evaluate`."""
+"""Evaluate trained models: `primdiffusion evaluate`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from primdiffusion.training.stored_people import find_people, read_person
 
 
 def run(arguments: Sequence[str]) -> None:
-    """One command line, errors as exceptions."""
+    """Run a command line; raises its errors."""
 
     def load(path: Path | None) -> TrainedReconstructor:
         return load_encoder(path, best_device())

@@ -1,4 +1,4 @@
-"""People for other programs: `primdiffusion export`, and `proxy`, `gaussians` and `human_npz` of JSON-RPC."""
+"""Export humans: `primdiffusion export`, and `proxy`, `gaussians` and `human_npz` of JSON-RPC."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ProxyRequest:
-    """Write the textured mesh of a person at rest."""
+    """Write the textured mesh of a human in the rest pose."""
 
     person: Path
     """A .human.safetensors file."""
     out_dir: Path
-    """Folder for proxy.npz and proxy.png; made if missing."""
+    """Output folder of proxy.npz and proxy.png; created if missing."""
     betas: list | None = None
-    """Shape coefficients; None for the file's."""
+    """Shape coefficients; None for those of the file."""
     triangles: int = requests.TRIANGLES
-    """At most."""
+    """Largest number of triangles."""
     texture_px: int = requests.TEXTURE_SIZE
-    """Pixels a side of proxy.png."""
+    """Width and height of proxy.png, pixels."""
     spacing: float = requests.VOXEL
-    """Of the grid that the surface is found on, metres."""
+    """Spacing of the grid that the surface is extracted from, metres."""
 
     def check(self) -> None:
         """See `Request`."""
         check_betas(self.betas)
 
     def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
-        """Writes both files or none.
+        """Write both files or none.
 
-        Raises OSError before any work if the folder cannot be written to; what load_human and mesh_proxy raise.
+        Raises OSError first of all if the folder cannot be written to; raises as load_human and mesh_proxy.
         """
         # torch is loaded late
         from primdiffusion.export.proxy import ARRAYS, TEXTURE, ProxySettings, mesh_proxy, write_proxy_arrays
@@ -69,20 +69,20 @@ class ProxyRequest:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GaussiansRequest:
-    """Write a person as 3D Gaussians, posed as an armature poses them."""
+    """Write a human as 3D Gaussians, posed by an armature."""
 
     person: Path
     """A .human.safetensors file."""
     out: Path
-    """The .ply to write."""
+    """Output .ply."""
     object: list | None = None
-    """[3][4] world matrix of the armature object; y up, metres. None, as `joints`: the T pose at the origin."""
+    """[3][4] world matrix of the armature object; y up, metres. Without it and `joints`: the T pose at the origin."""
     joints: list | None = None
-    """[24][3][4] from rest to posed in the object's space, SMPL's joint order."""
+    """[24][3][4] rest to posed in object space, SMPL's joint order."""
     betas: list | None = None
-    """Shape coefficients; None for the file's."""
+    """Shape coefficients; None for those of the file."""
     limit: int = requests.GAUSSIANS
-    """Gaussians at most."""
+    """Largest number of Gaussians."""
 
     def check(self) -> None:
         """See `Request`."""
@@ -96,7 +96,7 @@ class GaussiansRequest:
             raise ValueError(f"{self.limit} Gaussians were asked for: choose 1 or more")
 
     def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
-        """Raises OSError and what load_human does."""
+        """Raises OSError, and as load_human."""
         import torch  # late
 
         # torch is loaded late
@@ -120,21 +120,21 @@ class GaussiansRequest:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class HumanNpzRequest:
-    """Write the files of `generate` for a person who exists."""
+    """Write the files of `generate` for a saved human."""
 
     person: Path
     """A .human.safetensors file."""
     out_dir: Path
-    """Folder for them; made if missing."""
+    """Output folder; created if missing."""
     size: int = requests.PICTURE_SIZE
-    """Pixels a side of the pictures."""
+    """Width and height of the previews, pixels."""
 
     def check(self) -> None:
         """See `Request`."""
         check_size(self.size)
 
     def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
-        """Writes all files or none. Raises OSError and what load_human does."""
+        """Write all files or none. Raises OSError, and as load_human."""
         # torch is loaded late
         from primdiffusion.commands.output import FILES, write_human
         from primdiffusion.human_file import load_human
@@ -150,7 +150,7 @@ class HumanNpzRequest:
 
 
 def _shaped(person: Path, betas: list | None) -> Human:
-    """The person with other betas. Raises ValueError for another number of them, and what load_human does."""
+    """Load a human, with other betas if given. Raises ValueError for a wrong number of them, and as load_human."""
     import torch  # late
 
     # torch is loaded late
@@ -163,23 +163,23 @@ def _shaped(person: Path, betas: list | None) -> Human:
 
 @dataclasses.dataclass(frozen=True)
 class ExportCommand:
-    """Write a person for other programs; the ending of --out says what: .glb, .obj or .ply."""
+    """Export a human to other programs; the extension of --out selects the format: .glb, .obj or .ply."""
 
     human: tyro.conf.Positional[Path]
     """A .human file (or .human.safetensors)."""
     out: Path
-    """.glb: textured mesh with a skeleton; .obj: the mesh alone, with .mtl and .png beside it; .ply: 3D Gaussians."""
+    """.glb: textured mesh with a skeleton; .obj: the mesh alone, with .mtl and .png; .ply: 3D Gaussians."""
     triangles: int = requests.TRIANGLES
-    """Of the mesh, at most."""
+    """Largest number of triangles of the mesh."""
     texture: int = requests.TEXTURE_SIZE
-    """Pixels a side of the mesh's texture."""
+    """Width and height of the texture, pixels."""
     gaussians: int = requests.GAUSSIANS
-    """Gaussians, at most."""
+    """Largest number of Gaussians."""
     pose: Path | None = None
-    """.json or .npz with 72 axis-angle numbers (24 joints x 3, radians), for Gaussians; without it the T pose. Meshes
-    are in the T pose."""
+    """.json or .npz with 72 axis-angle numbers (24 joints x 3, radians), for Gaussians; the default is the T pose, as
+    for meshes."""
     frame: int = 0
-    """Which frame of a pose file that holds several."""
+    """Frame of a pose file with several."""
 
     def check(self) -> None:
         """See `Request`."""
@@ -192,7 +192,7 @@ class ExportCommand:
             raise FileNotFoundError(f"there is no folder {self.out.parent}: make it first, or choose another")
 
     def export(self) -> None:
-        """Exports, and prints the file's path."""
+        """Export, and print the path."""
         from primdiffusion.human_file import load_human  # torch is loaded late
 
         _writer(self.out)(self, load_human(self.human))
@@ -228,5 +228,5 @@ def _write_gaussians(asked: ExportCommand, human: Human) -> None:
 
 
 def run(arguments: Sequence[str]) -> None:
-    """One command line, errors as exceptions."""
+    """Run a command line; raises its errors."""
     parse(ExportCommand, arguments, "export").export()

@@ -1,4 +1,4 @@
-"""Draws frames, and keeps what the next one is likely to need again."""
+"""Draws frames for the render engine, with caches for the next frame."""
 
 from __future__ import annotations
 
@@ -30,39 +30,39 @@ from primdiffusion.render.solids import Solids
 from primdiffusion.reshaping import reshaped
 
 CHANNELS = 5
-"""Of a frame: combined and depth."""
-PEOPLE_KEPT = 64
+"""Channels of a frame: RGBA and depth."""
+HUMANS_CACHED = 64
 """About 8 MB each, and a quarter of that again where they are scaled."""
-SOLIDS_KEPT = 2
+SOLIDS_CACHED = 2
 MOST_DOUBLINGS = 16
-"""From the smallest person of a picture to the largest."""
+"""Largest range of scales in a frame, in powers of two."""
 
 Stamp = tuple[Path, int, int]
-"""A file as it is now: path, time of change, size."""
+"""Path, modification time and size of a file."""
 Numbers = tuple[Any, ...]
 """Nested tuples of floats."""
 
 
 class FrameDrawer:
-    """Draws into frames, and keeps the people, their places and the solids of the last pictures."""
+    """Draws frames, and caches the humans, placed primitives and solids of the last ones."""
 
     def __init__(self, device: torch.device) -> None:
-        """`device` is where to draw if its marcher is the fast one; otherwise pictures are drawn on the CPU."""
+        """Draw on `device` if it has a fast marcher, otherwise on the CPU."""
         self._device = device if cuda.available(device) else torch.device("cpu")
-        self._human = functools.lru_cache(PEOPLE_KEPT)(self._load)
-        self._shaped = functools.lru_cache(PEOPLE_KEPT)(self._reshape)
+        self._human = functools.lru_cache(HUMANS_CACHED)(self._load)
+        self._shaped = functools.lru_cache(HUMANS_CACHED)(self._reshape)
         self._rig = functools.lru_cache(1)(self._body)
-        self._placed = functools.lru_cache(PEOPLE_KEPT)(self._place)
-        self._everybody = functools.lru_cache(2)(self._together)
-        self._solids = functools.lru_cache(SOLIDS_KEPT)(_load_solids)
+        self._placed = functools.lru_cache(HUMANS_CACHED)(self._place)
+        self._all_placed = functools.lru_cache(2)(self._together)
+        self._solids = functools.lru_cache(SOLIDS_CACHED)(_load_solids)
         self._speed: dict[tuple[str, float, int], float] = {}
-        """Pixels a second of the last picture, by view, step and number of people."""
+        """Pixels per second of the last frame, by view, step and number of humans."""
 
     def draw(self, frame: FrameSpec, report: ReportProgress) -> dict[str, Any]:
-        """Fills the frame band by band from the top, with a report after each; returns what it took.
+        """Fill the frame band by band from the top, with a report after each; return the time taken.
 
-        Raises what load_human and place_skinned do, ValueError for a frame of the wrong size or solids that are none,
-        OSError for files that cannot be read or written, PictureOutOfMemory.
+        Raises as load_human and place_skinned, ValueError for a frame of the wrong size or an invalid file of solids,
+        OSError, and PictureOutOfMemory.
         """
         began = time.perf_counter()
         width, height = frame.size
@@ -92,7 +92,7 @@ class FrameDrawer:
             if frame.view == "boxes"
             else None
         )
-        return Scene(self._everybody(people), solids, None if chart is None else chart.cpu())
+        return Scene(self._all_placed(people), solids, None if chart is None else chart.cpu())
 
     def _together(self, people: tuple[Numbers, ...]) -> Primitives:
         placed = [self._placed(*person) for person in people]
@@ -119,7 +119,7 @@ class FrameDrawer:
         return load_human(file[0]).to(self._device)
 
     def _fill(self, picture: Picture, scene: Scene, frame: FrameSpec, report: ReportProgress) -> float:
-        """Draws into the frame; returns the seconds of the marcher."""
+        """Draw the scene; return the seconds spent in the marcher."""
         look = Look(
             frame.view,
             None if frame.background is None else tuple(frame.background),
@@ -142,7 +142,7 @@ class FrameDrawer:
 
 
 def map_frame(path: Path, width: int, height: int) -> Picture:
-    """The picture in a frame file; writing to it writes to the file.
+    """Map a frame file as an image; writing to it writes to the file.
 
     Raises FileNotFoundError, ValueError for a file of another size, OSError.
     """
@@ -151,7 +151,7 @@ def map_frame(path: Path, width: int, height: int) -> Picture:
     if given != wanted:
         raise ValueError(
             f"the frame {path} has {given} bytes, but {width} x {height} pixels need {wanted} (5 float32 a pixel): "
-            "make it anew for this size"
+            "create it for this size"
         )
     values = np.asarray(np.memmap(path, np.float32, "r+", shape=(width * height * CHANNELS,)))
     combined, depth = values[: width * height * 4], values[width * height * 4 :]
@@ -159,17 +159,17 @@ def map_frame(path: Path, width: int, height: int) -> Picture:
 
 
 def _first_guess(frame: FrameSpec) -> float:
-    """Pixels a second of an unknown machine, on the safe side: work grows with samples and with people."""
+    """A cautious estimate of pixels per second, from the number of samples and humans."""
     plain = FIRST_PIXELS / BAND_SECONDS
     return plain * min(1.0, frame.step / MarchSettings().step) / max(1, len(frame.people))
 
 
 def settings_for(step: float, objects: list[Any]) -> MarchSettings:
-    """Samples of people whose objects have the world matrices `objects`, each [3][4], as fine as their boxes ask for.
+    """Adapt the marcher to the scales of the objects, whose world matrices [3][4] are `objects`.
 
-    The lattice shrinks with the smallest person, or the boxes of a doll would fall between its points; strides grow
-    with the largest, so that a giant costs no more than a person. By powers of two: within a factor of 1.4 of natural
-    size nothing changes.
+    The lattice shrinks with the smallest human, or small boxes would fall between its points; strides grow with the
+    largest, so that it costs no more than one of natural size. By powers of two: within a factor of 1.4 of natural size
+    nothing changes.
     """
     volumes = [abs(float(np.linalg.det(np.array(matrix)[:, :3]))) for matrix in objects]
     powers = [round(math.log2(volume) / 3) for volume in volumes if volume > 0] or [0]
@@ -187,14 +187,14 @@ def _stamp(path: Path) -> Stamp:
 
 
 def _frozen(value: Any) -> Any:
-    """Nested lists of numbers as nested tuples of floats, which can be keys."""
+    """Convert nested lists of numbers to nested tuples of floats, for use as keys."""
     if value is None:
         return None
     return tuple(map(_frozen, value)) if isinstance(value, list) else float(value)
 
 
 def _load_solids(file: Stamp) -> Solids:
-    """Raises ValueError, naming the file, where it holds no solids."""
+    """Raise ValueError, naming the file, for an invalid file."""
     path = file[0]
     try:
         arrays = read_arrays(path, ("corners", "colour", "holdout"))

@@ -1,4 +1,4 @@
-"""The command `primdiffusion import-released`: the authors' checkpoint and the user's SMPL in, one like ours out."""
+"""Convert the authors' checkpoint and the user's SMPL file to a checkpoint: `primdiffusion import-released`."""
 
 from __future__ import annotations
 
@@ -27,35 +27,35 @@ from primdiffusion.staging import write_atomically
 SMPL_CELLS_OUTSIDE = 214
 """Of 1024 grid points outside every chart with SMPL's own UV (SPEC 1.2)."""
 SAME_BODY = 1e-4
-"""Metres by which two files of one body may differ."""
+"""Largest difference between two files of one body, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ImportReleased:
-    """Turn the authors' primdiffusion.pt into a checkpoint for generate, render, the add-on and everything else.
+    """Convert the authors' primdiffusion.pt to a checkpoint for generate, render, the extension and everything else.
 
-    Only the denoiser (stage 2) is imported. The new file holds nothing of SMPL: it names your SMPL file and its
-    fingerprint, and needs that file wherever it is used.
+    Only the denoiser (stage 2) is imported. The new file contains nothing of SMPL: it stores the path and checksum of
+    your SMPL file, which it needs wherever it is used.
     """
 
     checkpoint: tyro.conf.Positional[Path]
-    """The authors' file. It is read as tensors only: nothing in it is run."""
+    """The authors' file. Only tensors are read; no code in it is executed."""
     smpl: Path
     """Your SMPL_NEUTRAL.pkl, or a body of the same format as .npz."""
     uv: tuple[Path, ...]
     """The UV layout it was trained with: SMPL's UV .obj, an .npz with vt and ft, or the pair vt.npy ft.npy."""
     out: Path
-    """The .safetensors file to write."""
+    """Output .safetensors."""
     reference: Path | None = None
-    """Folder of the dataset's subject seq_000016-rp_alison_rigged_002, whose first frame set the sizes of boxes;
-    without it the mean body in the T pose sets them, which differs by millimetres."""
+    """Folder of the dataset's subject seq_000016-rp_alison_rigged_002, whose first frame determined the box sizes; the
+    default is the mean body in the T pose, which differs by millimetres."""
     chain: Literal["released", "trailing"] = "released"
-    """Which steps samplers visit: 991, 981, ... 1 as the released code does, or from the schedule's last step on."""
+    """Timesteps of samplers: 991, 981, ... 1 as in the released code, or from the last step of the schedule."""
     report: Path | None = None
-    """A .json to write: what became of every tensor."""
+    """Output .json with a report on every tensor."""
 
     def run(self) -> None:
-        """Imports, and prints what became of every group of tensors."""
+        """Import, and print a report on every group of tensors."""
         weights = read_weights(self.checkpoint)
         inventory = take_inventory(weights)
         print(inventory.account.table())
@@ -88,7 +88,7 @@ def _reference(folder: Path | None) -> Reference:
 
 
 def _about_body(weights: Mapping[str, Tensor], body: BodyModel) -> list[str]:
-    """Whether the SMPL given is the one that the checkpoint was trained on, which holds a copy of it."""
+    """Compare the given SMPL body with the copy in the checkpoint."""
     held = [
         value.reshape(body.template.shape)
         for key, value in weights.items()
@@ -106,7 +106,7 @@ def _about_body(weights: Mapping[str, Tensor], body: BodyModel) -> list[str]:
 
 
 def _about_layout(body_setup: BodySetup) -> str:
-    centred = (body_setup.anchors.barycentric == 1 / 3).all(-1)  # where the rule puts them, on the last face
+    centred = (body_setup.anchors.barycentric == 1 / 3).all(-1)  # where the rule puts those outside, on the last face
     outside = int((centred & (body_setup.anchors.face == len(body_setup.body.faces) - 1)).sum())
     return f"{outside} of {K} primitives lie outside of the UV charts; with SMPL's own UV {SMPL_CELLS_OUTSIDE} do"
 
@@ -139,5 +139,5 @@ def _write_report(
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parses and runs one command line."""
+    """Run a command line; raises its errors."""
     tyro.cli(ImportReleased, args=arguments, prog="primdiffusion import-released").run()

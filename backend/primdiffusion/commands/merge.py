@@ -1,5 +1,7 @@
-"""People as grids of voxels, for renderers that are not ours: `primdiffusion merge`, and `merge`, `merge_frames` and
-`fit_gain` of JSON-RPC."""
+"""Merge humans into voxel grids for other renderers.
+
+`primdiffusion merge`, and `merge`, `merge_frames` and `fit_gain` of JSON-RPC.
+"""
 
 from __future__ import annotations
 
@@ -24,20 +26,20 @@ if TYPE_CHECKING:
     from primdiffusion.primitives.primitives import Primitives
 
 GAIN_VIEWS = 4
-"""Around the person."""
+"""Views around the human."""
 GAIN_PIXELS = 128
-"""A side of each view; 4 x 128 x 128 rays meet a standing person about ten thousand times."""
+"""Width and height of each view; about ten thousand of the 4 x 128 x 128 rays meet a standing human."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MergeRequest:
-    """Write one grid of several people, z up. Needs no checkpoint."""
+    """Merge humans into one grid, z up. Needs no checkpoint."""
 
     people: list[PosedPerson]
     out: Path
-    """The .npz to write."""
+    """Output .npz."""
     voxel: float = VOXEL
-    """Metres a side."""
+    """Voxel size, metres."""
 
     def check(self) -> None:
         """See `Request`."""
@@ -45,7 +47,7 @@ class MergeRequest:
         _check_people(self.people)
 
     def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
-        """Returns the grid's path and shape. Raises what load_human, place_skinned and merge do."""
+        """Return the path and shape of the grid. Raises as load_human, place_skinned and merge."""
         began = time.perf_counter()
         report("merge", 0, 1, None)
         primitives = _together(self.people)
@@ -57,14 +59,14 @@ class MergeRequest:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MergeFramesRequest:
-    """Write a grid for each frame of a person. Needs no checkpoint."""
+    """Write a grid for each frame of a human. Needs no checkpoint."""
 
     people: list[PosedPerson]
-    """One person, once for each frame."""
+    """The same human, once for each frame."""
     out_dir: Path
-    """Folder for 0000.npz, 0001.npz, ...; made if missing."""
+    """Output folder of 0000.npz, 0001.npz, ...; created if missing."""
     voxel: float = VOXEL
-    """Metres a side."""
+    """Voxel size, metres."""
 
     def check(self) -> None:
         """See `Request`."""
@@ -72,9 +74,9 @@ class MergeFramesRequest:
         _check_people(self.people)
 
     def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
-        """Writes the grids one by one, each of them whole, so that a program may take them in meanwhile.
+        """Write the grids one by one, each atomically, so that another program can load them meanwhile.
 
-        Returns their paths. Raises as `MergeRequest`; what is there by then stays.
+        Returns their paths. Raises as `MergeRequest`; grids written before an error stay.
         """
         from primdiffusion.human_file import load_human  # torch is loaded late
 
@@ -94,17 +96,17 @@ class MergeFramesRequest:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FitGainRequest:
-    """Fit the density gain of renderers with exponential absorption. Needs no checkpoint."""
+    """Fit the density gain for renderers with exponential absorption. Needs no checkpoint."""
 
     people: list[PosedPerson]
-    """In the pose to fit in."""
+    """Humans in the pose to fit in."""
 
     def check(self) -> None:
         """See `Request`."""
         _check_people(self.people)
 
     def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
-        """The gain, from views around the person (see `fit_gain`); also raises as it."""
+        """Return the gain, fitted in views around the humans. Raises as `fit_gain`."""
         import numpy as np  # late
 
         # torch is loaded late
@@ -164,23 +166,23 @@ def _write(path: Path, primitives: Primitives, voxel: float) -> list[int]:
 
 @dataclasses.dataclass(frozen=True)
 class MergeCommand:
-    """Write people as one grid of voxels; the ending of --out says how: .vdb or .npz."""
+    """Merge humans into one voxel grid; the extension of --out selects the format: .vdb or .npz."""
 
     humans: tyro.conf.Positional[tuple[Path, ...]]
     """.human files (or .human.safetensors)."""
     out: Path
     """.vdb: grids density and Cd (needs Python's module openvdb); .npz: density, colour, origin, voxel. z up."""
     voxel: float = VOXEL
-    """Metres a side; finer shows more detail, at eight times the memory for half."""
+    """Voxel size, metres; half the size shows more detail at eight times the memory."""
     pose: Path | None = None
-    """.json or .npz with 72 axis-angle numbers (24 joints x 3, radians), for all of them; without it the T pose."""
+    """.json or .npz with 72 axis-angle numbers (24 joints x 3, radians), for all humans; the default is the T pose."""
     frame: int = 0
-    """Which frame of a pose file that holds several."""
+    """Frame of a pose file with several."""
     apart: float = 1.0
-    """Metres between neighbours, side by side, where there are several people."""
+    """Distance between neighbours, side by side, metres."""
 
     def merge(self) -> None:
-        """Merges, and prints the file's path."""
+        """Merge, and print the path."""
         import torch  # late
 
         # torch is loaded late
@@ -219,5 +221,5 @@ class MergeCommand:
 
 
 def run(arguments: Sequence[str]) -> None:
-    """One command line, errors as exceptions."""
+    """Run a command line; raises its errors."""
     parse(MergeCommand, arguments, "merge").merge()

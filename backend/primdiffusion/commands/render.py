@@ -1,4 +1,4 @@
-"""Draw a person: `primdiffusion render`, and `render` of JSON-RPC."""
+"""Render humans: `primdiffusion render`, and `render` and `draw` of JSON-RPC."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RenderRequest:
-    """Draw a saved person on black."""
+    """Render a saved human on black."""
 
     human: Path
     """A .human.safetensors file."""
     out: Path
-    """The PNG to write."""
+    """Output PNG."""
     width: int = PICTURE_SIZE
     height: int = PICTURE_SIZE
     yaw: float = 0.0
-    """Where the camera stands around the person: 0 in front, pi/2 at the person's left; radians."""
+    """Camera position around the human, radians: 0 in front, pi/2 at the human's left."""
     pose: Path | list | None = None
     """72 axis-angle values (24 x 3, radians), or a pose file (.json, .npz); None for the T pose."""
     depth: Path | None = None
-    """A second PNG, of depth."""
+    """A second PNG, of the depth."""
 
     def check(self) -> None:
         """See `Request`."""
@@ -47,7 +47,7 @@ class RenderRequest:
         check_angle("yaw", self.yaw, "radians")
 
     def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
-        """Returns the picture's path. Raises what load_human and read_pose do, and OSError."""
+        """Render, and return the paths. Raises as load_human and read_pose, and OSError."""
         # torch is loaded late
         from primdiffusion.human import framing, place
         from primdiffusion.human_file import load_human
@@ -66,7 +66,7 @@ class RenderRequest:
         report("render", 0, 1, None)
         rendering = march(primitives, framing(primitives, self.yaw, self.width, self.height))
         report("write", 1, 1, 0.0)
-        with contextlib.ExitStack() as files:  # both pictures or none
+        with contextlib.ExitStack() as files:  # both files or none
             to_png(files.enter_context(written_whole(self.out)), rendering)
             if self.depth is not None:
                 depth_to_png(files.enter_context(written_whole(self.depth)), rendering)
@@ -87,35 +87,35 @@ class DrawRequest(FrameSpec):
 
 @dataclasses.dataclass(frozen=True)
 class RenderCommand:
-    """Draw a person in a pose."""
+    """Render a human in a pose."""
 
     human: tyro.conf.Positional[Path]
     """A .human.safetensors file."""
     out: Path
-    """PNG to write."""
+    """Output PNG."""
     yaw: float = 0.0
-    """Degrees around the person: 0 the face, 90 their left side."""
+    """Camera position around the human, degrees: 0 in front, 90 at the human's left."""
     pose: Path | None = None
-    """.json or .npz with 72 axis-angle numbers (24 joints x 3, radians); without it the T pose."""
+    """.json or .npz with 72 axis-angle numbers (24 joints x 3, radians); the default is the T pose."""
     frame: int = 0
-    """Which frame of a pose file that holds several."""
+    """Frame of a pose file with several."""
     size: int = PICTURE_SIZE
     """Width and height, pixels."""
     width: int | None = None
-    """Pixels; without it the size."""
+    """Pixels; the default is --size."""
     height: int | None = None
-    """Pixels; without it the size."""
+    """Pixels; the default is --size."""
     view: View = VIEWS[0]
-    """colour; depth in colours, bright where near; alpha: what the person covers, in grey; boxes: the primitives."""
+    """colour; depth in false colours, bright where near; alpha in grey; boxes: the primitives."""
     step: float = RAY_STEP
-    """Metres between samples of a ray; finer is slower and closer to the truth."""
+    """Metres between samples of a ray; finer is slower and more accurate."""
     background: Literal["black", "white", "transparent"] = "black"
-    """What is behind the person."""
+    """Background behind the human."""
     depth: Path | None = None
-    """A second PNG: depth in colours, bright where near."""
+    """A second PNG: depth in false colours, bright where near."""
 
     def draw(self) -> None:
-        """Draws, and prints the picture's path."""
+        """Render, and print the path."""
         import torch  # late
 
         # torch is loaded late
@@ -133,7 +133,7 @@ class RenderCommand:
         width, height = (self.size if side is None else side for side in (self.width, self.height))
         camera = framing(primitives, math.radians(self.yaw), width, height)
         picture = draw(Scene(primitives, chart=body_of(human)[1].chart), camera, look)
-        with contextlib.ExitStack() as files:  # both pictures or none
+        with contextlib.ExitStack() as files:  # both files or none
             rgba_to_png(
                 files.enter_context(written_whole(self.out)),
                 torch.from_numpy(picture.combined),
@@ -155,5 +155,5 @@ class RenderCommand:
 
 
 def run(arguments: Sequence[str]) -> None:
-    """One command line, errors as exceptions."""
+    """Run a command line; raises its errors."""
     parse(RenderCommand, arguments, "render").draw()

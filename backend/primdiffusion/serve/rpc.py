@@ -1,6 +1,6 @@
-"""JSON-RPC 2.0, one message a line: framing and errors. Knows pipes and JSON, nothing of people.
+"""JSON-RPC 2.0, one message per line: framing and errors.
 
-A line is UTF-8 JSON without line breaks inside (json escapes them), ended by a newline. There are no batches.
+A line is UTF-8 JSON without line breaks (json escapes them) and ends with a newline. There are no batches.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ INVALID_PARAMS = -32602
 INTERNAL_ERROR = -32603
 CANCELLED = -32001
 DOMAIN_ERROR = -32002
-"""An error of the subject, not of the protocol; `data.kind` names it, `data.remedy` says what to do next."""
+"""An error of a request rather than the protocol; `data.kind` is its kind, `data.remedy` what to do next."""
 
 JsonId = str | int | float | None
 
 
 class RpcError(Exception):
-    """What a request fails with on the wire: a code, one sentence, and data for programs."""
+    """The error of a response: a code, one sentence, and data for programs."""
 
     def __init__(self, code: int, message: str, data: dict[str, Any] | None = None):
         super().__init__(message)
@@ -39,7 +39,7 @@ class RpcError(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class RpcRequest:
-    """One parsed message from the other side."""
+    """A parsed message."""
 
     method: str
     params: dict[str, Any]
@@ -49,7 +49,7 @@ class RpcRequest:
 
 
 class MalformedRequest(RpcError):
-    """A line that is no request; `id` is the request's own where it could still be read, as JSON-RPC asks."""
+    """A line that is not a request; `id` is that of the request if it could be read, as JSON-RPC requires."""
 
     def __init__(self, code: int, message: str, id: JsonId = None):
         super().__init__(code, message)
@@ -57,7 +57,7 @@ class MalformedRequest(RpcError):
 
 
 def parse_request(line: bytes) -> RpcRequest:
-    """The request in one line. Raises MalformedRequest for anything that is not one JSON-RPC 2.0 request object."""
+    """Parse a line. Raises MalformedRequest unless it is one JSON-RPC 2.0 request object."""
     try:
         message = json.loads(line.decode("utf-8"))
     except (ValueError, RecursionError) as e:
@@ -82,7 +82,7 @@ def parse_request(line: bytes) -> RpcRequest:
 
 
 class Wire:
-    """The writing end: whole lines from any thread, never interleaved."""
+    """Writes whole lines from any thread."""
 
     def __init__(self, stream: BinaryIO):
         self._stream = stream
@@ -95,13 +95,13 @@ class Wire:
             self._stream.flush()
 
     def respond(self, id: JsonId, result: Any) -> None:
-        """The result of a request."""
+        """Send the result of a request."""
         self._send({"id": id, "result": result})
 
     def fail(self, id: JsonId, error: RpcError) -> None:
-        """The error of a request."""
+        """Send the error of a request."""
         self._send({"id": id, "error": error.as_object()})
 
     def notify(self, method: str, **params: Any) -> None:
-        """A message without an answer."""
+        """Send a notification."""
         self._send({"method": method, "params": params})

@@ -1,12 +1,12 @@
-"""The child's side of the conversation: JSON-RPC 2.0 on stdin and stdout, a message a line (docs/design/protocol.md).
+"""The child process: JSON-RPC 2.0 on stdin and stdout, one message per line (docs/design/protocol.md).
 
-    reader thread     parses lines; answers hello, cancel and shutdown itself, so they work while a request runs
-    main thread       loads torch, then runs one request at a time of REQUESTS
-    heartbeat thread  a notification every 0.5 s, so that the other side can tell busy from hung
+    reader thread     parses lines; answers hello, cancel and shutdown itself, so that they work while a request runs
+    main thread       loads torch, then runs one request of REQUESTS at a time
+    heartbeat thread  sends a notification every 0.5 s, so that the client can tell busy from hung
 
-`hello` answers before torch is loaded: `device` is null until a `ready` notification brings it (or `problem`, a
-sentence, where the environment is broken). A second request meanwhile fails with kind "busy". The child ends when its
-stdin does, because then its parent is gone. Stray prints go to stderr: file descriptor 1 is moved away first of all.
+`hello` is answered before torch is loaded: `device` is null until the `ready` notification, which has a `problem` if
+the environment is broken. A second request while one is running fails with kind "busy". The child exits when its stdin
+closes, because its parent has exited. File descriptor 1 is redirected to stderr, so that prints do no harm.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from primdiffusion.commands.merge import FitGainRequest, MergeFramesRequest, Mer
 from primdiffusion.commands.reconstruct import ReconstructRequest
 from primdiffusion.commands.render import DrawRequest, RenderRequest
 from primdiffusion.commands.request import ParameterError, Request, read_record, read_request
-from primdiffusion.failures import Failure, describe
+from primdiffusion.failures import ErrorDescription, describe
 from primdiffusion.machine import memory, share_processors
 from primdiffusion.serve.rpc import (
     CANCELLED,
@@ -69,9 +69,9 @@ REQUESTS: dict[str, type[Request]] = {
     "gaussians": GaussiansRequest,
     "human_npz": HumanNpzRequest,
 }
-"""By method; they run on the main thread, one at a time."""
+"""Requests by method; they run on the main thread, one at a time."""
 GRACE_S = 3.0
-"""After the parent is gone a request has this long to reach its next step and tidy up; then the process ends anyway."""
+"""Time for a running request to stop and clean up when the parent has exited; then the process exits anyway."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,12 +87,12 @@ class CancelParams:
 
 
 class Cancelled(Exception):
-    """Raised in a request at work at its next step after a cancel."""
+    """Raised in a running request at the first step after a cancel."""
 
 
 @dataclasses.dataclass
 class Running:
-    """The request at work."""
+    """The running request."""
 
     message: RpcRequest
     request: Request
@@ -100,7 +100,7 @@ class Running:
 
 
 class Server:
-    """One conversation: lines from `source`, messages to `wire`."""
+    """Serves one client: lines from `source`, messages to `wire`."""
 
     def __init__(self, source: BinaryIO, wire: Wire):
         self._source = source
@@ -118,12 +118,12 @@ class Server:
         }
 
     def run(self) -> None:
-        """Serves until shutdown, or the end of the input or of the output. Call from the main thread."""
+        """Serve until shutdown or until input or output is closed. Call from the main thread."""
         threading.Thread(target=self._read, name="reader", daemon=True).start()
         threading.Thread(target=self._beat, name="heartbeat", daemon=True).start()
         session = self._warm_up()
         while (running := self._queue.get()) is not None:
-            self._work(session, running)
+            self._run_request(session, running)
 
     # reader thread
 
@@ -134,7 +134,7 @@ class Server:
             try:
                 self._dispatch(line)
             except OSError:
-                break  # the output is gone, and with it the parent
+                break  # the parent has exited
         self._end()
 
     def _dispatch(self, line: bytes) -> None:
@@ -162,7 +162,7 @@ class Server:
 
     def _cancel(self, message: RpcRequest) -> None:
         params = _parameters(read_record, CancelParams, message)
-        with self._lock:  # also while answering, so that the answer comes before the end of the request
+        with self._lock:  # also while responding, so that the response precedes that of the request
             found = self._running is not None and self._running.message.id == params.id
             if found and self._running is not None:
                 self._running.cancelled.set()
@@ -177,20 +177,20 @@ class Server:
         running = Running(message, _parameters(read_request, REQUESTS[message.method], message))
         with self._lock:
             if self._running is not None:
-                sentence = f"the backend is at work on request {self._running.message.id!r}: one at a time"
+                sentence = f"the backend is running request {self._running.message.id!r}: one at a time"
                 raise RpcError(DOMAIN_ERROR, sentence, {"kind": "busy", "remedy": "wait for it, or cancel it first"})
             self._running = running
         self._queue.put(running)
 
     def _end(self) -> None:
-        """A request at work may tidy up first; with none there is nothing to wait for, not even torch being loaded."""
+        """Exit at once without a running request, otherwise after GRACE_S for it to clean up."""
         self._ended.set()
         with self._lock:
             if self._running is None:
-                _leave(0)
+                _exit(0)
             self._running.cancelled.set()
         self._queue.put(None)
-        threading.Timer(GRACE_S, _leave, [0]).start()
+        threading.Timer(GRACE_S, _exit, [0]).start()
 
     # heartbeat thread
 
@@ -204,7 +204,7 @@ class Server:
     # main thread
 
     def _warm_up(self) -> Session | RpcError:
-        """Imports torch and all that needs it; a broken environment becomes the error of every later request."""
+        """Import torch and what needs it; an import error becomes the error of every later request."""
         try:
             # after `hello` can be answered
             from primdiffusion.commands import frame_drawer, output  # noqa: F401  loaded before the first request
@@ -220,7 +220,7 @@ class Server:
         self._notify("ready", **self._state)
         return session
 
-    def _work(self, session: Session | RpcError, running: Running) -> None:
+    def _run_request(self, session: Session | RpcError, running: Running) -> None:
         def report(stage: str, step: int, total: int, eta_s: float | None, /, **more: Any) -> None:
             if running.cancelled.is_set():
                 raise Cancelled
@@ -258,7 +258,7 @@ class Server:
 
 
 def _parameters(read: Callable[[type[R], dict[str, Any], str], R], record: type[R], message: RpcRequest) -> R:
-    """The parameters of a message; ValueErrors of reading become RpcError(INVALID_PARAMS)."""
+    """Read the parameters of a message. Raises RpcError(INVALID_PARAMS)."""
     try:
         return read(record, message.params, message.method)
     except ParameterError as e:
@@ -268,7 +268,7 @@ def _parameters(read: Callable[[type[R], dict[str, Any], str], R], record: type[
 
 
 def _as_rpc_error(error: Exception) -> RpcError:
-    """The error as a response carries it; the traceback goes to stderr, where the client keeps the last lines."""
+    """Convert an error for a response, and print its traceback to stderr, whose last lines the client keeps."""
     if isinstance(error, RpcError):
         return error
     traceback.print_exception(error, file=sys.stderr)
@@ -280,14 +280,14 @@ def _as_rpc_error(error: Exception) -> RpcError:
     return RpcError(DOMAIN_ERROR, failure.sentence, _data(failure))
 
 
-def _data(failure: Failure) -> dict[str, str]:
+def _data(failure: ErrorDescription) -> dict[str, str]:
     return {"kind": failure.kind, "remedy": failure.remedy}
 
 
 def guard_streams() -> tuple[BinaryIO, BinaryIO]:
-    """Moves the conversation away from file descriptors 0 and 1, so that no print, and no C library, can disturb it.
+    """Move the protocol away from file descriptors 0 and 1, out of reach of prints and C libraries.
 
-    Afterwards descriptor 1 leads to stderr and descriptor 0 to nothing. Returns the conversation's source and sink.
+    Afterwards descriptor 1 is stderr and descriptor 0 the null device. Returns the protocol's input and output.
     """
     sys.stdout.flush()
     source, sink = os.dup(0), os.dup(1)
@@ -299,7 +299,7 @@ def guard_streams() -> tuple[BinaryIO, BinaryIO]:
 
 
 def main() -> None:
-    """Serves on stdin and stdout until the other side is done."""
+    """Serve on stdin and stdout until the client is done."""
     share_processors()
     source, sink = guard_streams()
     status = 0
@@ -308,11 +308,11 @@ def main() -> None:
     except KeyboardInterrupt:
         status = 130
     except OSError as e:
-        print(f"the other end of the pipe is gone: {e}", file=sys.stderr)
-    _leave(status)
+        print(f"the pipe to the client is broken: {e}", file=sys.stderr)
+    _exit(status)
 
 
-def _leave(status: int) -> NoReturn:
-    """Ends the process from any thread. An ordinary exit would wait for the lock of a reader blocked on the pipe."""
+def _exit(status: int) -> NoReturn:
+    """Exit from any thread. An ordinary exit would wait for the lock of the reader, which blocks on the pipe."""
     sys.stderr.flush()
     os._exit(status)
