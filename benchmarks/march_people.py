@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.export.surface import Surface
+from primdiffusion.export.surface import OuterSurface
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, vertex_normals
@@ -55,7 +55,7 @@ def checkered_human(seed: int = 0, betas: Tensor | None = None, off_the_skin: fl
     body = default_body()
     betas = torch.zeros(10) if betas is None else betas
     vertices = body.shape(betas).vertices
-    suit = Surface(vertices.double().numpy(), body.faces.numpy())
+    suit = OuterSurface(vertices.double().numpy(), body.faces.numpy())
     cells = np.random.default_rng(seed).integers(40, 230, (32, 32, 4), dtype=np.uint8)
     texture = cells.repeat(8, axis=0).repeat(8, axis=1)
     texture[..., 3] = 255

@@ -49,9 +49,9 @@ class InfoCommand:
 
 
 def _installation() -> dict[str, Any]:
-    # torch is loaded late
-    import torch
+    import torch  # loaded late
 
+    # torch is loaded late
     from primdiffusion.diffusion.checkpoint import default_checkpoint, read_card
     from primdiffusion.encoder.model import default_encoder
 

@@ -79,6 +79,7 @@ class PackPayloads:
 
     def run(self) -> None:
         """Pack, and print the folder."""
+        # torch is loaded late
         from primdiffusion.training.shards import pack_people
         from primdiffusion.training.stored_people import find_people
 
@@ -98,7 +99,7 @@ class VerifyPayloads:
 
     def run(self) -> None:
         """Print a line for each damaged shard; raises ValueError if there is any."""
-        from primdiffusion.training.shards import damaged_shards
+        from primdiffusion.training.shards import damaged_shards  # torch is loaded late
 
         found = damaged_shards(self.folder)
         for sentence in found:

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from primdiffusion.export.field import pack_field
@@ -114,8 +115,6 @@ def _kernel(size: int) -> tuple[Float[Tensor, "s"], Float[Tensor, "s"]]:
 
 def _quaternions(rotation: Float[Tensor, "k 3 3"]) -> Float[Tensor, "k 4"]:
     """Convert rotation matrices to quaternions w, x, y, z."""
-    from scipy.spatial.transform import Rotation
-
     turned = Rotation.from_matrix(rotation.detach().cpu().double().numpy()).as_quat()[:, [3, 0, 1, 2]]
     return torch.from_numpy(turned).to(rotation)
 

@@ -48,7 +48,7 @@ def write_grid_npz(path: Path, grid: Merged) -> None:
 def check_openvdb() -> None:
     """Raise NoOpenVDB if the module `openvdb` is missing."""
     try:
-        import openvdb  # noqa: F401
+        import openvdb  # noqa: F401  optional dependency
     except ImportError as error:
         raise NoOpenVDB(
             "writing .vdb needs the module openvdb: install it (Debian and Ubuntu: python3-openvdb; Blender bundles "
@@ -59,7 +59,7 @@ def check_openvdb() -> None:
 def write_grid_vdb(path: Path, grid: Merged) -> None:
     """Write the grids `density` (1/m, a fog volume) and `Cd` (linear RGB) as half floats. Raises NoOpenVDB, OSError."""
     check_openvdb()
-    import openvdb
+    import openvdb  # optional dependency
 
     index_to_world = np.diag([grid.voxel] * 3 + [1.0])  # row vectors
     index_to_world[3, :3] = grid.origin

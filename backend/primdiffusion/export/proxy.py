@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64, UInt8
 from numpy import ndarray as Array
 from PIL import Image
+from scipy import ndimage, sparse
 from torch import Tensor
 
 from primdiffusion.export.field import Field, march_rays, pack_field, weights_at
 from primdiffusion.export.simplify import simplified, unwrapped
-from primdiffusion.export.surface import Surface, outside_surface
+from primdiffusion.export.surface import OuterSurface, outside_surface
 from primdiffusion.formats import requests
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.srgb import encode_srgb
@@ -111,7 +112,7 @@ def mesh_proxy(human: Human, settings: ProxySettings = DEFAULT_PROXY, on_stage: 
         on_stage("surface", 0, 3)
 
     fine = outside_surface(field, settings.spacing, meanwhile)
-    surface = Surface(*run_in_process(simplified, *fine, settings.triangles, meanwhile=meanwhile))
+    surface = OuterSurface(*run_in_process(simplified, *fine, settings.triangles, meanwhile=meanwhile))
     weights = skin_weights(field, surface, anchor_skin_weights(anchors, body))
     corner_uv = run_in_process(unwrapped, *surface, settings.texture_px, meanwhile=lambda: on_stage("unwrap", 1, 3))
     texture = bake_texture(field, surface, corner_uv, settings.texture_px, lambda: on_stage("texture", 2, 3))
@@ -120,10 +121,8 @@ def mesh_proxy(human: Human, settings: ProxySettings = DEFAULT_PROXY, on_stage: 
     return MeshProxy(surface.vertices, surface.faces, corner_uv, weights, texture, skeleton)
 
 
-def skin_weights(field: Field, surface: Surface, box_weights: Float[Tensor, "k 24"]) -> Float32[Array, "v 24"]:
+def skin_weights(field: Field, surface: OuterSurface, box_weights: Float[Tensor, "k 24"]) -> Float32[Array, "v 24"]:
     """Skin weights of the vertices: those of the boxes, smoothed along the mesh, limited to INFLUENCES joints."""
-    from scipy import sparse
-
     weights = weights_at(field, surface.vertices, box_weights.detach().cpu().numpy())
     count = len(surface.vertices)
     edges = np.concatenate([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]], surface.faces[:, [2, 0]]])
@@ -140,14 +139,12 @@ def skin_weights(field: Field, surface: Surface, box_weights: Float[Tensor, "k 2
 
 def bake_texture(
     field: Field,
-    surface: Surface,
+    surface: OuterSurface,
     corner_uv: Float[Array, "f 3 2"],
     texture_px: int,
     meanwhile: Callable[[], None] = lambda: None,
 ) -> UInt8[Array, "h w 3"]:
     """Bake a texture by marching inwards along each texel's normal; texels outside all charts copy the nearest one."""
-    from scipy import ndimage
-
     raster = rasterise_uv(corner_uv, texture_px, texture_px)
     row, column = np.nonzero(raster.covered)
     corners, share = surface.faces[raster.face[row, column]], raster.barycentric[row, column]

@@ -31,7 +31,7 @@ def simplified(
 def unwrapped(vertices: Float64[Array, "v 3"], faces: Int64[Array, "f 3"], texture_px: int) -> Float64[Array, "f 3 2"]:
     """Compute texture coordinates of every corner in non-overlapping charts (xatlas). Raises NoUnwrapping."""
     try:
-        import xatlas
+        import xatlas  # optional dependency
     except ModuleNotFoundError as error:  # it has no package for Python 3.14 or Linux on ARM
         raise NoUnwrapping(
             "textured meshes need xatlas, which has no package for this Python and machine: use Python 3.11 or 3.13 "

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray as Array
+from scipy import ndimage
 
 from primdiffusion.export.field import Field, density_at
 
@@ -26,7 +27,7 @@ class NoSurface(ValueError):
     """The density never reaches the isosurface level."""
 
 
-class Surface(NamedTuple):
+class OuterSurface(NamedTuple):
     """Closed triangles, counter-clockwise seen from outside."""
 
     vertices: Float64[Array, "v 3"]
@@ -43,7 +44,7 @@ class DensityGrid(NamedTuple):
     spacing: float
 
 
-def outside_surface(field: Field, spacing: float, meanwhile: Callable[[], None] = lambda: None) -> Surface:
+def outside_surface(field: Field, spacing: float, meanwhile: Callable[[], None] = lambda: None) -> OuterSurface:
     """Extract the outer surface by marching cubes (libigl); cavities are filled, small pieces dropped.
 
     `spacing` is the grid's in metres. `meanwhile` is called regularly; exceptions it raises cancel. Raises NoSurface.
@@ -81,8 +82,6 @@ def density_grid(field: Field, spacing: float, meanwhile: Callable[[], None] = l
 
 def filled(solid: Bool[Array, "x y z"], spacing: float) -> Bool[Array, "x y z"]:
     """Fill cavities, including those with openings narrower than GAP."""
-    from scipy import ndimage
-
     closed = np.asarray(ndimage.binary_closing(solid, iterations=max(round(GAP / 2 / spacing), 1)))
     inside = np.asarray(ndimage.binary_fill_holes(closed))
     return solid | (inside & np.logical_not(closed))  # gaps that only the closing filled stay open
@@ -90,8 +89,6 @@ def filled(solid: Bool[Array, "x y z"], spacing: float) -> Bool[Array, "x y z"]:
 
 def depth_below(field: Field, points: Float64[Array, "n 3"], spacing: float = 0.008) -> Float64[Array, "n"]:
     """Depth of points below the outer surface, metres, accurate to `spacing`; 0 outside."""
-    from scipy import ndimage
-
     grid = density_grid(field, spacing)
     depth = np.asarray(ndimage.distance_transform_edt(filled(grid.density > LEVEL, spacing))) * spacing
     index = np.rint((points - grid.origin) / spacing).astype(np.int64)
@@ -111,7 +108,7 @@ def _cubes_across(solid: Array) -> tuple[Int64[Array, "n"], Int64[Array, "c 8"]]
     return corners, cubes.reshape(flat.shape).astype(np.int64)
 
 
-def _large_pieces(vertices: Array, faces: Array) -> Surface:
+def _large_pieces(vertices: Array, faces: Array) -> OuterSurface:
     """Drop pieces smaller than SMALLEST_PIECE, and cavities, whose volume is negative."""
     import trimesh  # used only here
 
@@ -122,4 +119,4 @@ def _large_pieces(vertices: Array, faces: Array) -> Surface:
     if not len(mesh.faces):
         raise NoSurface(THIN)
     mesh.remove_unreferenced_vertices()
-    return Surface(np.array(mesh.vertices), np.array(mesh.faces))
+    return OuterSurface(np.array(mesh.vertices), np.array(mesh.faces))

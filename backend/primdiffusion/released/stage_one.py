@@ -37,7 +37,7 @@ NOT_CARRIED_OVER = "has the layers of the encoder 'released'; stage 1 is not imp
 
 
 @dataclasses.dataclass(frozen=True)
-class Layer:
+class DecoderLayer:
     """A weight-normalised convolution with a bias per position: three tensors (SPEC 2)."""
 
     weight: tuple[int | None, ...]
@@ -46,28 +46,28 @@ class Layer:
     """[out, side, side]."""
 
 
-def _same(outputs: int, inputs: int, kernel: int | None = None) -> Layer:
-    return Layer((outputs, inputs, kernel, kernel), (outputs, 32, 32))
+def _same(outputs: int, inputs: int, kernel: int | None = None) -> DecoderLayer:
+    return DecoderLayer((outputs, inputs, kernel, kernel), (outputs, 32, 32))
 
 
-def _up(inputs: int, outputs: int, side: int) -> Layer:
-    return Layer((inputs, outputs, 4, 4), (outputs, side, side))
+def _up(inputs: int, outputs: int, side: int) -> DecoderLayer:
+    return DecoderLayer((inputs, outputs, 4, 4), (outputs, side, side))
 
 
-def _up_thrice(outputs: int) -> list[Layer]:
+def _up_thrice(outputs: int) -> list[DecoderLayer]:
     return [_up(64, 32, 64), _up(32, 16, 128), _up(16, outputs, 256)]
 
 
-def _of_u_net(side: int) -> Layer:
-    return Layer((None,) * 4, (None, side, side))
+def _of_u_net(side: int) -> DecoderLayer:
+    return DecoderLayer((None,) * 4, (None, side, side))
 
 
-LAYERS: dict[str, list[Layer]] = {
+LAYERS: dict[str, list[DecoderLayer]] = {
     "local_pose_conv_block": [_same(32, 69), _same(32, 32), _same(32, 69)],
     "joint_conv_block": [_same(64, 96), _same(64, 64), _same(64, 96)],
     "embs_encoder": [
-        *(Layer((o, i, 4, 4), (o, side, side)) for i, o, side in ((3, 4, 128), (4, 8, 64), (8, 16, 32))),
-        Layer((64, None, 1, 1), (64, 32, 32)),
+        *(DecoderLayer((o, i, 4, 4), (o, side, side)) for i, o, side in ((3, 4, 128), (4, 8, 64), (8, 16, 32))),
+        DecoderLayer((64, None, 1, 1), (64, 32, 32)),
         *(_of_u_net(side) for side in (16, 8, 4, 2, 1, 2, 4, 8, 16, 32)),
     ],
     "decoder_motion": [_same(o, i, 3) for i, o in ((64, 64), (64, 128), (128, 64), (64, 64), (64, 9))],
