@@ -15,20 +15,20 @@ VENV52 := .venv52
 PYTHON313 ?= $(shell for python in python3.13 "$${PYENV_ROOT:-$$HOME/.pyenv}"/versions/3.13*/bin/python3.13; do \
 	"$$python" -c "import sys, ensurepip; sys.exit(sys.version_info[:2] != (3, 13))" 2>/dev/null && echo "$$python" && break; done)
 
-# Megabytes of environments (`du -sm`): a full disk is told before pip is in the middle of it.
+# Sizes of the environments in megabytes (`du -sm`): missing disk space is reported before pip begins.
 ROOM := sh scripts/enough_room.sh
 VENV_MB := $(VENV):3700
 VENV45_MB := $(VENV45):1000
 VENV52_MB := $(VENV52):1200
 
-# A worker for each core, each with one thread: more would fight over the cores.
+# One worker per core with one thread each: more threads would compete for the cores.
 ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE
-# A test is tried again where Blender itself has crashed under it (seen once in ed.undo_push), never where it fails.
+# Rerun a test if Blender itself crashed (seen once in ed.undo_push), never if the test failed.
 AGAIN_AFTER_A_CRASH := --reruns 1 --only-rerun "no exception says this"
 PYTEST := -m pytest -n logical --maxprocesses 8 --dist worksteal $(AGAIN_AFTER_A_CRASH)
 PYTEST_BLENDER := $(PYTEST) tests/blender --confcutdir tests/blender -m "not slow and not gpu and not any_blender"
 
-# Containers set it, and hundreds of child processes would each compile the backend anew.
+# Containers set it, and hundreds of child processes would each compile the backend again.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help demo test test-5.0 test-4.5 test-5.2 test-all lint setup clean
@@ -42,7 +42,7 @@ help:
 	@awk '/^## / { name = $$2; sub(/:$$/, "", name); sub(/^## [^:]*: /, ""); printf "make %-11s%s\n", name, $$0 }' $(MAKEFILE_LIST)
 
 ## test: the tests on Blender 5.0, 4.5 and 5.2; options for pytest: make test TEST_ARGS="-x -k motion"
-# One after the other, also with -j: they share the cores.
+# Sequential, also with -j: they share the cores.
 test:
 	@$(ROOM) $(VENV_MB) $(VENV45_MB) $(if $(PYTHON313),$(VENV52_MB))
 	$(MAKE) test-5.0
@@ -53,12 +53,12 @@ test:
 test-5.0: $(READY_TO_TEST)
 	$(ONE_THREAD) $(BIN)/python $(PYTEST) $(TEST_ARGS)
 
-## test-4.5: the tests that depend on the version of Blender, on 4.5
+## test-4.5: the tests that depend on Blender's version, on Blender 4.5
 test-4.5: $(VENV45)/ready
 	$(ONE_THREAD) $(VENV45)/bin/python $(PYTEST_BLENDER) $(TEST_ARGS)
 
-## test-5.2: the same on Blender 5.2, where a Python 3.13 is found
-# Without torch, which has its builds for one version of Python each: the backend's own process runs in .venv.
+## test-5.2: the same on Blender 5.2, if a Python 3.13 is found
+# .venv52 has no torch: the backend's process runs in .venv.
 ifeq ($(PYTHON313),)
 test-5.2:
 	@echo "Blender 5.2 was not tested: its module needs Python 3.13. Install it, or name it: make test PYTHON313=/path/to/python3.13"
@@ -67,7 +67,7 @@ test-5.2: $(VENV52)/ready $(READY_TO_TEST)
 	$(ONE_THREAD) PRIMDIFFUSION_PYTHON=$(CURDIR)/$(BIN)/python $(VENV52)/bin/python $(PYTEST_BLENDER) $(TEST_ARGS)
 endif
 
-## test-all: the slow tests too, on Blender 5.0
+## test-all: all tests, with the slow ones, on Blender 5.0
 test-all: $(READY_TO_TEST)
 	$(BIN)/python -m pytest -m "not gpu" $(TEST_ARGS)
 
@@ -94,7 +94,7 @@ $(READY_TO_TEST): $(READY)
 	$(PIP_INSTALL) -e ".[training,blender,test]"
 	touch $(READY_TO_TEST)
 
-# Blender 4.5's module; all else is .venv's.
+# Blender 4.5's module; everything else comes from .venv.
 $(VENV45)/ready: $(READY_TO_TEST) Makefile
 	@$(ROOM) $(VENV45_MB)
 	test -x $(VENV45)/bin/python || $(BIN)/python -m venv --without-pip $(VENV45)
