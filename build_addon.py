@@ -1,9 +1,9 @@
-"""Build the extension as one zip: the add-on, the backend as data, the default checkpoint.
+"""Build the extension as one zip: the add-on, the backend, the default checkpoints and the manual.
 
     python build_addon.py [--out dist]
 
-The manual's pages go along, for the panels' question marks. The same tree gives the same bytes. When `bpy` is
-installed, Blender's own extension tool validates the result.
+The build is reproducible: the same tree gives the same bytes. If `bpy` is installed, Blender's own extension tool
+validates the zip.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ BACKEND = ROOT / "backend" / "primdiffusion"
 FIXED_TIME = (1980, 1, 1, 0, 0, 0)
 LEFT_OUT_SUFFIXES = {".pyc", ".nbi", ".nbc", ".part"}
 STORED_SUFFIXES = {".safetensors", ".npz"}
-"""Compressed already, or not compressible: kept as they are, for a fast build and a fast install."""
+"""Compressed already, or not compressible: stored without compression, for a fast build and a fast install."""
 
 
 class BuildError(RuntimeError):
-    """The zip was not made or is not valid; the message says why."""
+    """The zip cannot be built or is not valid; the message says why."""
 
 
 def contents(addon: Path = ADDON, backend: Path = BACKEND) -> dict[str, Path]:
-    """Names in the zip to files, sorted by name: the add-on at the top, the backend under backend/primdiffusion.
+    """Files by their name in the zip, sorted: the add-on at the top, the backend under backend/primdiffusion.
 
-    The manual's pages are not files: see `build`.
+    The manual's pages are not included, because they are not files; `build` adds them.
     """
     files = {"LICENSE": ROOT / "LICENSE"}
     for root, prefix in ((addon, ""), (backend, "backend/primdiffusion/")):
@@ -52,7 +52,7 @@ def build(out: Path) -> Path:
     manifest = tomllib.loads((ADDON / "blender_manifest.toml").read_text(encoding="utf-8"))
     files = contents()
     if "backend/primdiffusion/__init__.py" not in files:
-        raise BuildError(f"the backend is missing in {BACKEND}; build from a complete checkout")
+        raise BuildError(f"the backend was not found in {BACKEND}: build from a complete checkout")
     try:
         pages = {f"manual/{name}": page for name, page in manual().items()}
     except ManualError as error:
@@ -72,7 +72,7 @@ def build(out: Path) -> Path:
 
 
 def blender_extension_tool() -> Path | None:
-    """Blender's command line tool for extensions inside the installed `bpy`, or None without `bpy`."""
+    """The path of Blender's command line tool for extensions in the installed `bpy`; None without `bpy`."""
     spec = importlib.util.find_spec("bpy")
     if spec is None or spec.origin is None:
         return None
@@ -80,15 +80,15 @@ def blender_extension_tool() -> Path | None:
 
 
 def validate(archive: Path, tool: Path) -> None:
-    """Raises BuildError with the tool's words when Blender would refuse the zip."""
+    """Raises BuildError with the tool's output if Blender would reject the zip."""
     command = [sys.executable, str(tool), "validate", "--valid-tags", "", str(archive)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        raise BuildError(f"Blender's extension tool refuses {archive.name}: {(done.stdout + done.stderr).strip()}")
+        raise BuildError(f"Blender's extension tool rejects {archive.name}: {(done.stdout + done.stderr).strip()}")
 
 
 def main() -> None:
-    """Build, validate, print the size."""
+    """Build the zip, validate it and print its size."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder for the zip")
     archive = build(parser.parse_args().out)

@@ -1,6 +1,6 @@
-"""The manual as pages that a browser shows without a network: docs/manual/*.md to HTML, and the pictures they show.
+"""Convert the manual (docs/manual/*.md) to HTML pages that work without a network.
 
-`build_addon.py` puts them into the zip; the panels' question marks and F1 open them.
+`build_addon.py` adds them to the zip. The panels' question marks and F1 open them.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ th, td {{ border-color: #444 }} a {{ color: #7fb8ee }} }}
 
 
 class ManualError(RuntimeError):
-    """The manual cannot be made; the message says why."""
+    """The manual cannot be converted; the message says why."""
 
 
 def manual(folder: Path = MANUAL) -> dict[str, bytes]:
-    """Names of files in the manual to what is in them: a page for each .md, and the pictures shown.
+    """Contents of the manual's files by name: an HTML page for each .md, and the pictures on the pages.
 
-    Links between pages lead to the pages made; those that leave the folder become their text. Raises ManualError for a
-    link or picture that leads nowhere.
+    Links between pages point to the HTML pages. Links out of the folder are replaced with their text. Raises
+    ManualError for a broken link or a missing picture.
     """
     files: dict[str, bytes] = {}
     for path in sorted(folder.glob("*.md")):
@@ -53,7 +53,7 @@ def manual(folder: Path = MANUAL) -> dict[str, bytes]:
 
 
 def slug(heading: str) -> str:
-    """What links call a heading, as code hosts do."""
+    """The anchor of a heading, as on GitHub."""
     return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
 
 
@@ -61,7 +61,7 @@ def _markdown():
     try:
         from markdown_it import MarkdownIt
     except ImportError as error:
-        raise ManualError("markdown-it-py makes the manual's pages: pip install markdown-it-py") from error
+        raise ManualError("markdown-it-py is needed to build the manual: pip install markdown-it-py") from error
     return MarkdownIt("commonmark", {"html": False}).enable(["table", "strikethrough"])
 
 
@@ -74,41 +74,44 @@ def _parse(path: Path) -> list[Token]:
 
 
 def _follow_links(tokens: list[Token], path: Path, files: dict[str, bytes]) -> None:
-    """Lead links to the pages made, and note the pictures in `files`."""
+    """Point links to the HTML pages, and add the pictures to `files`."""
     unlinked = False
     for token in (child for block in tokens for child in block.children or ()):
         if token.type == "image":
-            token.attrSet("src", _keep_picture(str(token.attrGet("src")), path, files))
+            token.attrSet("src", _add_picture(str(token.attrGet("src")), path, files))
         elif token.type == "link_open":
-            href = _led_to_page(str(token.attrGet("href")), path)
+            href = _html_link(str(token.attrGet("href")), path)
             token.attrSet("href", href)
             if unlinked := not href:
-                _make_nothing(token)
+                _blank(token)
         elif token.type == "link_close" and unlinked:
-            _make_nothing(token)
+            _blank(token)
 
 
-def _make_nothing(token: Token) -> None:
+def _blank(token: Token) -> None:
     token.type, token.tag, token.content = "text", "", ""
 
 
-def _led_to_page(href: str, path: Path) -> str:
-    """Where a link leads among the pages made; empty where it leads to another folder."""
+def _html_link(href: str, path: Path) -> str:
+    """The link's target among the HTML pages; empty if it points to another folder."""
     target, _, anchor = href.partition("#")
     if re.match(r"[a-z]+:", target) or not target:
         return href
     if not (path.parent / target).exists():
-        raise ManualError(f"{path.name} leads to {target}, which is not there")
+        raise ManualError(f"{path.name} links to {target}, which does not exist")
     if "/" in target or not target.endswith(".md"):
         return ""
     return target.removesuffix(".md") + ".html" + (f"#{anchor}" if anchor else "")
 
 
-def _keep_picture(name: str, path: Path, files: dict[str, bytes]) -> str:
-    """Note a picture in `files`: beside the page as it is there, else under pictures/; returns where."""
+def _add_picture(name: str, path: Path, files: dict[str, bytes]) -> str:
+    """Add a picture to `files` and return its name there.
+
+    A picture in the manual's folder keeps its path, any other goes to pictures/.
+    """
     source, folder = (path.parent / name).resolve(), path.parent.resolve()
     if not source.is_file():
-        raise ManualError(f"{path.name} shows {name}, which is not there")
-    kept = source.relative_to(folder).as_posix() if source.is_relative_to(folder) else f"pictures/{source.name}"
-    files[kept] = source.read_bytes()
-    return kept
+        raise ManualError(f"{path.name} shows {name}, which does not exist")
+    target = source.relative_to(folder).as_posix() if source.is_relative_to(folder) else f"pictures/{source.name}"
+    files[target] = source.read_bytes()
+    return target

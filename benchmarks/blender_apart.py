@@ -1,6 +1,6 @@
-"""Blender as a module apart from the user's own: settings and temporary files of this process alone, removed with it.
+"""Run Blender as a module without touching the user's settings: private settings and temporary files.
 
-Import it before bpy. They are removed when Python exits; a program that leaves by `os._exit` calls `remove` itself.
+Import this before bpy. The files are removed when Python exits; a program that exits by `os._exit` calls `remove`.
 """
 
 from __future__ import annotations

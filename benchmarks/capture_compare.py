@@ -1,4 +1,4 @@
-"""The same views from Cycles and from the rasteriser: how they differ, and whether joints fall where they should."""
+"""Compares captures from Cycles and from the rasteriser on the same views, and checks where joints are projected."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ SAME_DEPTH_M = 0.002
 @dataclasses.dataclass(frozen=True)
 class Difference:
     mask_iou: float
-    """Of the masks over one half."""
+    """Intersection over union of the masks, where their value is above one half."""
     squared: float
-    """Mean squared difference of colour bytes over the pixels that either covers, both out of the same kind of JPEG."""
+    """Mean squared difference of colour bytes over pixels that either covers, both from JPEGs of the same kind."""
     depth_share: float
-    """Share of the pixels with a depth in either that agree within SAME_DEPTH_M."""
+    """Share of pixels with a depth in either picture whose depths agree within SAME_DEPTH_M."""
     part_share: float
-    """Share of those pixels of one part in both."""
+    """Share of those pixels that show the same part in both pictures."""
     shift_px: float
-    """How far one picture lies beside the other."""
+    """Displacement between the two pictures in pixels."""
 
 
 def compare(captures: Captures, people: dict, samples: int) -> list[Difference]:
-    """Every view of `captures`, drawn again by the rasteriser from the SMPL parameters and cameras on disk."""
+    """Draws every view of `captures` again with the rasteriser, from the SMPL parameters and cameras on disk."""
     differences = []
     for name in captures.subjects:
         subject = captures.subject(name)
@@ -49,7 +49,7 @@ def compare(captures: Captures, people: dict, samples: int) -> list[Difference]:
 
 
 def joint_error_px(subject: Subject) -> float:
-    """Largest distance of the joints noted with the pictures from where the backend's body puts them."""
+    """The largest distance between joints saved with the captures and those of the backend's body, in pixels."""
     apart = [view.project(default_joints(subject))[0] - view.project(joints_of(subject))[0] for view in subject.views]
     return float(np.linalg.norm(apart, axis=-1).max())
 
@@ -72,7 +72,7 @@ def _difference(subject: Subject, frame: int, camera: int, shot) -> Difference:
 
 
 def _as_blender_stores(colours: np.ndarray) -> np.ndarray:
-    """Out of a JPEG with colour at half the resolution, as Blender writes it; the rasteriser's own have it whole."""
+    """The colours after a JPEG with half the colour resolution, as Blender writes it; the rasteriser's have full."""
     file = io.BytesIO()
     Image.fromarray(colours).save(file, "JPEG", quality=JPEG_QUALITY, subsampling="4:2:0")
     with Image.open(file) as picture:
@@ -80,7 +80,7 @@ def _as_blender_stores(colours: np.ndarray) -> np.ndarray:
 
 
 def _shift(first: np.ndarray, second: np.ndarray) -> float:
-    """The displacement between two pictures that explains most of their difference (Lucas and Kanade 1981), pixels."""
+    """The displacement in pixels that explains most of the difference of two pictures (Lucas and Kanade 1981)."""
     down, across = np.gradient(second, axis=(0, 1))
     gradients = np.stack([across.ravel(), down.ravel()], -1)
     return float(np.linalg.norm(np.linalg.lstsq(gradients, (first - second).ravel(), rcond=None)[0]))

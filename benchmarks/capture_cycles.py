@@ -1,4 +1,4 @@
-"""The extension's capture command as a child process, watched: views, time and memory."""
+"""Runs the extension's capture command as a child process and records time and memory at each view."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ MARK = b"PRIMDIFFUSION "
 class Moment:
     wall_s: float
     processor_s: float
-    """Of the process so far."""
+    """Processor seconds of the process so far."""
     resident_mb: float
 
 
 def cycles(people: Path, out: Path, poses: int, cameras: int, size: int, *more: str) -> list[Moment]:
-    """Capture with Cycles under uniform light; a moment a view.
+    """Render captures in Cycles under uniform light; one Moment per view.
 
     Raises:
-        RuntimeError: the command failed; with its last words.
+    RuntimeError: the command failed; contains the end of its output.
     """
     line = [
         sys.executable, "-m", "blender_primdiffusion.capture", "--people", people, "--out", out, "--poses", poses,

@@ -1,14 +1,16 @@
-"""Captures: Cycles and the rasteriser on the same views, and how fast training can read them.
+"""Compares captures from Cycles and from the rasteriser, and measures how fast training can read them.
 
 `python benchmarks/captures.py --assets DIR --json F` makes a few people, renders them with the extension's command in
-a child process (uniform light, 16 samples a pixel) and draws the same views with the rasteriser (9 samples a pixel).
-Seconds a view include writing all passes and leave out start-up and the first view. Cycles uses all cores, a process of
-the rasteriser one; `fast_speedup` is of processor seconds, what a full machine gains; the wall's is beside it.
+a child process (uniform light, 16 samples per pixel) and draws the same views with the rasteriser (9 samples per
+pixel). Seconds per view include writing all passes, and exclude start-up and the first view. Cycles uses all cores, the
+rasteriser one process with one core: `fast_speedup` is the ratio of processor seconds, which is what a machine gains
+with all cores busy; `fast_speedup_wall_one_process` is the ratio of wall seconds.
 PSNR is of sRGB bytes over the pixels that either picture covers, both as JPEGs of the kind that Blender writes, with
-colour at half the resolution (the rasteriser's own files have it whole). `joint_reprojection_px_max` is between the
-joints noted by the extension, from Blender's armature, and those of the backend's body from SMPL parameters and cameras
-on disk; `picture_shift_px_max` is how far Cycles' pictures lie beside those drawn from the same files.
-Null: not measured (`--quick` makes no 200 views and no people; without bpy nothing of Cycles is).
+half the colour resolution (the rasteriser's own files have full resolution). `joint_reprojection_px_max` is between the
+joints that the extension saved from Blender's armature and the joints of the backend's body, computed from the SMPL
+parameters and cameras on disk. `picture_shift_px_max` is the displacement between Cycles' pictures and those drawn from
+the same files. Null: not measured (`--quick` skips the 200 views and people_per_second; without bpy nothing of Cycles
+is measured).
 """
 
 from __future__ import annotations
@@ -42,17 +44,17 @@ from record import tell
 
 SIZE, SAMPLES = 512, 3
 FIRST_SEED = 20_000_000
-"""Of the people; training sets count from 0."""
+"""The seed of the first person; training sets count from 0."""
 GROWTH_VIEWS, GROWTH_FROM = 200, 20
-"""Views of the memory test, and how many of them warm up."""
+"""The number of views in the memory test, and how many of them are warm-up."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
-    parser.add_argument("--people", type=int, default=3, help="how many are compared")
-    parser.add_argument("--cameras", type=int, default=6, help="of each of the four poses")
-    parser.add_argument("--out", type=Path, help="keep people and captures here")
+    parser.add_argument("--people", type=int, default=3, help="number of people to compare")
+    parser.add_argument("--cameras", type=int, default=6, help="number of cameras for each of the four poses")
+    parser.add_argument("--out", type=Path, help="save people and captures here")
     parser.add_argument("--quick", action="store_true", help="one person, few views")
     parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
@@ -82,7 +84,7 @@ def _people(assets) -> float:
 
 
 def _fast(folder: Path, poses: int, cameras: int) -> dict[str, float]:
-    """Draws everybody in one process, the views counted after the first of each person."""
+    """Draws every person in one process; the first view of each person is not timed."""
     taken = built_in_poses().map(lambda values: values[:poses])
     job = Job(find_people(folder / "people"), taken, folder / "fast", Rig(count=cameras), samples=SAMPLES)
     list(render(Job(dict(itertools.islice(job.people.items(), 1)), taken, folder / "warm", Rig(count=1, width=64))))
@@ -129,7 +131,7 @@ def _no_cycles() -> dict[str, float | None]:
 
 
 def _pace(moments: list[Moment], people: int) -> tuple[float, float]:
-    """Wall and processor seconds a view, people's first views, which load them, left out."""
+    """Wall and processor seconds per view, without each person's first view, which includes loading."""
     each = len(moments) // people
     kept = [pair for i, pair in enumerate(itertools.pairwise(moments), start=1) if i % each]
     wall = sum(after.wall_s - before.wall_s for before, after in kept) / len(kept)
@@ -137,7 +139,7 @@ def _pace(moments: list[Moment], people: int) -> tuple[float, float]:
 
 
 def _growth(folder: Path) -> float:
-    """How much more memory Cycles' process holds after 200 views than after 20, MB."""
+    """Growth of the memory of Cycles' process between view 20 and view 200, in MB."""
     poses, cameras = 5, GROWTH_VIEWS // 5
     first = next(iter(find_people(folder / "people")))
     moments = cycles(folder / "people", folder / "growth", poses, cameras, 64, "--samples", "1", "--only", first)
@@ -145,7 +147,7 @@ def _growth(folder: Path) -> float:
 
 
 def _loader(folder: Path, seconds: float) -> dict[str, float]:
-    """Views a second that one worker hands to training; batches of 2 samples of 4 + 4 views."""
+    """Views per second that one worker delivers to training, in batches of 2 samples of 4 + 4 views."""
     captures = open_captures(folder / "fast")
     figures = {}
     for kind in ("files", "packed"):

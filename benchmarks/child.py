@@ -1,10 +1,10 @@
-"""How soon Blender's side of the pipe hears from its child, cancels and notices a death: ticked as by Blender's timer.
+"""How quickly the extension notices a cancel, a message or a death of its child, when ticked by Blender's timer.
 
     python benchmarks/child.py --json FILE
 
-Waits are in seconds from the event to the tick that shows it: a cancel while torch is loaded, between steps and while
-the child is stopped in the middle of one; a child that is killed. Beside them the longest tick of all, and the longest
-under a flood of messages.
+Waits are in seconds from the event to the tick that shows it: a cancel while torch is loaded, between steps, and while
+the child is stopped in the middle of a step; a child that is killed. The longest tick of all is also recorded, and the
+longest one under a flood of messages.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from worker.client import BackendClient, Died  # noqa: E402
 from worker.request import Request  # noqa: E402
 
 TICK_S = 0.1
-"""Of Blender's timer."""
+"""The interval of Blender's timer in seconds."""
 STEPS = 1000
-"""More than are waited for."""
+"""The sampling steps of a job, more than any measurement waits for."""
 BEATS = 10
 FLOOD = """
 import json, sys
@@ -44,13 +44,13 @@ PATIENCE_S = 120.0
 
 
 class Timer:
-    """Ticks jobs and remembers the longest tick."""
+    """Ticks jobs and records the longest tick."""
 
     def __init__(self) -> None:
         self.longest_s = 0.0
 
     def until(self, job: Request, reached: Callable[[], bool]) -> float:
-        """Seconds until `reached`; raises TimeoutError."""
+        """Seconds until `reached` is true; raises TimeoutError."""
         began = time.monotonic()
         while not reached():
             if time.monotonic() - began > PATIENCE_S:
@@ -85,7 +85,10 @@ def main() -> None:
 
 
 def cancel_seconds(timer: Timer, folder: Path, when: Callable[[Request], bool], send: int = 0) -> float:
-    """From the cancel of a job for which `when` holds, the signal `send` having reached its child, to its end."""
+    """Seconds from the cancel to the end of a job.
+
+    The cancel comes when `when` holds for the job and, if `send` is given, after this signal was sent to its child.
+    """
     backend = Backend(this_python)
     job = generate(backend, folder)
     timer.until(job, lambda: backend.client is not None and backend.client.pid is not None and when(job))
@@ -97,7 +100,7 @@ def cancel_seconds(timer: Timer, folder: Path, when: Callable[[Request], bool], 
 
 
 def death_seconds(timer: Timer, folder: Path) -> float:
-    """From the death of a child at work to the failure of its job."""
+    """Seconds from the death of a busy child to the failure of its job."""
     backend = Backend(this_python)
     job = generate(backend, folder)
     timer.until(job, lambda: job.step > 2)
@@ -108,13 +111,13 @@ def death_seconds(timer: Timer, folder: Path) -> float:
 
 
 def this_python() -> Generator[None, None, BackendClient]:
-    """The real child on the Python that runs this."""
+    """The real child, run by the Python that runs this script."""
     yield
     return BackendClient(Path(sys.executable))
 
 
 def flood_tick_s(folder: Path) -> float:
-    """The longest tick while a child writes messages as fast as it can."""
+    """The longest tick in seconds while a child writes messages as fast as it can."""
     package = folder / "flood" / "primdiffusion"
     package.mkdir(parents=True)
     (package / "__init__.py").touch()
@@ -131,7 +134,7 @@ def flood_tick_s(folder: Path) -> float:
 
 
 def heartbeat_interval_s() -> float:
-    """The longest time between two of BEATS heartbeats of an idle child."""
+    """The longest interval between BEATS heartbeats of an idle child, in seconds."""
     pipe = subprocess.PIPE
     child = subprocess.Popen([sys.executable, "-m", "primdiffusion.serve"], stdin=pipe, stdout=pipe)
     times, ready = [], False

@@ -1,7 +1,7 @@
-"""What a CUDA device reaches at best, measured: multiply-adds, copies of memory, reads from the second cache."""
+"""Measured limits of a CUDA device: multiply-adds, memory copies, reads from the second-level cache."""
 
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false
-# Triton's language is Python by its syntax alone.
+# Triton kernels are Python by syntax only.
 from __future__ import annotations
 
 import statistics
@@ -13,15 +13,15 @@ import triton.language as tl
 
 ROUNDS = 512
 CHAINS = 8
-"""Independent sums a lane, so that one does not wait for another."""
+"""Independent sums per lane, so that no sum waits for another."""
 LANES = 1024
 RESIDENT_BYTES = 16 << 20
-"""Fits into the second cache of an H200 (about 50 MB) three times."""
+"""Fits three times into the second-level cache of an H200 (about 50 MB)."""
 COPIED_BYTES = 4 << 30
 
 
 def median_ms(call: Callable[[], object], repeats: int = 50, warm_up: int = 5) -> float:
-    """Median milliseconds between CUDA events around a call, what the host takes to launch it included."""
+    """Median milliseconds between CUDA events around a call, with the time that the host takes to launch it."""
     for _ in range(warm_up):
         call()
     torch.cuda.synchronize()
@@ -60,7 +60,7 @@ def _read(source, out, blocks, rounds, LANES: tl.constexpr):
 
 
 def operations_per_second() -> float:
-    """float32 operations a second; a fused multiply-add counts as two."""
+    """float32 operations per second; a fused multiply-add counts as two."""
     programs = 64 * torch.cuda.get_device_properties(0).multi_processor_count
     out = torch.empty(programs * LANES, device="cuda")
     ms = median_ms(lambda: _multiply_add[(programs,)](out, ROUNDS, LANES=LANES, num_warps=4), 20)
@@ -68,14 +68,14 @@ def operations_per_second() -> float:
 
 
 def copied_bytes_per_second() -> float:
-    """Bytes read plus bytes written by a copy within the device's memory, much larger than its caches."""
+    """Bytes read plus bytes written per second by a copy in device memory much larger than the caches."""
     source = torch.rand(COPIED_BYTES // 4, device="cuda")
     target = torch.empty_like(source)
     return 2 * COPIED_BYTES / median_ms(lambda: target.copy_(source), 20) * 1e3
 
 
 def cached_bytes_per_second() -> float:
-    """Bytes a second read from the second cache, past the first."""
+    """Bytes per second read from the second-level cache, bypassing the first level."""
     lanes = 4 * LANES
     source = torch.rand(RESIDENT_BYTES // 4, device="cuda")
     blocks = source.numel() // lanes

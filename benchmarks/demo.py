@@ -1,6 +1,6 @@
-"""The whole road in one command: zip, install, generate, walk, save, render, march, contact sheet, and a table.
+"""The whole pipeline in one command: zip, install, generate, walk, save, render, march, contact sheet, and a table.
 
-Each stage is a process of its own, measured from outside. `--json FILE` also writes the figures of DESIGN.md.
+Each stage runs in its own process and is measured from outside. `--json FILE` also writes the figures.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ FRAMES, SHOWN = 48, 31
 
 
 def main() -> None:
-    """Runs the stages one after the other; a failed one ends the demo with its last lines."""
+    """Runs the stages one after another; if a stage fails, the demo ends with the last lines of its output."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "demo_out")
     parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
@@ -33,7 +33,7 @@ def main() -> None:
         "--assets",
         type=Path,
         default=nearby_assets(),
-        help="MakeHuman asset folder; with --json, 16 people made from it are compared with their meshes",
+        help="MakeHuman asset folder; with --json, 16 people made from it are compared to their meshes",
     )
     arguments = parser.parse_args()
     share_processors()
@@ -73,23 +73,23 @@ def main() -> None:
     figures["seconds_setup_excluded_total"] = time.perf_counter() - begun
     figures["peak_gb"] = max(row.took.peak_gb for row in rows)
     print(f"\n{stages.table(rows)}\n")
-    print(f"from the button to a person in the scene: {figures['seconds_pressed_to_standing']:.1f} s")
-    print(f"volumes follow linear blend skinning to {figures['lbs_error_mm_max']:.5f} mm")
+    print(f"from pressing the button to a person in the scene: {figures['seconds_pressed_to_standing']:.1f} s")
+    print(f"volumes follow linear blend skinning within {figures['lbs_error_mm_max']:.5f} mm")
     print(f"look at {out}: overview.png, contact_sheet.png, human.blend")
     if arguments.json is not None:
-        about = record.surroundings()  # a stage told its own already
+        about = record.surroundings()  # that stage has printed its own figures
         record.write_record(arguments.json, {name: value for name, value in figures.items() if name not in about})
 
 
 def nearby_assets() -> Path | None:
-    """The folder that PRIMDIFFUSION_ASSETS names, or one beside the checkout, if it is there."""
+    """The folder that PRIMDIFFUSION_ASSETS names, or an existing one beside the checkout; None without either."""
     beside = ROOT.parent / "shared" / "data" / "makehuman"
     folder = Path(os.environ.get("PRIMDIFFUSION_ASSETS", beside))
     return folder if folder.is_dir() else None
 
 
 def overview(out: Path, names: list[str], size: int = 384) -> None:
-    """The pictures that are there, side by side, as out/overview.png."""
+    """Saves the existing pictures side by side as out/overview.png."""
     pictures = [Image.open(out / f"{name}.png").convert("RGB") for name in names if (out / f"{name}.png").is_file()]
     strip = Image.new("RGB", (size * len(pictures), size))
     for column, picture in enumerate(pictures):

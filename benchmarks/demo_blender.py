@@ -1,8 +1,8 @@
 """The demo inside Blender: install the zip, press the button, walk, measure the volumes' motion, save, render.
 
 `person` installs the extension and generates through its own operator and the real child process; `cycles` opens
-the saved file anew and renders one frame. Blender's settings live in a temporary folder: an installed Blender keeps
-its own.
+the saved file and renders one frame. Blender's settings are in a temporary folder, so those of an installed Blender do
+not change.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SEED = 7
 
 
 def person(arguments: argparse.Namespace) -> dict[str, float]:
-    """Install, generate, keyframe, measure, save; the figures of these."""
+    """Install, generate, keyframe, measure and save; returns the figures."""
     bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)
     bpy.ops.extensions.package_install_files(
         filepath=str(arguments.zip), repo="user_default", enable_on_install=True, overwrite=True
@@ -73,7 +73,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float]:
 
 
 def lbs_error_mm(armature: bpy.types.Object, human_file: Path, rotation: np.ndarray, number: int) -> float:
-    """How far the farthest volume's centre is from linear blend skinning of its anchor as the backend computes it."""
+    """Largest distance in mm between a volume's centre and its anchor, skinned by the backend."""
     bpy.context.scene.frame_set(number)
     human = load_human(human_file)
     body, anchors = default_body().to(dtype=torch.float64), default_anchors().to(dtype=torch.float64)
@@ -92,7 +92,7 @@ def lbs_error_mm(armature: bpy.types.Object, human_file: Path, rotation: np.ndar
 
 
 def cycles(arguments: argparse.Namespace) -> dict[str, float]:
-    """Open the saved file, check that its volumes are there, and render the current frame in Cycles."""
+    """Open the saved file, check that its volumes exist, and render the current frame in Cycles."""
     bpy.ops.wm.open_mainfile(filepath=str(arguments.blend))
     scene = bpy.context.scene
     missing = [v.name for v in bpy.data.volumes if not Path(bpy.path.abspath(v.filepath)).is_file()]
@@ -119,7 +119,7 @@ def main() -> None:
     making.add_argument("--seed", type=int, default=SEED)
     making.add_argument("--steps", type=int, default=30)
     making.add_argument("--frames", type=int, default=48)
-    making.add_argument("--shown", type=int, default=31, help="frame of the walk that is shown, counted from 0")
+    making.add_argument("--shown", type=int, default=31, help="frame of the walk to show, counted from 0")
     drawing = stages.add_parser("cycles")
     drawing.set_defaults(stage=cycles)
     for name in ("blend", "out", "json"):

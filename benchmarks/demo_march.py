@@ -1,4 +1,4 @@
-"""The demo's marched pictures of the generated person: rest, walking, from the side, depth, primitives as boxes."""
+"""The demo's marched pictures of the generated person: rest, walking, side view, depth, primitives as boxes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SIDE = math.radians(70)
 
 
 def share_on_body(position: torch.Tensor) -> float:
-    """Share of the grid's cells with a place of their own on the body: on a face, 1 mm or more from all others."""
+    """Share of the grid's cells with a distinct point on the body: on a face, 1 mm or more from all others."""
     apart = torch.cdist(position.double(), position.double())
     apart.fill_diagonal_(torch.inf)
     body, anchors = default_body(), default_anchors()

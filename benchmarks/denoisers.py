@@ -1,8 +1,8 @@
-"""How large and how fast the denoisers are, and how far the default checkpoint's guesses lie from held-out people.
+"""Size and speed of the denoisers, and the error of the default checkpoint on held-out people.
 
 `python benchmarks/denoisers.py --json denoisers.json` writes one flat object; `--quick` (under a minute) skips the
-call of the paper's network. Seconds are medians of warm calls on the CPU. Held-out errors are those that the
-checkpoint's card states: they were measured when it was trained, on people that are not in the repository.
+call of the paper's network. Seconds are medians of warm calls on the CPU. Held-out errors are read from the
+checkpoint's card: they were measured in training, on people that are not in the repository.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ PEOPLE = 8
 
 
 def median_seconds(model: DiffusionModel, repeats: int) -> float:
-    """One person of STEPS DDIM steps."""
+    """Seconds to sample one person in STEPS DDIM steps."""
     times = []
     for seed in range(repeats + 1):
         begin = time.perf_counter()
@@ -35,7 +35,7 @@ def median_seconds(model: DiffusionModel, repeats: int) -> float:
 
 
 def spread(model: DiffusionModel, count: int) -> float:
-    """Root mean square distance of generated people from their mean, over that of the prior fitted to the data."""
+    """RMS distance of generated people from their mean, divided by that of the prior fitted to the data."""
     people = torch.cat([list(sample(model, [seed], STEPS))[-1].x0 for seed in range(count)]).flatten(1)
     generated = people.var(0).sum().sqrt()
     if not isinstance(model.denoiser, PersonDenoiser):
@@ -45,14 +45,14 @@ def spread(model: DiffusionModel, count: int) -> float:
 
 
 def gigaflops(network: torch.nn.Module, shape: tuple[int, ...]) -> float:
-    """Multiplications and additions of one call for one person, in 10^9, without computing it."""
+    """10^9 multiplications and additions in one call for one person, counted without computing it."""
     with FlopCounterMode(display=False) as counter, torch.device("meta"), torch.inference_mode():
         network(torch.empty(1, *shape), torch.zeros(1, dtype=torch.int64))
     return counter.get_total_flops() / 1e9
 
 
 def paper_network() -> dict[str, float | int | None]:
-    """Sizes of the paper's network, with and without attention at two levels."""
+    """Numbers of weights of the paper's network, with and without attention at two levels."""
     figures: dict[str, float | int | None] = {}
     for name, config in (("paper", PAPER), ("paper_attention", PAPER_WITH_ATTENTION)):
         with torch.device("meta"):
@@ -63,7 +63,7 @@ def paper_network() -> dict[str, float | int | None]:
 
 
 def paper_call_seconds() -> float:
-    """One call of the paper's network for one person, its weights untrained."""
+    """Seconds of one call of the paper's network for one person, with untrained weights."""
     network = SlabUNet().eval()
     x, t = torch.randn(1, 56, 256, 256), torch.zeros(1, dtype=torch.int64)
     begin = time.perf_counter()
@@ -73,7 +73,7 @@ def paper_call_seconds() -> float:
 
 
 def measure(quick: bool) -> dict[str, float | int | None]:
-    """Every figure; None is not measured here."""
+    """All figures; None means not measured here."""
     model = load_checkpoint()
     figures: dict[str, float | int | None] = {
         "checkpoint_megabytes": round(default_checkpoint().stat().st_size / 1e6, 2),

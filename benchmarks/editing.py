@@ -1,7 +1,8 @@
-"""The documentation's picture of editing: parts of the body, and people before and after each edit; nobody is picked.
+"""Draws the documentation's picture of editing: the regions of the body, and people before and after each edit.
 
-`python benchmarks/editing.py --out docs/pictures/editing.png` makes the people of successive seeds and edits them with
-the default checkpoint (or `--checkpoint`); `--json` keeps the seconds of each kind of edit. `--quick` takes few steps.
+`python benchmarks/editing.py --out docs/pictures/editing.png` generates the people of successive seeds, not
+hand-picked, and edits them with the default checkpoint (or `--checkpoint`); `--json` saves the seconds of each kind of
+edit. `--quick` takes few steps.
 """
 
 from __future__ import annotations
@@ -42,15 +43,15 @@ ARMS_LOWERED = 1.05
 BACKGROUND = (0.72, 0.72, 0.72)
 INK, PAPER = (20, 20, 20), (255, 255, 255)
 HEADING, LABEL = 24, 18
-"""Heights of a row's heading and of what is said below a picture, pixels."""
+"""Heights in pixels of a row's heading and of a picture's caption."""
 GARMENTS = ("top", "bottom", "shoes", "hair", "skin")
 
 Shown = tuple[str, Human] | tuple[str, Human, float]
-"""What is said below a picture, who is on it and from where (radians around them)."""
+"""A picture's caption, the person on it, and the yaw of the camera in radians."""
 
 
 class Studio:
-    """Makes people and edits them with one model, and keeps what each kind of edit took."""
+    """Generates and edits people with one model, and records the seconds of each kind of edit."""
 
     def __init__(self, model: DiffusionModel, steps: int) -> None:
         self.model, self.steps = model, steps
@@ -64,7 +65,7 @@ class Studio:
         return edited
 
     def parts(self) -> Iterator[Shown]:
-        """Which primitives belong to which part."""
+        """Which primitives belong to which part of the body."""
         person = self.people[0]
         yield "person", person
         painted = in_colours(person, DISJOINT)
@@ -75,7 +76,7 @@ class Studio:
             yield name, unions, yaw
 
     def varied(self) -> Iterator[Shown]:
-        """Neighbours at growing distances."""
+        """Variants at growing distances."""
         person = self.people[1]
         yield "before", person
         for amount in (0.2, 0.4, 0.6, 0.8, 1.0):
@@ -95,7 +96,7 @@ class Studio:
             yield f"{' and '.join(parts)}, seed {seed}", self._inpainted(person, parts, seed)
 
     def dressed(self) -> Iterator[Shown]:
-        """Clothes made anew as asked for, where the model knows outfits."""
+        """Clothes regenerated with the attributes given, if the model knows outfits."""
         person = self.people[3]
         outfits = self.model.vocabulary.categories.get("outfit", ())
         if outfits:
@@ -110,7 +111,7 @@ class Studio:
         return self.took("inpaint", lambda: inpaint(self.model, person, region, seed, self.steps, attributes or {}))
 
     def transferred(self) -> Iterator[Shown]:
-        """What one person wears onto another."""
+        """One person's clothes transferred to another."""
         target, source = self.people[1], self.people[2]
         top = region_of(["top"])
         yield "target", target
@@ -122,7 +123,7 @@ class Studio:
         yield "texture of all clothes", transfer_texture(source, target, region_of(["clothes"]))
 
     def harmonised(self) -> Iterator[Shown]:
-        """Another person's head, which the neck and hands do not fit at first."""
+        """Another person's head, which does not match the neck and hands at first."""
         target, source = self.people[3], self.people[0]
         region = region_of(["head", "hands"])
         pasted = transfer_garment(source, target, region_of(["head"]))
@@ -135,7 +136,7 @@ class Studio:
         return self.took("harmonise", lambda: harmonise(self.model, person, region, amount, 0, self.steps))
 
     def interpolated(self) -> Iterator[Shown]:
-        """The way from one person to another."""
+        """Steps of the interpolation from one person to another."""
         a, b = self.people[2], self.people[0]
         for number in range(COLUMNS):
             fraction = number / (COLUMNS - 1)
@@ -144,7 +145,7 @@ class Studio:
 
 
 def in_colours(human: Human, parts: tuple[str, ...]) -> Human:
-    """The person with every part in a colour of its own, as bright as they are there."""
+    """The person with one hue for each part, at the original brightness."""
     colours = torch.full((len(human.payload.rgb), 3), 0.75)
     for number, name in enumerate(parts):
         hue = 0.382 * number % 1
@@ -155,7 +156,7 @@ def in_colours(human: Human, parts: tuple[str, ...]) -> Human:
 
 
 def picture(human: Human, height: int, yaw: float = 0.0) -> np.ndarray:
-    """The person with lowered arms, two thirds as wide as high; sRGB bytes."""
+    """The person with lowered arms, in a picture two thirds as wide as high; sRGB bytes."""
     theta = torch.zeros(24, 3)
     for side, sign in (("left", -1.0), ("right", 1.0)):
         theta[JOINT_NAMES.index(f"{side}_shoulder"), 2] = sign * ARMS_LOWERED
@@ -165,7 +166,7 @@ def picture(human: Human, height: int, yaw: float = 0.0) -> np.ndarray:
 
 
 def sheet(rows: list[tuple[str, list[tuple[str, np.ndarray]]]], height: int) -> Image.Image:
-    """Rows below each other, each with its heading, and what its pictures show."""
+    """The rows one below the other, each with its heading, and each picture with its caption."""
     width, pitch = 2 * height // 3, HEADING + height + LABEL
     whole = Image.new("RGB", (COLUMNS * width, len(rows) * pitch), PAPER)
     pen = ImageDraw.Draw(whole)
@@ -181,19 +182,19 @@ def sheet(rows: list[tuple[str, list[tuple[str, np.ndarray]]]], height: int) -> 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--checkpoint", type=Path, help="without it the package's")
+    parser.add_argument("--checkpoint", type=Path, help="without it, the package's checkpoint")
     parser.add_argument("--height", type=int, default=270, help="pixels of each picture")
-    parser.add_argument("--quick", action="store_true", help="3 steps an edit")
+    parser.add_argument("--quick", action="store_true", help="3 steps per edit")
     parser.add_argument("--out", type=Path, required=True, help="PNG to write")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     studio = Studio(load_checkpoint(arguments.checkpoint, best_device()), 3 if arguments.quick else STEPS)
     rows = []
     for heading, shown in (
-        (f"regions: {len(DISJOINT)} parts that share no primitive, {len(PARTS)} names", studio.parts()),
+        (f"regions: {len(DISJOINT)} parts without common primitives, {len(PARTS)} names", studio.parts()),
         ("vary", studio.varied()),
-        ("inpaint: a region made anew to fit the rest", studio.inpainted()),
-        ("inpaint: the clothes, as asked for", studio.dressed()),
+        ("inpaint: a region regenerated to fit the rest", studio.inpainted()),
+        ("inpaint: clothes regenerated with attributes", studio.dressed()),
         ("transfer", studio.transferred()),
         ("harmonise", studio.harmonised()),
         ("interpolate", studio.interpolated()),

@@ -1,13 +1,13 @@
-"""How well the encoder reconstructs people, trained on and not, and how fast: the paper's Table 3 beside ours.
+"""Quality and speed of the encoder on training people and held-out people, beside the paper's Table 3.
 
 `python benchmarks/encoder.py --train CAPTURES --heldout CAPTURES --models DIR --json encoder.json --table encoder.md`
-evaluates the checkpoints full, shared_scale, template_rt, no_attention and full_at_equal_steps (.safetensors) of a
-folder, each if it is there; without --models the package's encoder. Everybody is encoded from eight views of one pose
+evaluates those of the checkpoints full, shared_scale, template_rt, no_attention and full_at_equal_steps (.safetensors)
+that the folder contains; without --models, the package's encoder. Each person is encoded from eight views of one pose
 and compared in all views (or --cameras of them) and poses at 512 x 512; figures with `_novel` are of views and poses
-that were not given. psnr_shared_scale and its like are of people trained on, as in the paper. Without folders of
-captures people of other seeds than those of the training are made from MakeHuman's assets (--assets) and held out.
---quick looks at one person. Times are those of the processor, best or median of several, or the wall clock's where
-their name has no `processor`.
+that the encoder was not given. As in the paper, psnr_shared_scale and similar figures are of training people. Without
+capture folders, held-out people are made from MakeHuman's assets (--assets), with seeds that training does not use.
+--quick evaluates one person. Times are the best or median of several; names with `processor` are processor time, the
+others wall time.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from primdiffusion.people.wardrobe import required_meshes
 from record import tell
 
 FIRST_SEED = 30_000_000
-"""Of people made here; training sets count from 0."""
+"""Seed of the first person made here; training sets count from 0."""
 PEOPLE, POSES, CAMERAS = 6, 4, 12
 REFINE_FIGURES = ("refine_psnr_heldout_views", "refine_seconds_cpu")
 Figures = dict[str, float | int | str | None]
 
 
 class Variant(NamedTuple):
-    """A row of the table."""
+    """A row of the table: one checkpoint."""
 
     name: str
-    """Of its checkpoint."""
+    """File name of its checkpoint, without the suffix."""
     title: str
     paper: tuple[float, float, float] | None
-    """PSNR, SSIM and LPIPS in the paper's Table 3: training people, all views and poses."""
+    """PSNR, SSIM and LPIPS from the paper's Table 3: training people, all views and poses."""
 
 
 VARIANTS = (
@@ -60,7 +60,7 @@ VARIANTS = (
 
 
 class Quality(NamedTuple):
-    """A checkpoint's means on both sets of people; None: there is no such set."""
+    """A checkpoint's means on both sets of people; None if there is no such set."""
 
     train: dict[str, Means] | None
     heldout: dict[str, Means] | None
@@ -107,12 +107,12 @@ def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--train", type=Path, help="captures of people that the encoder was trained on")
     parser.add_argument("--heldout", type=Path, help="captures of other people")
-    parser.add_argument("--models", type=Path, help="folder of checkpoints; without it the package's encoder")
-    parser.add_argument("--people", type=int, default=16, help="of each set, evenly of all")
-    parser.add_argument("--cameras", type=int, help="to compare in, evenly of all; without it all")
-    parser.add_argument("--lpips", type=Path, nargs="*", default=(), help="files of LPIPS' weights")
+    parser.add_argument("--models", type=Path, help="folder of checkpoints; without it, the package's encoder")
+    parser.add_argument("--people", type=int, default=16, help="number of people from each set, evenly spaced")
+    parser.add_argument("--cameras", type=int, help="number of cameras to compare in, evenly spaced; without it, all")
+    parser.add_argument("--lpips", type=Path, nargs="*", default=(), help="folder of the weights of LPIPS")
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
-    parser.add_argument("--without-refine", action="store_true", help="leave out benchmarks/refine.py")
+    parser.add_argument("--without-refine", action="store_true", help="skip benchmarks/refine.py")
     parser.add_argument("--quick", action="store_true", help="one person, two poses")
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--table", type=Path, help="markdown file for the tables")
@@ -120,7 +120,7 @@ def parsed() -> argparse.Namespace:
 
 
 def made_people(folder: Path, assets: Path | None, count: int) -> Path:
-    """Captures of `count` people that no training set holds, from other sides than those of the default rig."""
+    """Captures of `count` people that are in no training set, from other directions than the default rig's."""
     for _ in make_people(open_assets(assets, required_meshes()), PeopleSet(folder / "people", FIRST_SEED, count), 1):
         pass
     rig = Rig(count=CAMERAS, elevations=(5.0, 30.0))
@@ -131,7 +131,7 @@ def made_people(folder: Path, assets: Path | None, count: int) -> Path:
 
 
 def read_models(folder: Path | None) -> dict[str, EncoderModel]:
-    """The checkpoints that are there."""
+    """The checkpoints that exist in the folder."""
     if folder is None:
         return {"full": load_encoder()}
     paths = {variant.name: folder / f"{variant.name}.safetensors" for variant in VARIANTS}
@@ -141,7 +141,7 @@ def read_models(folder: Path | None) -> dict[str, EncoderModel]:
 def measured(
     model: EncoderModel, captures: Captures | None, arguments: argparse.Namespace, lpips: Lpips | None
 ) -> dict[str, Means] | None:
-    """Means of the parts of a set's pictures."""
+    """Means over each part of a set's pictures."""
     if captures is None:
         return None
     count = 1 if arguments.quick else min(arguments.people, len(captures.subjects))
@@ -158,7 +158,7 @@ def measured(
 
 
 def quality_figures(qualities: dict[str, Quality]) -> Figures:
-    """The named figures: the full model's with all details, the others' PSNR and SSIM; None where not measured."""
+    """Figures by name: the full model's in detail, the others' PSNR and SSIM; None where not measured."""
     figures: Figures = {}
     for variant in VARIANTS:
         quality = qualities.get(variant.name, Quality(None, None, None, None))

@@ -1,7 +1,7 @@
-"""How an encoder's training went: PSNR on people trained on and held out against steps, from a run's metrics.jsonl.
+"""Plots an encoder's training: PSNR on training people and held-out people by step, from a run's metrics.jsonl.
 
 `python benchmarks/encoder_curve.py --metrics docs/results/encoder_metrics.jsonl --plot docs/pictures/encoder_curve.png`
-draws it and prints what the last doubling of the steps gave, which is what another one may give at best.
+plots it and prints the gain of the last doubling of the steps, an upper bound for the gain of another doubling.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ import matplotlib
 matplotlib.use("Agg")
 from matplotlib import pyplot
 
-SETS = {"psnr_train": "people trained on", "psnr_held": "people held out"}
+SETS = {"psnr_train": "training people", "psnr_held": "people held out"}
 
 
 def read_curve(path: Path) -> dict[str, list[tuple[int, float]]]:
-    """Steps and PSNR (dB) of both sets."""
+    """Step and PSNR (dB) of each record, for both sets."""
     rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     return {name: [(row["step"], row[name]) for row in rows if name in row] for name in SETS}
 
 
 def last_doubling(curve: list[tuple[int, float]]) -> float:
-    """dB between half of the steps and all of them."""
+    """Gain in dB from half of the steps to all of them."""
     half = min(curve, key=lambda point: abs(point[0] - curve[-1][0] / 2))
     return curve[-1][1] - half[1]
 
@@ -43,7 +43,7 @@ def main() -> None:
         figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
         for name, curve in curves.items():
             axes.plot(*zip(*curve, strict=True), label=SETS[name])
-        axes.set(xlabel="steps", ylabel="PSNR, dB (whole pictures, 256 x 256)")
+        axes.set(xlabel="steps", ylabel="PSNR, dB (whole images, 256 x 256)")
         axes.grid(alpha=0.3)
         axes.legend()
         figure.savefig(arguments.plot, dpi=120)

@@ -1,8 +1,8 @@
-"""The documentation's picture of the encoder: people trained on, below them people held out, and what it made of them.
+"""Draws the documentation's picture of the encoder: training people, and below them held-out people.
 
 `python benchmarks/encoder_pictures.py --train CAPTURES --heldout CAPTURES --out docs/pictures/encoder.png` draws a row
-for each: one of the eight views that the encoder was given and its reconstruction; a view and a pose that it was not
-given, each before the captured picture; the novel pose's depth and primitives. Nobody is picked.
+for each person, not hand-picked: one of the eight views that the encoder was given and its reconstruction; a view and a
+pose that it was not given, each beside the captured picture; the novel pose's depth and primitives.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from torch import Tensor
 VIEWS = 8
 SIZE = 512
 MARGIN = 0.06
-"""Of the side of a cut square, on each side of the person."""
+"""Margin on each side of the person, as a share of the cropped square's side."""
 COLUMNS = (
     "given view (1 of 8)", "reconstruction", "novel view", "captured", "novel pose", "captured", "depth", "primitives"
 )  # fmt: skip
 HEADING, NAME = 26, 22
-"""Heights of the headings' row, and width of the names' column, pixels."""
+"""Height of the heading row and width of the name column, in pixels."""
 INK, PAPER = (235, 235, 235), (0, 0, 0)
 
 
 def row(model: EncoderModel, captures: Captures, name: str, novel_frame: int) -> Iterator[np.ndarray]:
-    """The person's pictures in the order of COLUMNS, each cut about the person; sRGB bytes."""
+    """The person's pictures in the order of COLUMNS, each cropped around the person; sRGB bytes."""
     subject, betas = captures.subject(name), default_betas(captures.subject(name))
     given = spread_cameras(subject, 0, VIEWS)
     novel = [camera for camera in range(len(subject.views)) if camera not in given] or list(given)
@@ -59,13 +59,13 @@ def row(model: EncoderModel, captures: Captures, name: str, novel_frame: int) ->
 
 
 def looked_at(primitives: Primitives, camera: Camera, look: str) -> Tensor:
-    """A picture of the drawing room's, sRGB-encoded over black."""
+    """The depth or the primitives, drawn over black, sRGB-encoded."""
     drawn = draw(Scene(primitives, chart=default_anchors().chart), camera, Look(look))
     return encode_srgb(torch.from_numpy(drawn.combined[..., :3]).clamp(0, 1))
 
 
 def cut(image: Tensor, mask: Tensor) -> np.ndarray:
-    """The square about the person, as bytes; black beyond the picture."""
+    """The square around the person, as bytes; black outside the picture."""
     rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
     middle = [(int(places[0]) + int(places[-1])) / 2 for places in (rows, columns)]
     longest = max(int(rows[-1] - rows[0]), int(columns[-1] - columns[0])) + 1
@@ -78,7 +78,7 @@ def cut(image: Tensor, mask: Tensor) -> np.ndarray:
 
 
 def sheet(rows: list[tuple[str, list[np.ndarray]]], cell: int) -> Image.Image:
-    """Rows below each other, with headings, and what the rows are at their left."""
+    """The rows one below the other, with column headings and row names."""
     whole = Image.new("RGB", (NAME + cell * len(COLUMNS), HEADING + cell * len(rows)), PAPER)
     pen, font = ImageDraw.Draw(whole), ImageFont.load_default(14)
     for number, title in enumerate(COLUMNS):
@@ -95,11 +95,11 @@ def sheet(rows: list[tuple[str, list[np.ndarray]]], cell: int) -> Image.Image:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--train", type=Path, help="captures of people that the encoder was trained on")
-    parser.add_argument("--heldout", type=Path, help="captures of other people")
-    parser.add_argument("--checkpoint", type=Path, help="without it the package's encoder")
-    parser.add_argument("--people", type=int, default=3, help="of each set, evenly of all")
-    parser.add_argument("--cell", type=int, default=224, help="pixels a side of a picture")
+    parser.add_argument("--train", type=Path, help="captures of training people")
+    parser.add_argument("--heldout", type=Path, help="captures of held-out people")
+    parser.add_argument("--checkpoint", type=Path, help="without it, the package's encoder")
+    parser.add_argument("--people", type=int, default=3, help="number of people from each set, evenly spaced")
+    parser.add_argument("--cell", type=int, default=224, help="side of a picture in pixels")
     parser.add_argument("--out", type=Path, required=True, help="PNG to write")
     arguments = parser.parse_args()
     model = load_encoder(arguments.checkpoint)
@@ -115,7 +115,7 @@ def main() -> None:
             novel_frame = 1 + number % last if last else 0
             rows.append((title, list(row(model, captures, name, novel_frame))))
     if not rows:
-        parser.error("name captures with --train or --heldout")
+        parser.error("give captures with --train or --heldout")
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     sheet(rows, arguments.cell).save(arguments.out, optimize=True)
     print(arguments.out)

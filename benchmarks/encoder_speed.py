@@ -1,4 +1,4 @@
-"""How long the encoder takes: one person from eight views, and the parts of a training step."""
+"""Times the encoder: reconstructing one person from eight views, and the parts of a training step."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from primdiffusion.training.fit_losses import loss_terms
 
 VIEWS = 8
 PARTS = ("data", "forward", "march", "march_backward", "backward", "update")
-"""Of a step; `march` holds the loss, whose share is small, `backward` is the network's alone."""
+"""The parts of a step. `march` includes the loss, a small share; `backward` is the network's alone."""
 
 
 def reconstruct_seconds(model: EncoderModel, captures: Captures, repeats: int) -> dict[str, float]:
-    """Seconds from eight 512 x 512 views in memory to a payload: the fastest of several, and how they divide."""
+    """Seconds from eight 512 x 512 views in memory to a payload: the fastest of several runs, and its parts."""
     person = captured_person(captures.root, captures.subjects[0], 0, VIEWS)
 
     def whole() -> Payload:
@@ -52,7 +52,7 @@ def reconstruct_seconds(model: EncoderModel, captures: Captures, repeats: int) -
 
 
 def step_seconds(captures: Captures, steps: int) -> dict[str, float | int]:
-    """Processor seconds of the parts of a training step with the default settings; medians of `steps` steps."""
+    """Processor seconds of the parts of a training step with the default settings: medians of `steps` steps."""
     config = FitConfig(data=captures.root, run=Path("unused"))
     torch.manual_seed(0)
     encoder = Encoder(PRESETS[config.encoder]).train()
@@ -63,7 +63,7 @@ def step_seconds(captures: Captures, steps: int) -> dict[str, float | int]:
         seconds: dict[str, float] = {}
         _step(config, encoder, optimiser, lambda: next(stream)[0], seconds)
         taken.append(seconds)
-    medians = {part: statistics.median(seconds[part] for seconds in taken[1:]) for part in PARTS}  # the first warms up
+    medians = {part: statistics.median(seconds[part] for seconds in taken[1:]) for part in PARTS}  # first: warm-up
     total = sum(medians.values())
     share = (medians["march"] + medians["march_backward"]) / total
     figures: dict[str, float | int] = {f"step_{part}_processor_seconds": medians[part] for part in PARTS}
@@ -78,7 +78,7 @@ def _step(
     read: Callable[[], FitSample],
     seconds: dict[str, float],
 ) -> None:
-    """One step, cut at the boxes that are marched, so that the marcher's adjoint is timed apart from the network's."""
+    """One step, split at the boxes that are marched: the marcher's adjoint is timed separately from the network's."""
 
     @contextmanager
     def timed(part: str) -> Iterator[None]:

@@ -1,10 +1,10 @@
-"""What the render engine in Blender adds to the marcher, and whether its pictures are the backend's.
+"""Measures the overhead of Blender's render engine over the marcher, and compares its pictures to the backend's.
 
 `python benchmarks/engine.py --json engine.json` renders one person at 512 x 512 through Blender (as a Python module)
-and the engine's warm child. Milliseconds are of wall time, the best of several frames; `_new_pose` poses the armature
-before every frame, otherwise only the camera moves. engine_overhead_ms is the time inside RenderEngine.render without
-the child's march. engine_pixel_error_max is the largest difference of an 8-bit PNG from the backend's own picture, in
-0 ... 1.
+and the engine's warm child. Milliseconds are wall time, the best of several frames; for `_new_pose` figures the
+armature is posed before every frame, otherwise only the camera moves. engine_overhead_ms is the time in
+RenderEngine.render without the child's march. engine_pixel_error_max is the largest difference between an 8-bit PNG and
+the backend's own picture, with pixel values in 0 ... 1.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ BACKEND_FROM_BLENDER = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def stage(human: Human, folder: Path) -> bpy.types.Object:
-    """A scene with the person, all 1024 volumes included, and a camera before it; the armature."""
+    """Set up a scene with the person, all 1024 volumes included, and a camera in front; returns the armature."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
     save_human(folder / "person.human.safetensors", human)
@@ -68,14 +68,14 @@ def stage(human: Human, folder: Path) -> bpy.types.Object:
 
 
 def pose(seed: int) -> np.ndarray:
-    """Joint rotations [24, 3, 3] of a person who moves a little."""
+    """Joint rotations [24, 3, 3] of a random small motion."""
     turns = np.random.default_rng(seed).normal(0, 0.15, (24, 3))
     return axis_angle_to_matrix(torch.from_numpy(turns).float()).double().numpy()
 
 
 @contextmanager
 def timed(module: object, name: str, seconds: list[float]) -> Iterator[None]:
-    """Notes how long each call of a function takes while the block runs."""
+    """Appends the duration of each call of a function to `seconds` while the block runs."""
     plain: Callable = getattr(module, name)
 
     def wrapped(*arguments: object, **named: object) -> object:
@@ -93,7 +93,7 @@ def timed(module: object, name: str, seconds: list[float]) -> Iterator[None]:
 
 
 def overhead(change: Callable[[int], None]) -> dict[str, float]:
-    """Milliseconds a frame of each part, of the frame with the least overhead; `change(i)` is called before frame i."""
+    """Milliseconds of each part of the frame with the least overhead; `change(i)` is called before frame i."""
     drawings: list = []
     plain = final.render_layer
 
@@ -134,7 +134,7 @@ def overhead(change: Callable[[int], None]) -> dict[str, float]:
 
 
 def pixel_error(human: Human, armature: bpy.types.Object, rotations: np.ndarray) -> float:
-    """The largest difference between the PNG that Blender saves and the backend's picture, in 0 ... 1."""
+    """The largest difference between Blender's saved PNG and the backend's picture, pixel values in 0 ... 1."""
     pose_from_joint_rotations(armature, rotations)
     bpy.ops.render.render(write_still=True)
     image = bpy.data.images.load(bpy.context.scene.render.filepath)

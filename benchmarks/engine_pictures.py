@@ -1,7 +1,8 @@
-"""The documentation's picture of the render engine: a generated person among solids in each view, and over Cycles.
+"""Draws the documentation's picture of the render engine: a person among solids in each view, and over Cycles.
 
 `python benchmarks/engine_pictures.py --out docs/pictures/engine.png` renders through Blender as a Python module. The
-last panel is made the documented way: Cycles draws the solids, the engine the people with holes, which go over them.
+last panel is made as the documentation describes: Cycles draws the solids, the engine draws the people with holdouts,
+and these are composited over the solids.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ SAMPLES = 64
 
 
 def stage(folder: Path, seed: int) -> bpy.types.Collection:
-    """A person who walks and waves between two cubes and a ball on a floor, before a camera; the person."""
+    """Set up a person who walks and waves between two cubes and a ball on a floor, and a camera; returns the person."""
     human = generated((seed,))[0]
     save_human(folder / "person.human.safetensors", human)
     export_for_blender(folder / "human.npz", human)
@@ -69,7 +70,7 @@ def stage(folder: Path, seed: int) -> bpy.types.Collection:
 
 
 def paint(colour: tuple[float, float, float]) -> None:
-    """A material of this linear colour for the active object."""
+    """Give the active object a material of this linear colour."""
     material = bpy.data.materials.new("paint")
     if bpy.app.version < (5, 0):
         material.use_nodes = True
@@ -78,7 +79,7 @@ def paint(colour: tuple[float, float, float]) -> None:
 
 
 def picture(folder: Path) -> np.ndarray:
-    """F12: linear, premultiplied [h, w, 4]."""
+    """Render the scene: linear, premultiplied [h, w, 4]."""
     render = bpy.context.scene.render
     render.image_settings.file_format, render.image_settings.color_mode = "OPEN_EXR", "RGBA"
     render.filepath = str(folder / "picture.exr")
@@ -91,7 +92,7 @@ def picture(folder: Path) -> np.ndarray:
 
 
 def over_cycles(person: bpy.types.Collection, folder: Path) -> np.ndarray:
-    """The engine's people over Cycles' solids, on which the hidden body mesh casts its shadow."""
+    """The engine's people over Cycles' solids; the hidden body mesh casts its shadow on them."""
     scene = bpy.context.scene
     scene.render.film_transparent = True
     scene.primdiffusion_render.solids = "HOLDOUT"

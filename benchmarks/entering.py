@@ -1,12 +1,12 @@
-"""How long a person of 1024 volumes keeps Blender's window from going on while they enter the scene.
+"""Measures how long Blender's window is blocked while a person of 1024 volumes is added to the scene.
 
-`python benchmarks/entering.py --json entering.json`. Milliseconds of wall time, each what the main thread does without
-a pause. At once, as scripts and background mode have it: at_once_build_ms, then at_once_evaluate_ms until Blender can
-draw. In a window a timer writes the volumes in slices (write_ms), their grids are read some at a time (read_ms, each
-time longest_read_ms at most), and only then enter_build_ms and enter_undo_ms, which evaluates the scene, are in the
-way. second_* is the same for somebody who joins a first person, and edit_* for one who takes the place of the second,
-with all volumes changed (at_once_edit_ms where that is done at once, then evaluated). Drawing is not in it;
-`scripts/window/look.py --scenes stalls` has that too.
+`python benchmarks/entering.py --json entering.json`. Figures are milliseconds of wall time that the main thread spends
+without a pause. Scripts and background mode do it at once: at_once_build_ms, then at_once_evaluate_ms until Blender
+can draw. In a window, a timer writes the volumes in slices (write_ms) and reads their grids in slices (read_ms, each
+slice longest_read_ms at most); only enter_build_ms and enter_undo_ms, which includes evaluating the scene, block the
+window. second_* are the same for a second person in the scene. edit_* are for replacing that second person with all
+volumes changed (at_once_edit_ms is without slices, including evaluation). Drawing is not included;
+`scripts/window/look.py --scenes stalls` includes it.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def new_file(folder: Path, name: str) -> None:
 
 
 def prepare(human: Path, place: Destination) -> tuple[WrittenHuman, dict[str, float]]:
-    """What a window does before the operator's turn."""
+    """The sliced part of adding a person, as a window does it."""
     began = time.perf_counter()
     written = write_now(human, place)
     figures = {"write_ms": 1000 * (time.perf_counter() - began)}
@@ -60,7 +60,7 @@ def prepare(human: Path, place: Destination) -> tuple[WrittenHuman, dict[str, fl
 
 
 def enter(human: Path) -> dict[str, float]:
-    """As in a window, a part after the other."""
+    """Add a person as a window does, one part after another; returns the milliseconds of each."""
     written, figures = prepare(human, Destination(next_folder("Human")))
     figures["enter_build_ms"] = milliseconds(lambda: build_written(bpy.context, written))
     figures["enter_undo_ms"] = milliseconds(lambda: bpy.ops.ed.undo_push(message="Generate Human"))
@@ -68,7 +68,7 @@ def enter(human: Path) -> dict[str, float]:
 
 
 def edit(person: bpy.types.Collection, human: Path, file: Path) -> dict[str, float]:
-    """Likewise, of somebody who becomes the one of `human`; grids of before are freed first, as in a window."""
+    """Replace `person` with `human` in the same way; the old grids are freed first, as in a window."""
     freed = milliseconds(free_unused_grids)
     written, figures = prepare(human, edit_destination(person))
     figures["free_ms"] = freed
@@ -88,7 +88,7 @@ def main() -> None:
 
 
 def measured(folder: Path) -> dict[str, float]:
-    """At once, then in parts, then in parts beside the person who is there, then edits of the one and of the other."""
+    """Figures of a person added at once, one added in parts, a second one beside them, and edits of the second one."""
     people = [folder / f"human_{seed}.npz" for seed in range(5)]
     for seed, path in enumerate(people):
         export_for_blender(path, checkered_human(seed))

@@ -1,9 +1,10 @@
-"""Figures of the extension: registration, building, frames, motion, memory, both attachments, Cycles, a soak.
+"""Figures of the extension: registration, building, frames, motion, memory, both attachments, Cycles, a soak test.
 
     python benchmarks/extension.py --json docs/results/extension.json
     python benchmarks/extension.py --also 4_5=.venv45/bin/python --json ...     # the same on another bpy: names + _4_5
 
-Each part runs in a process of its own; a real child generates. `--quick` renders smaller and soaks for five rounds.
+Each part runs in its own process; the real child generates. `--quick` renders smaller pictures and soaks for five
+rounds.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ PARTS = ["register", "person", "memory", "merged", "soak", "bare"]
 
 
 def main() -> None:
-    """Measure with this interpreter, then with the others."""
+    """Measure with this interpreter, then with those of --also."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
     parser.add_argument("--quick", action="store_true", help="smaller pictures, five rounds")
-    parser.add_argument("--parts", nargs="*", default=PARTS, help="the others' figures stay as they are in the file")
+    parser.add_argument("--parts", nargs="*", default=PARTS, help="parts to measure; the file's other figures stay")
     parser.add_argument(
         "--also",
         nargs="*",
@@ -49,7 +50,7 @@ def main() -> None:
 
 
 def measure(python: Path, arguments: argparse.Namespace) -> dict[str, float | str | None]:
-    """All parts on one version of bpy."""
+    """Figures of the chosen parts on one version of bpy."""
     with tempfile.TemporaryDirectory(prefix="primdiffusion_extension_") as name:
         folder = Path(name)
         command = [sys.executable, "-m", "primdiffusion", "generate", "--seed", "7", "--out", str(folder / "person")]
@@ -57,7 +58,7 @@ def measure(python: Path, arguments: argparse.Namespace) -> dict[str, float | st
         found: dict[str, float | str | None] = {"bpy": version(python)}
         if "register" in arguments.parts:
             times = [run(python, "register", folder)["register_ms"] for _ in range(REGISTRATIONS)]
-            found["register_ms"] = min(times)  # what other programs took is not ours
+            found["register_ms"] = min(times)  # the minimum: other programs only add time
         options = (
             {"merged": ["--size", "128"], "soak": ["--rounds", "5"], "bare": ["--rounds", "5"]}
             if arguments.quick
@@ -76,7 +77,7 @@ def version(python: Path) -> str:
 
 
 def run(python: Path, part: str, folder: Path, *options: str) -> dict[str, float | None]:
-    """The figures of one part; its words are shown when it fails."""
+    """The figures of one part; ends with the part's output if it fails."""
     command = [str(python), str(HERE / "extension_parts.py"), part, str(folder), *options]
     environment = {**os.environ, "PRIMDIFFUSION_PYTHON": sys.executable}
     print(f"{part} ...", file=sys.stderr, flush=True)

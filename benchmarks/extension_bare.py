@@ -1,11 +1,11 @@
-"""What Blender alone keeps of VDB files that are gone: no code of the extension runs here.
+"""Measures the memory that Blender itself retains for deleted VDB files: no code of the extension runs here.
 
     python benchmarks/extension_bare.py --rounds 20
 
 Each round writes 1024 files like a person's (a float and a colour grid of 10^3 voxels), shows them as volumes, removes
-these from the .blend, empties the cache of grids and deletes the files. Once under new names in every round, as people
-have them, and once under the same names: Blender remembers the headers of each path it has read and has no way to
-forget them (`volume_grid_file_cache.cc`: the map of files is only ever added to).
+these from the .blend, empties the grid cache and deletes the files. The names are new in every round, as a person's
+are, or the same in all rounds: Blender remembers the headers of each path it has read and cannot forget them
+(`volume_grid_file_cache.cc` only ever adds to the map of files).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ROUNDS = 30
 
 
 def growth_mb(rounds: int, *, new_names: bool) -> float:
-    """Megabytes a round."""
+    """Growth of resident memory per round, in MB."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     megabytes = []
     folder = Path(tempfile.mkdtemp(prefix="volumes_", dir=bpy.app.tempdir))
@@ -63,7 +63,7 @@ def _show_and_remove(files: list[Path]) -> None:
     for path in files:
         volume = bpy.data.volumes.new(path.stem)
         volume.filepath = str(path)
-        volume.grids.load()  # headers before voxels, as the extension has them
+        volume.grids.load()  # headers before voxels, as in the extension
         bpy.context.scene.collection.objects.link(bpy.data.objects.new(path.stem, volume))
     bpy.context.view_layer.update()
     bpy.data.batch_remove([*bpy.data.objects, *bpy.data.volumes])
@@ -75,7 +75,10 @@ def _show_and_remove(files: list[Path]) -> None:
 
 
 def figures(rounds: int) -> dict[str, float]:
-    """A round is a person's number of files. The old names come first: Blender keeps what the new ones have taken."""
+    """Growth per round with as many files as a person has.
+
+    The rounds with equal names come first, because Blender retains the memory of the others.
+    """
     same = growth_mb(rounds, new_names=False)
     return {"bare_growth_mb_same_paths": same, "bare_growth_mb_new_paths": growth_mb(rounds, new_names=True)}
 
@@ -85,7 +88,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     print(json.dumps(figures(parser.parse_args().rounds), indent=1), flush=True)
     blender_apart.remove()
-    os._exit(0)  # bpy as a module may hang when it is torn down
+    os._exit(0)  # bpy as a module may hang at exit
 
 
 if __name__ == "__main__":

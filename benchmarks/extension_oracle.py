@@ -1,4 +1,4 @@
-"""Volumes in Blender against the backend: linear blend skinning of their frames, and the posed surface's own frames."""
+"""Compares volumes in Blender to the backend: to its linear blend skinning, and to its frames on the posed surface."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from blender_primdiffusion.scene.convention import BLENDER_FROM_BACKEND
 def errors(
     collection: bpy.types.Collection, armature: bpy.types.Object, file: Path, numbers: range
 ) -> dict[str, float | None]:
-    """Largest differences over the frames `numbers`, of positions in mm and of axes in degrees."""
+    """Largest differences over the frames `numbers`: positions in mm, axes in degrees."""
     human = load_human(file)
     body, anchors = default_body().to(dtype=torch.float64), default_anchors().to(dtype=torch.float64)
     shaped = body.shape(human.betas.double())
@@ -58,7 +58,7 @@ def errors(
 
 
 def _pose(armature: bpy.types.Object, bases: np.ndarray) -> BodyPose:
-    """SMPL's pose as the bones are posed: R = O B O^-1, turned y up."""
+    """SMPL's pose from the bones' pose: R = O B O^-1, rotated to y up."""
     turn = BLENDER_FROM_BACKEND
     rotations = []
     for name, basis in zip(JOINT_NAMES, bases, strict=True):
@@ -75,7 +75,7 @@ def _volumes(collection: bpy.types.Collection) -> np.ndarray:
 
 
 def _instances(armature: bpy.types.Object) -> np.ndarray:
-    """World matrices of the volumes that stand on the surface, by their number."""
+    """World matrices of the volumes' instances on the surface, sorted by name."""
     graph = bpy.context.evaluated_depsgraph_get()
     found: dict[str, np.ndarray] = {}
     for instance in graph.object_instances:
@@ -85,6 +85,6 @@ def _instances(armature: bpy.types.Object) -> np.ndarray:
 
 
 def _apart(found: np.ndarray, expected: np.ndarray, world: np.ndarray) -> float:
-    """Millimetres between points in the world and points of the backend in the armature's space."""
+    """Largest distance in mm between world points and backend points given in the armature's space."""
     upright = expected @ BLENDER_FROM_BACKEND.T @ world[:3, :3].T + world[:3, 3]
     return 1e3 * float(np.linalg.norm(found - upright, axis=-1).max())

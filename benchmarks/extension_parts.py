@@ -1,6 +1,6 @@
-"""The parts of extension.py that run inside Blender, each in a process of its own: `PART FOLDER [options]` -> JSON.
+"""The parts of extension.py that run inside Blender, each in its own process: `PART FOLDER [options]` -> JSON.
 
-FOLDER holds `person/` (what `primdiffusion generate` has written) and takes each part's files.
+FOLDER contains `person/` (written by `primdiffusion generate`); parts write their files there.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ import resident
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 SEED, FRAMES, MOTION_FRAMES = 7, 48, 1500
-UNDO_STEPS = 4  # of the 32 by default: each holds a person's data blocks, and they must be full before growth is told
+UNDO_STEPS = 4  # instead of 32: each step holds a person's data blocks, and growth is measured with a full stack
 
 
 def register(_arguments: argparse.Namespace) -> dict[str, float]:
-    """Enabling the add-on, as at each start of Blender, its byte code being there."""
+    """Milliseconds to enable the add-on, as at each start of Blender, with byte code already compiled."""
     start = time.perf_counter()
     import blender_primdiffusion
 
@@ -64,7 +64,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float | None]:
 
 
 def memory(arguments: argparse.Namespace) -> dict[str, float]:
-    """One person: what Blender takes for them once all grids are read, and once it has given back what it can."""
+    """Blender's memory for one person after all grids are read, and after Release Memory."""
     _enable(arguments)
     from blender_primdiffusion.scene.build import build_human
 
@@ -79,7 +79,7 @@ def memory(arguments: argparse.Namespace) -> dict[str, float]:
 
 
 def merged(arguments: argparse.Namespace) -> dict[str, float]:
-    """The same Cycles frame with 1024 volumes and with one."""
+    """The same Cycles frame with 1024 volumes and with one merged volume."""
     _enable(arguments)
     from blender_primdiffusion.scene.build import build_human
     from blender_primdiffusion.scene.preview import setup_cycles_preview
@@ -101,7 +101,7 @@ def merged(arguments: argparse.Namespace) -> dict[str, float]:
 
 
 def soak(arguments: argparse.Namespace) -> dict[str, float]:
-    """Generate, pose, delete, again and again: what grows, what stays behind."""
+    """Generate, pose and delete repeatedly; measures memory growth, stray files and stray processes."""
     _enable(arguments)
     from blender_primdiffusion.jobs.queue import queue
     from blender_primdiffusion.scene.human import armature_of, humans
@@ -125,7 +125,7 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
         print(f"round {number + 1}: {blender[-1]:.0f} MB, {megabytes[-1]:.0f} MB with the child", flush=True)
     kept = {"shot.blend", "shot.blend1"}
     stray = [path for path in (arguments.folder / "scene").rglob("*") if path.is_file() and path.name not in kept]
-    compiled = Path(bpy.app.tempdir) / "primdiffusion" / "cache"  # where an add-on that is not installed keeps code
+    compiled = Path(bpy.app.tempdir) / "primdiffusion" / "cache"  # code cache of an add-on that is not installed
     temporary = [path for path in Path(bpy.app.tempdir).rglob("*") if path.is_file()]
     stray += [path for path in temporary if not path.is_relative_to(compiled)]
     for path in stray:
@@ -144,7 +144,7 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
 
 
 def _enable(arguments: argparse.Namespace) -> None:
-    """A new file in a folder of its own, the add-on from the checkout."""
+    """Save a new file in its own folder, and enable the add-on from the checkout."""
     import blender_primdiffusion
 
     (arguments.folder / "scene").mkdir(exist_ok=True)
@@ -154,18 +154,18 @@ def _enable(arguments: argparse.Namespace) -> None:
 
 
 def _amass(path: Path) -> Path:
-    """A file like AMASS's: SMPL-H, z up, every body joint in motion."""
+    """A file like those of AMASS: SMPL-H, z up, every body joint moving."""
     rng = np.random.default_rng(SEED)
     times = np.arange(MOTION_FRAMES) / 120.0
     poses = 0.3 * np.sin(times[:, None] * rng.uniform(1, 6, 156) + rng.uniform(0, 6, 156))
-    poses[:, :3] = [np.pi / 2, 0.0, 0.0]  # upright, where z is up
+    poses[:, :3] = [np.pi / 2, 0.0, 0.0]  # upright, with z up
     trans = np.stack([0.8 * times, np.zeros_like(times), np.full_like(times, 0.9)], -1)
     np.savez(path, poses=poses, trans=trans, mocap_framerate=120.0, betas=np.zeros(16), gender="neutral")
     return path
 
 
 def _frame_ms(scene: bpy.types.Scene) -> float:
-    """Median of a change of frame, the depsgraph evaluated."""
+    """Median milliseconds of a frame change, including the evaluation of the dependency graph."""
     times = []
     for number in range(1, FRAMES + 1):
         start = time.perf_counter()
@@ -175,10 +175,10 @@ def _frame_ms(scene: bpy.types.Scene) -> float:
 
 
 def _errors(collection: bpy.types.Collection, armature: bpy.types.Object, file: Path) -> dict[str, float | None]:
-    """Both attachments against the backend's own skinning and frames, over some frames of the motion."""
+    """Errors of both attachments against the backend's skinning and frames, over some frames of the motion."""
     try:
         import extension_oracle
-    except ImportError:  # without torch in this Python
+    except ImportError:  # this Python has no torch
         return {"lbs_error_mm_max": None, "surface_error_mm_max": None, "surface_error_deg_max": None}
     return extension_oracle.errors(collection, armature, file, range(1, MOTION_FRAMES, 211))
 
@@ -191,7 +191,7 @@ def _rendered(path: Path) -> float:
 
 
 def bare(arguments: argparse.Namespace) -> dict[str, float]:
-    """What Blender keeps without us, a person's number of files at a time."""
+    """Memory growth of Blender without the extension, per as many files as a person has."""
     import extension_bare
 
     return extension_bare.figures(arguments.rounds)
@@ -201,7 +201,7 @@ PARTS = {"register": register, "person": person, "memory": memory, "merged": mer
 
 
 def main() -> None:
-    """One part; its figures on a line of their own at the end."""
+    """Run one part and print its figures on the last line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("part", choices=PARTS)
     parser.add_argument("folder", type=Path)
@@ -212,7 +212,7 @@ def main() -> None:
     figures = PARTS[arguments.part](arguments)
     print("\nfigures " + json.dumps(figures), flush=True)
     blender_apart.remove()
-    os._exit(0)  # bpy as a module may hang when it is torn down
+    os._exit(0)  # bpy as a module may hang at exit
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     python benchmarks/house.py
     python benchmarks/house.py --walk --json docs/results/house.json    # --walk: also run Generate and count the files
 
-The source is parsed, never imported. What is counted is printed above the figures.
+The source is parsed, never imported. The items counted are printed above the figures.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ import record
 ROOT = Path(__file__).resolve().parents[1]
 PROGRAMS = {"backend": ROOT / "backend" / "primdiffusion", "extension": ROOT / "blender_primdiffusion"}
 TESTS = {"backend": ROOT / "tests" / "backend", "extension": ROOT / "tests" / "blender"}
-"""tests/contract is about both programs at once, so it mirrors neither."""
+"""tests/contract tests both programs together, so it mirrors neither."""
 SUITE = ROOT / "docs" / "results" / "suite.json"
 THREAD_MODULES = {"threading", "_thread", "concurrent.futures", "multiprocessing"}
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 NO_REASON = ("noqa", "type:", "fmt:", "pyright:")
-"""Comments for tools."""
+"""Comments for tools, not for readers."""
 
 
 @dataclass(frozen=True)
 class Import:
     targets: tuple[str, ...]
-    """Dotted names; of `from a import b` the name a.b, which may be a module or something in a."""
+    """Dotted names; `from a import b` gives a.b, which may be a module or a name defined in a."""
     first_line: int
     last_line: int
     in_function: bool
@@ -63,7 +63,7 @@ class Module:
 
     @property
     def lines(self) -> int:
-        """Lines of the file, with blank ones and comments."""
+        """Lines of the file, including blank lines and comments."""
         return len(self.source.splitlines())
 
 
@@ -120,9 +120,9 @@ def sizes(modules: list[Module]) -> dict[str, float | None]:
 
 
 def import_circles(modules: list[Module]) -> list[str]:
-    """Groups of modules that import each other: at the top of files, in functions, under `if TYPE_CHECKING`.
+    """Groups of modules that import each other at module level, in functions or under `if TYPE_CHECKING`.
 
-    Packages that an import passes on its way to a module are left out.
+    Parent packages that an import loads on its way to a module are not counted.
     """
     names = {module.name for module in modules}
     graph: dict[str, set[str]] = {}
@@ -134,7 +134,7 @@ def import_circles(modules: list[Module]) -> list[str]:
 
 
 def hidden_imports(modules: list[Module]) -> list[str]:
-    """Imports in functions without a comment that says why: beside them, or above them or the imports they follow."""
+    """Imports in functions without an explaining comment beside or above them, or above the group they belong to."""
     found = []
     for module in modules:
         comments = _comments(module.source)
@@ -190,7 +190,7 @@ def tests_without_source() -> list[str]:
 
 
 def walk() -> Mapping[str, float | None]:
-    """Run walk.py in a process of its own and read its figures."""
+    """Run walk.py in its own process and read its figures."""
     with tempfile.TemporaryDirectory(prefix="primdiffusion_house_") as folder:
         path = Path(folder) / "walk.json"
         subprocess.run([sys.executable, str(ROOT / "benchmarks" / "walk.py"), "--json", str(path)], check=True)

@@ -1,9 +1,9 @@
-"""The rooms of both programs and what imports what, drawn from the source: docs/pictures/house.png.
+"""Draws the rooms of both programs and the imports between them from the source: docs/pictures/house.png.
 
     python benchmarks/house_picture.py --out docs/pictures/house.png
 
-A room is drawn below all rooms that import it. Arrows that follow from others are left out: a room may import all that
-it can reach. Single files beside the rooms are left out too.
+A room is drawn below all rooms that import it. Arrows implied by others are omitted: a room may import every room that
+it can reach. Single files beside the rooms are omitted too.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def draw(axis: pyplot.Axes, program: str, modules: list[Module]) -> None:
-    """Rooms in layers, and arrows from a room to the rooms that it imports and that no longer way leads to."""
+    """Draw rooms in layers, and an arrow from a room to each imported room unless a longer path leads there."""
     edges = room_imports(program, modules)
     layers = layers_of({room for edge in edges for room in edge}, set(edges))
     rows: dict[int, list[str]] = {}
@@ -72,7 +72,7 @@ def draw(axis: pyplot.Axes, program: str, modules: list[Module]) -> None:
 
 
 def room_imports(program: str, modules: list[Module]) -> Counter[tuple[str, str]]:
-    """How many imports lead from one room to another."""
+    """The number of imports from one room to another."""
     own = {module.name: module.room for module in modules if module.program == program}
     counts: Counter[tuple[str, str]] = Counter()
     for module in modules:
@@ -87,7 +87,7 @@ def room_imports(program: str, modules: list[Module]) -> Counter[tuple[str, str]
 
 
 def shortest(edges: set[tuple[str, str]]) -> set[tuple[str, str]]:
-    """The edges that no longer way replaces: the transitive reduction of a graph without circles."""
+    """The edges that are not implied by a longer path: the transitive reduction of an acyclic graph."""
     below: dict[str, set[str]] = {}
     for above, other in edges:
         below.setdefault(above, set()).add(other)
@@ -99,9 +99,9 @@ def shortest(edges: set[tuple[str, str]]) -> set[tuple[str, str]]:
 
 
 def layers_of(rooms: set[str], edges: set[tuple[str, str]]) -> dict[str, int]:
-    """The length of the longest way down from each room; rooms without imports are at 0."""
+    """The length of the longest path down from each room; rooms without imports are at 0."""
     layers = dict.fromkeys(rooms, 0)
-    for _ in rooms:  # each round is right for one layer more
+    for _ in rooms:  # each round settles one more layer
         for above, below in edges:
             layers[above] = max(layers[above], layers[below] + 1)
     return layers

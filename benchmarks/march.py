@@ -1,9 +1,10 @@
-"""How fast and how exact the marcher is: people, poses, picture sizes, numbers of boxes, crowds.
+"""Speed and exactness of the marcher, for different people, poses, picture sizes, numbers of boxes and crowds.
 
 `python benchmarks/march.py --json march.json --table march.md --plot march.png` measures everything; `--quick` (about a
-minute) leaves out the largest pictures and the engine in Blender. Milliseconds are PROCESSOR time, all threads
-together, the best of several warm calls: on a shared machine the only honest figure. Its roofline (`roofline.py`) is
-measured in the same run. Errors are in 0 ... 1, against `march_reference` in float64.
+minute) leaves out the largest pictures and the engine in Blender. Milliseconds are PROCESSOR time of all threads
+together, the best of several warm calls, because wall time is unreliable on a shared machine. The roofline
+(`roofline.py`) is measured in the same run. Errors are against `march_reference` in float64, with pixel values in
+0 ... 1.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def leaves(record: Primitives | Camera) -> Primitives | Camera:
 
 
 def backward_ms(person: Primitives, camera: Camera, repeats: int) -> tuple[float, float]:
-    """Milliseconds of a forward call that keeps what the adjoint needs, and of the adjoint of every input."""
+    """Milliseconds of a forward call that saves what the adjoint needs, and of the adjoint for every input."""
     forward, backward = float("inf"), float("inf")
     for _ in range(repeats):
         boxes, view = leaves(person), leaves(camera)
@@ -71,7 +72,7 @@ def backward_ms(person: Primitives, camera: Camera, repeats: int) -> tuple[float
 
 
 def measured_row(scene: Scene, operations_per_second: float, repeats: int) -> Row:
-    """What one picture costs."""
+    """The cost of one picture."""
     settings = MarchSettings()
     counted = count_samples(scene.primitives, scene.camera, settings)
     forward = best(lambda: march(scene.primitives, scene.camera, settings), repeats)
@@ -90,7 +91,7 @@ def measured_row(scene: Scene, operations_per_second: float, repeats: int) -> Ro
 
 
 def speed(person: Primitives, operations_per_second: float, repeats: int) -> Figures:
-    """The default picture: forward at 4 and 1 mm, the adjoint, the reference."""
+    """Figures of the default picture: forward at 4 and 1 mm, the adjoint, the reference."""
     camera = portrait(512)
     figures: Figures = {"boxes": len(person.position)}
     stride = strides_of(person, MarchSettings())
@@ -123,7 +124,7 @@ def speed(person: Primitives, operations_per_second: float, repeats: int) -> Fig
 
 
 def crowd() -> Primitives:
-    """Sixteen people of 4096 small boxes: 4.3e9 pairs of a box and a pixel, of which almost none meet."""
+    """Sixteen people of 4096 small boxes: 4.3e9 pairs of a box and a pixel, almost none of which intersect."""
     count = 16 * 4096
     return Primitives(
         position=torch.rand((count, 3), generator=torch.Generator().manual_seed(27)) * 4 - 2,
@@ -135,7 +136,7 @@ def crowd() -> Primitives:
 
 
 def largest_error(person: Primitives, camera: Camera) -> float:
-    """Largest difference in rgb from the reference in float64, 0 ... 1."""
+    """Largest difference in rgb from the reference in float64, with values in 0 ... 1."""
     exact = march_reference(person.to(dtype=torch.float64), camera.to(dtype=torch.float64))
     return float((march(person, camera).rgb.double() - exact.rgb).abs().max())
 
@@ -161,14 +162,14 @@ def least_cosine(person: Primitives, camera: Camera) -> float:
 
 
 def inside_the_chest(size: int) -> Camera:
-    """A camera within the boxes of the chest, looking at an arm."""
+    """A camera inside the boxes of the chest, looking at an arm."""
     return look_at(
         torch.tensor([0.05, 0.2, 0.05]), torch.tensor([0.6, 0.3, 0.0]), vertical_fov=1.2, width=size, height=size
     )
 
 
 def exactness(person: Primitives) -> Figures:
-    """Against the reference in float64: from the front, contorted, in fewer boxes, opaque throughout, from within."""
+    """Errors against the reference in float64: from the front, contorted, fewer boxes, fully opaque, from inside."""
     posed = place(checkered_human(), contorted())
     opaque = dataclasses.replace(person, density=person.density * 10)
     pictures = [
@@ -185,13 +186,13 @@ def exactness(person: Primitives) -> Figures:
 
 
 def shrunk(camera: Camera, size: int = 48) -> Camera:
-    """The same view in fewer pixels: recorded gradients of the reference need memory for every sample."""
+    """The same view with fewer pixels: the recorded gradients of the reference need memory for every sample."""
     scale = camera.intrinsics.new_tensor([size / camera.width, size / camera.height, 1.0])
     return dataclasses.replace(camera, intrinsics=camera.intrinsics * scale[:, None], width=size, height=size)
 
 
 def from_script(script: str, names: tuple[str, ...], *arguments: str) -> Figures:
-    """Figures `names` of another benchmark's record; None where the script cannot measure them here."""
+    """The figures `names` of another benchmark's record; None if the script cannot measure them here."""
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "record.json"
         ran = subprocess.run([sys.executable, str(HERE / script), "--json", str(record), *arguments], check=False)

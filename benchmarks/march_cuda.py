@@ -1,11 +1,11 @@
-"""How fast and how exact the marcher is on a CUDA device: one person of 1024 boxes that fills the frame.
+"""Speed and exactness of the marcher on a CUDA device, for one person of 1024 boxes that fills the frame.
 
 `python benchmarks/march_cuda.py --json march_cuda.json` prints and writes one flat object. Milliseconds are medians
-between CUDA events around whole calls, launches and the one wait for the device included. The ceilings are measured on
-the same device in the same run; a sample costs `OPERATIONS_PER_SAMPLE` (SPEC 4) and, where nothing is reused, 128 bytes
-of voxels. `--kernels` adds a table of what each kernel takes, `--sweep` of how the work may be cut into programs.
+between CUDA events around whole calls, including launches and the one synchronisation with the device. The ceilings are
+measured on the same device in the same run; a sample costs `OPERATIONS_PER_SAMPLE` (SPEC 4) and, without reuse, 128
+bytes of voxels. `--kernels` adds a table of the time of each kernel, `--sweep` one of different program shapes.
 
-It needs a CUDA device, torch for CUDA, the triton that this torch names, and the package's own requirements; nothing
+It needs a CUDA device, torch for CUDA, the triton that this torch requires, and the package's own requirements; nothing
 is downloaded. From a checkout: `PYTHONPATH=backend python benchmarks/march_cuda.py`.
 """
 
@@ -36,12 +36,12 @@ SIZES = (256, 512, 1024, 2048)
 BATCHES = (4, 16)
 BYTES_OF_SAMPLE = 8 * 16
 EXACT_SIZE, GRADIENT_SIZE = 128, 96
-"""Pixels along a side of the pictures that are compared to the reference in float64."""
+"""Side in pixels of the pictures that are compared to the reference in float64."""
 Figures = dict[str, float | int | bool | str | None]
 
 
 def scene(size: int, views: int = 1, people: int = 1) -> tuple[Primitives, Camera]:
-    """A person, or so many different ones, and as many equal views, on the device."""
+    """A person, or several different ones, and equal views, on the device."""
     boxes = [standing_person(seed) for seed in range(people)]
     names = [field.name for field in dataclasses.fields(Primitives)]
     batch = Primitives(**{name: torch.stack([getattr(person, name) for person in boxes]) for name in names})
@@ -50,7 +50,7 @@ def scene(size: int, views: int = 1, people: int = 1) -> tuple[Primitives, Camer
 
 
 def leaves(record: Any) -> Any:
-    """The record with tensors of its own that collect gradients."""
+    """A copy of the record with tensors that collect gradients."""
     return record.map(lambda tensor: tensor.detach().clone().requires_grad_())
 
 
@@ -67,7 +67,7 @@ def training_ms(
     settings: MarchSettings,
     shapes: Shapes = Shapes(),  # noqa: B008
 ) -> tuple[float, float]:
-    """Of a forward pass that keeps what the backward pass needs, and of that one, for all gradients."""
+    """Milliseconds of a forward pass that saves the backward pass's inputs, and of the backward pass."""
     from cuda_ceilings import median_ms
 
     boxes, camera = leaves(boxes), leaves(camera)
@@ -81,7 +81,7 @@ def training_ms(
 
 
 def speed() -> Figures:
-    """Times and shares of the ceilings."""
+    """Milliseconds, and shares of the ceilings."""
     from cuda_ceilings import cached_bytes_per_second, copied_bytes_per_second, operations_per_second
 
     operations, copied, cached = operations_per_second(), copied_bytes_per_second(), cached_bytes_per_second()
@@ -114,7 +114,7 @@ def speed() -> Figures:
 
 
 def exactness() -> Figures:
-    """Against the reference in float64: the largest difference in rgb (0 ... 1), the smallest cosine of gradients."""
+    """Errors against the reference in float64: largest difference in rgb (0 ... 1), smallest cosine of gradients."""
     boxes, camera = scene(EXACT_SIZE)
     exact = march_reference(first_in_double(boxes), first_in_double(camera))
     figures: Figures = {"cuda_rgb_error_max": float((march_cuda(boxes, camera).rgb[0] - exact.rgb).abs().max())}
@@ -129,12 +129,12 @@ def exactness() -> Figures:
 
 
 def first_in_double(record: Any) -> Any:
-    """The first scene of a batch, in float64."""
+    """The first item of a batch, in float64."""
     return record.to(dtype=torch.float64).map(lambda tensor: tensor[0])
 
 
 def gradients(draw: Callable[..., Rendering], boxes: Primitives, camera: Camera) -> dict[str, Tensor]:
-    """Of a fixed random mix of rgb, alpha and depth."""
+    """Gradients of a fixed random combination of rgb, alpha and depth."""
     boxes, camera = leaves(boxes), leaves(camera)
     picture = draw(boxes, camera)
     depth = torch.where(picture.alpha > 0.05, picture.depth, 0)
@@ -146,7 +146,7 @@ def gradients(draw: Callable[..., Rendering], boxes: Primitives, camera: Camera)
 
 
 def print_kernels() -> None:
-    """What each kernel of a forward and a backward pass takes, by the profiler."""
+    """Print the time of each kernel in a forward and a backward pass, from the profiler."""
     from torch.profiler import ProfilerActivity, profile
 
     boxes, camera = (leaves(record) for record in scene(512))
@@ -159,7 +159,7 @@ def print_kernels() -> None:
 
 
 def variants() -> Iterator[Shapes]:
-    """Other ways to cut the work; the first is the default."""
+    """Other program shapes; the first is the default."""
     yield Shapes()
     for tile, samples, warps in (
         ((8, 4), 8, 8), ((8, 4), 4, 4), ((8, 4), 16, 8), ((8, 8), 4, 4), ((8, 8), 8, 8), ((4, 4), 8, 2), ((16, 4), 4, 4)
@@ -175,7 +175,7 @@ def variants() -> Iterator[Shapes]:
 
 
 def print_sweep() -> None:
-    """Forward and backward milliseconds of the variants at 512 x 512."""
+    """Print forward and backward milliseconds of the variants at 512 x 512."""
     boxes, camera = scene(512)
     for shapes in variants():
         forward, backward = training_ms(boxes, camera, DEFAULT, shapes)
@@ -186,8 +186,8 @@ def print_sweep() -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="file for the figures")
-    parser.add_argument("--kernels", action="store_true", help="also print what each kernel takes")
-    parser.add_argument("--sweep", action="store_true", help="also print times of other ways to cut the work")
+    parser.add_argument("--kernels", action="store_true", help="also print the time of each kernel")
+    parser.add_argument("--sweep", action="store_true", help="also print the times of other program shapes")
     arguments = parser.parse_args()
     if not torch.cuda.is_available():
         sys.exit("no CUDA device: torch sees none on this machine, so there is nothing to measure")

@@ -36,21 +36,21 @@ class Scene:
     """One picture to draw."""
 
     group: str
-    """What is varied: person, pose, size, boxes or people."""
+    """The group in the table: person, pose, size, boxes or people."""
     name: str
     primitives: Primitives
     camera: Camera
 
 
 def standing_person(seed: int = 0) -> Primitives:
-    """The default body's 1024 boxes in the rest pose, filled from its mesh under a random checkered texture."""
+    """The default body's 1024 boxes in the rest pose, filled from its mesh with a random checkered texture."""
     return place(checkered_human(seed))
 
 
 def checkered_human(seed: int = 0, betas: Tensor | None = None, off_the_skin: float = 0.0) -> Human:
-    """The default body (None: the mean one) under a random checkered texture: nothing that was trained takes part.
+    """The default body (`betas` None: the mean body) with a random checkered texture; uses no trained model.
 
-    The texture is on the skin, or on a suit that lies `off_the_skin` metres over it.
+    The texture is on the skin, or on a suit `off_the_skin` metres above it.
     """
     body = default_body()
     betas = torch.zeros(10) if betas is None else betas
@@ -73,7 +73,7 @@ def checkered_human(seed: int = 0, betas: Tensor | None = None, off_the_skin: fl
 
 
 def portrait(size: int) -> Camera:
-    """The whole person in a square picture; the body's origin is near its pelvis."""
+    """A camera that sees the whole person in a square picture; the body's origin is near its pelvis."""
     position, target = torch.tensor([0.6, 0.1, 3.2]), torch.tensor([0.0, -0.3, 0.0])
     return look_at(position, target, vertical_fov=math.radians(32), width=size, height=size)
 
@@ -84,20 +84,20 @@ def walking() -> BodyPose:
 
 
 def contorted(seed: int = 0) -> BodyPose:
-    """Every joint turned at random by about half a radian: limbs cross and boxes overlap."""
+    """Every joint rotated at random by about half a radian: limbs cross and boxes overlap."""
     turns = torch.randn((24, 3), generator=torch.Generator().manual_seed(seed)) * 0.3
     return BodyPose(axis_angle_to_matrix(turns), torch.zeros(3))
 
 
 def in_fewer_boxes(person: Primitives) -> Primitives:
-    """A quarter of the boxes, every other one of the grid's rows and columns, twice as wide: about the same cover."""
+    """A quarter of the boxes, every other row and column of the grid, twice as wide: about the same coverage."""
     index = torch.arange(GRID * GRID).reshape(GRID, GRID)[::2, ::2].flatten()
     kept = person.map(lambda tensor: tensor[index])
     return dataclasses.replace(kept, half_extent=kept.half_extent * torch.tensor([2.0, 2.0, 1.0]))
 
 
 def in_more_boxes(person: Primitives) -> Primitives:
-    """Every box as four, halved along tangent and bitangent, each with 8^3 voxels; the window thins their seams."""
+    """Every box as four, halved along tangent and bitangent, each with 8^3 voxels; the window fades their seams."""
     quarters = []
     for along_t, along_b in itertools.product((-0.5, 0.5), repeat=2):
         offset = person.half_extent * torch.tensor([along_t, along_b, 0.0])
@@ -114,7 +114,7 @@ def in_more_boxes(person: Primitives) -> Primitives:
 
 
 def _half(voxels: Tensor, axis: int, side: float) -> Tensor:
-    """The lower (side < 0) or upper half of an axis at 8 voxels again, by linear interpolation."""
+    """The lower (side < 0) or upper half of an axis, resampled to 8 voxels by linear interpolation."""
     size = voxels.shape[axis]
     place = torch.linspace(0, (size - 1) / 2, size) + (0 if side < 0 else (size - 1) / 2)
     low = place.floor().long().clamp_max(size - 2)
@@ -124,7 +124,7 @@ def _half(voxels: Tensor, axis: int, side: float) -> Tensor:
 
 
 def crowd(person: Primitives, count: int) -> Primitives:
-    """`count` people in rows of four, turned towards the camera as the first one is."""
+    """`count` people in rows of four, facing the camera like the first one."""
     members = []
     for i in range(count):
         shift = torch.tensor([(i % 4 - min(count - 1, 3) / 2) * SPACING, 0.0, -(i // 4) * SPACING])
@@ -138,7 +138,7 @@ def generated(seeds: tuple[int, ...]) -> list[Human]:
 
 
 def scenes(largest: int, seeds: tuple[int, ...] = (1, 2)) -> Iterator[Scene]:
-    """All pictures of the table, up to `largest` pixels a side."""
+    """All scenes of the table, with pictures up to `largest` pixels a side."""
     checkered = checkered_human()
     person, view = place(checkered), portrait(512)
     for size in (256, 512, 1024, 2048):

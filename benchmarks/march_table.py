@@ -11,7 +11,7 @@ COLOURS = {"size": "#1b6ca8", "person": "#c8553d", "pose": "#6a994e", "boxes": "
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """What one picture costs; milliseconds of processor time, all threads together."""
+    """The cost of one picture; milliseconds are processor time of all threads together."""
 
     group: str
     name: str
@@ -21,16 +21,16 @@ class Row:
     samples: int
     """Lattice points inside boxes on rays that are not yet opaque: the work of SPEC 4."""
     evaluated: int
-    """Those that were looked up; the others lie where a box holds nothing."""
+    """The samples that were looked up; the others are where a box is empty."""
     milliseconds: float
     roofline_ms: float
-    """What `samples` cost at the processor's measured ceiling."""
+    """The time of `samples` at the processor's measured ceiling."""
 
 
 def write_table(path: Path, rows: Sequence[Row]) -> None:
-    """A markdown table, a row a picture."""
+    """Write a markdown table with one row per picture."""
     lines = [
-        "| varied | picture | boxes | hit rays | samples (M) | evaluated (M) | ms | ns a sample | x roofline |",
+        "| varied | picture | boxes | hit rays | samples (M) | evaluated (M) | ms | ns per sample | x roofline |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
@@ -43,7 +43,7 @@ def write_table(path: Path, rows: Sequence[Row]) -> None:
 
 
 def write_plot(path: Path, rows: Sequence[Row]) -> None:
-    """Time against samples, where all pictures lie on one line, and against boxes x pixels, where they do not."""
+    """Plot time against samples, where all pictures lie on one line, and against boxes x pixels, where they do not."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -59,7 +59,7 @@ def write_plot(path: Path, rows: Sequence[Row]) -> None:
     samples = [row.samples for row in ordered]
     left.loglog(samples, [row.roofline_ms for row in ordered], "k-", linewidth=1, label="roofline")
     left.loglog(samples, [8 * row.roofline_ms for row in ordered], "k--", linewidth=1, label="8 x roofline")
-    left.set(xlabel="samples inside boxes", ylabel="processor time of a picture, ms")
+    left.set(xlabel="samples inside boxes", ylabel="processor time per picture, ms")
     right.set(xlabel="boxes x pixels")
     left.legend(fontsize=8)
     for axes in (left, right):

@@ -1,9 +1,9 @@
-"""A person in Cycles as 1024 volumes and as one, beside the engine's exact picture; and the two ways of attachment.
+"""Compares a person in Cycles as 1024 volumes, as one merged volume, and in the engine; and the two attachments.
 
 `python benchmarks/merged.py --json merged.json --pictures DIR` poses the default checkpoint's person 7 and renders
-512 x 512 pixels, one sample each. merged_speedup is the time of a Cycles picture of 1024 volumes through that of the
-merged one. PSNRs are of 8-bit pictures over grey. Frame times are of `frame_set` with 1024 volumes, the best;
-surface_error is against the backend's own frames on the surface as it poses it. `--no-volumes` leaves out the slow one.
+512 x 512 pixels with one sample. merged_speedup is the time of the Cycles picture of 1024 volumes divided by that of
+the merged one. PSNRs are of 8-bit pictures over grey. Frame times are the fastest `frame_set` with 1024 volumes;
+surface_error is against the backend's own frames on the posed surface. `--no-volumes` skips the slow render.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 def strong_poses(count: int) -> np.ndarray:
-    """Rotations [count, 24, 3, 3] of 25 degrees and more a joint."""
+    """Rotations [count, 24, 3, 3] with an angle of typically 25 degrees or more per joint."""
     turns = torch.randn(count, 72, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 0.45
     return BodyPose.from_axis_angle(turns).joint_rotation.numpy()
 
 
 def stepping() -> np.ndarray:
-    """A pose to look at [24, 3, 3]: a step, with bent arms."""
+    """Rotations [24, 3, 3] of the pose in the pictures: a step, with bent arms."""
     turns = torch.zeros(24, 3, dtype=torch.float64)
     turns[1, 0], turns[2, 0], turns[5, 0] = -0.5, 0.35, 0.6
     turns[16, 2], turns[17, 2], turns[18, 1], turns[19, 1] = -0.9, 0.8, -0.9, 0.5
@@ -61,7 +61,7 @@ def stepping() -> np.ndarray:
 
 
 def frame_ms() -> float:
-    """Milliseconds of the fastest frame_set over the keyed frames: other programs only make them slower."""
+    """Milliseconds of the fastest frame_set over the keyed frames; the fastest, as other programs only add time."""
     times = []
     for number in [*range(1, FRAMES + 1)] * 3:
         began = time.perf_counter()
@@ -71,7 +71,7 @@ def frame_ms() -> float:
 
 
 def surface_error(human, armature, rotations: np.ndarray) -> tuple[float, float]:
-    """Largest distance (mm) and angle (degrees) of the drawn instances from the backend's frames, over all frames."""
+    """Largest distance (mm) and angle (degrees) between instances and the backend's frames, over all frames."""
     body, anchors = body_of(human)
     distance = angle = 0.0
     for number, rotation in enumerate(rotations, 1):
@@ -92,7 +92,7 @@ def surface_error(human, armature, rotations: np.ndarray) -> tuple[float, float]
 
 
 def rendered(path: Path) -> tuple[np.ndarray, float]:
-    """The scene's picture [H, W, 3] in 0 ... 1 as its PNG holds it, and the seconds it took."""
+    """The scene's picture [H, W, 3] in 0 ... 1 as read from its PNG, and the seconds of the render."""
     bpy.context.scene.render.filepath = str(path)
     began = time.perf_counter()
     bpy.ops.render.render(write_still=True)
@@ -113,7 +113,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, required=True, help="folder for the PNGs")
     parser.add_argument("--person", type=Path, help="a .human.safetensors; otherwise one is generated")
     parser.add_argument(
-        "--no-volumes", action="store_true", help="without the picture of 1024 volumes, which takes minutes"
+        "--no-volumes", action="store_true", help="skip the picture of 1024 volumes, which takes minutes"
     )
     arguments = parser.parse_args()
     human = load_human(arguments.person) if arguments.person else generate(load_checkpoint(None), SEED, STEPS)
@@ -167,7 +167,7 @@ def main() -> None:
         pictures[name], figures["seconds_cycles_merged"] = rendered(folder / f"merged_{name}.png")
     bpy.context.scene.render.engine = "PRIMDIFFUSION"
     bpy.context.scene.render.dither_intensity = 0
-    rendered(folder / "exact.png")  # the child starts
+    rendered(folder / "exact.png")  # starts the child
     exact, figures["seconds_exact"] = rendered(folder / "exact.png")
     bpy.context.scene.render.engine = "CYCLES"
     for name, picture in pictures.items():

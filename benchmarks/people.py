@@ -1,10 +1,10 @@
-"""How much of a dressed person survives becoming primitives: marched payloads against the rasterised meshes.
+"""Measures how well primitives represent a dressed person: marched payloads against the rasterised meshes.
 
-`python benchmarks/people.py --assets DIR --json people.json` makes people of seeds that no training set uses and draws
-each from directions that `from_mesh` did not look from, at rest and in a pose (the mesh moved by skinning,
-primitives that ride on the posed body). `iou` is of the silhouettes (alpha over one half); `psnr` is of sRGB-encoded
-pictures on black, inside the bounding box of the mesh, `psnr_whole` over the whole picture and `psnr_shared` over the
-pixels of both silhouettes. `--quick` takes 4 people from 2 sides. `--pictures DIR` keeps mesh and payload side by side.
+`python benchmarks/people.py --assets DIR --json people.json` makes people from seeds that no training set uses and
+draws each from directions that `from_mesh` does not use, at rest and in a pose (the mesh moved by skinning, the
+primitives by the posed body). `iou` is of the silhouettes (alpha over one half). `psnr` is of sRGB-encoded pictures on
+black inside the bounding box of the mesh, `psnr_whole` of the whole picture and `psnr_shared` of the pixels in both
+silhouettes. `--quick` takes 4 people from 2 sides. `--pictures DIR` saves mesh and payload side by side.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Result = TypeVar("Result")
 FIRST_SEED = 10_000_000
 """Training sets count from 0."""
 DIRECTIONS = ((20, 10), (110, 5), (200, 15), (290, -10))
-"""Yaw and pitch of the cameras, degrees; none is a direction that from_mesh looks from."""
+"""Yaw and pitch of the cameras in degrees; none is a direction of from_mesh."""
 SIZE = 512
 FIELD_OF_VIEW = math.radians(30)
 BENDS = {
@@ -60,7 +60,7 @@ BENDS = {
 
 
 def camera_at(bounds: np.ndarray, yaw: float, pitch: float) -> Camera:
-    """A camera in degrees around the middle of `bounds`, which fit its picture with a tenth to spare."""
+    """A camera aimed at the middle of `bounds` from yaw and pitch in degrees; the bounds fit with a tenth to spare."""
     middle = bounds.mean(0)
     distance = 1.1 * (bounds[1] - bounds[0]).max() / 2 / math.tan(FIELD_OF_VIEW / 2)
     yaw, pitch = math.radians(yaw), math.radians(pitch)
@@ -85,12 +85,12 @@ def compare(drawn: RasterImage, marched: Rendering) -> dict[str, float]:
 
 
 def displayed(rgb: np.ndarray) -> np.ndarray:
-    """Linear colours as a screen's values, 0 ... 1."""
+    """Linear colours as sRGB-encoded values, 0 ... 1."""
     return encode_srgb(np.clip(rgb, 0, 1))
 
 
 def psnr(squared: np.ndarray) -> float:
-    """Decibels, of squared differences of values in 0 ... 1."""
+    """PSNR in decibels, from squared differences of values in 0 ... 1."""
     return float(-10 * np.log10(squared.mean()))
 
 
@@ -102,7 +102,7 @@ def bent() -> BodyPose:
 
 
 def measure(assets: Assets, people: int, directions: int, pictures: Path | None) -> dict[str, float | int]:
-    """All figures by name; `posed_` figures are of the pose, `seconds_` are medians."""
+    """All figures by name: `posed_` are of the pose, `seconds_` are medians."""
     body, anchors, base = default_body(), default_anchors(), load_base_mesh()
     figures: dict[str, list[dict[str, float]]] = {"people": [], "posed": []}
     seconds: dict[str, list[float]] = {"person": [], "surface_field": [], "colour": []}
@@ -147,7 +147,7 @@ def picture_of(
 
 
 def timed(call: Callable[[], Result]) -> tuple[Result, float]:
-    """What `call` returns, and its seconds."""
+    """The result of `call`, and its seconds."""
     begin = time.perf_counter()
     result = call()
     return result, time.perf_counter() - begin
@@ -157,7 +157,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
     parser.add_argument("--json", type=Path, help="file for the figures")
-    parser.add_argument("--pictures", type=Path, help="folder for mesh and payload side by side")
+    parser.add_argument("--pictures", type=Path, help="folder for pictures of mesh and payload side by side")
     parser.add_argument("--quick", action="store_true", help="4 people from 2 directions, under a minute")
     arguments = parser.parse_args()
     if arguments.pictures:

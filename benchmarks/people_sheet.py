@@ -1,8 +1,8 @@
-"""A sheet of people that `primdiffusion people` makes, of successive seeds and unpicked, arms let down.
+"""Draws a sheet of the people that `primdiffusion people` makes, from successive seeds, with lowered arms.
 
-`python benchmarks/people_sheet.py --assets DIR --out people.png` draws 64 of them with the package's rasteriser and a
-light of its own. `--flat` leaves the light out, as captures under uniform light do; `--heads` draws heads alone;
-`--poses F.npz` takes the pose of each person from a file of SMPL poses [N, 72] (key `poses`), evenly.
+`python benchmarks/people_sheet.py --assets DIR --out people.png` draws 64 of them, not hand-picked, with the package's
+rasteriser and a simple light. `--flat` leaves the light out, as captures under uniform light do; `--heads` draws only
+heads; `--poses F.npz` poses the people by a file of SMPL poses [N, 72] (key `poses`), evenly spaced.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ SUPERSAMPLE = 3
 BACKGROUND = 0.18
 """Linear grey."""
 HEIGHT = 2.15
-"""Metres that a picture of a whole person shows, at their distance."""
+"""Metres shown in a picture of a whole person, at the person's distance."""
 ARMS_DOWN = {"left_collar": 0.1, "left_shoulder": 1.05, "right_collar": -0.1, "right_shoulder": -1.05}
-"""Turns about -z, radians."""
+"""Rotations about -z in radians."""
 
 
 def arms_down() -> np.ndarray:
-    """[24, 3] axis-angle: a person who stands."""
+    """[24, 3] axis-angle: standing, with lowered arms."""
     theta = np.zeros((J, 3))
     for name, angle in ARMS_DOWN.items():
         theta[JOINT_NAMES.index(name), 2] = -angle
@@ -42,14 +42,14 @@ def arms_down() -> np.ndarray:
 
 
 def posed(person: Person, theta: np.ndarray) -> TexturedMesh:
-    """A person in a pose, [24, 3] axis-angle."""
+    """The mesh of a person in a pose, [24, 3] axis-angle."""
     shaped = default_body().shape(torch.from_numpy(person.betas).float())
     pose = BodyPose.from_axis_angle(torch.from_numpy(theta).float().flatten())
     return person.mesh.posed(shaped.pose(pose).skinning.numpy())
 
 
 def view_of(mesh: TexturedMesh, width: int, height: int, heads: bool) -> tuple[Camera, np.ndarray]:
-    """A camera in front and to the side, as far away for everybody, and the direction to it."""
+    """A camera to the front and the side, at the same distance for every person, and the direction to it."""
     low, high = mesh.bounds
     eyes = next(part for part in mesh.parts if part.name == "eyes").vertices.mean(0)
     middle = (low + high) / 2
@@ -62,7 +62,7 @@ def view_of(mesh: TexturedMesh, width: int, height: int, heads: bool) -> tuple[C
 
 
 def picture(mesh: TexturedMesh, width: int, height: int, heads: bool, lit: bool) -> np.ndarray:
-    """[height, width, 3] bytes."""
+    """The person's picture, [height, width, 3] bytes."""
     camera, way = view_of(mesh, width * SUPERSAMPLE, height * SUPERSAMPLE, heads)
     soup = flatten(mesh)
     fragments = draw(soup, camera)
@@ -98,9 +98,9 @@ def main() -> None:
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
     parser.add_argument("--out", type=Path, required=True, help="picture to write")
     parser.add_argument("--count", type=int, default=64)
-    parser.add_argument("--seed", type=int, default=0, help="of the first person")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first person")
     parser.add_argument("--columns", type=int, default=16)
-    parser.add_argument("--height", type=int, default=260, help="pixels of each person")
+    parser.add_argument("--height", type=int, default=260, help="pixels for each person")
     parser.add_argument("--heads", action="store_true")
     parser.add_argument("--flat", action="store_true")
     parser.add_argument("--poses", type=Path, help="npz with poses [N, 72]")

@@ -1,8 +1,8 @@
-"""How many people `primdiffusion people` makes a second on this machine.
+"""Measures how many people per second `primdiffusion people` makes on this machine.
 
 `python benchmarks/people_speed.py --assets DIR --count 32 --workers 2 --json F`. Start-up (processes, imports, decoding
-of the pack's pictures) is left out of `people_per_second` and told as `seconds_start`: it is the same for 8 people as
-for 800. The figure for 16 cores is this machine's, multiplied; it was not measured there.
+the assets' pictures) is not part of `people_per_second`; it is recorded as `seconds_start`, because it does not depend
+on the number of people. The figure for 16 cores is extrapolated from this machine.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from primdiffusion.people.wardrobe import required_meshes
 from record import tell
 
 WARM = 4
-"""People that each worker makes before the clock starts."""
+"""People that each worker makes before timing starts."""
 
 
 def people_per_second(count: int, workers: int, assets: Assets | None = None) -> float:
-    """Measured on this machine, once its workers run: `count` people more than the first WARM of each."""
+    """People per second on this machine, from `count` people after the first WARM of each worker."""
     return measure(count, workers, assets)["people_per_second"]
 
 
 def measure(count: int, workers: int, assets: Assets | None = None) -> dict[str, float]:
-    """Figures by name; makes count + WARM * workers people in a folder that is removed."""
+    """Figures by name; makes count + WARM * workers people in a temporary folder."""
     assets = assets or open_assets(None, required_meshes())
     first = WARM * workers
     with tempfile.TemporaryDirectory() as folder:

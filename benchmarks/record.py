@@ -1,4 +1,4 @@
-"""Figures as the benchmarks write them: one flat JSON object with device, versions and commit beside the numbers."""
+"""Writes the benchmarks' figures: one flat JSON object with device, versions and commit beside the numbers."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ PACKAGES = ("primdiffusion", "torch", "numpy", "numba", "bpy")
 
 
 def write_record(path: str | Path, figures: Mapping[str, float | int | bool | str | None]) -> None:
-    """Writes `figures` (None: not measured here) with device, versions, commit and date, whole or not at all.
+    """Writes `figures` (None: not measured here) with device, versions, commit and date; writes all or nothing.
 
-    Raises ValueError for a figure that is not finite, or has the name of one of those facts: JSON has no NaN, and a
-    failed measurement is no figure.
+    Raises ValueError for a figure that is not finite or has the name of one of those facts: JSON has no NaN, and a
+    failed measurement must not be recorded.
     """
     about = surroundings()
     if clash := sorted(set(about) & set(figures)):
@@ -42,7 +42,7 @@ def write_record(path: str | Path, figures: Mapping[str, float | int | bool | st
 
 
 def tell(figures: Mapping[str, float | int | bool | str | None], path: Path | None) -> None:
-    """Prints a figure a line; also writes the record where a path is given."""
+    """Prints one figure per line; also writes the record if a path is given."""
     if path is not None:
         write_record(path, figures)
     for name, value in figures.items():
@@ -50,7 +50,7 @@ def tell(figures: Mapping[str, float | int | bool | str | None], path: Path | No
 
 
 def surroundings() -> dict[str, str | int | float]:
-    """Device, cores, memory, versions, commit ("+" behind it: with changes) and date of a measurement."""
+    """Device, cores, memory, versions, commit ("+" at its end: uncommitted changes) and date of a measurement."""
     facts: dict[str, str | int | float] = {
         "device": device(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
@@ -66,7 +66,7 @@ def surroundings() -> dict[str, str | int | float]:
 
 
 def device() -> str:
-    """The graphics card torch uses, otherwise the processor."""
+    """The name of the graphics card that torch uses, otherwise of the processor."""
     import torch
 
     if torch.cuda.is_available():
@@ -79,7 +79,7 @@ def device() -> str:
 
 
 def commit() -> str:
-    """The checkout's commit, "unknown" outside one."""
+    """The checkout's commit; "unknown" outside a checkout."""
     here = Path(__file__).parent
     try:
         return subprocess.run(
@@ -95,11 +95,11 @@ def commit() -> str:
 
 @dataclasses.dataclass
 class Measurement:
-    """What a block of code took; complete when the block is left."""
+    """Time and memory of a block of code; complete when the block has ended."""
 
     seconds: float = math.nan
     peak_gb: float = math.nan
-    """Largest resident memory of this process and its children meanwhile, 10^9 bytes, sampled every 50 ms."""
+    """Largest resident memory of this process and its children during the block, in 10^9 bytes, sampled every 50 ms."""
 
 
 @contextlib.contextmanager
@@ -126,7 +126,7 @@ def measured() -> Iterator[Measurement]:
 
 
 def _resident() -> int:
-    """Bytes of this process and its children now; a child that ends while it is asked counts as nothing."""
+    """Resident bytes of this process and its children; a child that ends meanwhile counts as zero."""
     process, total = psutil.Process(), 0
     for member in (process, *process.children(recursive=True)):
         with contextlib.suppress(psutil.NoSuchProcess):

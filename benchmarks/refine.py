@@ -1,11 +1,11 @@
-"""What refining makes of a captured person: PSNR on cameras that were held out and in a pose that was, and how long.
+"""Measures what refining gains on a captured person: PSNR on held-out cameras and in a held-out pose, and time.
 
-`python benchmarks/refine.py --assets DIR --json F` makes one dressed person of a seed that no training set uses, draws
-them in nine poses from 24 sides at 256 x 256 with the rasteriser, and refines on eight poses and 21 cameras, once from
-`from_mesh` of their mesh and once from the bare grey body. PSNR is of whole sRGB-encoded pictures, mean over them:
-`heldout_views` three cameras in the eight poses, `unseen_pose` all cameras in the ninth. Seconds are those of the
-steps, by the clock and of the processor. `--quick` takes 60 steps from the mesh alone. `--pictures DIR` keeps held-out
-views side by side: before, after, target, from the mesh in the first row and from the body in the second.
+`python benchmarks/refine.py --assets DIR --json F` makes one dressed person from a seed that no training set uses,
+draws them in nine poses from 24 sides at 256 x 256 with the rasteriser, and refines on eight poses and 21 cameras, once
+starting from `from_mesh` of their mesh and once from the bare grey body. PSNR is of whole sRGB-encoded pictures,
+averaged: `heldout_views` are three cameras in the eight poses, `unseen_pose` all cameras in the ninth. Seconds are wall
+time and processor time of the steps. `--quick` takes 60 steps from the mesh only. `--pictures DIR` saves
+held-out views side by side: before, after, target; from the mesh in the first row, from the body in the second.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from primdiffusion.training.refine_views import bare_body, meshed_person, view_p
 from record import tell
 
 SEED = 30_000_000
-"""Of the person; training sets count from 0."""
+"""Seed of the person; training sets count from 0."""
 POSES, CAMERAS, HELD, SIZE = 9, 24, 3, 256
 QUICK_STEPS = 60
 
@@ -46,9 +46,9 @@ QUICK_STEPS = 60
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
-    parser.add_argument("--steps", type=int, default=RefineSettings().steps, help="of each refinement")
-    parser.add_argument("--seed", type=int, default=SEED, help="of the person")
-    parser.add_argument("--quick", action="store_true", help="few steps, from the mesh alone")
+    parser.add_argument("--steps", type=int, default=RefineSettings().steps, help="steps of each refinement")
+    parser.add_argument("--seed", type=int, default=SEED, help="seed of the person")
+    parser.add_argument("--quick", action="store_true", help="few steps, from the mesh only")
     parser.add_argument("--pictures", type=Path, help="folder for a PNG")
     parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
@@ -106,13 +106,13 @@ def measure(
 
 
 def mean_psnr(human: Human, views: Sequence[Views]) -> float:
-    """Over all pictures, dB."""
+    """The mean over all pictures, in dB."""
     return float(view_psnr(human, views).mean())
 
 
 @torch.no_grad()
 def compared(people: Sequence[Human], views: Sequence[Views]) -> torch.Tensor:
-    """The first picture of each record as each of the people shows it, then as it is; encoded [H, W, 3] in one row."""
+    """The first picture of each record, of each person and then of the target, in one row; sRGB-encoded [H, W, 3]."""
     columns = []
     for record in views:
         camera = record.camera.map(lambda values: values[0])

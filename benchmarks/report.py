@@ -1,4 +1,4 @@
-"""Writes docs/results.md: one table for each file in docs/results, every number as a benchmark measured it."""
+"""Writes docs/results.md: one table for each file in docs/results, with every number as measured by a benchmark."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ SOURCES = {
     "layout": ("The grid on the default body", "scripts/bake_layout"),
 }  # fmt: skip
 ABOUT = ("device", "cores", "memory_gb", "python", "commit", "date")
-"""Facts about the measurement, told above the table; package versions stay in the JSON file."""
+"""Facts about the measurement, printed above the table; package versions stay in the JSON file."""
 
 
 def section(name: str) -> str:
-    """The table of docs/results/NAME.json, null as "not measured", and the one that the benchmark wrote itself."""
+    """The table of docs/results/NAME.json, null as "not measured", followed by the benchmark's own table if any."""
     title, command = SOURCES[name]
     record = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
     about = ", ".join(f"{key} {record[key]}" for key in ABOUT if key in record)
@@ -48,7 +48,7 @@ def section(name: str) -> str:
 
 
 def main() -> None:
-    head = "# Results\n\nMade by `benchmarks/report.py` from `docs/results`; the commands make the files anew.\n\n"
+    head = "# Results\n\nMade by `benchmarks/report.py` from `docs/results`; the commands write the files.\n\n"
     present = [name for name in SOURCES if (RESULTS / f"{name}.json").is_file()]
     (ROOT / "docs" / "results.md").write_text(head + "\n\n".join(map(section, present)) + "\n", encoding="utf-8")
 

@@ -1,10 +1,10 @@
-"""What a move of a shape slider takes on a person of 1024 volumes.
+"""Measures how long moving a shape slider takes on a person of 1024 volumes.
 
 `python benchmarks/reshape.py --json reshape.json`, or `--quick` with fewer moves. Milliseconds are medians of wall
-time: reshape_ms of setting the betas (bones, body mesh and volumes get new places), reshape_evaluate_ms of what Blender
-does before it can draw again, most of it building its graph of dependencies anew, as it does whenever bones are edited:
-graph_ms is that alone, after an empty object was linked.
-body_file_mb is what is kept on disk for all people on one body; human_npz_mb what the backend hands over.
+time. reshape_ms: setting the betas, which moves bones, body mesh and volumes. reshape_evaluate_ms: Blender's work
+before it can draw again, mostly rebuilding the dependency graph, as after every edit of bones. graph_ms: that rebuild
+alone, triggered by linking an empty object. body_file_mb is the file on disk that all people on one body share;
+human_npz_mb is the file that the backend hands over.
 """
 
 from __future__ import annotations

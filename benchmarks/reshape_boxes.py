@@ -1,11 +1,11 @@
-"""How boxes should grow when a person gets another body: pictures of reshaped people against pictures made for it.
+"""Compares rules for the growth of boxes on another body: reshaped people against people made for that body.
 
-`python benchmarks/reshape_boxes.py --json F`, or `--quick` with small pictures. The default body under a checkered
+`python benchmarks/reshape_boxes.py --json F`, or `--quick` with small pictures. The default body with a checkered
 texture, bare or with a suit 2 cm off the skin, is filled into boxes at the mean body and reshaped to a heavy, a thin, a
-tall and a short one; the truth is the same texture filled into boxes at the other body. For each share of the stretch
-(`primdiffusion.reshaping.SHARE` is what people get): psnr_N of the pictures in dB, and holes_N, how much of what is
-opaque in the truth is seen through (opacity below 0.7); means over bodies and suits, N the share in percent.
-Names with a body, such as psnr_heavy_50, are of that one.
+tall and a short one; the reference is the same texture filled into boxes at that body. For each share of the stretch
+(`primdiffusion.reshaping.SHARE` is the default), in percent N: psnr_N of the pictures in dB, and holes_N, the share of
+pixels opaque in the reference that are transparent (opacity below 0.7); means over bodies and suits.
+Names with a body, such as psnr_heavy_50, are of that body.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from record import tell
 
 MEAN = torch.zeros(10)
 MEASURES = {"heavy": (1.76, 110.0), "thin": (1.76, 45.0), "tall": (2.1, None), "short": (1.45, None)}
-"""Metres, kilograms."""
+"""Height in metres and weight in kilograms."""
 OFF_THE_SKIN = (0.0, 0.02)
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 GREY = (0.35, 0.35, 0.35)
@@ -38,7 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path)
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--pictures", type=Path, help="folder for a picture of each")
+    parser.add_argument("--pictures", type=Path, help="folder for one picture per body")
     given = parser.parse_args()
     size = 128 if given.quick else 384
     figures: dict[str, float] = {}

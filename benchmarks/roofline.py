@@ -1,8 +1,9 @@
-"""How fast this processor multiplies and adds: the ceiling that the marcher's samples are held against.
+"""Measures how fast this processor multiplies and adds: the ceiling for the marcher's samples.
 
-A sample costs about 136 floating-point operations (SPEC 4): 24 for its place, 50 for trilinear weights and indices, 56
-for four channels at eight corners, the rest for the window and the sums. The ceiling is what the same compiler reaches
-on a polynomial of degree 32 whose arguments lie in the first cache: two operations a step, no waiting for memory.
+A sample costs about 136 floating-point operations (SPEC 4): 24 for its position, 50 for trilinear weights and indices,
+56 for four channels at eight corners, the rest for the window and the sums. The ceiling is what the same compiler
+reaches on a polynomial of degree 32 whose arguments are in the first-level cache: two operations per step, no waiting
+for memory.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 OPERATIONS_PER_SAMPLE = 136
 DEGREE = 32
 ARGUMENTS = 2048
-"""8 KB: they stay in the first cache."""
+"""8 KB: they stay in the first-level cache."""
 ROUNDS = 2000
 
 
@@ -34,7 +35,7 @@ def _polynomial(argument, value, rounds):
 
 
 def float32_operations_per_second(repeats: int = 7) -> float:
-    """Operations a second of ONE thread, the best of `repeats` runs; a fused multiply-add counts as two."""
+    """Operations per second of ONE thread, the best of `repeats` runs; a fused multiply-add counts as two."""
     argument = np.linspace(0.1, 0.9, ARGUMENTS, dtype=np.float32)
     value = np.zeros(ARGUMENTS, np.float32)
     _polynomial(argument, value, 1)
@@ -47,5 +48,5 @@ def float32_operations_per_second(repeats: int = 7) -> float:
 
 
 def roofline_ms(samples: int, operations_per_second: float) -> float:
-    """Milliseconds of one thread for `samples` at the ceiling."""
+    """Milliseconds for `samples` on one thread at the ceiling."""
     return 1e3 * samples * OPERATIONS_PER_SAMPLE / operations_per_second

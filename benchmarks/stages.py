@@ -1,4 +1,4 @@
-"""Runs the stages of a benchmark as processes of their own; wall seconds and peak memory of each process tree."""
+"""Runs the stages of a benchmark in their own processes; measures wall seconds and peak memory of each process tree."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from record import Measurement, measured
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """A stage that has run, and what it took."""
+    """A finished stage, its time and memory."""
 
     name: str
     took: Measurement
@@ -23,7 +23,7 @@ class StageFailed(RuntimeError):
 
 
 def run_stage(name: str, command: Sequence[str | Path], log: Path) -> Stage:
-    """Runs `command` with its output in `log`; raises StageFailed with the end of that output where it fails."""
+    """Runs `command` with its output in `log`; raises StageFailed with the end of that output if it fails."""
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("wb") as output, measured() as took:
         code = subprocess.run([str(part) for part in command], stdout=output, stderr=subprocess.STDOUT).returncode
@@ -34,7 +34,7 @@ def run_stage(name: str, command: Sequence[str | Path], log: Path) -> Stage:
 
 
 def table(rows: Sequence[Stage]) -> str:
-    """Seconds and peak memory of each stage, and the sum and maximum below."""
+    """Seconds and peak memory of each stage, with the sum and the maximum in the last row."""
     width = max(len(row.name) for row in rows)
     lines = [f"{'stage':<{width}}  {'seconds':>8}  {'peak GB':>8}"]
     lines += [f"{row.name:<{width}}  {row.took.seconds:8.1f}  {row.took.peak_gb:8.2f}" for row in rows]

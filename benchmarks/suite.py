@@ -1,8 +1,8 @@
-"""How long `make test` takes on each Blender.
+"""Measures how long `make test` takes on each Blender.
 
     python benchmarks/suite.py --json docs/results/suite.json
 
-Run it on a quiet machine whose environments are set up (`make test` before). Ends with an error when a test fails.
+Run it on an idle machine after `make test` has set up the environments. Ends with an error if a test fails.
 """
 
 from __future__ import annotations

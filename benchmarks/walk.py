@@ -1,11 +1,11 @@
-"""Which files of ours one press of Generate passes, from the press to the volumes in the scene.
+"""Counts the files of this repository that run between pressing Generate and the volumes in the scene.
 
     python benchmarks/walk.py
     python benchmarks/walk.py --json FILE
 
-Blender's module runs the operator from this checkout and the real child answers; both are traced. A file is passed
+Blender's module runs the operator from this checkout and the real child answers; both are traced. A file is counted
 when one of its functions runs. Functions that run only while modules are imported are not counted, nor are compiled
-functions that only other compiled functions call: no trace sees those.
+functions that only other compiled functions call, because no trace sees them.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from types import FrameType
 
 ROOT = Path(__file__).resolve().parents[1]
 SEED, STEPS = 7, 3
-IS_FUNCTION = 0x1  # CO_OPTIMIZED: bodies of modules and classes are without it
+IS_FUNCTION = 0x1  # CO_OPTIMIZED: not set for bodies of modules and classes
 
 
 class Trace:
-    """Appends each file below `folder` to `log` when the first of its functions runs outside an import."""
+    """Appends each file below `folder` to `log` when its first function runs outside an import."""
 
     def __init__(self, folder: Path, log: Path):
         self._folder = f"{folder}{os.sep}"
@@ -51,7 +51,7 @@ class Trace:
             return
         if not _is_importing(frame):
             self._passed.add(path)
-            with self._log.open("a", encoding="utf-8") as log:  # at once: the child may be killed
+            with self._log.open("a", encoding="utf-8") as log:  # immediately: the child may be killed
                 log.write(f"{path}\n")
 
 
@@ -75,11 +75,11 @@ def main() -> None:
         record.tell(figures, arguments.json)
     sys.stdout.flush()
     blender_apart.remove()
-    os._exit(0)  # bpy as a module may hang when it is torn down
+    os._exit(0)  # bpy as a module may hang at exit
 
 
 def _generate(folder: Path, log: Path) -> int:
-    """The number of volumes in the scene afterwards."""
+    """Generate a person; returns the number of volumes in the scene."""
     import bpy  # after blender_apart
 
     sys.path.insert(0, str(ROOT))
@@ -99,7 +99,7 @@ def _generate(folder: Path, log: Path) -> int:
 
 
 def _traced_python(path: Path, log: Path) -> Path:
-    """An executable like this Python that traces the child: `-m primdiffusion.serve`."""
+    """An executable like this Python that traces the child (`-m primdiffusion.serve`)."""
     python, script = shlex.quote(sys.executable), shlex.quote(str(Path(__file__).resolve()))
     traced = f'if [ "$1" = -m ]; then shift; exec {python} {script} --as-child {shlex.quote(str(log))} "$@"; fi'
     path.write_text(f'#!/bin/sh\n{traced}\nexec {python} "$@"\n')
