@@ -19,8 +19,7 @@ from primdiffusion.body.model import J
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people import load_base_mesh, make_person, open_assets
-from primdiffusion.raster.rasterise import draw
-from primdiffusion.raster.triangle_soup import flatten
+from primdiffusion.raster.rasterise import draw, flatten
 from record import tell
 
 REACH = 0.02

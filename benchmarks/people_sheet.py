@@ -20,8 +20,7 @@ from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people import Person, load_base_mesh, make_person, open_assets
-from primdiffusion.raster.rasterise import draw, shade
-from primdiffusion.raster.triangle_soup import TriangleSoup, flatten
+from primdiffusion.raster.rasterise import TriangleSoup, draw, flatten, shade
 
 YAW, PITCH, FIELD_OF_VIEW = math.radians(28), math.radians(6), math.radians(26)
 SUPERSAMPLE = 3

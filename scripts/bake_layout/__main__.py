@@ -15,9 +15,9 @@ from grid import Body, chart_of_cells, draw
 from half_body import left_half
 from metrics import measure
 from picture import draw_figure
-from primdiffusion.geometry.uv_atlas import UvRaster
 from primdiffusion.primitives.anchors import footprint_anchors
 from primdiffusion.primitives.primitives import S
+from primdiffusion.raster.uv_atlas import UvRaster
 from regions import cut_into_regions
 
 ROOT = pathlib.Path(__file__).parents[2]

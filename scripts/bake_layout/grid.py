@@ -10,9 +10,9 @@ from half_body import FILLED, Sheet, mirror_vertices
 from hand import project_hand
 from numpy import ndarray as Array
 from on_surface import barycentric_on, closest_on_faces
-from primdiffusion.geometry.uv_atlas import UvRaster, rasterise_uv
 from primdiffusion.primitives.anchors import CHARTS
 from primdiffusion.primitives.primitives import GRID
+from primdiffusion.raster.uv_atlas import UvRaster, rasterise_uv
 from rectangle import Flat
 from regions import REGIONS
 from scipy.ndimage import distance_transform_edt

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from numpy import ndarray as Array
 from primdiffusion.geometry.surface import surface_points, vertex_normals
-from primdiffusion.geometry.uv_atlas import UvRaster
 from primdiffusion.primitives.anchors import CHARTS, Anchors, attach, tangent_plane
 from primdiffusion.primitives.primitives import GRID, Frames
+from primdiffusion.raster.uv_atlas import UvRaster
 from scipy.spatial import cKDTree
 
 SAMPLES = 20_000

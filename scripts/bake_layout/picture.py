@@ -12,9 +12,9 @@ from PIL import Image
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.surface import vertex_normals
-from primdiffusion.geometry.uv_atlas import UvRaster, rasterise_uv
 from primdiffusion.primitives.anchors import CHARTS, Anchors, attach
 from primdiffusion.primitives.primitives import GRID, Frames
+from primdiffusion.raster.uv_atlas import UvRaster, rasterise_uv
 
 COLOURS = {
     "torso": (235, 120, 110),

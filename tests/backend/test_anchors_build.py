@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyModel, default_body
-from primdiffusion.geometry.uv_atlas import rasterise_uv
 from primdiffusion.primitives.anchors import (
     CHARTS,
     JOINT_REGION,
@@ -20,6 +19,7 @@ from primdiffusion.primitives.anchors import (
     tangent_plane,
 )
 from primdiffusion.primitives.primitives import GRID, K
+from primdiffusion.raster.uv_atlas import rasterise_uv
 
 RADIUS, HEIGHT, SEGMENTS = 0.3, 1.2, 64
 

@@ -13,7 +13,7 @@ from primdiffusion.drawing.scene import NOTHING, Look, Picture, Scene
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.raster.nearest_triangle import nearest_triangles
+from primdiffusion.raster.z_buffer import nearest_triangles
 from primdiffusion.render.boxes import draw_boxes
 from primdiffusion.render.image import depth_colours
 from primdiffusion.render.lattice import MarchSettings, Span

@@ -10,8 +10,7 @@ from capture_scenes import BLUE, GREEN, RED, WHITE, box, square
 from primdiffusion.capture.reader import as_camera
 from primdiffusion.formats.camera_rig import View, look_at
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
-from primdiffusion.raster.figure import figure_of
-from primdiffusion.raster.multisample import shoot
+from primdiffusion.raster.multisample import figure_of, shoot
 from primdiffusion.raster.rasterise import rasterise
 
 REST = np.tile(np.eye(4), (24, 1, 1))

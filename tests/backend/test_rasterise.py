@@ -6,10 +6,8 @@ import pytest
 import torch
 import trimesh
 from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
-from primdiffusion.raster.orthographic import OrthographicView, view_along
-from primdiffusion.raster.rasterise import rasterise
-from primdiffusion.raster.triangle_soup import UnusableMesh
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, UnusableMesh
+from primdiffusion.raster.rasterise import OrthographicView, rasterise, view_along
 
 
 def part(vertices, faces, texture=((255, 255, 255, 255),), corner_uv=None, name="part") -> TexturedPart:

@@ -13,7 +13,7 @@ from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.surface import surface_points, vertex_normals
 from primdiffusion.primitives.anchors import CHARTS, attach, default_anchors, default_texels
 from primdiffusion.primitives.primitives import GRID, Frames, K, Payload, Primitives, S
-from primdiffusion.raster.nearest_triangle import nearest_triangles
+from primdiffusion.raster.z_buffer import nearest_triangles
 from primdiffusion.render.march import march
 
 BODY = default_body()

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from primdiffusion.geometry.uv_atlas import closest_in_uv, rasterise_uv
+from primdiffusion.raster.uv_atlas import closest_in_uv, rasterise_uv
 
 UV = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 SQUARE = np.array([[0, 1, 2], [0, 2, 3]])

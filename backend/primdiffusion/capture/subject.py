@@ -18,9 +18,8 @@ from primdiffusion.formats import camera_files, capture_layout, picture_files
 from primdiffusion.formats.arrays import ArrayFileError, read_numbers
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
-from primdiffusion.raster.figure import Figure, figure_of
-from primdiffusion.raster.multisample import Shot, shoot
-from primdiffusion.raster.texture_pyramid import BYTE_OF_LINEAR, encode_bytes
+from primdiffusion.raster.multisample import Figure, Shot, figure_of, shoot
+from primdiffusion.raster.textures import BYTE_OF_LINEAR, encode_bytes
 
 JPEG_QUALITY = 95
 

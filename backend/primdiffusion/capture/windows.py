@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from primdiffusion.formats.camera_rig import View
-from primdiffusion.raster.rasterise import LINEAR_OF_BYTE
-from primdiffusion.raster.texture_pyramid import BYTE_OF_LINEAR
+from primdiffusion.raster.textures import BYTE_OF_LINEAR, LINEAR_OF_BYTE
 
 
 @dataclasses.dataclass(frozen=True)

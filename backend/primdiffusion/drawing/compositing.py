@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from primdiffusion.drawing.scene import NOTHING, Picture
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.raster.nearest_triangle import nearest_triangles
+from primdiffusion.raster.z_buffer import nearest_triangles
 from primdiffusion.render.solids import Layer, Solids, shade_solids
 
 FINER = 2

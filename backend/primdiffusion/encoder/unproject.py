@@ -24,10 +24,10 @@ from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.capture.dataset import Views
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.surface import surface_points, vertex_normals
-from primdiffusion.geometry.uv_atlas import UvRaster, rasterise_uv
 from primdiffusion.primitives.anchors import default_texels
 from primdiffusion.primitives.primitives import GRID, Frames, K, S
-from primdiffusion.raster.nearest_triangle import nearest_triangles
+from primdiffusion.raster.uv_atlas import UvRaster, rasterise_uv
+from primdiffusion.raster.z_buffer import nearest_triangles
 
 SIDE = GRID * S
 """Texels per side: one per column of voxels."""

@@ -14,6 +14,10 @@ from trimesh.geometry import mean_vertex_normals
 from trimesh.triangles import cross
 
 
+class UnusableMesh(ValueError):
+    """A textured mesh that cannot be drawn: empty, not finite, or with faces that name no vertex."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class TexturedPart:
     """A mesh with one texture, such as a body or a garment. Arrays may be shared: never write to them."""

@@ -9,10 +9,11 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 from scipy.ndimage import distance_transform_edt
 from trimesh.geometry import faces_to_edges
 from trimesh.graph import connected_component_labels
+
+from primdiffusion.raster.uv_atlas import rasterise_uv
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -31,45 +32,18 @@ class TexelMap:
         return np.einsum("hwk,hwkc->hwc", self.barycentric, corners)
 
 
-@njit(cache=True)
-def _draw(corner_uv: np.ndarray, size: int, face: np.ndarray, barycentric: np.ndarray) -> None:
-    """Write the last triangle that covers each texel centre."""
-    for f in range(corner_uv.shape[0]):
-        x0, y0 = corner_uv[f, 0, 0] * size, (1 - corner_uv[f, 0, 1]) * size
-        x1, y1 = corner_uv[f, 1, 0] * size, (1 - corner_uv[f, 1, 1]) * size
-        x2, y2 = corner_uv[f, 2, 0] * size, (1 - corner_uv[f, 2, 1]) * size
-        area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
-        if abs(area) < 1e-12:
-            continue
-        left, right = max(0, int(min(x0, x1, x2) - 0.5)), min(size - 1, int(max(x0, x1, x2)))
-        top, bottom = max(0, int(min(y0, y1, y2) - 0.5)), min(size - 1, int(max(y0, y1, y2)))
-        for row in range(top, bottom + 1):
-            for column in range(left, right + 1):
-                x, y = column + 0.5, row + 0.5
-                b = ((x - x0) * (y2 - y0) - (x2 - x0) * (y - y0)) / area
-                c = ((x1 - x0) * (y - y0) - (x - x0) * (y1 - y0)) / area
-                a = 1 - b - c
-                if a >= -1e-6 and b >= -1e-6 and c >= -1e-6:
-                    face[row, column] = f
-                    barycentric[row, column, 0] = a
-                    barycentric[row, column, 1] = b
-                    barycentric[row, column, 2] = c
-
-
 def texel_map(corner_uv: Float[np.ndarray, "F 3 2"], size: int) -> TexelMap:
     """Rasterise texture coordinates at `size` x `size` texels.
 
     Raises:
         ValueError: no texel's centre is inside a triangle.
     """
-    face = np.full((size, size), -1, np.int32)
-    barycentric = np.zeros((size, size, 3), np.float32)
-    _draw(np.ascontiguousarray(corner_uv, np.float64), size, face, barycentric)
-    inside = face >= 0
+    raster = rasterise_uv(np.asarray(corner_uv, np.float64) * (1, -1) + (0, 1), size, size)
+    inside = raster.covered
     if not inside.any():
         raise ValueError(f"no texel of {size} x {size} is covered: the mesh has no texture coordinates")
     nearest = np.asarray(distance_transform_edt(~inside, return_distances=False, return_indices=True))
-    return TexelMap(face[tuple(nearest)], barycentric[tuple(nearest)], inside)
+    return TexelMap(raster.face[tuple(nearest)], raster.barycentric[tuple(nearest)].astype(np.float32), inside)
 
 
 def connected_faces(faces: Int[np.ndarray, "F 3"], vertex_count: int) -> Int[np.ndarray, " F"]:

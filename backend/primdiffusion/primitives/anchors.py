@@ -19,8 +19,8 @@ from torch import Tensor
 from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.surface import signed_volume, surface_points, uv_gradient
-from primdiffusion.geometry.uv_atlas import closest_in_uv, rasterise_uv
 from primdiffusion.primitives.primitives import GRID, Frames, K, S
+from primdiffusion.raster.uv_atlas import closest_in_uv, rasterise_uv
 
 CHARTS = (
     "torso",

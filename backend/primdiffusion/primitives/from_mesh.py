@@ -11,8 +11,8 @@ from jaxtyping import Float32, Int32
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.primitives.primitives import Frames, Payload, S
 from primdiffusion.primitives.surface_points import carve, look_around, nearest, visible_points
-from primdiffusion.raster.mip import pyramid
-from primdiffusion.raster.triangle_soup import TriangleSoup, flatten
+from primdiffusion.raster.rasterise import TriangleSoup, flatten
+from primdiffusion.raster.textures import mip_levels
 
 FULL_DENSITY = 200.0
 """Density of solid matter, 1/m; its inverse is the attenuation length."""
@@ -155,7 +155,7 @@ def _sample(
     texture: np.ndarray, uv: Float32[np.ndarray, "n 2"], footprint: Float32[np.ndarray, "n"]
 ) -> Float32[np.ndarray, "n 3"]:
     """Linear colour from the mip level whose texel size is closest to the footprint."""
-    levels = pyramid(texture, MIP_LEVELS)
+    levels = mip_levels(texture, MIP_LEVELS)
     texels = footprint * np.sqrt(texture.shape[0] * texture.shape[1])
     level = np.clip(np.rint(np.log2(np.maximum(texels, 1e-6))), 0, len(levels) - 1).astype(np.int64)
     u, v = uv[:, 0] - np.floor(uv[:, 0]), 1 - (uv[:, 1] - np.floor(uv[:, 1]))

@@ -8,9 +8,7 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
-from primdiffusion.raster.orthographic import OrthographicView, view_along
-from primdiffusion.raster.rasterise import Fragments, draw
-from primdiffusion.raster.triangle_soup import TriangleSoup
+from primdiffusion.raster.rasterise import Fragments, OrthographicView, TriangleSoup, draw, view_along
 
 DIRECTIONS = (
     (0.0, 0.0, -1.0),

@@ -1,1 +1,1 @@
-"""Textured triangles as pictures: z-buffers, textures at several sizes, orthographic views."""
+"""Rasterised triangles: the z-buffer, textured meshes, views for captures, UV charts."""

@@ -1,10 +1,8 @@
-"""Views of a posed figure on the CPU: several samples a pixel, an alpha test, textures, no light; all passes at once.
+"""Views of a posed human for captures: several samples per pixel, textures, an alpha test, no light.
 
-Edge functions in homogeneous coordinates (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates",
-1997): with a triangle's corners p_i in camera space and a pixel's ray d = (x, y, 1), e_i = d . (p_j x p_k) are its
-barycentrics times its depth's reciprocal times a constant. They are linear in the pixel and need no clipping where a
-triangle crosses the camera's plane. First the nearest triangle of every sample, then the samples' colours. Surfaces are
-two-sided.
+The z-buffer finds the nearest triangle of each sample. A triangle's edge functions, scaled to its corners' depths, are
+linear in the pixel and proportional to its perspective-correct barycentric coordinates, so colours, normals and texture
+footprints follow from them. Surfaces are two-sided.
 """
 
 from __future__ import annotations
@@ -13,20 +11,104 @@ import dataclasses
 
 import numba
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, Float64, Int32, UInt8
 
+from primdiffusion.body.model import J
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.geometry.srgb import decode_srgb
-from primdiffusion.raster.figure import PosedFigure
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+from primdiffusion.raster.rasterise import NEAR, flatten
+from primdiffusion.raster.textures import TexturePyramid, texels_around, texture_pyramid
+from primdiffusion.raster.z_buffer import AlphaTest, project, z_buffer
 
-NEAR = 1e-3
-"""Metres along the optical axis: nearer surfaces are not seen."""
-ALPHA_TEST = 0.5
-"""Of 1; the cutoff of the alpha mode MASK."""
+SAME_PLACE = 1e-6
+"""Vertices of a part closer than this in the rest pose (metres) share a normal, so texture seams stay smooth."""
 COARSE_TEXELS = 8.0
-"""Texels under a sample from which on the halved texture is read."""
+"""Texels under a sample above which the halved texture is read."""
 LINEAR_OF_SIXTEENTH = decode_srgb(np.arange(255 * 16 + 1) / (255 * 16)).astype(np.float32)
 """Linear intensity of sixteenths of an sRGB-encoded byte: textures are interpolated as stored, as Cycles does."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Figure:
+    """What of a person no pose changes. All parts one after the other."""
+
+    mesh: TexturedMesh
+    """In the rest pose."""
+    faces: Int32[np.ndarray, "F 3"]
+    corner_uv: Float32[np.ndarray, "F 3 2"]
+    part: Int32[np.ndarray, "F"]
+    """Which part a face belongs to."""
+    textures: TexturePyramid
+    joint: UInt8[np.ndarray, "F"]
+    """The joint with the most weight on a face's corners."""
+    corner: Int32[np.ndarray, "V"]
+    """Vertices in one place of a part share a number; normals are means over these."""
+
+    def posed(self, skinning: Float[np.ndarray, "J 4 4"]) -> PosedFigure:
+        """The figure moved by linear blend skinning, world <- rest."""
+        vertices = np.concatenate([part.posed(skinning).vertices for part in self.mesh.parts])
+        return PosedFigure(self, vertices, self._normals(vertices))
+
+    def _normals(self, vertices: np.ndarray) -> np.ndarray:
+        """Means of the normals of the faces about each place, weighted with their areas; unit length."""
+        corners = vertices[self.faces]
+        doubled_area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        places = self.corner[self.faces]
+        total = np.stack(
+            [
+                np.bincount(places.ravel(), np.repeat(doubled_area[:, axis], 3), minlength=self.corner.max() + 1)
+                for axis in range(3)
+            ],
+            -1,
+        )
+        total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
+        return total[self.corner].astype(np.float32)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PosedFigure:
+    """A person in a pose."""
+
+    figure: Figure
+    vertices: Float64[np.ndarray, "V 3"]
+    """Metres."""
+    normals: Float32[np.ndarray, "V 3"]
+    """Unit, out of the front of the faces."""
+
+
+def figure_of(mesh: TexturedMesh) -> Figure:
+    """The mesh ready to be drawn.
+
+    Raises:
+        UnusableMesh: no part has a face, a coordinate is not finite, a face names a vertex that is not there, or a
+            texture has no texel.
+    """
+    soup = flatten(mesh)
+    first = 0
+    corners = []
+    for part in mesh.parts:
+        places = np.round(part.vertices / SAME_PLACE).astype(np.int64)
+        _, corner = np.unique(places, axis=0, return_inverse=True)
+        corners.append(corner.reshape(-1) + first)
+        first += len(part.vertices)
+    return Figure(
+        mesh=mesh,
+        faces=soup.faces,
+        corner_uv=soup.corner_uv,
+        part=soup.part,
+        textures=texture_pyramid(mesh),
+        joint=np.concatenate([_joints_of_faces(part) for part in mesh.parts]),
+        corner=np.concatenate(corners).astype(np.int32),
+    )
+
+
+def _joints_of_faces(part: TexturedPart) -> UInt8[np.ndarray, "F"]:
+    sums = np.zeros((len(part.faces), J))
+    rows = np.arange(len(part.faces))[:, None]
+    for corner in part.faces.T:
+        np.add.at(sums, (rows, part.skin_index[corner]), part.skin_weight[corner])
+    return sums.argmax(1).astype(np.uint8)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -66,20 +148,20 @@ def shoot(posed: PosedFigure, view: View, samples: int = 3) -> Shot:
         return shot
     # Sample (column, row) of the fine grid lies at pixel (left, top) + ((column, row) + 1/2) / samples.
     grid = np.array([[samples, 0, -left * samples], [0, samples, -top * samples], [0, 0, 1.0]]) @ view.intrinsics
-    edges = np.empty((len(figure.faces), 3, 3))
-    nearness = np.zeros(((bottom - top) * samples, (right - left) * samples), np.float32)
-    face = np.zeros(nearness.shape, np.int32)
-    rgba = textures.rgba.view(np.uint32)[:, 0]
-    _draw(
-        in_camera, grid, np.linalg.inv(grid), figure.faces, figure.corner_uv, figure.part, rgba, textures.start,
-        textures.size, textures.cut_out, edges, nearness, face,
+    points = project(in_camera, grid, NEAR)
+    nearest = z_buffer(
+        points, figure.faces, (bottom - top) * samples, (right - left) * samples, (NEAR, np.inf),
+        alpha_test=AlphaTest(figure.corner_uv, figure.part, textures.full_size, bilinear=True),
     )  # fmt: skip
+    face, rgba = nearest.triangle, textures.rgba.view(np.uint32)[:, 0]
+    edges = np.empty((len(figure.faces), 3, 3))
+    _edge_functions(points, figure.faces, face, edges)
     _shade(
         face, samples, left, top, edges, figure.corner_uv, figure.part, rgba, textures.start, textures.size,
         textures.last, textures.cut_out, LINEAR_OF_SIXTEENTH, shot.rgb, shot.coverage,
     )  # fmt: skip
     _look_up(
-        face, nearness, samples, left, top, edges, figure.faces, figure.joint, posed.normals, posed.vertices,
+        face, nearest.depth, samples, left, top, edges, figure.faces, figure.joint, posed.normals, posed.vertices,
         view.position, shot.depth, shot.normal, shot.part,
     )  # fmt: skip
     return shot
@@ -99,86 +181,19 @@ def _extent(in_camera: np.ndarray, view: View) -> tuple[int, int, int, int]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _neighbours(u, v, rows, columns):
-    """The four texels about (u, v), wrapping around, as columns, rows and shares of the second of each; v up."""
-    x, y = (u - np.floor(u)) * columns - 0.5, (1.0 - (v - np.floor(v))) * rows - 0.5
-    x0, y0 = int(np.floor(x)), int(np.floor(y))
-    x1, y1 = x0 + 1, y0 + 1
-    return (
-        x0 if x0 >= 0 else columns - 1, x1 if x1 < columns else 0, y0 if y0 >= 0 else rows - 1, y1 if y1 < rows else 0,
-        np.float32(x - x0), np.float32(y - y0),
-    )  # fmt: skip
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _alpha(u, v, rgba, start, rows, columns):
-    """Bilinear, of 255."""
-    x0, x1, y0, y1, wx, wy = _neighbours(u, v, rows, columns)
-    above, below, one = start + y0 * columns, start + y1 * columns, np.float32(1)
-    upper = np.float32(rgba[above + x0] >> 24) * (one - wx) + np.float32(rgba[above + x1] >> 24) * wx
-    lower = np.float32(rgba[below + x0] >> 24) * (one - wx) + np.float32(rgba[below + x1] >> 24) * wx
-    return upper * (one - wy) + lower * wy
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _draw(
-    points, grid, inverse_grid, faces, corner_uv, face_part, rgba, start, size, cut_out, edges, nearness, face
-):  # fmt: skip
-    height, width = face.shape
-    furthest = 1.0 / NEAR
-    column_of, row_of = np.empty(len(points)), np.empty(len(points))
-    for n in range(len(points)):
-        z = max(points[n, 2], NEAR)
-        column_of[n] = (grid[0, 0] * points[n, 0] + grid[0, 1] * points[n, 1]) / z + grid[0, 2]  # K: upper triangular
-        row_of[n] = grid[1, 1] * points[n, 1] / z + grid[1, 2]
-    for f in range(faces.shape[0]):
-        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
-        left, right, top, bottom = 0, width - 1, 0, height - 1
-        if min(points[i, 2], points[j, 2], points[k, 2]) >= NEAR:
-            left = int(np.ceil(max(min(column_of[i], column_of[j], column_of[k]) - 0.5, 0.0)))
-            right = int(np.floor(min(max(column_of[i], column_of[j], column_of[k]) - 0.5, width - 1.0)))
-            top = int(np.ceil(max(min(row_of[i], row_of[j], row_of[k]) - 0.5, 0.0)))
-            bottom = int(np.floor(min(max(row_of[i], row_of[j], row_of[k]) - 0.5, height - 1.0)))
-            if left > right or top > bottom:
-                continue
-        elif max(points[i, 2], points[j, 2], points[k, 2]) < NEAR:
-            continue
-        # Cross products of shared edges are each other's exact negatives, so no ray slips between two triangles.
-        e, volume = edges[f], 0.0
+def _edge_functions(points, faces, face, edges):
+    """Write the edge functions (linear in column, row, 1) of the visible faces, scaled to barycentric weights."""
+    seen = np.zeros(len(faces), np.bool_)
+    for f in face.ravel():
+        if f >= 0:
+            seen[f] = True
+    for f in np.flatnonzero(seen):
         for corner in range(3):
             p, q = points[faces[f, (corner + 1) % 3]], points[faces[f, (corner + 2) % 3]]
-            x, y, z = p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
-            volume += (
-                points[faces[f, corner], 0] * x + points[faces[f, corner], 1] * y + points[faces[f, corner], 2] * z
-            )
-            for axis in range(3):
-                e[corner, axis] = x * inverse_grid[0, axis] + y * inverse_grid[1, axis] + z * inverse_grid[2, axis]
-        if volume == 0.0:
-            continue
-        if volume < 0.0:
-            for corner in range(3):
-                for axis in range(3):
-                    e[corner, axis] = -e[corner, axis]
-        scale, part = 3.0 / abs(volume), face_part[f]  # the sum counted the volume three times
-        for row in range(top, bottom + 1):
-            y = row + 0.5
-            a0, b0, c0 = e[0, 1] * y + e[0, 2], e[1, 1] * y + e[1, 2], e[2, 1] * y + e[2, 2]
-            for column in range(left, right + 1):
-                x = column + 0.5
-                a, b, c = e[0, 0] * x + a0, e[1, 0] * x + b0, e[2, 0] * x + c0
-                if (a < 0.0) | (b < 0.0) | (c < 0.0):
-                    continue
-                total = a + b + c
-                near = np.float32(total * scale)
-                if near <= nearness[row, column] or near > furthest:
-                    continue
-                if cut_out[part]:
-                    u = (a * corner_uv[f, 0, 0] + b * corner_uv[f, 1, 0] + c * corner_uv[f, 2, 0]) / total
-                    v = (a * corner_uv[f, 0, 1] + b * corner_uv[f, 1, 1] + c * corner_uv[f, 2, 1]) / total
-                    if _alpha(u, v, rgba, start[part, 0], size[part, 0, 0], size[part, 0, 1]) < 255 * ALPHA_TEST:
-                        continue
-                nearness[row, column] = near
-                face[row, column] = f + 1
+            scale = points[faces[f, corner], 3]
+            edges[f, corner, 0] = (p[1] * q[2] - p[2] * q[1]) * scale
+            edges[f, corner, 1] = (p[2] * q[0] - p[0] * q[2]) * scale
+            edges[f, corner, 2] = (p[0] * q[1] - p[1] * q[0]) * scale
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
@@ -205,7 +220,7 @@ def _shade(
             covered = 0
             for row in range(pixel_row * samples, (pixel_row + 1) * samples):
                 for column in range(pixel * samples, (pixel + 1) * samples):
-                    covered += face[row, column] > 0
+                    covered += face[row, column] >= 0
             if covered == 0:
                 continue
             # Where nothing but the person is seen, every other sample, as on a chessboard, tells its colour.
@@ -214,7 +229,7 @@ def _shade(
             for row in range(pixel_row * samples, (pixel_row + 1) * samples):
                 first = pixel * samples + (row - pixel_row * samples) % stride
                 for column in range(first, (pixel + 1) * samples, stride):
-                    f = face[row, column] - 1
+                    f = face[row, column]
                     if f < 0:
                         continue
                     e, uv, x, y = edges[f], corner_uv[f], column + 0.5, row + 0.5
@@ -229,7 +244,7 @@ def _shade(
                         holed = cut_out[part]
                         level = _level(u, v, e, uv, scale, size[part, 0, 0] * size[part, 0, 1], last[part])
                     columns = size[part, level, 1]
-                    x0, x1, y0, y1, wx, wy = _neighbours(u, v, size[part, level, 0], columns)
+                    x0, x1, y0, y1, wx, wy = texels_around(u, v, size[part, level, 0], columns)
                     above, below = start[part, level] + y0 * columns, start[part, level] + y1 * columns
                     p, q, r, s = rgba[above + x0], rgba[above + x1], rgba[below + x0], rgba[below + x1]
                     w, t = (one - wx) * (one - wy), wx * (one - wy)
@@ -254,17 +269,17 @@ def _shade(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _look_up(
-    face, nearness, samples, left, top, edges, faces, joint, normals, vertices, eye, depth, normal, part
+    face, distance, samples, left, top, edges, faces, joint, normals, vertices, eye, depth, normal, part
 ):  # fmt: skip
     direction = np.zeros(3)
     for pixel_row in range(face.shape[0] // samples):
         row = pixel_row * samples + samples // 2
         for pixel in range(face.shape[1] // samples):
             column = pixel * samples + samples // 2
-            f = face[row, column] - 1
+            f = face[row, column]
             if f < 0:
                 continue
-            depth[top + pixel_row, left + pixel] = 1 / nearness[row, column]
+            depth[top + pixel_row, left + pixel] = distance[row, column]
             part[top + pixel_row, left + pixel] = 1 + joint[f]
             towards, length = 0.0, 0.0
             direction[:] = 0

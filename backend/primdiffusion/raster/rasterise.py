@@ -1,30 +1,59 @@
-"""Pictures of textured meshes on the CPU: a z-buffer, an alpha test, textures; no light.
+"""Images of textured meshes, unlit, with an alpha test, from cameras and orthographic views.
 
-Two steps, as in deferred shading: `draw` finds for each pixel the nearest triangle that passes the alpha test, `shade`
-looks up its colour. `rasterise` does both and averages sub-pixels.
+Deferred shading: `draw` finds the triangle seen at each pixel, `shade` looks up its colour, and `rasterise` does both
+and averages sub-pixels.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numba
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float, Float32, Float64, Int32
 
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.srgb import decode_srgb
-from primdiffusion.geometry.textured_mesh import TexturedMesh
-from primdiffusion.raster.orthographic import OrthographicView
-from primdiffusion.raster.triangle_soup import ALPHA_TEST, TriangleSoup, flatten, gather_textures
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, UnusableMesh
+from primdiffusion.raster.textures import ALPHA_TEST, LINEAR_OF_BYTE, Textures, gather_textures
+from primdiffusion.raster.z_buffer import AlphaTest, barycentrics, project, z_buffer
 
 NEAR = 1e-3
-"""Triangles with a corner closer to a camera's plane than this (metres) are left out, not clipped."""
+"""Metres in front of a camera; nearer surfaces are not drawn."""
 
-LINEAR_OF_BYTE = decode_srgb(np.arange(256, dtype=np.float64) / 255).astype(np.float32)
-"""Linear intensity of an sRGB-encoded byte."""
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class OrthographicView:
+    """Parallel rays along the third row of `world_to_view`; x right, y down, as in an OpenCV camera."""
+
+    world_to_view: Float[np.ndarray, "3 4"]
+    """[R | t], metres; the view's origin is the outer corner of pixel (0, 0)."""
+    pixel_size: float
+    """Side of a pixel, metres."""
+    width: int
+    height: int
+
+    @property
+    def direction(self) -> Float[np.ndarray, "3"]:
+        """Where the rays go."""
+        return self.world_to_view[2, :3]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TriangleSoup:
+    """Triangles of all parts, parts one after the other."""
+
+    vertices: Float64[np.ndarray, "V 3"]
+    """Metres."""
+    faces: Int32[np.ndarray, "F 3"]
+    """Numbers into `vertices`."""
+    corner_uv: Float32[np.ndarray, "F 3 2"]
+    """v up, as in TexturedPart."""
+    part: Int32[np.ndarray, "F"]
+    """Which part a face belongs to."""
+    texels: Textures
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -104,29 +133,22 @@ def _picture(
 
 
 def draw(soup: TriangleSoup, view: Camera | OrthographicView) -> Fragments:
-    """The nearest triangle behind each pixel centre; where two are equally near, the one of lower number."""
-    if isinstance(view, OrthographicView):
+    """The nearest triangle behind each pixel centre that passes the alpha test; of several at one depth the first."""
+    parallel = isinstance(view, OrthographicView)
+    if parallel:
         in_view = soup.vertices @ view.world_to_view[:, :3].T + view.world_to_view[:, 3]
-        pixels, depth = in_view[:, :2] / view.pixel_size, in_view[:, 2]
-        inverse_depth = np.ones_like(depth)
-        perspective = False
+        ones = np.ones(len(in_view))
+        points = np.column_stack([in_view[:, :2] / view.pixel_size, ones, in_view[:, 2]])
+        clip = (-np.inf, np.inf)
     else:
         world_to_camera = view.world_to_camera.detach().cpu().double().numpy()
-        intrinsics = view.intrinsics.detach().cpu().double().numpy()
         in_camera = soup.vertices @ world_to_camera[:, :3].T + world_to_camera[:, 3]
-        depth = in_camera[:, 2]
-        inverse_depth = 1 / np.maximum(depth, NEAR)
-        pixels = (in_camera @ intrinsics.T)[:, :2] * inverse_depth[:, None]
-        perspective = True
-    face = np.full((view.height, view.width), -1, np.int32)
-    barycentric = np.zeros((view.height, view.width, 3), np.float32)
-    buffer = np.full((view.height, view.width), np.inf, np.float32)
-    texels = soup.texels
-    _draw(
-        np.ascontiguousarray(pixels), np.ascontiguousarray(depth), inverse_depth, perspective, soup.faces,
-        soup.corner_uv, soup.part, texels.rgba, texels.start, texels.size, texels.cut_out, face, barycentric, buffer,
-    )  # fmt: skip
-    return Fragments(face, barycentric, buffer)
+        points = project(in_camera, view.intrinsics.detach().cpu().double().numpy(), NEAR)
+        clip = (NEAR, np.inf)
+    alpha_test = AlphaTest(soup.corner_uv, soup.part, soup.texels)
+    nearest = z_buffer(points, soup.faces, view.height, view.width, clip, parallel=parallel, alpha_test=alpha_test)
+    barycentric = barycentrics(points, soup.faces, nearest.triangle, parallel, np.float32)
+    return Fragments(nearest.triangle, barycentric, nearest.depth)
 
 
 def shade(soup: TriangleSoup, fragments: Fragments) -> Float32[np.ndarray, "H W 3"]:
@@ -168,58 +190,67 @@ def _blocks(picture: np.ndarray, side: int) -> np.ndarray:
     return picture.reshape(height, side, width, side).swapaxes(1, 2).reshape(height, width, side * side)
 
 
-@numba.njit(cache=True, nogil=True)
-def texel_at(u, v, rows, columns):
-    """Row-major number of the texel under (u, v), which wrap around; v up."""
-    row = min(int((1.0 - (v - np.floor(v))) * rows), rows - 1)
-    column = min(int((u - np.floor(u)) * columns), columns - 1)
-    return row * columns + column
+def view_along(
+    direction: tuple[float, float, float], bounds: Float[np.ndarray, "2 3"], pixel_size: float
+) -> OrthographicView:
+    """The view along `direction` that just holds the box `bounds` and starts in front of it; y of the world is up.
+
+    Raises:
+        ValueError: `direction` is zero or `pixel_size` is not positive.
+    """
+    forward = np.asarray(direction, np.float64)
+    length = float(np.linalg.norm(forward))
+    if length == 0 or pixel_size <= 0:
+        raise ValueError(
+            f"No view along {direction} with pixels of {pixel_size} m: give a direction and a positive pixel size."
+        )
+    forward = forward / length
+    up = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.999 else np.array([0.0, 0.0, 1.0])
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    corners = np.stack(np.meshgrid(*np.asarray(bounds, np.float64).T, indexing="ij"), -1).reshape(8, 3) @ rotation.T
+    low, high = corners.min(0) - pixel_size, corners.max(0) + pixel_size
+    width, height = (math.ceil((high[axis] - low[axis]) / pixel_size) for axis in (0, 1))
+    return OrthographicView(np.concatenate([rotation, -low[:, None]], axis=1), pixel_size, width, height)
 
 
-@numba.njit(cache=True, nogil=True)
-def _draw(
-    pixels, depth, inverse_depth, perspective, faces, corner_uv, face_part, rgba, start, size, cut_out,
-    face, bary, buffer,
-):  # fmt: skip
-    height, width = face.shape
-    for f in range(faces.shape[0]):
-        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
-        if perspective and min(depth[i], depth[j], depth[k]) < NEAR:
-            continue
-        xi, yi, xj, yj, xk, yk = pixels[i, 0], pixels[i, 1], pixels[j, 0], pixels[j, 1], pixels[k, 0], pixels[k, 1]
-        area = (xj - xi) * (yk - yi) - (xk - xi) * (yj - yi)
-        if area == 0.0:
-            continue
-        left = int(np.ceil(max(min(xi, xj, xk) - 0.5, 0.0)))
-        right = int(np.floor(min(max(xi, xj, xk) - 0.5, width - 1.0)))
-        top = int(np.ceil(max(min(yi, yj, yk) - 0.5, 0.0)))
-        bottom = int(np.floor(min(max(yi, yj, yk) - 0.5, height - 1.0)))
-        part = face_part[f]
-        for row in range(top, bottom + 1):
-            y = row + 0.5
-            for column in range(left, right + 1):
-                x = column + 0.5
-                a = ((xj - x) * (yk - y) - (xk - x) * (yj - y)) / area
-                b = ((xk - x) * (yi - y) - (xi - x) * (yk - y)) / area
-                c = 1.0 - a - b
-                if a < 0.0 or b < 0.0 or c < 0.0:
-                    continue
-                if perspective:
-                    a, b, c = a * inverse_depth[i], b * inverse_depth[j], c * inverse_depth[k]
-                    z = 1.0 / (a + b + c)
-                    a, b, c = a * z, b * z, c * z
-                else:
-                    z = a * depth[i] + b * depth[j] + c * depth[k]
-                if not np.float32(z) < buffer[row, column]:
-                    continue
-                if cut_out[part]:
-                    u = a * corner_uv[f, 0, 0] + b * corner_uv[f, 1, 0] + c * corner_uv[f, 2, 0]
-                    v = a * corner_uv[f, 0, 1] + b * corner_uv[f, 1, 1] + c * corner_uv[f, 2, 1]
-                    if rgba[start[part] + texel_at(u, v, size[part, 0], size[part, 1]), 3] < ALPHA_TEST:
-                        continue
-                buffer[row, column] = z
-                face[row, column] = f
-                bary[row, column, 0], bary[row, column, 1], bary[row, column, 2] = a, b, c
+def flatten(mesh: TexturedMesh) -> TriangleSoup:
+    """The mesh as a soup.
+
+    Raises:
+        UnusableMesh: no part has a face, a coordinate is NaN or infinite, a face names a vertex that is not there, or a
+            texture has no texel.
+    """
+    parts = [part for part in mesh.parts if len(part.faces)]
+    if not parts:
+        raise UnusableMesh(f"The mesh has no triangles in its {len(mesh.parts)} parts; give it at least one.")
+    for part in parts:
+        _check(part)
+    first = np.cumsum([0] + [len(part.vertices) for part in mesh.parts])
+    return TriangleSoup(
+        vertices=np.concatenate([np.asarray(part.vertices, np.float64) for part in mesh.parts]),
+        faces=np.concatenate([part.faces.astype(np.int32) + np.int32(first[i]) for i, part in enumerate(mesh.parts)]),
+        corner_uv=np.concatenate([part.corner_uv.astype(np.float32) for part in mesh.parts]),
+        part=np.repeat(np.arange(len(mesh.parts), dtype=np.int32), [len(part.faces) for part in mesh.parts]),
+        texels=gather_textures(mesh),
+    )
+
+
+def _check(part: TexturedPart) -> None:
+    """Refuse what a compiled loop would read out of bounds or lose silently."""
+    for name, values in (("vertices", part.vertices), ("corner_uv", part.corner_uv)):
+        if not np.isfinite(values).all():
+            raise UnusableMesh(
+                f"Part {part.name!r} has {int((~np.isfinite(values)).sum())} NaN or infinite values in {name}; "
+                "repair or drop the part."
+            )
+    low, high = int(part.faces.min()), int(part.faces.max())
+    if low < 0 or high >= len(part.vertices):
+        raise UnusableMesh(
+            f"Part {part.name!r} has faces that name vertices {low} to {high}, but only {len(part.vertices)} vertices; "
+            "repair the faces."
+        )
 
 
 @numba.njit(cache=True, nogil=True)

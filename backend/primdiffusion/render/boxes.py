@@ -14,7 +14,7 @@ from torch import Tensor
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.raster.nearest_triangle import nearest_triangles
+from primdiffusion.raster.z_buffer import nearest_triangles
 from primdiffusion.render.solids import Layer, eye_of
 
 LIT = (0.35, 0.65)

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32
 from numpy import ndarray
 
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.raster.nearest_triangle import NearestTriangle
+from primdiffusion.raster.z_buffer import NearestTriangle
 
 SKY = 0.45
 """Light from all above: SKY * (1 + n_up) / 2."""

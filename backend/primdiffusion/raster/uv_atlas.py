@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
+
+from primdiffusion.raster.z_buffer import barycentrics, z_buffer
+
+EDGE_SLACK = 1e-9
+"""In barycentric coordinates: a gap between two faces would be worse than a texel of both."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,40 +36,19 @@ class UvRaster:
 def rasterise_uv(corner_uv: Float[Array, "f 3 2"], height: int, width: int) -> UvRaster:
     """Rasterise the charts into height x width texels; where charts overlap, the later face wins.
 
-    UV faces without area are skipped. Raises ValueError on coordinates that are not finite.
+    Texel centres on an edge belong to both of its faces. UV faces without area are skipped. Raises ValueError on
+    coordinates that are not finite.
     """
     corner_uv = np.asarray(corner_uv, dtype=np.float64)
     if not np.isfinite(corner_uv).all():
         raise ValueError("the UV coordinates hold NaN or infinite values: export the mesh's UV map again")
-    face = np.full((height, width), -1, dtype=np.int64)
-    barycentric = np.zeros((height, width, 3))
-    _draw(corner_uv * (width, height), face, barycentric)
-    return UvRaster(face, barycentric)
-
-
-@numba.njit(cache=True)
-def _draw(corners, face, barycentric):  # pragma: no cover (compiled)
-    height, width = face.shape
-    for f in range(corners.shape[0]):
-        (ax, ay), (bx, by), (cx, cy) = corners[f]
-        twice_area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        if abs(twice_area) < 1e-12:
-            continue
-        x_first = max(int(np.ceil(min(ax, bx, cx) - 0.5)), 0)
-        x_last = min(int(np.floor(max(ax, bx, cx) - 0.5)), width - 1)
-        y_first = max(int(np.ceil(min(ay, by, cy) - 0.5)), 0)
-        y_last = min(int(np.floor(max(ay, by, cy) - 0.5)), height - 1)
-        for row in range(y_first, y_last + 1):
-            for column in range(x_first, x_last + 1):
-                x, y = column + 0.5 - ax, row + 0.5 - ay
-                wb = (x * (cy - ay) - y * (cx - ax)) / twice_area
-                wc = ((bx - ax) * y - (by - ay) * x) / twice_area
-                # Texels exactly on an edge belong to both faces: a gap between them would be worse.
-                if wb >= -1e-9 and wc >= -1e-9 and wb + wc <= 1 + 1e-9:
-                    face[row, column] = f
-                    barycentric[row, column, 0] = 1 - wb - wc
-                    barycentric[row, column, 1] = wb
-                    barycentric[row, column, 2] = wc
+    points = np.zeros((3 * len(corner_uv), 4))  # all at depth 0, where the z-buffer keeps the face drawn first
+    points[:, :2] = (corner_uv * (width, height)).reshape(-1, 2)
+    points[:, 2] = 1
+    faces = np.ascontiguousarray(np.arange(len(points), dtype=np.int32).reshape(-1, 3)[::-1])
+    found = z_buffer(points, faces, height, width, (0, 0), parallel=True, slack=EDGE_SLACK).triangle
+    barycentric = barycentrics(points, faces, found, True, np.float64)
+    return UvRaster(np.where(found < 0, -1, len(faces) - 1 - found).astype(np.int64), barycentric)
 
 
 def closest_in_uv(

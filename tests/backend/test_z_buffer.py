@@ -6,7 +6,7 @@ import torch
 import trimesh
 from march_scenes import camera_at
 from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.raster.nearest_triangle import nearest_triangles
+from primdiffusion.raster.z_buffer import nearest_triangles
 from primdiffusion.render.solids import HEADLIGHT, SKY, Solids, UnusableSolids, shade_solids
 
 pytest.importorskip("embreex", reason="there is nothing to compare with")
