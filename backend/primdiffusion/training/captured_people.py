@@ -1,4 +1,4 @@
-"""Encode captured people as training payloads with the frozen encoder, optionally refined."""
+"""Encode captures as training payloads with the trained encoder, optionally refined."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ from primdiffusion.training.stored_people import read_person
 
 @dataclasses.dataclass(frozen=True)
 class EncodeSettings:
-    """How captures become payloads."""
+    """Settings of encoding."""
 
     views: int = 8
-    """Pictures of one frame given to the encoder, spread around the person; all where there are fewer."""
+    """Input images of one frame, spread around the subject; all if there are fewer."""
     looks: int = 1
     """Frames to encode, one payload each, evenly spaced from the first."""
     refine_steps: int = 0
-    """Refinement steps on all pictures of all frames; 0 keeps the encoder's payload."""
+    """Refinement steps on all images of all frames; 0 for none."""
     refine_size: int = 256
-    """Largest side of the pictures used for refinement, pixels."""
+    """Largest side of the images used in refinement, pixels."""
     seed: int = 0
-    """Seed of the order of pictures in refinement."""
+    """Seed of the order of images in refinement."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for values out of range."""
+        """Raise ValueError for values out of range."""
         for name, least in (("views", 1), ("looks", 1), ("refine_steps", 0), ("refine_size", 1), ("seed", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be {least} or more")
@@ -57,7 +57,7 @@ def encode_people(
     settings: EncodeSettings = EncodeSettings(),
     cards: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Iterator[Outcome]:
-    """Write NAME.npz of every captured person into `out`; yields each outcome and continues after failures.
+    """Write NAME.npz of every subject into `out`; yields each outcome and continues after failures.
 
     The files are those of `primdiffusion payloads`, with delta scales and their source. A file of the same source is
     not written again ("skipped"). `cards` holds attributes and seeds of people by name (`read_cards`).
@@ -92,7 +92,7 @@ def encode_people(
 def looks_of(
     model: EncoderModel, captures: Captures, name: str, settings: EncodeSettings
 ) -> tuple[list[Payload], Float[Tensor, "10"]]:
-    """Return a person's payloads, on the CPU, and the betas of the body that their boxes are placed on.
+    """Return the payloads of a subject, on the CPU, and the betas of the body that carries the boxes.
 
     Raises:
         FileNotFoundError, ConditioningError, CaptureFileError, ArrayFileError, BodyFileError: captures are missing,
@@ -116,7 +116,7 @@ def looks_of(
 
 
 def frames_of_looks(frames: int, looks: int) -> list[int]:
-    """`looks` evenly spaced frames from the first on, fewer where there are fewer."""
+    """Return `looks` evenly spaced frames from the first on, or all if there are fewer."""
     count = min(frames, looks)
     return [look * frames // count for look in range(count)]
 

@@ -1,4 +1,4 @@
-"""Settings of stage 1's training; saved as JSON beside its weights."""
+"""Settings of a run of stage 1, saved as JSON with its weights."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ AT_LEAST_ONE = (
 
 @dataclasses.dataclass(frozen=True)
 class LossConfig:
-    """Weights of the terms; colours count 0 ... 255 as in SPEC 2. 0 leaves a term out."""
+    """Weights of the terms of the objective, for colours in 0 ... 255 (SPEC 2); 0 disables a term."""
 
     rgb: float = 1.0
     """mean (I - I*)^2 / 16^2, sRGB-encoded."""
     silhouette: float = 2.0
-    """mean |mask - alpha|. The released code has 0.01; ours keeps dark clothes on black from growing."""
+    """mean |mask - alpha|. The released code has 0.01; a larger weight stops dark clothes from spreading over black."""
     volume: float = 0.0001
     """Sum over the boxes of the product of their half extents, in decimetres. The released code has 0.001; with it our
-    boxes, which start smaller, shrink until they part: its pull is small, but the same in every step."""
+    boxes, which start smaller, shrink until gaps appear."""
     alpha_prior: float = 0.0
     """mean log(0.1 + a) + log(1.1 - a) + 2.20727; the released code has 1."""
     perceptual: float = 0.0
-    """L1 of VGG19's features, [20, 5, .9, .5, .5]; the released code has 1. Needs `perceptual_weights`."""
+    """L1 distance of VGG19 features, [20, 5, .9, .5, .5]; the released code has 1. Needs `perceptual_weights`."""
     perceptual_weights: Path | None = None
     """A file of torchvision's VGG19 weights."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for weights that are negative or not finite."""
+        """Raise ValueError for weights that are negative or not finite."""
         for name in ("rgb", "silhouette", "volume", "alpha_prior", "perceptual"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"loss.{name} is {getattr(self, name)}: it must be 0 or more")
@@ -55,63 +55,63 @@ class FitConfig:
     """A run of `primdiffusion fit`."""
 
     data: Path
-    """Captures to train on; packed ones are read much faster."""
+    """Captures to train on; packed ones load much faster."""
     run: Path
-    """Folder for weights, metrics, pictures and this configuration; an unfinished run in it is resumed."""
+    """Folder of the run: weights, metrics, images and settings; an unfinished run is resumed."""
     held: Path | None = None
-    """Captures of other people to measure on now and then."""
+    """Captures of held-out subjects for evaluation."""
     encoder: Preset = "default"
     """default, its ablations shared_scale, template_rt and no_attention, or the architectures paper and released."""
     steps: int = 20_000
-    """Optimiser steps; the learning rate falls to a tenth along a cosine over them."""
+    """Optimiser steps; the learning rate decays to a tenth along a cosine."""
     batch: int = 4
-    """People in a step, of each process."""
+    """Subjects per step and process."""
     views: int = 6
-    """Pictures that the encoder is given; where a person has fewer, some are given twice."""
+    """Input images; if a subject has fewer, some are used twice."""
     targets: int = 2
-    """Pictures that are compared, of each person."""
+    """Target images of each subject."""
     size: int = 256
-    """Pixels a side of these."""
+    """Width and height of the targets, pixels."""
     framing: Literal["whole", "crop"] = "crop"
-    """crop: squares about the person, of `size` pixels or more; whole: the pictures, as the paper's."""
+    """crop: squares around the subject, of `size` pixels or more; whole: whole images, as in the paper."""
     conditioning_frame: Literal["first", "same", "any"] = "any"
-    """Pose in which the encoder sees the person: near T (released), that of the targets, or any."""
+    """Frame of the input images: the first, near T (released), that of the targets, or any."""
     step: float = 0.004
     """Metres between samples of a ray."""
     learning_rate: float = 2e-5
-    """AdamW's, after a warm-up of 100 steps."""
+    """Learning rate of AdamW after a warm-up of 100 steps."""
     place_rate: float = 80.0
-    """Times as fast learn the biases that every place of the UV square has of its own."""
+    """Factor on the learning rate of untied biases."""
     weight_decay: float = 0.0
-    """AdamW's."""
+    """Weight decay of AdamW."""
     gradient_clip: float = 1.0
-    """Largest norm of a step's gradient."""
+    """Largest norm of the gradient."""
     ema: float = 0.998
-    """Decay of the average of weights that is evaluated and shipped."""
+    """Decay of the averaged weights, which are evaluated and saved."""
     hold_scale: int = 200
-    """Steps in which delta scales stay 1 (released: 2000)."""
+    """Steps with fixed delta scales (released: 2000)."""
     mixed_precision: Literal["no", "bf16"] = "no"
-    """Of the network; the marcher computes in float32."""
+    """Precision of the network; the marcher runs in float32."""
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
     seed: int = 0
-    """Of everything random."""
+    """Seed of all random numbers."""
     minutes: float | None = None
-    """Stop after this time, to be resumed; None trains to the end."""
+    """Time limit, after which the run can be resumed."""
     workers: int = 0
-    """Processes that prepare samples; 0 does it in between."""
+    """Data loading processes; 0 loads in the main process."""
     threads: int | None = None
-    """Processor threads; None leaves torch's choice."""
+    """CPU threads; the default is torch's."""
     save_every: float = 120.0
-    """Seconds between checkpoints: what a kill can lose. 0 writes one after every step."""
+    """Seconds between checkpoints; 0 saves after every step."""
     log_every: int = 25
-    """Steps between lines of metrics.jsonl; what they hold are running means."""
+    """Steps between lines of metrics.jsonl, which are running means."""
     evaluate_every: int = 500
-    """Steps between measurements on a few people of `data` and of `held`."""
+    """Steps between evaluations on a few subjects of `data` and `held`."""
     pictures_every: int = 500
-    """Steps between pictures."""
+    """Steps between images."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for settings that cannot be."""
+        """Raise ValueError for values out of range."""
         for name in AT_LEAST_ONE:
             if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be 1 or more")

@@ -1,4 +1,4 @@
-"""Samples of stage 1: what the encoder reads of a person, and pictures that the result is compared with."""
+"""Samples of stage 1: unprojected input images, and target images."""
 
 from __future__ import annotations
 
@@ -21,43 +21,43 @@ from primdiffusion.primitives.primitives import Frames
 from primdiffusion.training.fit_config import FitConfig
 
 CAUGHT = "Caught "
-"""How torch's loader begins what a worker raised; the worker's traceback follows."""
+"""Start of the messages with which torch's loader wraps errors of workers; their traceback follows."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FitSample(TensorRecord):
-    """One person, or a batch of such."""
+    """One subject, or a batch."""
 
     found: Unprojected
-    """What was looked up in the pictures that the encoder is given."""
+    """The unprojected input images."""
     axis_angle: Float[Tensor, "*b 24 3"]
-    """The pose in these."""
+    """Pose of the input images."""
     frames: Frames
-    """Of the boxes in the targets' pose, before delta scales."""
+    """Frames of the boxes in the pose of the targets, before delta scales."""
     target: Views
     subject: Int64[Tensor, "*b"]
     frame: Int64[Tensor, "*b"]
-    """Of the targets."""
+    """Frame of the targets."""
 
 
 Batch = tuple[FitSample, Position]
-"""Samples, and the place behind them."""
+"""Samples, and the position after them."""
 
 
 class FitDataset(SampleSet[FitSample]):
-    """`CaptureDataset`'s samples, unprojected where they are read: in the loader's workers."""
+    """Samples of a `CaptureDataset`, unprojected in the workers that load them."""
 
     def __init__(self, samples: CaptureDataset, encoder: EncoderConfig) -> None:
-        """Raises what `betas_of` does, for everybody: before training begins and not within it."""
+        """Raises as `betas_of`, so that invalid subjects are errors before training starts."""
         self.samples, self.encoder = samples, encoder
         self.betas = betas_of(samples.captures)
 
     def __len__(self) -> int:
-        """Samples of an epoch."""
+        """Number of samples in an epoch."""
         return len(self.samples)
 
     def __getitem__(self, position: tuple[int, int]) -> FitSample:
-        """The sample at a position. Raises what `CaptureDataset` does."""
+        """Load the sample at a position. Raises as `CaptureDataset`."""
         sample = self.samples[position]
         given, target, betas = sample.conditioning, sample.target, self.betas[int(sample.subject)]
         return FitSample(
@@ -71,23 +71,23 @@ class FitDataset(SampleSet[FitSample]):
 
 
 def betas_of(captures: Captures) -> Float[Tensor, "people 10"]:
-    """Everybody's betas of the default body.
+    """Return the betas of all subjects on the default body.
 
     Raises:
-        ConditioningError: somebody was captured on another body model.
-        FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a camera has no pictures, a file is damaged.
+        ConditioningError: a subject was captured on another body model.
+        FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a camera has no images, a file is damaged.
     """
     return torch.stack([default_betas(captures.subject(name)) for name in captures.subjects])
 
 
 def fit_dataset(captures: Captures, config: FitConfig) -> FitDataset:
-    """The samples of a run."""
+    """Return the dataset of a run."""
     settings = SampleSettings(config.views, config.targets, config.size, config.framing, config.conditioning_frame)
     return FitDataset(CaptureDataset(captures, settings, config.seed), PRESETS[config.encoder])
 
 
 def fit_batches(dataset: FitDataset, config: FitConfig, start: Position, share: Share) -> Iterator[Batch]:
-    """`batches` of a run; errors of the loader's workers are told as they would be without any.
+    """Yield the batches of a run, with the original errors of worker processes.
 
     Raises:
         FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
@@ -104,6 +104,6 @@ def fit_batches(dataset: FitDataset, config: FitConfig, start: Position, share: 
         if "DataLoader worker" not in str(error):
             raise
         raise ChildProcessError(
-            f"one of the {config.workers} processes that prepare samples was killed, as happens where memory runs out: "
+            f"one of the {config.workers} processes that load samples was killed, perhaps because memory ran out: "
             "resume with fewer --workers"
         ) from error

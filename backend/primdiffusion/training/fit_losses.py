@@ -1,4 +1,4 @@
-"""Terms of stage 1's objective (paper sec. 3.2, L_rec; SPEC 2), on sRGB-encoded pictures in 0 ... 1."""
+"""Terms of the objective of stage 1 (paper sec. 3.2, L_rec; SPEC 2), on sRGB-encoded images in 0 ... 1."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from primdiffusion.training.fit_config import LossConfig
 
 RESIDUAL = 255 / 16
-"""Colours count 0 ... 255, their residuals by 1 / 16 (SPEC 1.9)."""
+"""Colours are scaled to 0 ... 255, their residuals by 1 / 16 (SPEC 1.9)."""
 DECIMETRES = 10.0
 ALPHA_PRIOR_FLOOR = 2.20727
 """-(log 0.1 + log 1.1): the prior is zero where alpha is 0 or 1."""
@@ -25,17 +25,17 @@ def rgb_loss(image: Picture, target: Picture) -> Tensor:
 
 
 def silhouette_loss(alpha: Float[Tensor, "*b H W"], mask: Float[Tensor, "*b H W"]) -> Tensor:
-    """L_sil: mean absolute difference of what boxes and the person cover of each pixel."""
+    """L_sil: mean absolute difference of alpha and mask."""
     return (alpha - mask).abs().mean()
 
 
 def volume_loss(half_extent: Float[Tensor, "*b K 3"]) -> Tensor:
-    """L_vol: the sum over the boxes of the product of their three half extents, in decimetres; mean over people."""
+    """L_vol: sum over the boxes of the product of their half extents, in decimetres; mean over the batch."""
     return (DECIMETRES * half_extent).prod(-1).sum(-1).mean()
 
 
 def alpha_prior(alpha: Float[Tensor, "*b H W"]) -> Tensor:
-    """Zero where alpha is 0 or 1, 1.19 where it is a half: the released code's taste for solid silhouettes (SPEC 2)."""
+    """The released code's prior (SPEC 2): 0 for an alpha of 0 or 1, 1.19 for one half."""
     return ((0.1 + alpha).log() + (1.1 - alpha).log() + ALPHA_PRIOR_FLOOR).mean()
 
 
@@ -48,13 +48,13 @@ def loss_terms(
     weights: LossConfig,
     perceptual: Features | None = None,
 ) -> dict[str, Tensor]:
-    """The terms that have a weight, by name, weighted: their sum is the objective.
+    """Return the weighted terms with a weight, by name; the objective is their sum.
 
     Raises:
         ValueError: the perceptual loss has a weight, but its function is not given.
     """
     if weights.perceptual and perceptual is None:
-        raise ValueError("the perceptual loss has a weight but no features: give those of `load_perceptual`")
+        raise ValueError("the perceptual loss has a weight but no features: pass those of `load_perceptual`")
     terms: dict[str, Callable[[], Tensor]] = {
         "rgb": lambda: rgb_loss(image, target),
         "silhouette": lambda: silhouette_loss(alpha, mask),

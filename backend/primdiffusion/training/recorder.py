@@ -1,4 +1,4 @@
-"""Record a run: metrics, pictures and a progress bar."""
+"""Record a run: metrics, images and a progress bar."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class StepMetrics:
 
     step: int
     terms: dict[str, float]
-    """The objective's terms, weighted; of this process' people."""
+    """Weighted terms of the objective on the batch of this process."""
     gradient: float
-    """Norm, before clipping."""
+    """Norm of the gradient before clipping."""
     seconds: dict[str, float]
-    """Of the step's parts, the last of which includes the update."""
+    """Times of the parts of a step; the last includes the update."""
 
 
 class StepTimer:
@@ -42,7 +42,7 @@ class StepTimer:
         self._last = time.perf_counter()
 
     def lap(self, name: str) -> None:
-        """Ends a lap."""
+        """End a lap."""
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         now = time.perf_counter()
@@ -51,7 +51,7 @@ class StepTimer:
 
 
 class Every(Protocol):
-    """Intervals of logging, evaluation and pictures, in steps."""
+    """Intervals of logging, evaluation and images, in steps."""
 
     @property
     def log_every(self) -> int: ...
@@ -62,9 +62,9 @@ class Every(Protocol):
 
 
 class Recorder(ABC):
-    """metrics.jsonl, pictures and the bar; of the main process.
+    """Writes metrics.jsonl and images and shows a progress bar, in the main process.
 
-    Running means are part of the state's place, so that a resumed run writes the lines of one that never stopped.
+    Running means are saved in the state, so that a resumed run writes the same lines as an uninterrupted one.
     """
 
     def __init__(self, steps: int, every: Every, state: TrainingState, name: str | None = None) -> None:
@@ -100,7 +100,7 @@ class Recorder(ABC):
 
     @abstractmethod
     def draw(self) -> None:
-        """Write pictures made with the averaged weights."""
+        """Write images generated with the averaged weights."""
 
     @abstractmethod
     def append(self, row: Mapping[str, float]) -> None:

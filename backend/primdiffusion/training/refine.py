@@ -1,12 +1,12 @@
-"""Refine one person to match pictures: gradient descent on the payload, through the marcher.
+"""Refine a human to match images: gradient descent on the payload, through the marcher.
 
-    start = bare_body(betas)                        # or an encoder's, or from_mesh's, or any other person
-    refined = refine(start, views).human            # views: pictures of one pose each, several poses
+    start = bare_body(betas)                        # or any other human, such as one from the encoder
+    refined = refine(start, views).human            # views: images of several poses
 
-Adam on three fields of the payload: colours as sRGB encodes them, density, and the logarithm of the boxes' sizes. The
+Adam optimises sRGB-encoded colours, densities and the logarithm of box sizes. The
 objective is that of stage 1 (paper sec. 3.2: L_rgb, L_sil), on random views. Values that no view shows have no
-gradient and stay unchanged, bit for bit. There is no other regulariser: a few views of one pose are overfitted and the
-person gets worse from other sides; some tens of views in several poses work well.
+gradient and stay bit-identical. There is no other regulariser: it overfits to a few views of one pose, and other sides
+get worse; some tens of views in several poses work well.
 """
 
 from __future__ import annotations
@@ -32,42 +32,42 @@ from primdiffusion.training.refine_views import PosedView, drawn, psnr_of, scene
 BETAS = (0.9, 0.99)
 """Adam's decay rates; short averages, because a run is a few hundred steps."""
 WARM_UP = 10
-"""Steps in which the rates rise to their full size: Adam's first steps are all of one length, whatever the gradient."""
+"""Warm-up of the rates, in steps: Adam's first steps have the same length for any gradient."""
 LARGEST_CHANGE = 3.0
-"""How many times a box's side may grow or shrink."""
+"""Largest factor by which the side of a box grows or shrinks."""
 MEASURED = 32
-"""Views, evenly chosen, on which the person is judged before and after."""
+"""Views, evenly spaced, for the PSNR before and after."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RefineSettings:
-    """How a person is refined. The rates are found by search on people that are dressed in detail."""
+    """Settings of refinement. The rates were tuned on humans in detailed clothes."""
 
     steps: int = 300
-    """Steps of Adam."""
+    """Optimiser steps."""
     views: int = 2
-    """Pictures a step."""
+    """Images per step."""
     colour_rate: float = 0.04
-    """Of sRGB-encoded colours in 0 ... 1."""
+    """Learning rate of sRGB-encoded colours in 0 ... 1."""
     density_rate: float = 0.04
-    """Of density, in units of FULL_DENSITY."""
+    """Learning rate of densities in units of FULL_DENSITY."""
     scale_rate: float = 0.03
-    """Of the logarithm of the boxes' sizes; 0: they stay as they are."""
+    """Learning rate of the logarithm of box sizes; 0 keeps them."""
     last_rate: float = 0.1
-    """What is left of the rates at the end of their fall, half a cosine."""
+    """Fraction of the rates at the end of their cosine decay."""
     largest_density: float = FULL_DENSITY
-    """1/m; more gains a tenth of a dB, and would not fit into the bytes of the diffusion model's training set."""
+    """1/m; more gains a tenth of a dB, and exceeds the range of the training set of the diffusion model."""
     silhouette: float = 0.05
-    """Weight of the silhouette's mean square error, that of the colours' being 1."""
+    """Weight of the mean square error of the silhouette, relative to that of the colours."""
     step: float = 0.006
     """Metres between samples of a ray."""
     seconds: float = math.inf
-    """Ends earlier, after the step in which so much time is over; the rates have not fallen as far then."""
+    """Time limit, checked after each step; the decay of the rates does not adapt to it."""
     seed: int = 0
-    """Of the order of views."""
+    """Seed of the order of views."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for numbers with which nothing can be refined."""
+        """Raise ValueError for values out of range."""
         least = {"steps": 1, "views": 1, "colour_rate": 0, "density_rate": 0, "scale_rate": 0, "last_rate": 0,
                  "largest_density": 1, "silhouette": 0, "step": 1e-4, "seconds": 0}  # fmt: skip
         for name, lowest in least.items():
@@ -85,18 +85,18 @@ class RefineStep(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Refined:
-    """A refined person and what it took."""
+    """Result of a refinement."""
 
     human: Human
     """On the CPU."""
     psnr_before: float
-    """Mean over up to MEASURED of the given views, dB (`view_psnr`)."""
+    """Mean over up to MEASURED views, dB (`view_psnr`)."""
     psnr_after: float
-    """Likewise."""
+    """The same after refinement."""
     steps: int
-    """Done; fewer than asked for where time ran out."""
+    """Completed steps; fewer than requested if time ran out."""
     seconds: float
-    """Of the steps."""
+    """Duration of the steps."""
 
 
 def refine(
@@ -105,16 +105,16 @@ def refine(
     settings: RefineSettings = RefineSettings(),
     on_step: Callable[[RefineStep], None] | None = None,
 ) -> Refined:
-    """The person, their betas kept, with a payload that looks like the views; on the payload's device.
+    """Return the human with the same betas and a payload optimised to match the views; runs on the payload's device.
 
-    `views` are records of one pose each, unbatched, pictures [v, H, W]; their poses are those of a body with the
-    human's betas. The same input and settings give the same bits on the same device. `on_step` sees each step after it
-    is done; an exception that it raises ends the run (this is how cancelling works).
+    `views` are records of one pose each, unbatched, with images [v, H, W]; their poses apply to a body with the human's
+    betas. Deterministic for the same input, settings and device. `on_step` is called after each step; an exception that
+    it raises cancels.
 
     Raises:
-        ValueError: there are no views, or they do not fit their cameras, or a record's masks are empty; the human
-            is of another body, or holds NaN; the pictures lead to numbers that are not finite.
-        PictureOutOfMemory: pictures of this size do not fit.
+        ValueError: there are no views, they do not match their cameras, or masks are empty; the human is on another body
+            or has NaN; the optimisation diverges.
+        PictureOutOfMemory: images of this size do not fit into memory.
     """
     human.validate()
     scenes = scenes_of(human, views)
@@ -144,8 +144,8 @@ def refine(
             break
     seconds = time.perf_counter() - began
     payload = leaves.result(start)
-    judged = scenes[:: math.ceil(len(scenes) / MEASURED)]
-    before, after = (float(psnr_of(judged, candidate).mean()) for candidate in (start, payload))
+    measured = scenes[:: math.ceil(len(scenes) / MEASURED)]
+    before, after = (float(psnr_of(measured, candidate).mean()) for candidate in (start, payload))
     provenance = {**human.provenance, "refined_steps": number, "refined_views": len(scenes), "version": __version__}
     refined = dataclasses.replace(human, payload=payload, provenance=provenance).to("cpu").validate()
     return Refined(refined, before, after, number, seconds)
@@ -159,7 +159,7 @@ class _Leaves(NamedTuple):
     density: Tensor
     """In units of FULL_DENSITY."""
     log_scale: Tensor
-    """Of the boxes' sizes in units of those at the start."""
+    """Logarithm of box sizes relative to the start."""
 
     @classmethod
     def of(cls, start: Payload) -> _Leaves:
@@ -173,7 +173,7 @@ class _Leaves(NamedTuple):
 
     @torch.no_grad()
     def clamp_(self, largest_density: float) -> None:
-        """Back to values that mean something; not before the step, where a gradient would end at the border."""
+        """Clamp to valid values, after the step: clamping in the forward pass would stop the gradient at the bounds."""
         self.colour.clamp_(0, 1)
         self.density.clamp_(0, largest_density / FULL_DENSITY)
         self.log_scale.clamp_(-math.log(LARGEST_CHANGE), math.log(LARGEST_CHANGE))
@@ -203,7 +203,7 @@ def _share_of_rate(done: int, settings: RefineSettings) -> float:
 
 
 def _loss(scene: PosedView, payload: Payload, settings: RefineSettings) -> Tensor:
-    """L_rgb + silhouette * L_sil as sums over the pixels; colours mean over their channels."""
+    """L_rgb + silhouette * L_sil, summed over pixels; L_rgb is the mean over channels."""
     rendering = drawn(scene, payload, settings.step)
     target = scene.target.float() / 255
     colour = (encode_srgb(rendering.rgb) - target[..., :3]).square().mean(-1)

@@ -33,7 +33,7 @@ PEOPLE_EACH = 32
 
 
 class ShardError(ValueError):
-    """Packed people that cannot be used; one sentence that names the file and says what to do."""
+    """A damaged shard or index; the message names the file and the remedy."""
 
 
 def open_people(folder: Path) -> PersonDataset:
@@ -47,7 +47,7 @@ def open_people(folder: Path) -> PersonDataset:
 
 
 def pack_people(folder: Path, out: Path, people_each: int = PEOPLE_EACH) -> Iterator[int]:
-    """Write the people of a folder as shards; yields how many are packed. A second run starts over.
+    """Write the people of a folder as shards; yields the number packed so far. A second run starts over.
 
     Raises:
         ValueError: `out` holds packed people already, or a person's file is damaged (it is named); no people a shard.
@@ -109,7 +109,7 @@ class PackedPeople:
     """People in shards; each shard is checked against its SHA-256 when first read (half a second for 256 MiB)."""
 
     def __init__(self, folder: Path) -> None:
-        """Reads the index alone. Raises FileNotFoundError, ShardError where it is damaged or of another version."""
+        """Read the index. Raises FileNotFoundError, and ShardError if it is damaged or of another version."""
         index = _read_index(folder / INDEX)
         try:
             self.full_density = float(index["full_density"])
@@ -127,18 +127,18 @@ class PackedPeople:
         self._open: dict[int, Any] = {}
 
     def known(self, index: int) -> tuple[Attributes, ...]:
-        """Attributes of each colouring of a person. Raises what `person` does."""
+        """Return the attributes of each colouring of a person. Raises as `person`."""
         shard, place, _ = self._rows(index)
         return attributes_of(self._stored[index], self._slice(shard, "betas")[place], self.variants[index])
 
     def person(self, index: int) -> PersonVariants:
-        """Read a person. Raises ShardError that names the shard where it is damaged, OSError."""
+        """Read a person. Raises ShardError, naming a damaged shard, and OSError."""
         shard, place, rows = self._rows(index)
         voxels, scale, betas = self._slice(shard, "voxels")[rows], self._scale(shard, rows), self._slice(shard, "betas")
         return PersonVariants(voxels, scale, betas[place], self.known(index), self.full_density)
 
     def variant(self, index: int, number: int) -> tuple[Tensor, Tensor]:
-        """Voxels and delta scales of one colouring; nothing else is read. Raises what `person` does."""
+        """Read voxels and delta scales of one colouring. Raises as `person`."""
         shard, _, rows = self._rows(index)
         row = slice(rows.start + number, rows.start + number + 1)
         return self._slice(shard, "voxels")[row][0], self._scale(shard, row)[0]
@@ -152,7 +152,7 @@ class PackedPeople:
             raise ShardError(f"{path} is damaged, its SHA-256 is not that of {INDEX}: pack the people again")
 
     def _rows(self, index: int) -> tuple[int, int, slice]:
-        """Shard of a person, their place in it, and their rows."""
+        """Return the shard of a person, the index in it, and the rows."""
         shard = bisect.bisect_right(self._firsts, index) - 1
         first = self._firsts[shard]
         start = sum(self.variants[first:index])

@@ -19,11 +19,11 @@ from primdiffusion.training.stored_people import PersonDataset, payload_of_bytes
 
 NETWORK = "slab"
 MEASURED = 4
-"""Held-out people on which the error is measured, one colouring each: a slab takes 15 MB, a guess as long as a step."""
+"""Held-out humans used in evaluation, one colouring each: a slab takes 15 MB, its evaluation the time of a step."""
 
 
 class SlabTrainee:
-    """A `SlabUNet` and the people it learns: unweighted x0 error at uniform levels, as in the paper."""
+    """A `SlabUNet` and its training data: unweighted x0 error at uniform levels, as in the paper."""
 
     def __init__(
         self,
@@ -43,19 +43,19 @@ class SlabTrainee:
 
     @property
     def phases(self) -> Mapping[str, PhaseConfig]:
-        """One."""
+        """Return the single phase."""
         return {NETWORK: self.config}
 
     def network(self, name: str) -> nn.Module:
-        """The U-Net."""
+        """Return the U-Net."""
         return self.began
 
     def put(self, name: str, network: nn.Module) -> None:
-        """Lets it compute."""
+        """Use a network as the denoiser."""
         self.denoiser = network
 
     def slabs(self, places: Sequence[tuple[int, int]]) -> Float[Tensor, "b 56 256 256"]:
-        """People as the network sees them. Raises ValueError that names a damaged file, OSError."""
+        """Load slabs. Raises ValueError, naming a damaged file, and OSError."""
         voxels, scales = zip(*(self.people.variant(*place) for place in places), strict=True)
         density = self.people.full_density
         payload = payload_of_bytes(torch.stack(voxels).to(self.device), torch.stack(scales).to(self.device), density)
@@ -74,12 +74,12 @@ class SlabTrainee:
         return (level_weight(signal, noise, self.config) * error.square()).mean()
 
     def errors(self) -> Mapping[int, float]:
-        """On the first colourings of a few who are held out, in the slab's units."""
+        """Evaluate on the first colourings of a few held-out humans, in units of the slab."""
         held = self.slabs([(index, 0) for index in self.held])
         return x0_errors({"rms": self._guess}, self.schedule, held, batch=1)["rms"]
 
     def model(self) -> DiffusionModel:
-        """What is in place, without a card; it knows nothing of bodies' shapes."""
+        """Return the model without a card; body shapes are not modelled."""
         density = self.people.full_density
         return DiffusionModel(self.denoiser, self.schedule, WholeSlab(), STANDARD_SHAPES, density, {}, chain=self.chain)
 

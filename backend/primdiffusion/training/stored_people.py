@@ -1,4 +1,4 @@
-"""Stored people, the training set of stage 2: payloads as bytes, in a folder of files or in shards."""
+"""The training set of stage 2: payloads as bytes, in a folder of files or in shards."""
 
 from __future__ import annotations
 
@@ -30,58 +30,58 @@ _VOXELS = (K, S, S, S, 4)
 
 @dataclasses.dataclass(frozen=True)
 class PersonVariants:
-    """One geometry with several colourings, or several looks of one captured person."""
+    """One geometry with several colourings, or several payloads of a captured subject."""
 
     voxels: UInt8[Tensor, "n k 8 8 8 4"]
     """sRGB-encoded colour and relative density of each colouring."""
     delta_scale: Float[Tensor, "n k 3"]
-    """Factors on the anchors' half extents; 1 where the file holds none."""
+    """Factors on the half extents of the anchors; 1 if the file has none."""
     betas: Float[Tensor, "10"]
     attributes: tuple[Attributes, ...]
-    """Of each colouring, in the words of `primdiffusion.people.wardrobe`, and height and weight, which betas tell."""
+    """Attributes of each colouring, as named in `primdiffusion.people.wardrobe`; height and weight from the betas."""
     full_density: float
-    """1/m that 255 stands for."""
+    """Density of a byte value of 255, 1/m."""
 
     def payload(self, variant: int) -> Payload:
-        """One colouring, in float32."""
+        """Return one colouring in float32."""
         return payload_of_bytes(self.voxels[variant], self.delta_scale[variant], self.full_density)
 
 
 class PersonDataset(Protocol):
-    """A data set of people, read on demand, in an order that depends on the files alone."""
+    """A dataset, read on demand; its order depends on the files only."""
 
     @property
     def names(self) -> Sequence[str]:
-        """Of all people, sorted."""
+        """Names of all people, sorted."""
         ...
 
     @property
     def variants(self) -> Sequence[int]:
-        """How many colourings each has."""
+        """Number of colourings of each."""
         ...
 
     @property
     def full_density(self) -> float:
-        """1/m that 255 stands for, in all of them."""
+        """Density of a byte value of 255, 1/m, the same for all."""
         ...
 
     def known(self, index: int) -> tuple[Attributes, ...]:
-        """`PersonVariants.attributes` of one of them, without reading voxels; raises what `person` does."""
+        """Return `PersonVariants.attributes` without reading voxels. Raises as `person`."""
         ...
 
     def person(self, index: int) -> PersonVariants:
-        """Read a person. Raises ValueError that names the file where it is damaged, OSError."""
+        """Read a person. Raises ValueError, naming a damaged file, and OSError."""
         ...
 
     def variant(self, index: int, number: int) -> tuple[UInt8[Tensor, "k 8 8 8 4"], Float[Tensor, "k 3"]]:
-        """Voxels and delta scales of one colouring; raises what `person` does."""
+        """Read voxels and delta scales of one colouring. Raises as `person`."""
         ...
 
 
 def payload_of_bytes(
     voxels: UInt8[Tensor, "*b k 8 8 8 4"], delta_scale: Float[Tensor, "*b k 3"], full_density: float
 ) -> Payload:
-    """Stored voxels and delta scales as payloads, in float32."""
+    """Convert stored voxels and delta scales to payloads in float32."""
     values = voxels.movedim(-1, -4).float() / 255
     return Payload(decode_srgb(values[..., :3, :, :, :]), values[..., 3, :, :, :] * full_density, delta_scale.float())
 
@@ -95,7 +95,7 @@ def attributes_of(stored: Mapping[str, Any], betas: Float[Tensor, "10"], count: 
 
 
 def read_person(path: Path) -> PersonVariants:
-    """A person's file; ValueError if it is damaged or of another shape."""
+    """Read a file. Raises ValueError if it is damaged or of another shape."""
     try:
         with np.load(path, allow_pickle=False) as file:
             outline = _outline_of(file)
@@ -115,12 +115,12 @@ def read_person(path: Path) -> PersonVariants:
 
 @dataclasses.dataclass(frozen=True)
 class Outline:
-    """Contents of a person's file except its voxels."""
+    """Content of a file without its voxels."""
 
     variants: int
     betas: Float[Tensor, "10"]
     stored: Mapping[str, Any]
-    """Attributes as they are stored."""
+    """Stored attributes."""
     full_density: float
 
     def known(self) -> tuple[Attributes, ...]:
@@ -129,7 +129,7 @@ class Outline:
 
 
 def read_outline(path: Path) -> Outline:
-    """Read a person's file except its voxels; ValueError if it is damaged."""
+    """Read a file without its voxels. Raises ValueError if it is damaged."""
     try:
         with np.load(path, allow_pickle=False) as file:
             return _outline_of(file)
@@ -150,17 +150,17 @@ def _outline_of(file: NpzFile) -> Outline:
 
 
 def _length(member: IO[bytes]) -> int:
-    """First dimension of an array in numpy's format, from its header."""
+    """Return the first dimension of an array from its header."""
     major, _ = np.lib.format.read_magic(member)
     read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
     return read(member)[0][0]
 
 
 class PersonFolder:
-    """A folder of people, a file each."""
+    """A folder with one file per person."""
 
     def __init__(self, folder: Path) -> None:
-        """Looks into every file, without reading voxels.
+        """Inspect all files without reading voxels.
 
         Raises:
             FileNotFoundError: there are fewer than two.
@@ -173,21 +173,21 @@ class PersonFolder:
         self.full_density = one_density([outline.full_density for outline in self.outlines])
 
     def known(self, index: int) -> tuple[Attributes, ...]:
-        """Attributes of each colouring of a person."""
+        """Return the attributes of each colouring of a person."""
         return self.outlines[index].known()
 
     def person(self, index: int) -> PersonVariants:
-        """Read a person. Raises ValueError where its file is damaged."""
+        """Read a person. Raises ValueError if the file is damaged."""
         return read_person(self.paths[index])
 
     def variant(self, index: int, number: int) -> tuple[Tensor, Tensor]:
-        """Voxels and delta scales of one colouring; all of the person's are read for it."""
+        """Read voxels and delta scales of one colouring; reads all of the file."""
         person = self.person(index)
         return person.voxels[number], person.delta_scale[number]
 
 
 def find_people(folder: Path) -> list[Path]:
-    """The people's files in a folder, sorted; FileNotFoundError if there are fewer than two."""
+    """Return the files of a folder, sorted. Raises FileNotFoundError if there are fewer than two."""
     paths = sorted(folder.glob("*.npz"))
     if len(paths) < 2:
         raise FileNotFoundError(
