@@ -280,16 +280,16 @@ def model_card(card: Mapping[str, Any]) -> str:
         [
             f"# Model card: {card['name']}",
             "",
-            "Made from the checkpoint by `python -m primdiffusion.diffusion.checkpoint`; not written by hand.",
+            "Generated from the checkpoint by `python -m primdiffusion.diffusion.checkpoint`; do not edit.",
             "",
             *(f"- {key.replace('_', ' ')}: {_plain(value)}" for key, value in facts.items()),
             "",
             *_attribute_section(card.get("attributes", {})),
             "## Held-out error",
             "",
-            "Root mean square error of the guessed clean latents at each step t of 1000, for people whose geometry was",
-            "never trained on; all on the same noise. `gaussian`: the closed-form denoiser of one Gaussian fitted to",
-            "the training people; `mixture`: of Gaussians for all kinds of people; `denoiser`: this checkpoint.",
+            "Root mean square error of x0 predictions in latent units at steps t of 1000, on people with held-out",
+            "geometry and the same noise. `gaussian`: the closed-form denoiser of one Gaussian fitted to",
+            "the training set; `mixture`: of a mixture of Gaussians; `denoiser`: this checkpoint.",
             "",
             "| t | " + " | ".join(levels) + " |",
             "|---" * (len(levels) + 1) + "|",
@@ -307,10 +307,10 @@ def _attribute_section(attributes: Mapping[str, Any]) -> list[str]:
     """Lines of the section on attributes; empty for an unconditional model."""
     values = [f"- {name}: {', '.join(words)}" for name, words in attributes.get("categories", {}).items()]
     numbers = [
-        f"- {name}: about {mean:.3g}, of standard deviation {spread:.2g}"
+        f"- {name}: mean {mean:.3g}, standard deviation {spread:.2g}"
         for name, (mean, spread) in attributes.get("scalars", {}).items()
     ]
-    return ["## What it can be asked for", "", *values, *numbers, ""] if values or numbers else []
+    return ["## Attributes", "", *values, *numbers, ""] if values or numbers else []
 
 
 def _plain(value: object) -> str:

@@ -112,8 +112,8 @@ def refine(
     it raises cancels.
 
     Raises:
-        ValueError: there are no views, they do not match their cameras, or masks are empty; the human is on another body
-            or has NaN; the optimisation diverges.
+        ValueError: there are no views, they do not match their cameras, or masks are empty; the human is on another
+            body or has NaN; the optimisation diverges.
         PictureOutOfMemory: images of this size do not fit into memory.
     """
     human.validate()
