@@ -33,7 +33,6 @@ from march import from_script
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.attribute_network import category, features_of
-from primdiffusion.evaluation.clip_vision import load_clip_vision
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance
 from primdiffusion.evaluation.gallery import COLOURINGS, made_gallery, mesh_sources, payload_of
 from primdiffusion.evaluation.generation import (
@@ -44,8 +43,8 @@ from primdiffusion.evaluation.generation import (
     real_vs_real,
     table,
 )
-from primdiffusion.evaluation.inception import load_inception
 from primdiffusion.evaluation.neighbours import nearest_stored
+from primdiffusion.evaluation.pretrained_networks import load_clip_vision, load_inception
 from primdiffusion.evaluation.voxel_baseline import load_voxel_model
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.primitives.primitives import Primitives

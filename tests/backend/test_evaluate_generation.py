@@ -1,5 +1,6 @@
 """Distances of sets of people, the feature space they are taken in, and the nearest training people."""
 
+import itertools
 import math
 
 import numpy as np
@@ -50,6 +51,18 @@ def test_frechet_distance_needs_no_more_samples_than_features():
 def test_kernel_distance_is_torchmetrics():
     first, second = draws(30, 6, 0).double(), draws(30, 6, 1, shift=0.5).double()
     assert kernel_distance(first, second) == pytest.approx(float(poly_mmd(first, second)), rel=1e-9)
+
+
+def test_kernel_distance_of_sets_of_two_sizes_is_the_mean_over_pairs():
+    first, second = draws(7, 3, 0).double(), draws(5, 3, 1, shift=0.5).double()
+
+    def mean(pairs):
+        kernels = [(float(a @ b) / 3 + 1) ** 3 for a, b in pairs]
+        return sum(kernels) / len(kernels)
+
+    within = mean(itertools.permutations(first, 2)) + mean(itertools.permutations(second, 2))
+    across = mean(itertools.product(first, second))
+    assert kernel_distance(first, second) == pytest.approx(within - 2 * across, rel=1e-9)
 
 
 def test_kernel_distance_has_no_bias_and_frechet_distance_has():

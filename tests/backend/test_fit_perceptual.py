@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from primdiffusion.picture_features import VGG16, VGG19, PictureFeatures, WeightsFileError
+from primdiffusion.evaluation.pretrained_networks import VGG16, VGG19, PictureFeatures, WeightsFileError
 from primdiffusion.training.fit_perceptual import LAYERS, PerceptualLoss, load_perceptual
 
 

@@ -1,8 +1,4 @@
-"""Image metrics: PSNR, SSIM, LPIPS, fine detail and mask IoU. Images are sRGB-encoded RGB in [0, 1].
-
-Implemented here because torchmetrics comes only with the extra `training`, and evaluating a checkpoint should not need
-it. The tests compare them with torchmetrics and scikit-image.
-"""
+"""Image metrics: PSNR, SSIM, LPIPS, fine detail and mask IoU. Images are sRGB-encoded RGB in [0, 1]."""
 
 from __future__ import annotations
 
@@ -16,7 +12,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor, nn
 
-from primdiffusion.picture_features import (
+from primdiffusion.evaluation.pretrained_networks import (
     ALEXNET,
     VGG16,
     Architecture,
@@ -26,10 +22,8 @@ from primdiffusion.picture_features import (
     read_weights,
 )
 
-WINDOW, SIGMA = 11, 1.5
-"""SSIM's Gaussian window, pixels."""
-K1, K2 = 0.01, 0.03
-"""SSIM's constants, for a data range of 1."""
+WINDOW = 11
+"""Width of SSIM's Gaussian window, pixels."""
 FIGURE_MARGIN = 8
 """Pixels around a figure that count in `figure_psnr`: what sticks out of its outline is an error too."""
 FINE_SIGMA = 3.0
@@ -74,31 +68,20 @@ def ssim(image: Float[Tensor, "*b H W 3"], target: Float[Tensor, "*b H W 3"]) ->
     """Structural similarity of each image (Wang et al. 2004, eq. 13), mean over channels and windows.
 
     Gaussian windows of 11 x 11 pixels, sigma 1.5, biased variances; windows that cross the border are left out, as in
-    Wang et al.'s program and scikit-image. Raises ValueError if shapes differ or a side has fewer than 11 pixels.
+    Wang et al.'s program and scikit-image. Raises ValueError if shapes differ or a side has fewer than 11 pixels, and
+    ImportError without the extra `training`.
     """
+    from torchmetrics.functional.image import structural_similarity_index_measure  # in the extra `training`
+
     _check_pair(image, target)
     height, width = image.shape[-3:-1]
     if min(height, width) < WINDOW:
         raise ValueError(f"images have {width} x {height} pixels: SSIM needs at least {WINDOW} x {WINDOW}")
-    x, y = (picture.reshape(-1, height, width, 3).movedim(-1, 1) for picture in (image, target))
-    moments = _blurred(torch.stack([x, y, x * x, y * y, x * y]).flatten(0, 2))
-    mean_x, mean_y, square_x, square_y, product = moments.unflatten(0, (5, -1))
-    c1, c2 = K1**2, K2**2
-    covariance, variances = product - mean_x * mean_y, square_x + square_y - mean_x**2 - mean_y**2
-    luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
-    similarity = luminance * (2 * covariance + c2) / (variances + c2)
-    return similarity.mean((-2, -1)).reshape(-1, 3).mean(-1).reshape(image.shape[:-3])
-
-
-def _blurred(pictures: Float[Tensor, "n H W"]) -> Float[Tensor, "n h w"]:
-    """Gaussian-weighted means over the windows that lie entirely inside."""
-    count = len(pictures)
-    offset = torch.arange(WINDOW, dtype=pictures.dtype, device=pictures.device) - WINDOW // 2
-    weight = (-0.5 * (offset / SIGMA).square()).exp()
-    weight = (weight / weight.sum()).expand(count, 1, 1, WINDOW)
-    # A batch of images as channels of one: as a batch of one channel each it is nine times slower on CPU.
-    columns = torch.nn.functional.conv2d(pictures[None], weight.mT, groups=count)
-    return torch.nn.functional.conv2d(columns, weight, groups=count)[0]
+    pair = (picture.reshape(-1, height, width, 3).movedim(-1, 1) for picture in (image, target))
+    # Its own mean takes windows across the border too, in mirrored images.
+    _, windows = structural_similarity_index_measure(*pair, data_range=1.0, reduction="none", return_full_image=True)
+    inside = slice(WINDOW // 2, -(WINDOW // 2))
+    return windows[..., inside, inside].mean((-3, -2, -1)).reshape(image.shape[:-3])
 
 
 def figure_psnr(

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from primdiffusion.picture_features import VGG19, PictureFeatures, fill, read_weights
+from primdiffusion.evaluation.pretrained_networks import VGG19, PictureFeatures, fill, read_weights
 
 LAYERS = ("relu1_2", "relu2_2", "relu3_2", "relu4_2", "relu5_2")
 """SPEC 2 names weights but no layers: the second of each block, as perceptual losses in image synthesis take them."""
