@@ -33,12 +33,12 @@ class BuildError(RuntimeError):
 
 
 def contents(addon: Path = ADDON, backend: Path = BACKEND) -> dict[str, Path]:
-    """Files by their name in the zip, sorted: the add-on at the top, the backend under backend/primdiffusion.
+    """Files by their name in the zip, sorted: the add-on at the top, the backend under bundled/primdiffusion.
 
     The manual's pages are not included, because they are not files; `build` adds them.
     """
     files = {"LICENSE": ROOT / "LICENSE"}
-    for root, prefix in ((addon, ""), (backend, "backend/primdiffusion/")):
+    for root, prefix in ((addon, ""), (backend, "bundled/primdiffusion/")):
         for path in root.rglob("*"):
             inside = path.relative_to(root)
             hidden = any(part == "__pycache__" or part.startswith(".") for part in inside.parts)
@@ -51,7 +51,7 @@ def build(out: Path) -> Path:
     """Write `primdiffusion-<version>.zip` into `out` and return its path. Raises BuildError when a part is missing."""
     manifest = tomllib.loads((ADDON / "blender_manifest.toml").read_text(encoding="utf-8"))
     files = contents()
-    if "backend/primdiffusion/__init__.py" not in files:
+    if "bundled/primdiffusion/__init__.py" not in files:
         raise BuildError(f"the backend was not found in {BACKEND}: build from a complete checkout")
     try:
         pages = {f"manual/{name}": page for name, page in manual().items()}

@@ -25,9 +25,8 @@ import record
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "blender_primdiffusion"))
-from worker.backend import Backend  # noqa: E402
-from worker.client import BackendClient, Died  # noqa: E402
-from worker.request import Request  # noqa: E402
+from backend.client import BackendClient, Died  # noqa: E402
+from backend.requests import Backend, Request  # noqa: E402
 
 TICK_S = 0.1
 """The interval of Blender's timer in seconds."""

@@ -51,7 +51,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float]:
     rotations = walk_and_wave(arguments.frames)
     numbers = np.arange(1, arguments.frames + 1)
     start = time.perf_counter()
-    import_module(f"{MODULE}.scene.keyframes").keyframe_poses(
+    import_module(f"{MODULE}.scene.armature").keyframe_poses(
         armature, numbers, rotations, np.zeros((arguments.frames, 3)), "Walk"
     )
     keyframed = time.perf_counter() - start
@@ -100,7 +100,7 @@ def cycles(arguments: argparse.Namespace) -> dict[str, float]:
         count = len(bpy.data.volumes)
         raise SystemExit(f"{arguments.blend} reopened with {count} volumes, {len(missing)} without a file")
     sys.path.insert(0, str(ROOT))
-    from blender_primdiffusion.scene.preview import setup_cycles_preview
+    from blender_primdiffusion.scene.cycles import setup_cycles_preview
 
     setup_cycles_preview(scene, size=arguments.size, samples=arguments.samples, yaw=arguments.yaw, world=0.48)
     scene.render.filepath = str(arguments.out)

@@ -26,12 +26,12 @@ from record import tell
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from blender_primdiffusion.jobs.building import SLICE_S
+from blender_primdiffusion.jobs.follow import SLICE_S
 from blender_primdiffusion.scene.build import build_human, build_written, next_folder
 from blender_primdiffusion.scene.edit import edit_destination, replace_person
-from blender_primdiffusion.scene.grid_cache import free_unused_grids, read_grids
 from blender_primdiffusion.scene.human import humans
-from blender_primdiffusion.scene.writing import Destination, WrittenHuman, write_now
+from blender_primdiffusion.scene.human_npz import Destination, WrittenHuman, write_now
+from blender_primdiffusion.scene.volumes import free_unused_grids, read_grids
 
 
 def milliseconds(does: Callable[[], object]) -> float:

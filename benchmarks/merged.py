@@ -32,14 +32,13 @@ from record import tell
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import blender_primdiffusion
 from blender_primdiffusion.scene import merged as merging
-from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import set_attachment
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.grid_cache import person_memory
+from blender_primdiffusion.scene.cycles import setup_cycles_preview
 from blender_primdiffusion.scene.human import armature_of
-from blender_primdiffusion.scene.keyframes import keyframe_poses
 from blender_primdiffusion.scene.material import set_density_gain
-from blender_primdiffusion.scene.preview import setup_cycles_preview
+from blender_primdiffusion.scene.volumes import person_memory
 
 SEED, STEPS, SIZE, GREY = 7, 30, 512, 0.48
 FRAMES = 10

@@ -6,7 +6,7 @@ import sys
 
 from . import register, unregister
 from .capture.launch import leave
-from .ui.batch.command import execute
+from .ui.batch import execute
 
 if __name__ == "__main__":
     register()

@@ -1,4 +1,4 @@
-"""A command line within Blender: a stdout of our own, progress in words, an end by Ctrl-C between pieces of work."""
+"""Command lines within Blender: a separate stdout, durations as text, Ctrl-C between pieces of work."""
 
 from __future__ import annotations
 
@@ -9,20 +9,23 @@ import sys
 from collections.abc import Callable, Iterator
 
 DONE, FAILED, UNUSABLE, NO_BACKEND, CANCELLED = 0, 1, 2, 3, 130
-"""Exit codes: all is well; something failed, and the report lists it; nothing could be begun with these words; there is
-no Python that runs the backend; told to stop."""
+"""Exit codes: all done; some failed, and the report lists them; usage error; no Python runs the backend; stopped."""
+
+
+class UsageError(ValueError):
+    """Options that a command does not accept."""
 
 
 def duration(seconds: float) -> str:
-    """Seconds in words for people."""
+    """Seconds as text: 2 min 5 s."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {seconds} s" if minutes else f"{seconds} s"
 
 
 @contextlib.contextmanager
-def stdout_of_our_own() -> Iterator[Callable[[str], None]]:
-    """A way to write lines to stdout while all else that is written there, by Blender, is dropped."""
+def separate_stdout() -> Iterator[Callable[[str], None]]:
+    """A function that writes lines to stdout, while Blender's own output is dropped."""
     sys.stdout.flush()
     ours = os.dup(1)
     nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -41,28 +44,26 @@ def stdout_of_our_own() -> Iterator[Callable[[str], None]]:
 
 
 class Stop:
-    """Whether a command was asked to stop; read between pieces of work."""
+    """Whether a command should stop; checked between pieces of work."""
 
     def __init__(self, ended: Callable[[], bool] = lambda: False) -> None:
-        """`ended` is another reason to stop, looked at each time."""
+        """`ended` is another reason to stop, checked each time."""
         self._asked = False
         self.ended = ended
 
     def set(self) -> None:
-        """Ask."""
         self._asked = True
 
     def is_set(self) -> bool:
-        """Whether it was asked to."""
         self._asked = self._asked or self.ended()
         return self._asked
 
 
 @contextlib.contextmanager
 def stopped_by_signals() -> Iterator[Stop]:
-    """Set by Ctrl-C or a polite kill, for the time between pieces of work; the second one ends the process at once.
+    """Set by Ctrl-C or SIGTERM; a second signal ends the process at once.
 
-    An exception would not do: raised while Cycles calls Python, it is printed and forgotten.
+    An exception would be lost: raised while Cycles calls Python, it is only printed.
     """
     stop = Stop()
     asked = []
@@ -77,7 +78,7 @@ def stopped_by_signals() -> Iterator[Stop]:
     try:
         for number in (signal.SIGINT, signal.SIGTERM):
             before[number] = signal.signal(number, note)
-    except ValueError:  # not in the main thread, which alone gets signals
+    except ValueError:  # not in the main thread
         pass
     try:
         yield stop

@@ -1,37 +1,34 @@
-"""Where the extension finds and keeps things: its own backend, its preferences, its folder for caches."""
+"""Paths and preferences of the extension: its backend, its folders, its caches."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Generator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
 
-if TYPE_CHECKING:
-    from collections.abc import Generator
-
-    from .worker.backend import Backend
-    from .worker.client import BackendClient
-    from .worker.setup import SetUpFolder
+from .backend import environment
+from .backend.client import BackendClient
+from .backend.requests import Backend
 
 EXTENSION = str(__package__)
 """The extension's full module name; `bl_ext.<repository>.primdiffusion` once installed."""
 CACHE_VARIABLE = "PRIMDIFFUSION_CACHE"
-"""Names another folder than `cache_folder`'s own, for several Blenders to share."""
+"""Environment variable: a folder for caches, which several Blenders may share."""
 
 
 def backend_module_path() -> Path | None:
-    """The folder that holds the package `primdiffusion`: bundled in the zip, or beside us in a checkout, else None."""
+    """The folder that holds the package `primdiffusion`: in the zip, or beside us in a checkout, else None."""
     root = Path(__file__).resolve().parent
-    for folder in (root / "backend", root.parent / "backend"):
+    for folder in (root / "bundled", root.parent / "backend"):
         if (folder / "primdiffusion" / "__init__.py").is_file():
             return folder
     return None
 
 
 def own_folder() -> Path:
-    """A writable folder of the extension's own; a temporary one when it runs from a checkout."""
+    """The extension's writable folder; a temporary one in a checkout."""
     try:
         return Path(bpy.utils.extension_path_user(EXTENSION, create=True))
     except ValueError:  # not installed as an extension
@@ -39,22 +36,20 @@ def own_folder() -> Path:
 
 
 def cache_folder() -> Path:
-    """Where children keep byte code and compiled kernels: our own, or what CACHE_VARIABLE names."""
+    """Folder for the children's byte code and compiled kernels."""
     named = os.environ.get(CACHE_VARIABLE, "")
     return Path(named).absolute() if named else own_folder() / "cache"
 
 
-def set_up_folder() -> SetUpFolder:
-    """Where the private environment is, or would be: lasting, and short enough for Windows."""
-    from .worker import setup
-
+def set_up_folder() -> environment.SetUpFolder:
+    """Folder of the private environment, with a path short enough for Windows."""
     try:
         own = Path(bpy.utils.extension_path_user(EXTENSION))
     except ValueError:  # not installed as an extension
         own = Path(bpy.utils.user_resource("DATAFILES", path="primdiffusion"))
     local = os.environ.get("LOCALAPPDATA") if os.name == "nt" else None
-    root = setup.short_root(own, Path(local) if local else None, "{}{}".format(*bpy.app.version))
-    return setup.SetUpFolder(root)
+    root = environment.short_root(own, Path(local) if local else None, "{}{}".format(*bpy.app.version))
+    return environment.SetUpFolder(root)
 
 
 def preference(name: str) -> str:
@@ -65,16 +60,13 @@ def preference(name: str) -> str:
 
 
 def new_backend(python: str) -> Backend:
-    """A child that is yet to be started, on the interpreter of this path; empty: found when it starts."""
-    from .worker import client, environment
-    from .worker.backend import Backend
-
+    """A backend, not yet started, on the interpreter of this path, or for "" on the one found when it starts."""
     module_path, cache = backend_module_path(), cache_folder()
     own_environment = set_up_folder().environment
 
     def make_client() -> Generator[None, None, BackendClient]:
         found = yield from environment.search(python or None, own_environment, module_path, cache_dir=cache)
-        made = client.BackendClient(found.path, module_path, cache_dir=cache)
+        made = BackendClient(found.path, module_path, cache_dir=cache)
         made.info["torch"] = found.torch  # the child does not report it
         return made
 

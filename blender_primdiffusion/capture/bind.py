@@ -16,14 +16,12 @@ from ..scene.armature import build_armature
 from ..scene.convention import points_to_backend, points_to_blender
 from .body import Body, blend
 from .fit import fit_surface, vertex_normals
-from .parameters import Parameters, read_parameters
-from .registration import Registration, register
-from .scan_files import ScanError, ScanFile
+from .registration import Registration, axis_name, register, scale_note
+from .scan_files import Parameters, ScanError, ScanFile, read_parameters
 from .skinned_surface import mesh_points
-from .upright import axis_name, scale_note
 
 _FAR_M, _LOOSE_M = 0.10, 0.06
-"""Mean distance from which on a scan is not the body's; distance at which a point's nearest place says little."""
+"""Mean distance beyond which a scan is not of this body; distance at which a point's nearest place means little."""
 _EXACT_M = 0.003
 _SMOOTHING = 40
 _SAME_PLACE_M = 1e-5
@@ -31,7 +29,7 @@ _SAME_PLACE_M = 1e-5
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Bound:
-    """What binding made."""
+    """The result of binding."""
 
     armature: bpy.types.Object
     betas: NDArray[np.float64]
@@ -39,7 +37,7 @@ class Bound:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Surface:
+class ScanSurface:
     """All meshes of a scan as one, its points in one place joined, so that seams stay closed."""
 
     points: NDArray[np.float64]
@@ -63,7 +61,7 @@ def bind_static(
     parameters = read_parameters(scan_file)
     found = _register(scan_file, body, parameters, meshes)
     surface = _surface(meshes, found, parameters)
-    betas, shift, told = _shape(body, parameters, surface, scan_file)
+    betas, shift, shape_notes = _shape(body, parameters, surface, scan_file)
     posed, _, skinning = body.pose(betas, parameters.rotations, shift)
     weights, trust = surface_weights(surface, posed, body)
     rest = points_to_blender(unpose(surface.points, weights, skinning))
@@ -75,7 +73,7 @@ def bind_static(
         start += len(chosen)
         _attach(mesh, armature, rest[chosen], weights[chosen])
     context.view_layer.update()
-    notes = [*parameters.notes, *_registration_notes(found), *told]
+    notes = [*parameters.notes, *_registration_notes(found), *shape_notes]
     notes.append(f"bound to the body by its nearest surface, {np.mean(trust < 0.2):.0%} of it loose")
     return Bound(armature, betas, notes)
 
@@ -107,7 +105,7 @@ def _known(body: Body, betas: NDArray) -> NDArray[np.float64]:
     return np.asarray(betas, np.float64)[: body.shape_basis.shape[-1]]
 
 
-def _surface(meshes: Sequence[bpy.types.Object], found: Registration, parameters: Parameters) -> Surface:
+def _surface(meshes: Sequence[bpy.types.Object], found: Registration, parameters: Parameters) -> ScanSurface:
     """The scan where the unscaled, unmoved body of its parameters is."""
     vertices = found.apply(points_to_backend(mesh_points(meshes)))
     vertices = (vertices - parameters.translation) / parameters.scale
@@ -121,7 +119,7 @@ def _surface(meshes: Sequence[bpy.types.Object], found: Registration, parameters
     return join_surface(vertices, np.concatenate(triangles))
 
 
-def join_surface(vertices: NDArray, triangles: NDArray) -> Surface:
+def join_surface(vertices: NDArray, triangles: NDArray) -> ScanSurface:
     """Vertices [V, 3] and triangles [F, 3] with vertices in one place as one point."""
     cells = np.round(vertices / _SAME_PLACE_M).astype(np.int64)
     _, first, point_of = np.unique(cells, axis=0, return_index=True, return_inverse=True)
@@ -129,10 +127,10 @@ def join_surface(vertices: NDArray, triangles: NDArray) -> Surface:
     faces, points = point_of[triangles], vertices[first]
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
-    return Surface(points, vertex_normals(points, faces), edges[edges[:, 0] != edges[:, 1]], point_of)
+    return ScanSurface(points, vertex_normals(points, faces), edges[edges[:, 0] != edges[:, 1]], point_of)
 
 
-def _shape(body: Body, parameters: Parameters, surface: Surface, scan_file: ScanFile):
+def _shape(body: Body, parameters: Parameters, surface: ScanSurface, scan_file: ScanFile):
     """Betas, shift and notes: the parameters' own shape, unless they are of another body: then one that is fitted.
 
     SMPL parameters found beside a scan are SMPL's; on the default body their pose holds and their shape does not.
@@ -149,11 +147,11 @@ def _shape(body: Body, parameters: Parameters, surface: Surface, scan_file: Scan
             f"{scan_file.path} does not match {scan_file.parameters}: its surface is {fit.residual * 100:.0f} cm from "
             "the body; check that they belong together"
         )
-    told = f"shape of the {body.name} body fitted to its surface, {fit.residual * 1000:.0f} mm off on average"
-    return fit.betas, fit.shift, [told]
+    note = f"shape of the {body.name} body fitted to its surface, {fit.residual * 1000:.0f} mm off on average"
+    return fit.betas, fit.shift, [note]
 
 
-def _nearest_on(surface: Surface) -> Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]:
+def _nearest_on(surface: ScanSurface) -> Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]:
     tree = KDTree(len(surface.points))
     for number, point in enumerate(surface.points):
         tree.insert(point, number)
@@ -168,7 +166,9 @@ def _nearest_on(surface: Surface) -> Callable[[NDArray, NDArray], tuple[NDArray,
     return nearest
 
 
-def surface_weights(surface: Surface, posed: NDArray, body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def surface_weights(
+    surface: ScanSurface, posed: NDArray, body: Body
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Skin weights [n, 24] of the surface's points, and how much the body says about each [n], 0 ... 1.
 
     A point takes the weights of the nearest place on the posed body that faces the same way, so that an arm beside the

@@ -16,24 +16,25 @@ from collections.abc import Callable, Sequence
 
 import bpy
 
-from ..console import CANCELLED, DONE, FAILED, UNUSABLE, Stop, duration, stdout_of_our_own, stopped_by_signals
+from ..backend.child_streams import stdin_has_ended
+from ..console import CANCELLED, DONE, FAILED, UNUSABLE, Stop, UsageError, duration, separate_stdout, stopped_by_signals
 from ..formats.capture_layout import CaptureFolderError
-from ..worker.child_streams import stdin_has_ended
-from .job import CaptureError, Progress, run
-from .options import MARK, UsageError, parse, settings_of
+from .job import CaptureError, CaptureProgress, run
+from .options import MARK, parse, settings_of
 from .report import Report, report_path
 from .scan import ScanError, ScanFile, find_scans
 from .settings import CaptureSettings
-from .verify import repair, verify
+from .subject import repair, verify
 
-_TOLD_S = 1.0
+_PRINT_S = 1.0
+"""Between lines of progress."""
 
 Say = Callable[..., None]
-"""Takes a line; for --progress json a Progress too."""
+"""Prints a line; with --progress json, also a CaptureProgress."""
 
 
 class _Stopped(Exception):
-    """Told to stop."""
+    """The command was asked to stop."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -43,8 +44,8 @@ def main(argv: Sequence[str]) -> int:
     except UsageError as error:
         print(f"capture: {error}; --help names all options", file=sys.stderr, flush=True)
         return UNUSABLE
-    with stdout_of_our_own() as write:
-        say = _saying_json(write) if options.progress == "json" else write
+    with separate_stdout() as write:
+        say = _json_lines(write) if options.progress == "json" else write
         try:
             with stopped_by_signals() as stop:
                 return _run(options, say, stop)
@@ -52,7 +53,7 @@ def main(argv: Sequence[str]) -> int:
             print(f"capture: {error}", file=sys.stderr, flush=True)
             return UNUSABLE
         except _Stopped:
-            say("Stopped; the same command goes on from here.")
+            say("Stopped; the same command resumes from here.")
             return CANCELLED
 
 
@@ -69,9 +70,9 @@ def scans_in(folders: Sequence, only: Sequence[str] = ()) -> list[ScanFile]:
             found[scan.name] = scan
     unknown = sorted(set(only) - set(found))
     if unknown:
-        raise ScanError(f"nobody is called {unknown[0]} in {', '.join(map(str, folders))}")
+        raise ScanError(f"there is no scan {unknown[0]} in {', '.join(map(str, folders))}")
     if not found:
-        raise ScanError("nobody to render: name a folder of scans with --people")
+        raise ScanError("there are no scans: name a folder of them with --people")
     return [found[name] for name in sorted(found) if not only or name in only]
 
 
@@ -96,7 +97,7 @@ def _check(options: argparse.Namespace, say: Say) -> int:
     wrong = repair(options.out) if options.repair else verify(options.out)
     for sentence in wrong:
         say(sentence)
-    say(f"{options.out}: {f'{len(wrong)} problems' if wrong else 'all is whole'}")
+    say(f"{options.out}: {f'{len(wrong)} problems' if wrong else 'no problems'}")
     return FAILED if wrong else DONE
 
 
@@ -108,7 +109,7 @@ def _render(options: argparse.Namespace, settings: CaptureSettings, scans: list[
         raise CaptureFolderError(
             f"nothing can be written to {settings.out} ({reason}): choose another folder with --out"
         ) from error
-    report, told = Report(), 0.0
+    report, printed = Report(), 0.0
     with contextlib.closing(run(bpy.context, settings, scans, report)) as steps:
         for progress in steps:
             if options.progress == "json":
@@ -116,8 +117,8 @@ def _render(options: argparse.Namespace, settings: CaptureSettings, scans: list[
             elif options.progress == "text":
                 for line in progress.news:
                     say(line)
-                if time.monotonic() - told > _TOLD_S or progress.done == progress.total:
-                    told = time.monotonic()
+                if time.monotonic() - printed > _PRINT_S or progress.done == progress.total:
+                    printed = time.monotonic()
                     say(describe(progress))
             if stop.is_set():
                 raise _Stopped
@@ -127,16 +128,16 @@ def _render(options: argparse.Namespace, settings: CaptureSettings, scans: list[
     return FAILED if report.failed else DONE
 
 
-def _saying_json(write: Callable[[str], None]) -> Say:
-    """Blender may have said things of its own before: what is ours begins with MARK."""
+def _json_lines(write: Callable[[str], None]) -> Say:
+    """Lines of ours begin with MARK, unlike Blender's."""
 
-    def say(what: str | Progress) -> None:
+    def say(what: str | CaptureProgress) -> None:
         write(MARK + json.dumps({"line": what} if isinstance(what, str) else dataclasses.asdict(what)))
 
     return say
 
 
-def describe(progress: Progress) -> str:
-    """A line for people."""
+def describe(progress: CaptureProgress) -> str:
+    """Progress as a line of text."""
     left = "" if progress.eta_s is None else f", {duration(progress.eta_s)} left"
     return f"{progress.subject}: view {progress.done} of {progress.total}{left}"

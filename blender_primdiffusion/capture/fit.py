@@ -1,4 +1,4 @@
-"""The shape of a body that a scan's person has: from the joints of a skeleton, or from a surface."""
+"""Fit the shape of a body to a scan: to the joints of a skeleton, or to a surface."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _RIDGE_M = 0.008
 """A beta of 1 costs as much as a joint that is this far off, metres: rigs are no more exact than that."""
 _WEIGHTS = {"hip": 0.5, "collar": 0.1, "hand": 0.2, "foot": 0.3, "pelvis": 0.2, "spine1": 0.05, "spine2": 0.05,
             "spine3": 0.05, "neck": 0.3, "head": 0.3}  # fmt: skip
-"""How much a joint counts, 1 for the rest: rigs agree about knees and elbows, less about spines and toes."""
+"""Weights of joints, 1 for the others: rigs agree on knees and elbows, less on spines and toes."""
 _SURFACE_RIDGE_M = 0.002
 """A beta of 1 costs as much as a surface that is this far off everywhere, metres."""
 _LARGEST_BETA = 4.0
@@ -30,18 +30,18 @@ class ShapeFit:
     betas: NDArray[np.float64]
     """[B]."""
     scale: float
-    """Of the scan: 1 unless only a person of another size fits."""
+    """Of the scan: 1 unless only another size fits."""
     shift: NDArray[np.float64]
     """Of the scan after scaling [3], metres."""
     residual: float
-    """Root mean square distance of the joints, metres, each counted by how well rigs agree about it."""
+    """Weighted root mean square distance of the joints, metres."""
 
 
 def fit_joints(body: Body, joints: Mapping[str, NDArray]) -> ShapeFit:
     """The shape whose joints at rest are nearest to `joints` (SMPL's name -> place at the T rest, metres, y up).
 
     min over betas, shift: sum_j w_j |scale * x_j + shift - J_j(betas)|^2 + ridge |betas|^2, whose J is linear in betas.
-    The scale is 1, and free between `_SCALES` only where a fit at 1 is poor or its betas are those of nobody.
+    The scale is 1, and free between `_SCALES` only where a fit at 1 is poor or its betas are too large.
     """
     names = [name for name in JOINT_NAMES if name in joints]
     places = np.array([joints[name] for name in names])
@@ -79,9 +79,9 @@ def fit_surface(
 ) -> ShapeFit:
     """The shape and the shift of a posed body whose surface is nearest to a scan's.
 
-    `nearest` gives for points [n, 3] with normals [n, 3] the scan's nearest places [n, 3] and how much each is to be
-    trusted [n], 0 ... 1. A posed vertex is linear in betas, so each round is a least-squares problem. The residual is
-    the root mean square of the trusted distances along the normals' places, metres.
+    `nearest` returns, for points [n, 3] with normals [n, 3], the nearest points of the scan [n, 3] and their trust
+    [n], 0 ... 1. A posed vertex is linear in betas, so each round is a least-squares problem. The residual is the root
+    mean square of the distances, weighted by trust, metres.
     """
     betas = np.array(betas, np.float64)[: body.shape_basis.shape[-1]]
     betas = np.concatenate([betas, np.zeros(body.shape_basis.shape[-1] - len(betas))])
@@ -103,7 +103,7 @@ def fit_surface(
 def _surface_step(basis: NDArray, off: NDArray, trust: NDArray, betas: NDArray) -> NDArray[np.float64]:
     """The change of betas and shift that best takes points by `off` [n, 3]; `basis` [n, 3, B] is a beta's effect.
 
-    That joints move with betas too is left to the next round.
+    Joints, which move with the betas too, are updated in the next round.
     """
     count = basis.shape[-1]
     unknowns = np.concatenate([basis, np.broadcast_to(np.eye(3), (len(basis), 3, 3))], -1)
@@ -115,7 +115,7 @@ def _surface_step(basis: NDArray, off: NDArray, trust: NDArray, betas: NDArray) 
 
 
 def vertex_normals(vertices: NDArray, faces: NDArray) -> NDArray[np.float64]:
-    """Unit normals [V, 3], faces' weighted by their areas; zero where no face is."""
+    """Unit normals [V, 3] of vertices, weighted by the areas of faces; zero without faces."""
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     summed = np.stack(

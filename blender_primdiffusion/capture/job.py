@@ -1,4 +1,4 @@
-"""A whole capture: everybody, one after the other, view by view. Its caller owns progress, pace and cancelling."""
+"""A whole capture, subject by subject and view by view. Its caller controls pace and cancelling."""
 
 from __future__ import annotations
 
@@ -15,29 +15,56 @@ import numpy as np
 
 from ..formats.camera_rig import View, bounding_sphere
 from ..formats.capture_layout import claim, complete, view_seed
+from ..motion.files import MotionFileError, read_motion
 from ..motion.motion import Motion
+from ..motion.poses import built_in_poses, pick_poses
 from .body import Body, read_body
-from .inside import cameras_inside
 from .passes import write_passes
-from .poses import choose_poses
 from .report import Report
 from .scan import Scan, ScanFile, load_scan
 from .settings import CaptureSettings
-from .shots import shoot_centres, shoot_colours
-from .stage import Stage
+from .skinned_surface import cameras_inside
+from .stage import Stage, shoot_centres, shoot_colours
 from .subject import Sitting, begin, is_drawn, is_finished, list_subjects, name_reference
 from .surfaces import mark_parts, prepare_materials
+
+
+def choose_poses(settings: CaptureSettings, report: Report) -> Motion:
+    """The poses [F] of a capture, for all subjects: near-T first, then built-in ones or a spread of the files'.
+
+    Subjects stay in place: translations are left out. A file that cannot be used is noted
+    in the report. Raises MotionFileError where none can.
+    """
+    if not settings.pose_files:
+        return _in_place(built_in_poses(settings.pose_count))
+    motions = []
+    for path in settings.pose_files:
+        try:
+            motions.append(read_motion(path))
+            report.notes += [f"{path.name}: {note}" for note in motions[-1].notes]
+        except MotionFileError as error:
+            report.fail("", "poses", str(error))
+    if not motions:
+        raise MotionFileError(
+            f"none of the {len(settings.pose_files)} pose files can be used: {report.failed[-1]['why']}"
+        )
+    return _in_place(pick_poses(motions, settings.pose_count, settings.seed))
+
+
+def _in_place(motion: Motion) -> Motion:
+    return dataclasses.replace(motion, translations=np.zeros_like(motion.translations))
+
 
 _CENTRE_PASSES = frozenset({"depth", "normal", "part"})
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
 class CaptureError(ValueError):
-    """Something that cannot be captured; one sentence."""
+    """A capture is impossible; the message is one sentence."""
 
 
 class Loader(Protocol):
-    """Brings a scan into the context's scene."""
+    """Loads a scan into the context's scene."""
 
     def __call__(self, context: bpy.types.Context, scan_file: ScanFile, body: Body) -> Scan:
         """Raises ScanError."""
@@ -45,22 +72,22 @@ class Loader(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class Progress:
-    """How far a capture is, after a view."""
+class CaptureProgress:
+    """Progress of a capture after a view."""
 
     subject: str
     frame: int
     camera: int
     done: int
-    """Views that need no more work, of this run's `total`."""
+    """Finished views, of this run's `total`."""
     total: int
     eta_s: float | None
-    """Seconds that are left; None until a view has been rendered."""
+    """Seconds left; None until a view has been rendered."""
     news: tuple[str, ...] = ()
-    """Failures and notes since the step before, a line each."""
+    """Failures and notes since the last step, a line each."""
 
 
-Steps = Generator[Progress, None, Report]
+Steps = Generator[CaptureProgress, None, Report]
 
 
 def run(
@@ -73,10 +100,10 @@ def run(
 ) -> Steps:
     """Render the shard's part of `scans` in the poses of the settings, or in given ones, a view a step.
 
-    What is done already is skipped, so the same call goes on after a kill, and ends in the same files. A subject that
-    fails is noted in the report, which the generator returns, and the others go on; closing the generator cancels, and
-    leaves nothing in the file. The user's scene is active between steps. Raises CaptureFolderError, CaptureError for
-    poses that are not finite, MotionFileError where there are no poses, and OSError where there is no room left.
+    Finished views are skipped, so the same call resumes after a kill and ends in the same files. A subject that fails
+    is noted in the report, which the generator returns; closing the generator cancels, and leaves nothing in the file.
+    The user's scene is active between steps. Raises CaptureFolderError, CaptureError for poses that are not finite,
+    MotionFileError where there are no poses, and OSError where the disk is full.
     """
     report = Report() if report is None else report
     poses = choose_poses(settings, report) if poses is None else poses
@@ -84,15 +111,15 @@ def run(
         raise CaptureError(f"the poses of {poses.name} hold numbers that are not finite: leave them out")
     claim(settings.out, settings.about(len(poses)))
     body = read_body(settings.body)
-    everybody = sorted(scans, key=lambda scan: scan.name)
+    ordered = sorted(scans, key=lambda scan: scan.name)
     index, count = settings.shard
-    mine = everybody[index::count]
+    mine = ordered[index::count]
     clock = _Clock(len(mine) * len(poses) * settings.camera_count, report)
-    clock.tell(*(f"{failure['what']}: {failure['why']}" for failure in report.failed))
+    clock.note(*(f"{failure['what']}: {failure['why']}" for failure in report.failed))
     try:
         for scan_file in mine:
             yield from _try_subject(context, settings, scan_file, poses, body, load, clock)
-            if settings.released_reference and scan_file is everybody[0] and scan_file.name in report.done:
+            if settings.released_reference and scan_file is ordered[0] and scan_file.name in report.done:
                 name_reference(settings.out, scan_file.name)
             report.write(settings.out, settings.shard)
     finally:
@@ -101,7 +128,9 @@ def run(
     return report
 
 
-def _try_subject(context, settings, scan_file, poses, body, load, clock: _Clock) -> Generator[Progress, None, None]:
+def _try_subject(
+    context, settings, scan_file, poses, body, load, clock: _Clock
+) -> Generator[CaptureProgress, None, None]:
     folder, report = settings.out / scan_file.name, clock.report
     clock.begin(scan_file.name)
     views = len(poses) * settings.camera_count
@@ -115,27 +144,27 @@ def _try_subject(context, settings, scan_file, poses, body, load, clock: _Clock)
         report.done.append(scan_file.name)
         list_subjects(settings.out)
     except OSError as error:
-        clock.tell(report.fail(scan_file.name, "capture", str(error)))
+        clock.note(report.fail(scan_file.name, "capture", str(error)))
         if error.errno in _NO_ROOM:
             raise
-    except Exception as error:  # a batch of days must not end for one scan, whatever is wrong with it
+    except Exception as error:  # one bad scan must not end a batch of days
         known = isinstance(error, (ValueError, RuntimeError))
         why = str(error) if known and str(error) else f"{type(error).__name__}: {error}"
-        clock.tell(report.fail(scan_file.name, "capture", why))
+        clock.note(report.fail(scan_file.name, "capture", why))
     yield clock.skip_rest(views)
 
 
-def _capture(context, settings, scan_file, poses, body, load, clock: _Clock) -> Generator[Progress, None, None]:
+def _capture(context, settings, scan_file, poses, body, load, clock: _Clock) -> Generator[CaptureProgress, None, None]:
     folder = settings.out / scan_file.name
     with contextlib.closing(Stage(context, settings)) as stage:
-        clock.tell_once(stage.device_note)
+        clock.note_once(stage.device_note)
         with stage.entered() as own:
             scan = load(own, scan_file, body)
-            clock.tell(*(f"{scan_file.name}: {note}" for note in scan.notes))
-            for thing in scan.objects:
-                mark_parts(thing, scan.joint_of_group)
+            clock.note(*(f"{scan_file.name}: {note}" for note in scan.notes))
+            for obj in scan.objects:
+                mark_parts(obj, scan.joint_of_group)
             prepare_materials(scan.objects, unlit=settings.light == "uniform")
-            views = list(settings.cameras) or _views_about(scan, settings, poses)
+            views = list(settings.cameras) or _views_around(scan, settings, poses)
             joints = np.stack([scan.pose(*pose) for pose in zip(poses.rotations, poses.translations, strict=True)])
         begin(folder, Sitting(scan.betas, poses, joints, views), settings.layouts)
         for frame in range(len(poses)):
@@ -143,7 +172,7 @@ def _capture(context, settings, scan_file, poses, body, load, clock: _Clock) -> 
             if missing:
                 with stage.entered() as own:
                     scan.pose(poses.rotations[frame], poses.translations[frame])
-                    _refuse_inside(scan, own, views, frame)
+                    _check_outside(scan, own, views, frame)
             for camera, view in enumerate(views):
                 if camera in missing:
                     with clock.rendering():
@@ -151,15 +180,15 @@ def _capture(context, settings, scan_file, poses, body, load, clock: _Clock) -> 
                 yield clock.step(frame, camera)
 
 
-def _views_about(scan: Scan, settings: CaptureSettings, poses: Motion) -> list[View]:
+def _views_around(scan: Scan, settings: CaptureSettings, poses: Motion) -> list[View]:
     return settings.rig.views(*bounding_sphere(scan.bounds(poses.rotations, poses.translations)))
 
 
-def _refuse_inside(scan: Scan, context: bpy.types.Context, views: list[View], frame: int) -> None:
+def _check_outside(scan: Scan, context: bpy.types.Context, views: list[View], frame: int) -> None:
     inside = cameras_inside(scan.objects, context.evaluated_depsgraph_get(), views)
     if inside:
         raise CaptureError(
-            f"camera {inside[0]} is inside the person in frame {frame}: move it away, or give the rig a larger margin"
+            f"camera {inside[0]} is inside the human in frame {frame}: move it away, or give the rig a larger margin"
         )
 
 
@@ -172,14 +201,14 @@ def _shoot(stage: Stage, settings: CaptureSettings, folder: Path, view: View, wh
 
 
 class _Clock:
-    """Counts views, times those that are rendered, and keeps news until the next step."""
+    """Counts views, times renders, and collects notes until the next step."""
 
     def __init__(self, total: int, report: Report):
         self.report = report
         self._total, self._done, self._rendered, self._seconds = total, 0, 0, 0.0
         self._subject, self._of_subject = "", 0
         self._news: list[str] = []
-        self._told: set[str] = set()
+        self._noted: set[str] = set()
 
     def begin(self, subject: str) -> None:
         self._subject, self._of_subject = subject, 0
@@ -191,27 +220,27 @@ class _Clock:
         self._seconds += time.monotonic() - began
         self._rendered += 1
 
-    def tell(self, *news: str) -> None:
+    def note(self, *news: str) -> None:
         self._news += news
 
-    def tell_once(self, news: str) -> None:
-        if news not in self._told:
-            self._told.add(news)
-            self.tell(news)
+    def note_once(self, news: str) -> None:
+        if news not in self._noted:
+            self._noted.add(news)
+            self.note(news)
 
-    def step(self, frame: int, camera: int) -> Progress:
+    def step(self, frame: int, camera: int) -> CaptureProgress:
         self._done += 1
         self._of_subject += 1
         return self._progress(frame, camera)
 
-    def skip_rest(self, views: int) -> Progress:
-        """The subject, of so many views, needs no more work."""
+    def skip_rest(self, views: int) -> CaptureProgress:
+        """Count the subject's remaining views as done."""
         self._done += views - self._of_subject
         self._of_subject = views
         return self._progress(-1, -1)
 
-    def _progress(self, frame: int, camera: int) -> Progress:
+    def _progress(self, frame: int, camera: int) -> CaptureProgress:
         left = self._total - self._done
         eta_s = left * self._seconds / self._rendered if self._rendered else None
         news, self._news = tuple(self._news), []
-        return Progress(self._subject, frame, camera, self._done, self._total, eta_s, news)
+        return CaptureProgress(self._subject, frame, camera, self._done, self._total, eta_s, news)

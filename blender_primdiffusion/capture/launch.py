@@ -26,7 +26,7 @@ def run_command() -> int:
 
 def leave(code: int) -> NoReturn:
     """End the process without Blender's own end: 4.5 as a module hangs there while a thread waits for stdin."""
-    import bpy
+    import bpy  # this script finds the package before
 
     sys.stdout.flush()
     sys.stderr.flush()

@@ -1,45 +1,38 @@
-"""The words of the command `capture`, what they ask for, and how it answers programs."""
+"""The options of the command `capture`, and its output for programs."""
 
 from __future__ import annotations
 
+import argparse
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, get_args
+from typing import NoReturn, get_args
 
 import numpy as np
 
+from ..console import UsageError
 from ..formats.camera_rig import Arrangement, Rig, View
 from .blender_camera import CameraError
 from .names import LAYOUTS, PASSES
 from .settings import Background, CaptureSettings, Device, Light
-
-if TYPE_CHECKING:
-    import argparse  # takes a fifth of what registering may take; imported where it is used
 
 MARK = "PRIMDIFFUSION "
 """Begins each line of --progress json; an object follows: {"line": ...}, or the fields of `job.Progress`."""
 _POSE_ENDINGS = (".npz", ".npy", ".json", ".bvh")
 
 
-class UsageError(ValueError):
-    """Words that the command does not understand."""
-
-
 def parser() -> argparse.ArgumentParser:
     """All options of the command, with their defaults."""
-    import argparse
-
     rig = Rig()
     made = argparse.ArgumentParser(
         prog="capture", description="Render people from all sides in Cycles, into a dataset."
     )
-    made.error = _refuse
+    made.error = _raise_usage_error
     add = made.add_argument
     add("--people", type=Path, nargs="+", default=[], help="folders of scans, or of what `primdiffusion people` made")
-    add("--out", type=Path, required=True, help="the dataset's folder; one begun before is gone on with")
+    add("--out", type=Path, required=True, help="the dataset's folder; an unfinished one is resumed")
     add("--seed", type=int, default=0)
-    add("--only", nargs="+", default=[], metavar="SUBJECT", help="just these people")
+    add("--only", nargs="+", default=[], metavar="SUBJECT", help="only these subjects")
     add("--shard", type=_shard, default=(0, 1), metavar="I/N", help="the people I, I + N, ... of the sorted list")
     add("--body", type=Path, help="an SMPL body as .npz of plain arrays instead of the default one")
     add("--pose-files", type=Path, nargs="+", default=[], help="AMASS or pose .npz, .npy, .json, .bvh, or folders")
@@ -50,9 +43,7 @@ def parser() -> argparse.ArgumentParser:
     add("--fov", type=float, default=rig.vertical_fov, help="vertical, degrees (default %(default)s)")
     add("--size", type=int, nargs=2, default=(rig.width, rig.height), metavar=("WIDTH", "HEIGHT"))
     add("--margin", type=float, default=rig.margin, help="room around people (default %(default)s)")
-    add(
-        "--camera-file", type=Path, help='cameras that stand still: {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}'
-    )
+    add("--camera-file", type=Path, help='fixed cameras: {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}')
     add("--passes", nargs="+", default=PASSES, choices=PASSES)
     add("--light", choices=get_args(Light), default="uniform")
     add("--hdri", type=Path, help="the picture of --light hdri")
@@ -67,9 +58,9 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="the first subject also under the name the released code needs",
     )
-    add("--list", action="store_true", help="name the people of the shard, render nothing")
+    add("--list", action="store_true", help="list the subjects of the shard, render nothing")
     add("--verify", action="store_true", help="check the dataset, render nothing")
-    add("--repair", action="store_true", help="with --verify: take away what is damaged; without: then render it anew")
+    add("--repair", action="store_true", help="with --verify: remove damaged files; without: then render them again")
     add("--progress", choices=("text", "json", "none"), default="text", help="on stdout")
     add("--while-stdin", action="store_true", help="stop when stdin ends: for programs that start this one")
     return made
@@ -146,13 +137,11 @@ def _files_of_poses(paths: Sequence[Path]) -> Iterator[Path]:
         yield from found
 
 
-def _refuse(message: str) -> NoReturn:
+def _raise_usage_error(message: str) -> NoReturn:
     raise UsageError(message)
 
 
 def _shard(text: str) -> tuple[int, int]:
-    import argparse
-
     index, _, count = text.partition("/")
     if not (index.isdigit() and count.isdigit() and int(index) < int(count)):
         raise argparse.ArgumentTypeError(f"{text!r} is no shard: 0/4 is the first of four")

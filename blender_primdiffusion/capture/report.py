@@ -1,4 +1,4 @@
-"""What became of everybody in a batch, on disk while it goes on."""
+"""The report of a batch, written to disk while it runs."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from ..formats.capture_layout import replacing
 
 @dataclasses.dataclass
 class Report:
-    """Grows while a batch is rendered."""
+    """Results of a batch so far."""
 
     done: list[str] = dataclasses.field(default_factory=list)
     """Subjects that were finished now."""
     failed: list[dict[str, str]] = dataclasses.field(default_factory=list)
-    """Of each failure: subject (empty where it was none's), what was tried, and why it did not succeed."""
+    """For each failure: subject (empty for none), what was tried, and why it failed."""
     skipped: list[str] = dataclasses.field(default_factory=list)
     """Subjects that were finished before."""
     notes: list[str] = dataclasses.field(default_factory=list)
-    """What was found out about scans and poses, a sentence each."""
+    """Notes on scans and poses, a sentence each."""
 
     def fail(self, subject: str, what: str, why: str) -> str:
         """Note a failure; returns it as one line."""
@@ -35,5 +35,5 @@ class Report:
 
 
 def report_path(root: Path, shard: tuple[int, int]) -> Path:
-    """Where the report of a shard lies."""
+    """Path of a shard's report."""
     return root / ("report.json" if shard[1] == 1 else f"report-{shard[0]}-of-{shard[1]}.json")

@@ -1,7 +1,8 @@
-"""Armatures of imported people: which one, at rest, where its bones are, and what hangs on it."""
+"""Rigs of imported humans: their armatures at rest, and any rig as a chain of bones posed by SMPL's joint rotations."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 
 import bpy
@@ -9,15 +10,98 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ..formats.joints import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES, PARENTS
+from ..motion.skeleton import chain
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
 from .scan_files import ScanError, ScanFile
-from .skeleton import Skeleton
 
 
-def find_armature(things: Sequence[bpy.types.Object], scan_file: ScanFile) -> bpy.types.Object | None:
+@dataclasses.dataclass(frozen=True, eq=False)
+class RigSkeleton:
+    """A rig at rest in the world; metres, y up, facing +z."""
+
+    names: list[str]
+    """Of the bones, parents first [N]."""
+    parents: list[int]
+    """Of each bone, -1 for a root."""
+    heads: NDArray[np.float64]
+    """[N, 3]."""
+    axes: NDArray[np.float64]
+    """World from the bone's own axes, rotations [N, 3, 3]."""
+    joint: NDArray[np.int64]
+    """The SMPL joint that each bone is [N]; -1 for fingers, twists and the like, which stay with their parents."""
+    at_rest: NDArray[np.float64]
+    """How each part is turned from SMPL's rest to the rig's [24, 3, 3] (`motion.rigs`)."""
+    body_joints: NDArray[np.float64]
+    """The fitted body's joints at SMPL's rest [24, 3]: the whole turns about its pelvis."""
+
+    def transforms(self, rotations: NDArray, translation: NDArray) -> NDArray[np.float64]:
+        """What each bone does to points of the rig's rest [N, 4, 4] in a pose of SMPL's joints.
+
+        A bone that is joint j turns by G_j A_j^T: back from the rig's rest to SMPL's, then as SMPL's joint in the
+        world. Its head goes where its parent takes it; bones without a posed parent go where the body's pelvis does.
+        """
+        world = chain(np.asarray(rotations, np.float64))
+        moves = world @ np.swapaxes(self.at_rest, -1, -2)
+        out = np.tile(np.eye(4), (len(self.names), 1, 1))
+        pelvis = self.body_joints[0]
+        for bone, parent in enumerate(self.parents):
+            joint = self.joint[bone]
+            if parent >= 0:
+                out[bone] = out[parent]
+            if joint < 0:
+                continue
+            out[bone, :3, :3] = moves[joint]
+            if self.is_top(bone):
+                head = pelvis + world[0] @ (self.heads[bone] - pelvis) + translation
+            else:
+                head = out[parent, :3, :3] @ self.heads[bone] + out[parent, :3, 3]
+            out[bone, :3, 3] = head - moves[joint] @ self.heads[bone]
+        return out
+
+    def is_top(self, bone: int) -> bool:
+        """Whether a bone is a joint and none above it is."""
+        if self.joint[bone] < 0:
+            return False
+        above = self.parents[bone]
+        while above >= 0:
+            if self.joint[above] >= 0:
+                return False
+            above = self.parents[above]
+        return True
+
+    def joints(self, transforms: NDArray) -> NDArray[np.float64]:
+        """The 24 joints [24, 3]: the bones' heads, and for joints that the rig lacks the body's, off their parents."""
+        bone_of = {int(joint): bone for bone, joint in enumerate(self.joint) if joint >= 0}
+        places = np.zeros((len(JOINT_NAMES), 3))
+        carrier = list(range(len(JOINT_NAMES)))
+        for joint, parent in enumerate(PARENTS):
+            bone = bone_of.get(joint)
+            if bone is not None:
+                places[joint] = transforms[bone, :3, :3] @ self.heads[bone] + transforms[bone, :3, 3]
+                continue
+            carrier[joint] = carrier[parent]
+            turn = transforms[bone_of[carrier[joint]], :3, :3] @ self.at_rest[carrier[joint]]
+            places[joint] = places[parent] + turn @ (self.body_joints[joint] - self.body_joints[parent])
+        return places
+
+    def bases(self, transforms: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Turns [N, 3, 3] of the pose bones in their own axes, and displacements [N, 3] of the tops, metres."""
+        identity = np.eye(4)
+        above = np.array([transforms[p] if p >= 0 else identity for p in self.parents])
+        inverse = np.swapaxes(above[:, :3, :3], -1, -2)
+        own = np.swapaxes(self.axes, -1, -2)
+        turns = own @ inverse @ transforms[:, :3, :3] @ self.axes
+        here = (transforms[:, :3, :3] @ self.heads[..., None])[..., 0] + transforms[:, :3, 3]
+        carried = (above[:, :3, :3] @ self.heads[..., None])[..., 0] + above[:, :3, 3]
+        moves = (own @ inverse @ (here - carried)[..., None])[..., 0]
+        tops = np.array([self.is_top(bone) for bone in range(len(self.names))])
+        return turns, np.where(tops[:, None], moves, 0.0)
+
+
+def find_armature(objects: Sequence[bpy.types.Object], scan_file: ScanFile) -> bpy.types.Object | None:
     """The armature that moves meshes; None where none does. Raises ScanError where several do."""
-    used = {armature for thing in things if thing.type == "MESH" for armature in [moved_by(thing)] if armature}
+    used = {armature for obj in objects if obj.type == "MESH" for armature in [moved_by(obj)] if armature}
     if len(used) > 1:
         names = ", ".join(sorted(armature.name for armature in used))
         raise ScanError(
@@ -27,7 +111,7 @@ def find_armature(things: Sequence[bpy.types.Object], scan_file: ScanFile) -> bp
 
 
 def moved_by(mesh: bpy.types.Object) -> bpy.types.Object | None:
-    """The armature that a mesh follows, by a modifier or as a child of it or of one of its bones."""
+    """The armature that a mesh follows, by a modifier or as a child of one of its bones."""
     for modifier in mesh.modifiers:
         if modifier.type == "ARMATURE" and modifier.object is not None:
             return modifier.object
@@ -40,10 +124,10 @@ def moved_by(mesh: bpy.types.Object) -> bpy.types.Object | None:
 
 
 def split_meshes(
-    things: Sequence[bpy.types.Object], scan_file: ScanFile
+    objects: Sequence[bpy.types.Object], scan_file: ScanFile
 ) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:
     """Meshes with faces that follow the armature, and those that do not. Raises ScanError where no mesh has a face."""
-    meshes = [thing for thing in things if thing.type == "MESH" and len(thing.data.polygons)]
+    meshes = [obj for obj in objects if obj.type == "MESH" and len(obj.data.polygons)]
     if not meshes:
         raise ScanError(f"{scan_file.path} holds no surface: export the person's mesh, not only its skeleton or points")
     moving = [mesh for mesh in meshes if moved_by(mesh) is not None]
@@ -73,13 +157,13 @@ def set_at_rest(armature: bpy.types.Object, meshes: Sequence[bpy.types.Object]) 
 
 
 def free_bones(armature: bpy.types.Object, names: Sequence[str]) -> None:
-    """Let bones move off their parents' ends, where the rig glues them on."""
-    glued = [name for name in names if armature.data.bones[name].use_connect]
-    if not glued:
+    """Disconnect bones from the ends of their parents."""
+    connected = [name for name in names if armature.data.bones[name].use_connect]
+    if not connected:
         return
     bpy.context.view_layer.objects.active = armature
     bpy.ops.object.mode_set(mode="EDIT")
-    for name in glued:
+    for name in connected:
         armature.data.edit_bones[name].use_connect = False
     bpy.ops.object.mode_set(mode="OBJECT")
 
@@ -100,7 +184,7 @@ def to_backend(places: Mapping[str, NDArray]) -> dict[str, NDArray[np.float64]]:
 
 def skeleton_of(
     armature: bpy.types.Object, joints: Mapping[str, str], at_rest: NDArray, body_joints: NDArray
-) -> Skeleton:
+) -> RigSkeleton:
     """The armature at rest in the world, whose bones `joints` (SMPL's name -> the bone's) are SMPL's."""
     joint_of = {bone: JOINT_NAMES.index(joint) for joint, bone in joints.items()}
     bones = _parents_first(armature)
@@ -108,7 +192,7 @@ def skeleton_of(
     world = np.array(armature.matrix_world)
     turn = BLENDER_FROM_BACKEND.T @ world[:3, :3] / uniform_scale(armature)
     rest = np.array([np.array(bone.matrix_local) for bone in bones])
-    return Skeleton(
+    return RigSkeleton(
         names=names,
         parents=[names.index(bone.parent.name) if bone.parent is not None else -1 for bone in bones],
         heads=points_to_backend(rest[:, :3, 3] @ world[:3, :3].T + world[:3, 3]),
@@ -125,14 +209,14 @@ def uniform_scale(armature: bpy.types.Object) -> float:
 
 
 def add_root(
-    context: bpy.types.Context, things: Sequence[bpy.types.Object], name: str, placing: NDArray
+    context: bpy.types.Context, objects: Sequence[bpy.types.Object], name: str, placing: NDArray
 ) -> bpy.types.Object:
-    """An empty above all that has no parent yet, which moves everything by `placing` [4, 4] in the world."""
+    """An empty as parent of all objects without one, which moves everything by `placing` [4, 4] in the world."""
     root = bpy.data.objects.new(f"{name} root", None)
     context.scene.collection.objects.link(root)
-    for thing in things:
-        if thing.parent is None:
-            thing.parent = root
+    for obj in objects:
+        if obj.parent is None:
+            obj.parent = root
     root.matrix_world = Matrix(placing.tolist())
     context.view_layer.update()
     return root
@@ -147,6 +231,6 @@ def affine(linear: NDArray, shift: NDArray) -> NDArray[np.float64]:
 
 def _parents_first(armature: bpy.types.Object) -> list[bpy.types.Bone]:
     ordered = [bone for bone in armature.data.bones if bone.parent is None]
-    for bone in ordered:  # grows while it is walked through
+    for bone in ordered:  # grows while it is iterated
         ordered.extend(bone.children)
     return ordered

@@ -1,4 +1,4 @@
-"""Scans of people in the scene, posed by SMPL's joint rotations whatever rig they came with."""
+"""Scans in the scene, posed by SMPL's joint rotations whatever their rig."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from ..formats.joints import JOINT_NAMES
 from ..motion.rigs import BoneMap, facing, map_bones, rig_from_smpl
 from ..motion.rotation import to_axis_angle
 from ..scene.convention import matrix_to_quaternion, points_to_blender
-from .belongings import Belongings
 from .bind import bind_static
 from .body import Body
 from .fit import ShapeFit, fit_joints
-from .importing import import_file
+from .registration import stand_up
 from .rigged import (
+    RigSkeleton,
     add_root,
     affine,
     bone_heads,
@@ -30,11 +30,10 @@ from .rigged import (
     to_backend,
     uniform_scale,
 )
-from .scan_files import ScanError, ScanFile, find_scans, own_betas
-from .skeleton import Skeleton
+from .scan_files import ScanError, ScanFile, find_scans, import_file, own_betas
 from .skinned_surface import SkinnedSurface, mesh_points, skinned_surface
-from .textures import complete_colours
-from .upright import stand_up
+from .stage import AddedData
+from .surfaces import complete_colours
 
 __all__ = ["Scan", "ScanError", "ScanFile", "find_scans", "load_scan"]
 
@@ -47,18 +46,18 @@ _OWN_NAMES = {name: name for name in JOINT_NAMES}
 
 
 class Scan:
-    """A person in the scene. `remove` it: its data-blocks stay in the file until then."""
+    """A scan in the scene. Its data-blocks stay in the file until `remove`."""
 
     def __init__(
         self,
         name: str,
         objects: Sequence[bpy.types.Object],
         armature: bpy.types.Object,
-        skeleton: Skeleton,
+        skeleton: RigSkeleton,
         betas: NDArray,
         body: str,
         notes: Sequence[str],
-        belongings: Belongings,
+        added: AddedData,
     ) -> None:
         self.name = name
         self.objects = list(objects)
@@ -66,12 +65,12 @@ class Scan:
         self.armature = armature
         self.skeleton = skeleton
         self.betas: NDArray[np.float64] = np.asarray(betas, np.float64)
-        """Shape of the body that stands for the person [10]."""
+        """Shape of the fitted body [10]."""
         self.body = body
         """Name of that body."""
         self.notes = list(notes)
-        """What was found out and done on loading, a sentence each."""
-        self._belongings = belongings
+        """What was found and done on loading, a sentence each."""
+        self._added = added
         self._surface: SkinnedSurface = skinned_surface(self.objects, skeleton.names)
 
     def pose(self, rotations: NDArray, translation: NDArray) -> NDArray[np.float64]:
@@ -107,42 +106,42 @@ class Scan:
         return None
 
     def remove(self) -> None:
-        """Take everything that loading made out of the file."""
-        self._belongings.remove()
+        """Remove everything that loading has added to the file."""
+        self._added.remove()
 
 
 def load_scan(context: bpy.types.Context, scan_file: ScanFile, body: Body) -> Scan:
     """Import a person into the context's scene: upright, facing forward, in metres, ready to be posed.
 
     A skinned person keeps its rig; `body` is fitted to its joints. A person without a rig needs SMPL parameters of
-    `body` beside it and gets a rig. Raises ScanError, and then nothing of it stays in the file.
+    `body` beside it and gets a rig. Raises ScanError, and then leaves nothing in the file.
     """
-    belongings = Belongings()
+    added = AddedData()
     try:
-        with belongings:
-            things = import_file(scan_file.path)
-            armature = find_armature(things, scan_file)
+        with added:
+            objects = import_file(scan_file.path)
+            armature = find_armature(objects, scan_file)
             if armature is None:
-                return _load_static(context, scan_file, body, things, belongings)
-            return _load_rigged(context, scan_file, body, things, armature, belongings)
+                return _load_static(context, scan_file, body, objects, added)
+            return _load_rigged(context, scan_file, body, objects, armature, added)
     except BaseException:
-        belongings.remove()
+        added.remove()
         raise
 
 
-def _load_static(context, scan_file: ScanFile, body: Body, things, belongings: Belongings) -> Scan:
+def _load_static(context, scan_file: ScanFile, body: Body, objects, added: AddedData) -> Scan:
     """A scan without a rig: bound to the body in the pose of its parameters, and brought back to rest."""
-    moving, still = split_meshes(things, scan_file)
+    moving, still = split_meshes(objects, scan_file)
     meshes = [*moving, *still]
     bound = bind_static(context, scan_file, body, meshes)
-    _discard(things, meshes)
+    _discard(objects, meshes)
     notes = [*bound.notes, *complete_colours(meshes, scan_file.path)]
     skeleton = skeleton_of(bound.armature, _OWN_NAMES, _no_turns(), body.rest(bound.betas)[1])
-    return Scan(scan_file.name, meshes, bound.armature, skeleton, bound.betas, body.name, notes, belongings)
+    return Scan(scan_file.name, meshes, bound.armature, skeleton, bound.betas, body.name, notes, added)
 
 
-def _load_rigged(context, scan_file: ScanFile, body: Body, things, armature, belongings: Belongings) -> Scan:
-    meshes, loose = split_meshes(things, scan_file)
+def _load_rigged(context, scan_file: ScanFile, body: Body, objects, armature, added: AddedData) -> Scan:
+    meshes, loose = split_meshes(objects, scan_file)
     set_at_rest(armature, meshes)
     try:
         bones = map_bones([bone.name for bone in armature.data.bones])
@@ -151,27 +150,27 @@ def _load_rigged(context, scan_file: ScanFile, body: Body, things, armature, bel
         raise ScanError(f"{scan_file.path}: {e}") from e
     free_bones(armature, list(bones.joints.values()))
     standing = stand_up(axes, mesh_points(meshes), str(scan_file.path))
-    root = add_root(context, things, scan_file.name, affine(standing.rotation * standing.scale, np.zeros(3)))
-    skeleton, betas, told = _fit_rig(context, root, armature, bones, scan_file, body)
-    notes = [*standing.notes, *told]
+    root = add_root(context, objects, scan_file.name, affine(standing.rotation * standing.scale, np.zeros(3)))
+    skeleton, betas, fit_notes = _fit_rig(context, root, armature, bones, scan_file, body)
+    notes = [*standing.notes, *fit_notes]
     if bones.rig != "SMPL":
         notes.append(f"bones as {bones.rig} names them")
     if loose:
         notes.append(f"left out, as no bone moves it: {', '.join(mesh.name for mesh in loose)}")
-    _discard(things, [*meshes, armature])
+    _discard(objects, [*meshes, armature])
     notes += complete_colours(meshes, scan_file.path)
-    return Scan(scan_file.name, meshes, armature, skeleton, betas, body.name, notes, belongings)
+    return Scan(scan_file.name, meshes, armature, skeleton, betas, body.name, notes, added)
 
 
 def _fit_rig(context, root, armature, bones: BoneMap, scan_file: ScanFile, body: Body):
-    """The rig as a skeleton, moved to where the body of its person is at rest; that body's betas; notes."""
+    """The rig as a skeleton, moved onto the fitted body at rest; the betas of that body; notes."""
     heads, tips = to_backend(bone_heads(armature, bones.joints)), to_backend(bone_heads(armature, bones.tips))
     known = own_betas(scan_file.path)
     if known is not None and known[1] == body.name:
         joints = body.rest(np.array(known[0]))[1]
         if all(np.abs(heads[name] - joints[JOINT_NAMES.index(name)]).max() < _EXACT_M for name in heads):
             skeleton = skeleton_of(armature, bones.joints, _no_turns(), joints)
-            return skeleton, np.array(known[0]), ["shape as its file tells"]
+            return skeleton, np.array(known[0]), ["shape as stated in its file"]
     rest_joints = body.rest(np.zeros(0))[1]
     for _ in range(_ROUNDS):
         at_rest = rig_from_smpl(heads, tips, rest_joints)
@@ -190,7 +189,7 @@ def _fit_rig(context, root, armature, bones: BoneMap, scan_file: ScanFile, body:
 def _fit_notes(fit: ShapeFit, at_rest: NDArray) -> list[str]:
     notes = [f"shape fitted to its joints, {fit.residual * 1000:.0f} mm off on average"]
     if fit.residual > _POOR_FIT_M:
-        notes.append("no body is like this person: masks and pictures are right, the parameters only nearly")
+        notes.append("no body fits well: masks and pictures are exact, the parameters only approximate")
     if abs(fit.scale - 1) > 0.005:
         notes.append(f"scaled by {fit.scale:.2f} to the size of a body")
     if _largest_turn(at_rest) > _T_REST_DEG:
@@ -208,14 +207,14 @@ def _no_turns() -> NDArray[np.float64]:
     return np.tile(np.eye(3), (len(JOINT_NAMES), 1, 1))
 
 
-def _discard(things: Sequence[bpy.types.Object], kept: Sequence[bpy.types.Object]) -> None:
-    """Remove imported objects that are not the person: cameras, lights, leftover meshes; parents stay."""
+def _discard(objects: Sequence[bpy.types.Object], keep: Sequence[bpy.types.Object]) -> None:
+    """Remove imported objects that are not part of the human: cameras, lights, stray meshes; parents stay."""
     parents = set()
-    for thing in kept:
-        above = thing.parent
+    for obj in keep:
+        above = obj.parent
         while above is not None:
             parents.add(above)
             above = above.parent
-    for thing in things:
-        if thing not in kept and thing not in parents:
-            bpy.data.objects.remove(thing)
+    for obj in objects:
+        if obj not in keep and obj not in parents:
+            bpy.data.objects.remove(obj)

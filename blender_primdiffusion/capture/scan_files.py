@@ -1,4 +1,4 @@
-"""Scans on disk: which files of a folder are people, by what names they go, and where their parameters are."""
+"""Scans on disk: which files of a folder are humans, their import, and the SMPL parameters beside them."""
 
 from __future__ import annotations
 
@@ -10,24 +10,31 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..formats.arrays import ArrayFileError, array_names, read_arrays
+from ..motion.files import POSE_KEYS, MotionFileError, motion_from_arrays
+
 ENDINGS = (".glb", ".gltf", ".fbx", ".obj")
-"""Files that hold a person; of several with one name in a folder the first of these counts."""
+"""Files of scans; of several with the same name in a folder, the first of these is used."""
 _GENERIC = {"person", "model", "scan", "mesh", "scene", "body", "human", "untitled", "object"}
-"""Names that say nothing: the folder's name serves."""
+"""Generic names: the folder's name is used instead."""
 _RELEASED = ("outputs_re_fitting/refit_smpl_2nd_plain.npz", "refit_smpl_2nd_plain.npz")
 _LARGEST_JSON = 64 * 2**20
 
 
 class ScanError(ValueError):
-    """A scan that cannot be used; one sentence: what is wrong, what was given, what to do."""
+    """A scan cannot be used; the message is one sentence."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ScanFile:
-    """One person on disk."""
+    """One human on disk."""
 
     name: str
-    """The subject's: `[A-Za-z0-9._-]+`, not starting with a dot, unlike the others'."""
+    """Name of the subject: unique, `[A-Za-z0-9._-]+`, not starting with a dot."""
     path: Path
     """The .glb, .gltf, .fbx or .obj."""
     parameters: Path | None
@@ -35,9 +42,9 @@ class ScanFile:
 
 
 def find_scans(folder: Path | str) -> list[ScanFile]:
-    """The people in a folder and its folders, sorted by path; or the one that a file is.
+    """The scans in a folder and below, sorted by path; or the one in a file.
 
-    Hidden folders are left out. Raises ScanError where the folder is missing or holds nobody.
+    Hidden folders are left out. Raises ScanError where the folder is missing or holds no scan.
     """
     folder = Path(folder)
     if folder.is_file():
@@ -63,7 +70,7 @@ def find_scans(folder: Path | str) -> list[ScanFile]:
     for path in sorted(chosen.values()):
         name, number = _slug(path), 1
         unlike = name
-        while unlike.lower() in taken:  # file systems that ignore case must not mix two subjects
+        while unlike.lower() in taken:  # some file systems ignore case
             number += 1
             unlike = f"{name}_{number}"
         taken.add(unlike.lower())
@@ -72,7 +79,7 @@ def find_scans(folder: Path | str) -> list[ScanFile]:
 
 
 def own_betas(path: Path) -> tuple[list[float], str] | None:
-    """Betas and the body's name that the backend's people carry in their .glb; None in other files."""
+    """Betas and the name of the body, which the backend writes into its .glb files; None for other files."""
     if path.suffix.lower() != ".glb":
         return None
     try:
@@ -91,7 +98,7 @@ def own_betas(path: Path) -> tuple[list[float], str] | None:
 
 
 def _models(folder: Path) -> Iterator[Path]:
-    """Files of scans, sorted; linked folders are gone into, each folder once."""
+    """Files of scans, sorted; follows linked folders, each folder once."""
     entered = set()
     for inner, folders, names in os.walk(folder, followlinks=True):
         if os.path.realpath(inner) in entered:
@@ -125,3 +132,105 @@ def _parameters(path: Path) -> Path | None:
     beside = [other for other in path.parent.iterdir() if other.suffix.lower() == ".npz"]
     models = {other.stem for other in path.parent.iterdir() if other.suffix.lower() in ENDINGS}
     return beside[0] if len(beside) == 1 and len(models) == 1 else None
+
+
+def import_file(path: Path) -> list[bpy.types.Object]:
+    """Import a .glb, .gltf, .fbx or .obj into the scene; its objects. Raises ScanError where Blender cannot read it."""
+    if not path.is_file():
+        raise ScanError(f"there is no scan {path}: check the path")
+    before = {obj.session_uid for obj in bpy.data.objects}
+    importers = {".glb": _import_gltf, ".gltf": _import_gltf, ".fbx": _import_fbx, ".obj": _import_obj}
+    try:
+        importers[path.suffix.lower()](str(path))
+    except Exception as e:  # Python importers raise anything on damaged files
+        raise ScanError(f"{path} cannot be imported: {_last_line(e)}; export it again") from e
+    return [obj for obj in bpy.data.objects if obj.session_uid not in before]
+
+
+def _import_gltf(path: str) -> None:
+    bpy.ops.import_scene.gltf(filepath=path, disable_bone_shape=True, bone_heuristic="BLENDER")
+
+
+def _import_fbx(path: str) -> None:
+    try:
+        bpy.ops.wm.fbx_import(filepath=path, use_anim=False)
+    except RuntimeError:  # the older importer reads some files that the newer one rejects
+        bpy.ops.import_scene.fbx(filepath=path, use_anim=False)
+
+
+def _import_obj(path: str) -> None:
+    bpy.ops.wm.obj_import(filepath=path)
+
+
+def _last_line(error: Exception) -> str:
+    """The exception at the end of an importer's traceback, without Blender's location."""
+    lines = [line.strip() for line in str(error).splitlines()]
+    lines = [line for line in lines if line and not line.startswith("Location: ")]
+    return (lines[-1] if lines else type(error).__name__).removeprefix("Error: ")
+
+
+_SHAPE_KEYS = ("betas", "shape", "beta")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Parameters:
+    """A posed body: x = scale * body(betas, rotations) + translation."""
+
+    betas: NDArray[np.float64]
+    """[n]."""
+    rotations: NDArray[np.float64]
+    """[24, 3, 3]."""
+    translation: NDArray[np.float64]
+    """[3], the scan's units."""
+    scale: float
+    body: str
+    """Name of the body that the betas belong to; empty where the file does not state it."""
+    notes: list[str]
+
+
+def read_parameters(scan_file: ScanFile) -> Parameters:
+    """The parameters of a scan; of several frames the first.
+
+    The .npz of plain arrays has `global_orient` and `body_pose` (or `pose`, `poses`), `betas`, and if wanted `transl`
+    or `trans`, `scale`, and `body`, the name of the body whose shape `betas` are. Raises ScanError where it is missing
+    or holds something else.
+    """
+    path = scan_file.parameters
+    if path is None:
+        pickled = [e for e in (".pkl", ".pickle") if scan_file.path.with_suffix(e).is_file()]
+        hint = "; pickles are never read, save it as .npz of plain arrays" if pickled else ""
+        raise ScanError(
+            f"{scan_file.path} has no skeleton, and no SMPL parameters are beside it: put {scan_file.path.stem}.npz "
+            f"with global_orient, body_pose, betas and transl there{hint}"
+        )
+    try:
+        arrays = read_arrays(path, optional=(*POSE_KEYS, *_SHAPE_KEYS, "scale", "body"))
+        motion = motion_from_arrays({key: arrays[key] for key in POSE_KEYS if key in arrays}, path)
+    except (ArrayFileError, MotionFileError, OSError) as e:
+        raise ScanError(str(e)) from e
+    except StopIteration:
+        names = ", ".join(array_names(path)[:8])
+        raise ScanError(f"{path} holds no pose ({names}): it needs global_orient and body_pose, or pose") from None
+    betas = next((arrays[key] for key in _SHAPE_KEYS if key in arrays), np.zeros(10))
+    scale = arrays.get("scale", np.ones(1))
+    return Parameters(
+        betas=_row(betas, path, "betas"),
+        rotations=motion.rotations[0],
+        translation=motion.translations[0],
+        scale=_positive(scale, path),
+        body=str(arrays["body"].ravel()[0]) if arrays.get("body", np.zeros(0)).size == 1 else "",
+        notes=[f"first of {len(motion)} frames of parameters"] if len(motion) > 1 else [],
+    )
+
+
+def _row(values: NDArray, path: Path, name: str) -> NDArray[np.float64]:
+    if values.dtype.kind not in "iuf" or values.size == 0 or not np.isfinite(values).all():
+        raise ScanError(f"{path}: {name!r} holds something else than finite numbers")
+    return np.asarray(values, np.float64).reshape(-1, values.shape[-1] if values.ndim else 1)[0]
+
+
+def _positive(values: NDArray, path: Path) -> float:
+    number = float(_row(values, path, "scale")[0])
+    if not number > 0:
+        raise ScanError(f"{path}: 'scale' is {number:g}, not positive")
+    return number

@@ -21,39 +21,39 @@ Device = Literal["auto", "cpu", "gpu"]
 
 @dataclasses.dataclass(frozen=True)
 class CaptureSettings:
-    """What to render of everybody. Raises ValueError where that is impossible."""
+    """What to render of each subject. Raises ValueError for impossible settings."""
 
     out: Path
     """The dataset's folder."""
     seed: int = 0
-    """Of the dataset: choice of poses, and the noise of every view (`layout.view_seed`)."""
+    """Of the choice of poses, and of the noise of every view (`capture_layout.view_seed`)."""
     rig: Rig = dataclasses.field(default_factory=Rig)
-    """Cameras about each person; its picture size holds for `cameras` too."""
+    """Cameras around each subject; its picture size applies to `cameras` too."""
     cameras: tuple[View, ...] = ()
-    """Cameras that stand still while people change, instead of the rig's."""
+    """Fixed cameras for all subjects, instead of the rig's."""
     pose_files: tuple[Path, ...] = ()
-    """Motion and pose files; none: the built-in poses."""
+    """Motion and pose files; empty for the built-in poses."""
     pose_count: int = 20
     passes: tuple[str, ...] = PASSES
     light: Light = "uniform"
     """uniform: every surface shows its own colour; dome: a white sky; hdri: the picture `hdri`."""
     hdri: Path | None = None
     background: Background = "black"
-    """transparent: one pass more, "rgba", with straight alpha; img stays over black."""
+    """transparent adds the pass "rgba", with straight alpha; img stays over black."""
     samples: int = 16
-    """Of a pixel."""
+    """Per pixel."""
     denoise: bool = False
-    """Of img under a dome or HDRI light; masks and the passes of pixel centres never are."""
+    """Denoise img under a dome or HDRI light; other passes never are."""
     device: Device = "auto"
     threads: int = 0
-    """Of Cycles on the CPU; 0: as many as there are cores."""
+    """Of Cycles on the CPU; 0 for all cores."""
     shard: tuple[int, int] = (0, 1)
     """(i, n): the subjects i, i + n, i + 2 n, ... of the sorted list."""
     layouts: tuple[str, ...] = LAYOUTS
     released_reference: bool = False
-    """Whether the first subject is also there under the name that the released code looks for."""
+    """Whether the first subject is also stored under the name that the released code expects."""
     body: Path | None = None
-    """A user's own SMPL body, an .npz; none: the default body."""
+    """The user's SMPL body, an .npz; None for the default body."""
 
     def __post_init__(self) -> None:
         index, count = self.shard
@@ -93,7 +93,7 @@ class CaptureSettings:
         return len(self.cameras) or self.rig.count
 
     def about(self, frames: int) -> dict[str, Any]:
-        """What everybody who writes to the dataset must agree on: its dataset.json."""
+        """The content of dataset.json, on which all runs that write to the dataset must agree."""
         return {
             "seed": self.seed,
             "rig": _about_views(self.cameras) if self.cameras else dataclasses.asdict(self.rig),

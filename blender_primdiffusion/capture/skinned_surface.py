@@ -1,4 +1,4 @@
-"""All points of skinned meshes, for the room that a person takes up over its poses without asking Blender."""
+"""Posed meshes: the space that a human takes up over its poses, and cameras that are inside of it."""
 
 from __future__ import annotations
 
@@ -7,16 +7,20 @@ from collections.abc import Iterable, Sequence
 
 import bpy
 import numpy as np
+from mathutils import Vector
+from mathutils.bvhtree import BVHTree
 from numpy.typing import NDArray
 
-from ..formats.camera_rig import bounding_sphere
-from ..scene.convention import points_to_backend
+from ..formats.camera_rig import View, bounding_sphere
+from ..scene.convention import points_to_backend, points_to_blender
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SkinnedSurface:
-    """Points of a surface at the rig's rest, and the bones that move each: all of them, so that both programs put the
-    cameras in the same places."""
+    """All points of a surface at the rig's rest, and the bones that move each.
+
+    The backend uses the same points, so that both programs place cameras alike.
+    """
 
     points: NDArray[np.float64]
     """[n, 3], y up, metres."""
@@ -26,7 +30,7 @@ class SkinnedSurface:
     """[n, K]; rows sum to 1."""
 
     def posed(self, transforms: NDArray) -> NDArray[np.float64]:
-        """The points once the bones [N, 4, 4] moved them."""
+        """The points [n, 3] moved by bones [N, 4, 4]."""
         moved = np.zeros_like(self.points)
         for bone, weight in zip(self.bones.T, self.weights.T, strict=True):
             chosen = transforms[bone, :3]
@@ -34,7 +38,7 @@ class SkinnedSurface:
         return moved
 
     def outermost(self, poses: Iterable[NDArray]) -> NDArray[np.float64]:
-        """Of all points in all poses (transforms [N, 4, 4]) those that bound them: same box, same bounding sphere."""
+        """Points in all poses (transforms [N, 4, 4]) that have the same box and bounding sphere as all of them."""
         poses = list(poses)
         extremes = []
         for transforms in poses:
@@ -74,7 +78,7 @@ def _widened(values: NDArray, columns: int) -> NDArray:
 
 
 def _influences(mesh: bpy.types.Object, bones: Sequence[str]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Numbers of bones and their weights [V, K] of each vertex; of what no bone moves the root."""
+    """Bone indices and weights [V, K] of each vertex; the root's where no bone moves it."""
     number = {name: place for place, name in enumerate(bones)}
     if mesh.parent_type == "BONE" and mesh.parent_bone in number:
         alone = np.full((len(mesh.data.vertices), 1), number[mesh.parent_bone], np.int32)
@@ -89,3 +93,56 @@ def _influences(mesh: bpy.types.Object, bones: Sequence[str]) -> tuple[NDArray[n
     for vertex, row in enumerate(rows):
         index[vertex, : len(row)], weight[vertex, : len(row)] = zip(*row, strict=True)
     return index, weight / weight.sum(1, keepdims=True)
+
+
+TOUCHING_M = 0.02
+"""Nearer than this to a surface a camera counts as inside."""
+_DIRECTIONS = [
+    Vector((x, y, z)).normalized() for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z
+]
+
+
+def cameras_inside(
+    objects: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph, views: Sequence[View]
+) -> list[int]:
+    """Indices of the views inside of the meshes `objects` as posed, or at their surface.
+
+    A camera is inside where most rays first meet the back of a face, so open clothes are no problem.
+    """
+    meshes = [_world_mesh(obj, depsgraph) for obj in objects]
+    points = np.concatenate([points for points, _ in meshes])
+    low, high = points.min(0) - TOUCHING_M, points.max(0) + TOUCHING_M
+    positions = [points_to_blender(view.position) for view in views]
+    near = [i for i, at in enumerate(positions) if ((low <= at) & (at <= high)).all()]
+    if not near:
+        return []
+    trees = [BVHTree.FromPolygons(points.tolist(), faces) for points, faces in meshes]
+    return [i for i in near if _is_inside(trees, Vector(positions[i]))]
+
+
+def _is_inside(trees: list[BVHTree], at: Vector) -> bool:
+    if any(
+        distance is not None and distance < TOUCHING_M for *_, distance in (tree.find_nearest(at) for tree in trees)
+    ):
+        return True
+    behind = 0
+    for direction in _DIRECTIONS:
+        hits = [tree.ray_cast(at, direction) for tree in trees]
+        hits = [(distance, normal) for _, normal, _, distance in hits if distance is not None]
+        if hits:
+            _, normal = min(hits, key=lambda hit: hit[0])
+            behind += normal.dot(direction) > 0
+    return behind > len(_DIRECTIONS) / 2
+
+
+def _world_mesh(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[NDArray[np.float64], list[tuple]]:
+    evaluated = obj.evaluated_get(depsgraph)
+    mesh = evaluated.to_mesh()
+    try:
+        points = np.empty(3 * len(mesh.vertices), np.float32)
+        mesh.vertices.foreach_get("co", points)
+        world = np.array(evaluated.matrix_world, np.float64)
+        faces = [tuple(polygon.vertices) for polygon in mesh.polygons]
+        return points.reshape(-1, 3).astype(np.float64) @ world[:3, :3].T + world[:3, 3], faces
+    finally:
+        evaluated.to_mesh_clear()

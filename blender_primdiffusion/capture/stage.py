@@ -1,4 +1,4 @@
-"""The scene a capture is rendered in: of its own, so that the user's stays as it is, and gone when the capture ends."""
+"""The scene that a capture is rendered in: separate, so that the user's stays as it is, and removed afterwards."""
 
 from __future__ import annotations
 
@@ -10,13 +10,82 @@ from pathlib import Path
 
 import bpy
 
-from .belongings import Belongings
-from .device import choose_device
-from .settings import CaptureSettings
+from ..formats.camera_rig import View
+from .blender_camera import aim
+from .passes import Centres, Colours, read_centres, read_colours
+from .settings import CaptureSettings, Device
 from .surfaces import OPAQUE, PART
 
+_EXCLUDED = frozenset({"window_managers", "workspaces", "screens", "libraries"})
+
+
+class AddedData:
+    """Tracks the data-blocks that are added within `with` blocks; `remove` removes them, and no others."""
+
+    def __init__(self) -> None:
+        self._ours: set[int] = set()
+        self._before: set[int] = set()
+
+    def __enter__(self) -> AddedData:
+        self._before = {block.session_uid for block in data_blocks()}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ours |= {block.session_uid for block in data_blocks()} - self._before
+
+    def remove(self) -> None:
+        """Remove those that are left."""
+        bpy.data.batch_remove([block for block in data_blocks() if block.session_uid in self._ours])
+        self._ours.clear()
+
+
+def data_blocks() -> Iterator[bpy.types.ID]:
+    """All data-blocks but windows, workspaces and libraries."""
+    for prop in bpy.data.bl_rna.properties:
+        if prop.type == "COLLECTION" and prop.identifier not in _EXCLUDED:
+            yield from getattr(bpy.data, prop.identifier)
+
+
+_KINDS = ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL")
+
+
+def choose_device(scene: bpy.types.Scene, wanted: Device) -> str:
+    """Set the scene's device, the CPU where no GPU can be used; returns a sentence on it.
+
+    The preferences change only where no device was chosen before.
+    """
+    addon = bpy.context.preferences.addons.get("cycles")
+    if wanted == "cpu" or addon is None:
+        scene.cycles.device = "CPU"
+        return "Cycles renders on the CPU."
+    names = _gpus(addon.preferences)
+    scene.cycles.device = "GPU" if names else "CPU"
+    if names:
+        return f"Cycles renders on {', '.join(names)}."
+    return "No GPU can be used; Cycles renders on the CPU." if wanted == "gpu" else "Cycles renders on the CPU."
+
+
+def _gpus(preferences: bpy.types.AddonPreferences) -> list[str]:
+    chosen = preferences.compute_device_type
+    kinds = (chosen,) if chosen != "NONE" else _KINDS
+    for kind in kinds:
+        try:
+            preferences.compute_device_type = kind
+        except TypeError:  # this Blender was built without it
+            continue
+        preferences.refresh_devices()
+        devices = [device for device in preferences.devices if device.type == kind]
+        if chosen == "NONE":
+            for device in devices:
+                device.use = True
+        if names := [device.name for device in devices if device.use]:
+            return names
+    preferences.compute_device_type = chosen
+    return []
+
+
 _LAYERS = 256
-"""Of transparent surfaces behind each other: hair is many cards deep."""
+"""Transparent surfaces along a ray: hair has many layers."""
 
 
 class StageError(RuntimeError):
@@ -24,16 +93,16 @@ class StageError(RuntimeError):
 
 
 class Stage:
-    """A scene with a camera, lights and Cycles' settings. Close it: nothing of it may stay in the file."""
+    """A scene with a camera, lights and Cycles' settings; `close` removes all of it."""
 
     def __init__(self, context: bpy.types.Context, settings: CaptureSettings):
-        self.belongings = Belongings()
-        """What was made for the capture: use as a context around whatever makes more."""
+        self.added = AddedData()
+        """Data added for the capture: use as a context around whatever adds more."""
         self.scratch = Path(tempfile.mkdtemp(prefix="primdiffusion_capture_", dir=bpy.app.tempdir or None))
-        """For pictures between Cycles and us."""
+        """Folder for rendered files."""
         self._context = context
         try:
-            with self.belongings:
+            with self.added:
                 self.scene = bpy.data.scenes.new("PrimDiffusion Capture")
                 self.camera = bpy.data.objects.new("Capture", bpy.data.cameras.new("Capture"))
                 self.scene.collection.objects.link(self.camera)
@@ -48,10 +117,10 @@ class Stage:
 
     @contextlib.contextmanager
     def entered(self) -> Iterator[bpy.types.Context]:
-        """Makes the scene the active one while the block lasts; what the block makes belongs to the stage."""
+        """Make the scene active for the block; data added in the block is removed with the stage."""
         window = self._context.window
         with contextlib.ExitStack() as stack:
-            stack.enter_context(self.belongings)
+            stack.enter_context(self.added)
             if window is None:
                 layer = self.scene.view_layers[0]
                 stack.enter_context(bpy.context.temp_override(scene=self.scene, view_layer=layer))
@@ -62,8 +131,8 @@ class Stage:
             yield bpy.context
 
     def close(self) -> None:
-        """Take everything out of the file again."""
-        self.belongings.remove()
+        """Remove everything from the file."""
+        self.added.remove()
         shutil.rmtree(self.scratch, ignore_errors=True)
 
 
@@ -73,7 +142,7 @@ def _set_up_cycles(scene: bpy.types.Scene, settings: CaptureSettings) -> None:
     render.film_transparent = True
     render.threads_mode, render.threads = ("FIXED", settings.threads) if settings.threads else ("AUTO", 1)
     render.resolution_percentage = 100
-    render.use_persistent_data = True  # the views of a pose share one scene: only the camera moves
+    render.use_persistent_data = True  # only the camera moves between the views of a pose
     render.use_compositing = render.use_sequencer = render.use_border = render.use_motion_blur = False
     cycles.use_adaptive_sampling = False
     cycles.use_denoising = settings.denoise and settings.light != "uniform"
@@ -109,3 +178,44 @@ def _light(scene: bpy.types.Scene, settings: CaptureSettings) -> None:
         except RuntimeError as error:
             raise StageError(f"the HDRI {settings.hdri} cannot be read: choose an .hdr or .exr picture") from error
         world.node_tree.links.new(picture.outputs["Color"], background.inputs["Color"])
+
+
+_NARROWEST_PX = 0.01
+"""Cycles' narrowest filter: rays within 0.02 px of the pixel's centre."""
+
+
+def shoot_colours(stage: Stage, view: View, seed: int, samples: int) -> Colours:
+    """Colours and coverage, averaged over each pixel by a box of its size. Raises StageError."""
+    cycles = stage.scene.cycles
+    cycles.pixel_filter_type, cycles.samples = "BOX", samples
+    return read_colours(_render(stage, view, seed))
+
+
+def shoot_centres(stage: Stage, view: View, seed: int) -> Centres:
+    """What the rays through the pixels' centres hit. Raises StageError."""
+    cycles = stage.scene.cycles
+    denoise, cycles.use_denoising = cycles.use_denoising, False
+    cycles.pixel_filter_type, cycles.filter_width, cycles.samples = "GAUSSIAN", _NARROWEST_PX, 1
+    try:
+        return read_centres(_render(stage, view, seed))
+    finally:
+        cycles.use_denoising = denoise
+
+
+def _render(stage: Stage, view: View, seed: int) -> Path:
+    scene, render, path = stage.scene, stage.scene.render, stage.scratch / "view.exr"
+    render.resolution_x, render.resolution_y = view.width, view.height
+    render.pixel_aspect_x, render.pixel_aspect_y = aim(stage.camera, view)
+    scene.cycles.seed = seed
+    path.unlink(missing_ok=True)
+    try:
+        with stage.added:  # the first render makes the image Render Result
+            bpy.ops.render.render(scene=scene.name)
+        render.pixel_aspect_x = render.pixel_aspect_y = 1.0  # 5.0 cannot write layers with non-square pixels
+        result = next(image for image in bpy.data.images if image.type == "RENDER_RESULT")
+        result.save_render(str(path), scene=scene)
+    except RuntimeError as error:
+        raise StageError(f"Cycles could not render: {' '.join(str(error).split())}") from error
+    if not path.is_file():
+        raise StageError(f"Cycles wrote no picture to {stage.scratch}: is there room, and is the folder writable?")
+    return path

@@ -1,11 +1,13 @@
-"""One person's folder of a dataset: what is there, what is missing, and all files that are not pictures."""
+"""A subject's folder in a dataset: what is written, what is missing; datasets verified and repaired."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +17,16 @@ from ..formats.camera_files import write_cameras, write_colmap, write_nerf, writ
 from ..formats.camera_rig import View
 from ..formats.capture_layout import (
     COMPLETE_FILE,
+    DATASET_FILE,
+    ENDINGS,
+    LIST_FILE,
     RELEASED_REFERENCE,
     SMPL_FOLDER,
     SMPL_PLAIN_FILE,
     CaptureFolderError,
     damage,
     picture_path,
+    read_about,
     write_joints,
     write_list,
     write_smpl,
@@ -31,7 +37,7 @@ from ..motion.motion import Motion
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sitting:
-    """A person, the poses to take and the cameras about them."""
+    """A human, its poses and the cameras around it."""
 
     betas: NDArray[np.float64]
     poses: Motion
@@ -41,14 +47,14 @@ class Sitting:
 
 
 def begin(folder: Path, sitting: Sitting, layouts: tuple[str, ...]) -> None:
-    """Write all but the pictures and the completion mark.
+    """Write all files but the pictures and the completion mark.
 
-    Raises CaptureFolderError where the folder holds another person, or other poses.
+    Raises CaptureFolderError where the folder holds another human, or other poses.
     """
     poses = sitting.poses
     theta = poses.axis_angle().reshape(len(poses), 72)
     smpl = (theta[:, :3], theta[:, 3:], sitting.betas, poses.translations)
-    _refuse_others(folder, smpl)
+    _check_same(folder, smpl)
     write_smpl(folder, *smpl)
     write_joints(folder, sitting.views, sitting.joints)
     write_cameras(folder, sitting.views)
@@ -62,9 +68,9 @@ def begin(folder: Path, sitting: Sitting, layouts: tuple[str, ...]) -> None:
 
 
 def is_finished(folder: Path) -> bool:
-    """Whether the subject is complete, as far as sizes tell. What of it is missing or cut short is taken away.
+    """Whether the subject is complete, judged by file sizes. Removes truncated files of an incomplete one.
 
-    Then it is unfinished, and the next run makes just that anew.
+    The next run then renders only those again.
     """
     wrong = damage(folder, checksums=False)
     if not wrong:
@@ -74,7 +80,7 @@ def is_finished(folder: Path) -> bool:
 
 
 def remove_damaged(folder: Path, wrong: dict[Path, str]) -> None:
-    """Take away what `layout.damage` names and, first, the completion mark that vouches for it."""
+    """Remove the files that `capture_layout.damage` names, and first the completion mark."""
     (folder / COMPLETE_FILE).unlink(missing_ok=True)
     for path in wrong:
         if path != folder:
@@ -82,23 +88,23 @@ def remove_damaged(folder: Path, wrong: dict[Path, str]) -> None:
 
 
 def is_drawn(folder: Path, kinds: tuple[str, ...], frame: int, camera: int) -> bool:
-    """Whether all pictures of a view are there and whole."""
+    """Whether all pictures of a view exist and are whole."""
     return all(is_whole_picture(picture_path(folder, kind, camera, frame)) for kind in kinds)
 
 
 def finished_subjects(root: Path) -> list[str]:
-    """Names of the complete subjects; the released code's reference is one of them under another name."""
+    """Names of the complete subjects, without the released code's reference, which is one of them."""
     names = (path.parent.name for path in root.glob(f"*/{COMPLETE_FILE}"))
     return sorted(name for name in names if name != RELEASED_REFERENCE)
 
 
 def list_subjects(root: Path) -> None:
-    """Write the list of complete subjects anew."""
+    """Write the list of complete subjects."""
     write_list(root, finished_subjects(root))
 
 
 def name_reference(root: Path, subject: str) -> None:
-    """Let the finished `subject` be there under the name from which the released code takes its rest sizes."""
+    """Link the finished `subject` under the name from which the released code takes its rest sizes."""
     reference = root / RELEASED_REFERENCE
     if subject == RELEASED_REFERENCE or reference.exists():
         return
@@ -111,13 +117,13 @@ def name_reference(root: Path, subject: str) -> None:
         os.replace(partial, reference)
 
 
-def _refuse_others(folder: Path, smpl: tuple[NDArray, ...]) -> None:
+def _check_same(folder: Path, smpl: tuple[NDArray, ...]) -> None:
     wanted = dict(zip(("global_orient", "body_pose", "betas", "transl"), smpl, strict=True))
     path = folder / SMPL_FOLDER / SMPL_PLAIN_FILE
     try:
         present = read_arrays(path, optional=tuple(wanted)) if path.is_file() else {}
     except ArrayFileError:
-        present = {}  # cut short: it is written anew
+        present = {}  # truncated: it is written again
     for name, values in wanted.items():
         values = np.atleast_2d(values)
         if name in present and not (
@@ -126,3 +132,84 @@ def _refuse_others(folder: Path, smpl: tuple[NDArray, ...]) -> None:
             raise CaptureFolderError(
                 f"{folder} holds another person or other poses ({name} differs): choose another folder, or remove it"
             )
+
+
+def verify(root: Path) -> list[str]:
+    """What is wrong with the dataset, a sentence for each file or subject.
+
+    Finished subjects are compared with the sizes and checksums they had, which reads every file. Of unfinished ones
+    truncated pictures are named, and how many views are done. Raises CaptureFolderError where there is no
+    dataset.
+    """
+    about = _read_checked(root)
+    wrong = []
+    for folder in subject_folders(root):
+        wrong += [f"{path}: {what}" for path, what in _problems(folder, about).items()]
+    return wrong + [f"{root / LIST_FILE}: names {name}, which is not there" for name in _listed_in_vain(root)]
+
+
+def repair(root: Path) -> list[str]:
+    """As `verify`, and removes damaged files and the completion marks of their subjects.
+
+    Rendering the same captures again then renders only those views.
+    """
+    about = _read_checked(root)
+    wrong = verify(root)
+    for folder in subject_folders(root):
+        problems = _problems(folder, about)
+        if problems:
+            remove_damaged(folder, {path: what for path, what in problems.items() if path != folder})
+        for partial in folder.glob("**/.*.partial.*"):
+            partial.unlink(missing_ok=True)
+    list_subjects(root)
+    return wrong
+
+
+def subject_folders(root: Path) -> list[Path]:
+    """Folders of all subjects, finished or not, sorted."""
+    return sorted(
+        path
+        for path in root.iterdir()
+        if path.is_dir() and not path.name.startswith(".") and path.name != RELEASED_REFERENCE
+    )
+
+
+def _read_checked(root: Path) -> dict[str, Any]:
+    about = read_about(root)
+    numbers = (about.get("frames"), (about.get("rig") or {}).get("count"))
+    passes = about.get("passes")
+    if not all(isinstance(n, int) and 0 < n <= 10**6 for n in numbers) or not isinstance(passes, list):
+        raise CaptureFolderError(
+            f"{root / DATASET_FILE} lacks the numbers of frames and cameras: render into a new folder"
+        )
+    if not set(passes) <= set(ENDINGS):
+        raise CaptureFolderError(f"{root / DATASET_FILE} names passes that this program does not know: {passes}")
+    return about
+
+
+def _problems(folder: Path, about: dict[str, Any]) -> dict[Path, str]:
+    """What is wrong with one subject, by file; the folder itself stands for what is not finished."""
+    wrong = damage(folder)
+    pictures = list(_pictures(folder, about))
+    if folder not in wrong:
+        wrong |= {path: "missing" for path in pictures if not path.is_file()}
+        return wrong
+    whole = [is_whole_picture(path) for path in pictures]
+    cut = {path: "cut short" for path, ok in zip(pictures, whole, strict=True) if not ok and path.is_file()}
+    marked = "" if not (folder / COMPLETE_FILE).exists() else f"; its {COMPLETE_FILE} cannot be read"
+    return {folder: f"not finished: {sum(whole)} of {len(pictures)} pictures are there{marked}", **cut}
+
+
+def _pictures(folder: Path, about: dict[str, Any]) -> Iterator[Path]:
+    for frame in range(about["frames"]):
+        for camera in range(about["rig"]["count"]):
+            for kind in about["passes"]:
+                yield picture_path(folder, kind, camera, frame)
+
+
+def _listed_in_vain(root: Path) -> list[str]:
+    try:
+        names = (root / LIST_FILE).read_text(encoding="utf-8").split()
+    except FileNotFoundError:
+        return []
+    return [name for name in names if not (root / name / COMPLETE_FILE).is_file()]

@@ -6,7 +6,7 @@ import time
 
 import bpy
 
-from ..worker.drawing import Drawing
+from ..backend.drawing import Drawing
 from . import studio
 from .camera import camera_view, wanted_region
 from .frames import Frame

@@ -40,7 +40,7 @@ class Frame:
         self._values[:] = 0
 
 
-class Frames:
+class SharedFrames:
     """A folder in shared memory for frames and other files that the child reads; `close` removes it.
 
     Several threads may use it, each with its own names: Blender renders in a thread while viewports draw.

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
 from ..scene.convention import transforms_to_backend
-from ..scene.files import person_file
-from ..scene.human import BETAS, MARK
+from ..scene.human import BETAS, MARK, person_file
 from .solids import scene_solids, stored, visible_instances
 
 SMALLEST_SCALE = 1e-4

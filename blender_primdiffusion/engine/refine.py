@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from ..worker.drawing import Drawing
+from ..backend.drawing import Drawing
 from .frames import Frame
 from .view import PinholeView
 

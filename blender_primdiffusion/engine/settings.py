@@ -31,25 +31,25 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
     )
     view: bpy.props.EnumProperty(
         name="View",
-        description="What of the people is drawn",
+        description="What is drawn of people",
         items=(
-            ("COLOUR", "Colour", "The people as they look"),
+            ("COLOUR", "Colour", "People as they look"),
             ("DEPTH", "Depth", "Near is bright"),
             ("ALPHA", "Alpha", "How opaque the people are"),
-            ("BOXES", "Primitives", "The boxes that people are made of, shaded, each in a colour of its own"),
+            ("BOXES", "Primitives", "The boxes that people are made of, shaded, each in a different colour"),
         ),
         default="COLOUR",
         update=_redraw,
     )
     solids: bpy.props.EnumProperty(
         name="Solid Objects",
-        description="What becomes of meshes and other surfaces",
+        description="How meshes and other surfaces are drawn",
         items=(
-            ("SHADED", "Shaded", "Drawn with simple shading; they hide people behind them"),
+            ("SHADED", "Shaded", "Drawn with simple shading; they hide people behind"),
             (
                 "HOLDOUT",
                 "Holdout",
-                "Not drawn; they cut holes into the people, to be filled with Cycles' picture",
+                "Not drawn, but they cut holes into people, for compositing over a Cycles render",
             ),
             ("IGNORED", "Ignored", "People are drawn as if they were not there"),
         ),

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import atexit
 
+from ..backend.drawing import IDLE_S, DrawingChild
 from ..places import new_backend, preference
-from ..worker.drawing import IDLE_S, DrawingChild
-from .frames import Frames
+from .frames import SharedFrames
 
-frames = Frames()
+frames = SharedFrames()
 """For all renders and viewports."""
 _children: dict[str, DrawingChild] = {}
 """By the preference for the backend's Python; one at a time."""

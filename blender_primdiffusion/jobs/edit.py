@@ -1,8 +1,9 @@
-"""A person made of one in the scene, in place, as the child is asked for it."""
+"""Jobs that change a human in place: edits, and volumes restored after their files were lost."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -10,29 +11,42 @@ from typing import Any, ClassVar
 import bpy
 import numpy as np
 
-from ..scene.edit import edit_destination
-from ..scene.files import person_file
-from ..scene.overlap import overlap_warning_in
-from ..scene.writing import Destination
-from ..worker.sentence import sentence
-from .job import Job, chosen_checkpoint
-from .person import show_in_place
-from .target import Target
+from ..backend.requests import sentence
+from ..scene.cycles import overlap_warning_in
+from ..scene.edit import Replaced, edit_destination, replace_person, restore_destination, restore_volumes
+from ..scene.human import MARK, person_file
+from ..scene.human_npz import Destination, read_human, write_now
+from ..scene.volumes import free_unused_grids
+from .follow import building
+from .missing_files import look
+from .queue import Job, chosen_checkpoint
+from .target import HumanTarget
 
 _PICTURE_PX = 16
-"""The child's pictures of the finished person are of no use here."""
+"""Of the child's previews, which are not used here."""
 _STEP_PICTURE_PX = 256
-"""Of the person so far, for the panel."""
+"""Of the picture after each step, for the panel."""
+
+
+def show_in_place(context: bpy.types.Context, person: bpy.types.Collection, result: dict[str, Any]) -> Replaced:
+    """Show the human of the child's `result` in place of `person`. Raises as `replace_person` does."""
+    human, file = Path(result["human"]), Path(result["person"])
+    written = building.take(human)
+    done = replace_person(person, written or write_now(human, edit_destination(person)), file)
+    if written is None:  # otherwise `building` has freed them
+        context.view_layer.update()  # evaluated data holds the old grids
+        free_unused_grids()
+    return done
 
 
 @dataclasses.dataclass(frozen=True)
 class EditJob(Job):
-    """What the edits have in common."""
+    """Base of the edits."""
 
     made: ClassVar[str]
-    """What became of the person, for the news."""
+    """Past participle for the message: Varied."""
 
-    target: Target
+    target: HumanTarget
     steps: int
     asked: Mapping[str, Any]
     """The method's other parameters. A region {"painted": [V numbers]} holds weights, and travels as a file."""
@@ -40,17 +54,15 @@ class EditJob(Job):
 
     @classmethod
     def of(cls, person: bpy.types.Collection, steps: int, asked: Mapping[str, Any]) -> EditJob:
-        """Raises ValueError for a person that cannot be edited, FileNotFoundError for one whose file is missing."""
+        """Raises ValueError for a human that cannot be edited, FileNotFoundError for one whose file is missing."""
         person_file(person)
-        return cls(Target.of(person), steps, asked)
+        return cls(HumanTarget.of(person), steps, asked)
 
     @property
     def label(self) -> str:
-        """For people."""
         return f"{self.undo}: {self.target.name}"
 
     def params(self, folder: Path) -> dict[str, Any]:
-        """Of the child's method."""
         asked = dict(self.asked)
         if isinstance(asked.get("region"), Mapping):
             np.savez(folder / "region.npz", weights=np.asarray(asked["region"]["painted"], np.float32))
@@ -61,42 +73,124 @@ class EditJob(Job):
         return {**params, **checkpoint, "out_dir": str(folder)}
 
     def place(self) -> Destination:
-        """In the place of the person's own."""
         return edit_destination(self.target.found())
 
     def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
-        """Show the edited person in the place of the one that was; in which scene does not matter."""
         person = self.target.found()
         done = show_in_place(context, person, result)
         shape = ", the body's shape too" if done.reshaped else ""
-        news = f"{self.made} in {result['seconds']:.1f} s; {done.volumes} of {done.of} volumes of {person.name} changed"
+        message = (
+            f"{self.made} in {result['seconds']:.1f} s; {done.volumes} of {done.of} volumes of {person.name} changed"
+        )
         warnings = (*result.get("warnings", ()), done.warning, overlap_warning_in(context.scene, person))
-        return " ".join([f"{news}{shape}.", *(sentence(text) for text in warnings if text)])
+        return " ".join([f"{message}{shape}.", *(sentence(text) for text in warnings if text)])
 
 
 class VaryJob(EditJob):
-    """Vary."""
+    """Vary the whole human."""
 
     kind = method = "vary"
     undo, made = "Vary Human", "Varied"
 
 
 class RedressJob(EditJob):
-    """Re-dress Region."""
+    """Generate a region again."""
 
     kind = method = "inpaint"
     undo, made = "Re-dress Region", "Re-dressed"
 
 
 class TransferJob(EditJob):
-    """Transfer Texture."""
+    """Transfer a region from another human."""
 
     kind = method = "transfer"
     undo, made = "Transfer Texture", "Texture transferred"
 
 
 class BlendJob(EditJob):
-    """Blend."""
+    """Blend with another human."""
 
     kind = method = "interpolate"
     undo, made = "Blend Humans", "Blended"
+
+
+@dataclasses.dataclass(frozen=True)
+class RestoreJob(Job):
+    """Write exactly the lost volumes again, from the human's own file."""
+
+    kind = "restore_volumes"
+    method = "human_npz"
+    undo = "Restore Volumes"
+
+    target: HumanTarget
+    file: str
+
+    @property
+    def label(self) -> str:
+        return f"Restore Volumes of {self.target.name}"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        return {"person": self.file, "out_dir": str(folder), "size": _PICTURE_PX}
+
+    def place(self) -> Destination:
+        return restore_destination(self.target.found())
+
+    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+        person, human, file = self.target.found(), Path(result["human"]), Path(self.file)
+        written = building.take(human) or write_now(human, restore_destination(person))
+        count = restore_volumes(person, written, file)
+        look()
+        return f"{count} volumes of {person.name} restored from their file in {result['seconds']:.1f} s"
+
+
+@dataclasses.dataclass(frozen=True)
+class RegenerateJob(Job):
+    """Generate a human that has lost all files again from its seed, in its place."""
+
+    kind = "regenerate"
+    method = "generate"
+    undo = "Generate Again"
+
+    target: HumanTarget
+    made: dict[str, Any]
+    """The human's provenance."""
+    checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
+
+    @property
+    def label(self) -> str:
+        return f"Generate {self.target.name} again, seed {self.made['seed']}"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        asked = {name: self.made[name] for name in ("steps", "sampler", "attributes", "guidance") if name in self.made}
+        checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
+        return {"seed": self.made["seed"], **asked, **checkpoint, "size": _PICTURE_PX, "out_dir": str(folder)}
+
+    def place(self) -> Destination:
+        return edit_destination(self.target.found())
+
+    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+        """Raises ValueError where another checkpoint has generated another human."""
+        person, human = self.target.found(), Path(result["human"])
+        made, before = read_human(human).meta, json.loads(person[MARK])
+        for name in ("checkpoint_sha256", "checkpoint"):
+            if name in before and made.get(name) != before[name]:
+                raise ValueError(
+                    f"{person.name!r} was made by the checkpoint {before.get('checkpoint')!r}, and this one is "
+                    f"{made.get('checkpoint')!r}: choose that one in the preferences, "
+                    "otherwise the result would be another person"
+                )
+        show_in_place(context, person, result)
+        look()
+        return f"{person.name} generated again from seed {self.made['seed']} in {result['seconds']:.1f} s"
+
+
+def made_from_seed(person: bpy.types.Collection) -> dict[str, Any]:
+    """The provenance of a human that its seed reproduces. Raises ValueError for others."""
+    made = json.loads(person[MARK])
+    if made.get("edits"):
+        raise ValueError(
+            f"{person.name!r} was edited after they were generated, so no seed reproduces them: restore their files"
+        )
+    if not isinstance(made.get("seed"), int) or "steps" not in made:
+        raise ValueError(f"{person.name!r} was not generated from a seed: restore their files")
+    return made

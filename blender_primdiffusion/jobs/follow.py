@@ -1,4 +1,7 @@
-"""Follow jobs to their end: by a timer while there is a window, by waiting in background mode."""
+"""Follow jobs to their end: by a timer while there is a window, by waiting in background mode.
+
+A result's volumes are written and loaded in slices of time before the operator runs, so that it returns quickly.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +9,126 @@ import contextlib
 import time
 import traceback
 from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import bpy
 
-from .building import building
-from .job import Job
 from .memory import release_when_idle
 from .pictures import so_far
-from .queue import GONE, Entry, Outcome, queue
-from .remedies import refusal_of_the_scene
+from .queue import GONE, Entry, Job, JobOutcome, queue
+from .remedies import error_before_the_scene
+
+if TYPE_CHECKING:
+    from ..scene.human_npz import Destination, VolumeWriter, WrittenHuman
+    from .queue import Entry, Job
+
+SLICE_S = 0.05
+"""Of writing volumes or reading grids between two redraws."""
+_SHOWN_STEPS = 10
+"""Of the bar: a redraw may take longer than SLICE_S."""
+_WRITING = 0.6
+"""Share of the time that writing takes."""
+
+
+class Building:
+    """Volumes of one human at a time. All methods are for Blender's main thread."""
+
+    def __init__(self) -> None:
+        self._entry: Entry | None = None
+        self._human: Path | None = None
+        self._writing: VolumeWriter | None = None
+        self._read = 0
+        self._shown = 0
+
+    @property
+    def fraction(self) -> float:
+        """Progress from 0 to 1; 1 when there is nothing to build."""
+        if self._writing is None:
+            return 1.0
+        if not self._writing.over:
+            return _WRITING * self._writing.fraction
+        written = self._writing.result
+        if written is None or not written.files:
+            return 1.0
+        return _WRITING + (1 - _WRITING) * self._read / len(written.files)
+
+    @property
+    def busy(self) -> bool:
+        """Volumes are left to write, or grids to read."""
+        if self._writing is None:
+            return False
+        written = self._writing.result
+        return not self._writing.over or (written is not None and self._read < len(written.files))
+
+    def moved(self) -> bool:
+        """Whether the bar has advanced a step since the last call."""
+        before, self._shown = self._shown, int(_SHOWN_STEPS * self.fraction)
+        return self._shown != before
+
+    def begin(self, entry: Entry, result: dict[str, Any]) -> None:
+        """Start on the human of the child's `result`, if it has one; once for each entry."""
+        if entry is self._entry:
+            return
+        self.close()
+        self._entry = entry
+        place = _place(entry.job) if "human" in result else None
+        if place is not None:
+            from ..scene.human_npz import VolumeWriter  # needs numpy
+
+            self._human = Path(result["human"])
+            self._writing = VolumeWriter(self._human, place)
+
+    def advance(self, *, may_work: bool) -> bool:
+        """Do some of the work if `may_work`; whether more is left before the operator runs."""
+        if self._writing is None:
+            return False
+        if not self._writing.over:
+            if may_work:
+                self._writing.work(SLICE_S)
+            return self.busy
+        written = self._writing.result
+        if written is None or self._read == len(written.files):
+            return False  # after a failure the operator tries again and reports it
+        if may_work:
+            from ..scene.volumes import free_unused_grids, read_grids, read_headers  # needs numpy
+
+            if self._read == 0:
+                if not self._entry.job.new_person:  # the old ones; freed later, the new ones would be read twice
+                    free_unused_grids()
+                read_headers(path for path in written.files if path.is_file())
+            self._read += read_grids(written.files[self._read :], SLICE_S)
+        return self._read < len(written.files)
+
+    def take(self, human: Path) -> WrittenHuman | None:
+        """The written human of this human.npz, whose files are the caller's from now on; None if not written."""
+        return self._writing.take() if self._writing is not None and human == self._human else None
+
+    def close(self) -> None:
+        """Stop, and remove files that were written but not taken."""
+        if self._writing is not None:
+            self._writing.stop()
+        self._entry = self._human = self._writing = None
+        self._read = self._shown = 0
+
+
+def _place(job: Job) -> Destination | None:
+    try:
+        return job.place()
+    except (ValueError, OSError):  # reported by the operator
+        return None
+
+
+building = Building()
+"""One, as there is one queue."""
+
 
 _IN_THE_WAY = {"UNDO", "BLOCKING", "GRAB_CURSOR", "GRAB_CURSOR_X", "GRAB_CURSOR_Y"}
-"""Options of modal operators that hold on to the scene or the mouse; others (screencasts) may run for ever."""
+"""Options of modal operators that block the scene or the mouse; others (screencasts) may run for ever."""
 
 
 def in_the_way() -> str:
-    """What a result waits for, for people; empty when nothing keeps it from the scene."""
+    """What a result has to wait for, as shown in panels; empty for nothing."""
     if bpy.app.is_job_running("RENDER"):
         return "the render"
     windows = bpy.context.window_manager.windows
@@ -32,27 +139,27 @@ def in_the_way() -> str:
 
 
 def enter() -> None:
-    """Hand the answer to the operator that puts it into the scene it was asked for."""
+    """Run the operator that puts the result into the scene it was requested for."""
     entry = queue.current
     scene = next((scene for scene in bpy.data.scenes if scene.session_uid == entry.scene_uid), None)
     if scene is None and entry.job.undo:
-        queue.refuse(refusal_of_the_scene(GONE.format(entry.scene)))
+        queue.fail(error_before_the_scene(GONE.format(entry.scene)))
         return
     try:
         with _shown(scene):
             bpy.ops.primdiffusion.take_result()
-    except RuntimeError as error:  # the timer must go on, whatever state Blender is in
+    except RuntimeError as error:  # the timer must continue, whatever state Blender is in
         traceback.print_exc()
         if queue.current is entry:
-            queue.refuse(refusal_of_the_scene(f"the result could not enter the scene: {error}"))
+            queue.fail(error_before_the_scene(f"the result could not enter the scene: {error}"))
 
 
 @contextlib.contextmanager
 def _shown(scene: bpy.types.Scene | None) -> Iterator[None]:
-    """A context with this scene in a window: timers have none of their own.
+    """A context with this scene in a window: timers have none.
 
-    Where no window shows the scene, one does for as long as this takes: a context of another scene than its window's
-    crashes operators (4.5, 5.0).
+    Where no window shows the scene, one switches to it for the block: operators crash in a context whose scene is not
+    the window's (4.5, 5.0).
     """
     windows = list(bpy.context.window_manager.windows)
     window = next((window for window in windows if window.scene == scene), windows[0] if windows else None)
@@ -75,16 +182,15 @@ class PRIMDIFFUSION_OT_take_result(bpy.types.Operator):
 
     bl_idname = "primdiffusion.take_result"
     bl_label = "Take Result"
-    bl_options = {"INTERNAL"}  # noqa: RUF012  not UNDO: the step has the job's own name, and none is made on failure
+    bl_options = {"INTERNAL"}  # not UNDO: the step has the job's own name, and none is made on failure
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        """Only while a result waits."""
         cls.poll_message_set("No result is ready")
         return queue.ready
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Failures are the panel's to show, or of the operator that waits."""
+        """Failures are shown by the panel, or reported by the operator that waits."""
         undo = queue.current.job.undo
         if undo:
             _leave_edit_mode(context)
@@ -98,14 +204,14 @@ class PRIMDIFFUSION_OT_take_result(bpy.types.Operator):
 
 
 def _leave_edit_mode(context: bpy.types.Context) -> None:
-    """Undo steps made in an edit mode hold what is being edited alone, not the person."""
+    """Undo steps made in an edit mode hold only the edited object, not the new human."""
     if context.mode.startswith(("EDIT", "PARTICLE")):
         bpy.ops.object.mode_set(mode="OBJECT")
 
 
 TICK_S = 0.1
 WATCH_S = 0.25
-_TOLD_S = 1.0
+_PRINT_S = 1.0
 """Between lines of progress on the console in background mode."""
 
 
@@ -124,28 +230,28 @@ def submit(operator: bpy.types.Operator, context: bpy.types.Context, job: Job) -
 
 
 def keep_following() -> None:
-    """Have Blender call `follow` until the line is empty."""
+    """Have Blender call `follow` until the queue is empty."""
     if not bpy.app.timers.is_registered(follow):
         bpy.app.timers.register(follow, first_interval=TICK_S, persistent=True)
 
 
 def follow() -> float | None:
-    """The timer: one tick of the line; an answer enters the scene as soon as nothing is in the way."""
+    """The timer: one tick of the queue; a result enters the scene as soon as nothing is in the way."""
     changed = queue.tick()
     if queue.ready and not queue.advancing:
-        changed |= _nearer()
+        changed |= _advance()
     if not queue.ready:
         building.close()
     changed |= so_far.show(queue.request.picture if queue.request is not None else None)
     if changed:
         redraw()
     if building.busy and not in_the_way():
-        return 0.0  # whatever the user does meanwhile comes first all the same
+        return 0.0  # input events still come first
     return TICK_S if queue.busy else None
 
 
 def watch() -> float:
-    """The timer between jobs: notice a child that died, end one that has been idle for long."""
+    """The timer between jobs: notice a child that died, end one that has been idle."""
     if queue.busy:
         keep_following()
     elif queue.listen() or release_when_idle(time.monotonic()):
@@ -160,9 +266,9 @@ def keep_watching() -> None:
 
 
 def redraw() -> None:
-    """Draw the sidebars of all windows anew: nothing else tells them that the job has moved on.
+    """Redraw the sidebars of all windows, which do not notice progress themselves.
 
-    Not the views beside them, which take long to draw.
+    Not the views beside them, which take long.
     """
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
@@ -171,10 +277,10 @@ def redraw() -> None:
                     region.tag_redraw()
 
 
-def _wait_for(entry: Entry) -> Outcome:
+def _wait_for(entry: Entry) -> JobOutcome:
     printed = 0.0
     while queue.last is None or queue.last.entry is not entry:
-        if queue.tick() and queue.request is not None and time.monotonic() - printed > _TOLD_S:
+        if queue.tick() and queue.request is not None and time.monotonic() - printed > _PRINT_S:
             printed = time.monotonic()
             print(f"PrimDiffusion: {queue.request.message}", flush=True)
         if queue.ready:
@@ -184,15 +290,12 @@ def _wait_for(entry: Entry) -> Outcome:
     return queue.last
 
 
-def _nearer() -> bool:
-    """Bring the answer nearer to the scene, and into it at last; True when something visible changed."""
+def _advance() -> bool:
+    """Build some of the result, and let it enter the scene when built; True when something visible changed."""
     building.begin(queue.current, queue.request.result or {})
-    waits = bool(in_the_way())
-    if building.goes_on(may_work=not waits):
+    blocked = bool(in_the_way())
+    if building.advance(may_work=not blocked):
         return building.moved()
-    if not waits:
+    if not blocked:
         enter()
-    return not waits
-
-
-CLASSES = (PRIMDIFFUSION_OT_take_result,)
+    return not blocked

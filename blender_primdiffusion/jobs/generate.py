@@ -1,22 +1,46 @@
-"""A person from noise, as the child is asked for it."""
+"""Jobs that add a new human to the scene: from noise, or from captures."""
 
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import bpy
 
-from .job import Job, chosen_checkpoint
-from .person import build_person
-from .seeds import random_seed
+from ..backend.requests import sentence
+from ..scene.build import build_written, next_folder, stand_beside_others
+from ..scene.cycles import overlap_warning_in
+from ..scene.human_npz import Destination, write_now
+from .follow import building
+from .queue import Job, chosen_checkpoint
+
+
+def build_person(
+    context: bpy.types.Context, result: dict[str, Any], made: str, name: str = "Human"
+) -> tuple[bpy.types.Collection, str]:
+    """Build the human of the child's `result`; returns the collection and the message ("Generated in 1.2 s, ...").
+
+    Raises as `build_human` does, and then leaves nothing.
+    """
+    keep = [Path(result["person"])] if "person" in result else []  # which the engine draws
+    human = Path(result["human"])
+    written = building.take(human) or write_now(human, Destination(next_folder(name)))
+    collection = build_written(context, written, name, keep)
+    stand_beside_others(context, collection)
+    warnings = list(result.get("warnings", ()))
+    if overlap := overlap_warning_in(context.scene, collection):
+        warnings.append(overlap)
+    notice = f"{made} in {result['seconds']:.1f} s, built in {time.monotonic() - written.began:.1f} s"
+    return collection, " ".join([sentence(notice), *map(sentence, warnings)])
+
 
 _PICTURE_PX = 16
-"""The child's pictures of the finished person are of no use here."""
+"""Of the child's previews, which are not used here."""
 _STEP_PICTURE_PX = 256
-"""Of the person so far, for the panel."""
+"""Of the picture after each step, for the panel."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,26 +55,52 @@ class GenerateJob(Job):
     steps: int
     sampler: str = "ddim"
     asked: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """attributes and guidance, where something is asked for."""
+    """Attributes and guidance, where given."""
     checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
-    renews_seed: bool = False
-    """The panel's seed was used and is not locked: with this person it becomes another one."""
+    next_seed: int | None = None
+    """What the panel's seed becomes with this human; None where it was not used, or is locked."""
 
     @property
     def label(self) -> str:
-        """For people."""
         return f"Human, seed {self.seed}"
 
     def params(self, folder: Path) -> dict[str, Any]:
-        """Of the child's method generate."""
         params = {"seed": self.seed, "steps": self.steps, "sampler": self.sampler, **self.asked}
         params |= {"size": _PICTURE_PX, "picture_px": _STEP_PICTURE_PX}
         checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
         return {**params, **checkpoint, "out_dir": str(folder)}
 
     def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
-        """Build the person."""
         notice = build_person(context, result, "Generated")[1]
-        if self.renews_seed:
-            context.scene.primdiffusion.seed = random_seed()
+        if self.next_seed is not None:
+            context.scene.primdiffusion.seed = self.next_seed
         return notice
+
+
+@dataclasses.dataclass(frozen=True)
+class ReconstructJob(Job):
+    """Human from Captures."""
+
+    kind = method = "reconstruct"
+    undo = "Human from Captures"
+    new_person = "Human"
+
+    capture: str
+    """Folder of a dataset of captures, or of one subject in it."""
+    subject: str
+    """Empty for the only one."""
+    frame: int
+    views: int
+    checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("encoder"))
+
+    @property
+    def label(self) -> str:
+        return f"Human from Captures, {self.subject or Path(self.capture).name}"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        params: dict[str, Any] = {"capture": self.capture, "frame": self.frame, "views": self.views}
+        optional = {"subject": self.subject, "checkpoint": self.checkpoint}
+        return {**params, **{k: v for k, v in optional.items() if v}, "out_dir": str(folder)}
+
+    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+        return build_person(context, result, "Reconstructed")[1]

@@ -1,24 +1,37 @@
-"""What the child computes on, and the memory it holds: told, and given back."""
+"""What the child computes on, and the memory it holds: shown in panels, and released."""
 
 from __future__ import annotations
 
 import os
+import subprocess
 
 import bpy
 
 from ..places import EXTENSION
 from .queue import queue
 
+
+def resident_bytes(pid: int) -> int | None:
+    """Physical memory of a process; None on Windows, or where the process is gone."""
+    if os.name == "nt":
+        return None
+    try:
+        shown = subprocess.run(["ps", "-o", "rss=", "-p", str(pid)], capture_output=True, timeout=1.0, check=True)
+        return int(shown.stdout) * 1024
+    except (OSError, subprocess.SubprocessError, ValueError):
+        return None
+
+
 IDLE_MINUTES = 10.0
-"""Where the preferences do not say."""
-_WORTH_TELLING = 50e6
+"""Default, where the preferences have none."""
+_WORTH_REPORTING = 50e6
 """Bytes."""
 
 
 def device_line() -> str:
-    """What panels say of the device: its name, and its memory in all and free where the child has told."""
-    if queue.child_news:
-        return f"{queue.child_news}; restarts with the next person"
+    """The device as panels show it: its name, and its total and free memory as far as the child has reported them."""
+    if queue.child_message:
+        return f"{queue.child_message}; restarts with the next person"
     info = queue.info
     if not info.get("device_name"):
         return "starts with the first person"
@@ -31,13 +44,13 @@ def device_line() -> str:
 
 
 def idle_minutes() -> float:
-    """After how long a child that nobody needs is ended; 0: never."""
+    """Minutes after which an idle child is ended; 0 for never."""
     addon = bpy.context.preferences.addons.get(EXTENSION)
     return float(getattr(addon.preferences, "idle_minutes", IDLE_MINUTES)) if addon is not None else IDLE_MINUTES
 
 
 def release_when_idle(now: float) -> bool:
-    """End the child when nothing has been asked of it for `idle_minutes`; whether it was. `now`: time.monotonic().
+    """End the child after `idle_minutes` without a job; whether it was ended. `now`: time.monotonic().
 
     Grids that Blender can read again are freed with it.
     """
@@ -47,20 +60,20 @@ def release_when_idle(now: float) -> bool:
     if queue.release() is None:
         return False
     if not bpy.app.is_job_running("RENDER"):
-        from ..scene.grid_cache import free_unused_grids
+        from ..scene.volumes import free_unused_grids  # needs numpy
 
         free_unused_grids()
     return True
 
 
 def release() -> str:
-    """End the children that generate and draw, and free grids that Blender can read again; what that gave back.
+    """End the children that generate and draw, and free grids that Blender can read again; returns what was freed.
 
     Raises RuntimeError while one of them is busy.
     """
+    # needs numpy
     from ..engine import studio
-    from ..scene.grid_cache import free_unused_grids
-    from ..worker.process_memory import resident_bytes
+    from ..scene.volumes import free_unused_grids
 
     if queue.busy:
         raise RuntimeError("the backend is busy: wait for it, or cancel the job first")
@@ -74,7 +87,7 @@ def release() -> str:
     free_unused_grids()
     grids = before - (resident_bytes(os.getpid()) or before)
     freed = (
-        f"Blender gave back {grids / 1e9:.1f} GB of volumes, read again when needed" if grids > _WORTH_TELLING else ""
+        f"Blender gave back {grids / 1e9:.1f} GB of volumes, read again when needed" if grids > _WORTH_REPORTING else ""
     )
     if not pids:
         return freed or "nothing to release: the backend is not running"

@@ -1,4 +1,4 @@
-"""What the child is asked for by renderers that are not ours: merged grids and the density gain."""
+"""Jobs for other renderers: merged volumes, and the density gain."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from ..scene.attachment import set_attachment
 from ..scene.human import armature_of
 from ..scene.material import set_density_gain
 from ..scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
-from .job import Job
-from .target import Target
+from .queue import Job
+from .target import HumanTarget
 
 
 @dataclasses.dataclass(frozen=True)
 class Moment:
-    """A person in one pose."""
+    """A human in one pose."""
 
     params: dict[str, Any]
-    """As the child wants them, with the armature's object at the origin: what is merged moves with that object."""
+    """Parameters of the child, with the armature object at the origin: the merged volume moves with that object."""
     digest: str
     """See `pose_digest`."""
 
     @classmethod
     def now(cls, person: bpy.types.Collection, armature: bpy.types.Object | None = None) -> Moment:
-        """As the person, or the evaluated `armature` that stands for them, is posed now.
+        """The current pose of the human, or of the evaluated `armature` if given.
 
-        Raises ValueError for a renamed bone or a pose that holds NaN, FileNotFoundError where the person's file is
+        Raises ValueError for a renamed bone or a pose that holds NaN, FileNotFoundError where the human's file is
         missing.
         """
         armature = armature_of(person) if armature is None else armature
@@ -45,28 +45,25 @@ class Moment:
 
 @dataclasses.dataclass(frozen=True)
 class MergeJob(Job):
-    """A person in one pose as one volume."""
+    """Merge a human in one pose into one volume."""
 
     kind = method = "merge"
     undo = "Merge Human"
 
-    target: Target
+    target: HumanTarget
     moment: Moment
     voxel: float
     """Metres."""
 
     @property
     def label(self) -> str:
-        """For people."""
         return f"Merge {self.target.name}"
 
     def params(self, folder: Path) -> dict[str, Any]:
-        """Of the child's method."""
         people = [{**self.moment.params, "human": self.target.file_now()}]
         return {"people": people, "voxel": self.voxel, "out": str(folder / "grid.npz")}
 
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
-        """Show the merged volume in the place of the others."""
         person = self.target.found()
         digest = write_grid(read_grid(Path(result["out"])), folder / "grid.vdb")
         files = publish([folder / "grid.vdb"], [digest], merged_folder(person))
@@ -78,28 +75,27 @@ class MergeJob(Job):
 
 @dataclasses.dataclass
 class MergeFramesJob(Job):
-    """A person as one volume, another one for each frame."""
+    """Merge a human into one volume for each frame."""
 
     kind = method = "merge_frames"
     undo = "Merge Frames"
 
-    target: Target
+    target: HumanTarget
     moments: list[Moment]
     start: int
     """The first frame's number."""
     voxel: float
     """Metres."""
     _digests: list[str] = dataclasses.field(default_factory=list, init=False, repr=False)
-    """Of the VDB files that are written."""
+    """Of the VDB files written so far."""
     _error: OSError | ValueError | None = dataclasses.field(default=None, init=False, repr=False)
 
     @property
     def label(self) -> str:
-        """For people."""
         return f"Merge {self.target.name}, {len(self.moments)} frames"
 
     def params(self, folder: Path) -> dict[str, Any]:
-        """Of the child's method; its grids become VDB files as they appear (see `advance`)."""
+        """The grids become VDB files as they appear: see `advance`."""
         file = self.target.file_now()
         self._digests, self._error = [], None
         people = [{**moment.params, "human": file} for moment in self.moments]
@@ -118,7 +114,6 @@ class MergeFramesJob(Job):
         return _grid(folder, len(self._digests)).is_file()
 
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
-        """Show the sequence in the place of the volumes."""
         person = self.target.found()
         while self.advance(folder):
             pass
@@ -134,26 +129,23 @@ class MergeFramesJob(Job):
 
 @dataclasses.dataclass(frozen=True)
 class FitGainJob(Job):
-    """The density gain of a person in one pose."""
+    """Fit the density gain of a human in one pose."""
 
     kind = method = "fit_gain"
     undo = "Fit Density Gain"
     decimals: ClassVar[int] = 2
 
-    target: Target
+    target: HumanTarget
     moment: Moment
 
     @property
     def label(self) -> str:
-        """For people."""
         return f"Fit Density Gain: {self.target.name}"
 
     def params(self, _folder: Path) -> dict[str, Any]:
-        """Of the child's method."""
         return {"people": [{**self.moment.params, "human": self.target.file_now()}]}
 
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
-        """Give the person the gain."""
         person, gain = self.target.found(), round(result["gain"], self.decimals)
         set_density_gain(person, gain)
         return (

@@ -1,4 +1,4 @@
-"""Which files of people are missing, looked up after loading, saving and undo, and by a slow timer."""
+"""Missing files of humans, looked up after loading, saving and undo, and by a slow timer."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ OFTEN_S = 15.0
 
 @dataclasses.dataclass
 class State:
-    """What was found when it was last looked."""
+    """What the last look found."""
 
-    told: str = ""
-    """Like: 12 volumes of 'Human'; empty when nobody misses anything."""
+    summary: str = ""
+    """For instance: 12 volumes of 'Human'; empty when nothing is missing."""
     without_person_file: tuple[str, ...] = ()
-    """People who cannot be made again from their file: their names."""
+    """Names of humans that cannot be restored from their own file."""
 
 
 state = State()
 
 
 def look() -> None:
-    """Find out now."""
-    before = state.told
-    state.told, state.without_person_file = _found() if any_humans() else ("", ())
-    if state.told != before:
+    """Look now."""
+    before = state.summary
+    state.summary, state.without_person_file = _found() if any_humans() else ("", ())
+    if state.summary != before:
         redraw()
 
 
 def _found() -> tuple[str, tuple[str, ...]]:
-    from ..scene.missing import find_person, missing_files
+    from ..scene.missing import find_person, missing_files  # needs numpy
 
     lost = missing_files()
     alone = [one.person.name for one in lost if one.person_file and not one.linked and find_person(one) is None]
@@ -51,7 +51,7 @@ def look_after(*_: object) -> None:
 
 @persistent
 def look_soon(*_: object) -> None:
-    """Handler of undo_post and redo_post: several may follow on each other quickly."""
+    """Handler of undo_post and redo_post, several of which may follow each other quickly."""
     if bpy.app.background:
         look()
     else:
@@ -59,7 +59,7 @@ def look_soon(*_: object) -> None:
 
 
 def start() -> None:
-    """Have Blender call `look` soon and now and then."""
+    """Have Blender call `look` soon, and then every OFTEN_S."""
     if bpy.app.background:
         return
     stop()
@@ -79,9 +79,9 @@ def _tick() -> float:
 
 @persistent
 def collect_before_saving(blend_path: str, *_: object) -> None:
-    """Handler of save_pre; the collecting code is imported once there is a human."""
+    """Handler of save_pre."""
     if any_humans():
-        from ..scene import collect
+        from ..scene import collect  # needs numpy
 
         collect.collect_before_saving(blend_path)
 
@@ -96,7 +96,7 @@ HANDLERS = (
 
 
 def register() -> None:
-    """Start to look now and then."""
+    """Start the timer."""
     start()
 
 

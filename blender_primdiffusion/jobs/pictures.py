@@ -1,4 +1,4 @@
-"""Pictures that panels draw: of the person being made, and of files."""
+"""Pictures that panels draw: of the human being generated, and of files."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ _NAME = "so far"
 
 
 class SoFar:
-    """One picture at a time; the one before it is given back."""
+    """One picture at a time; the one before is freed."""
 
     def __init__(self) -> None:
         self._collection: bpy.utils.previews.ImagePreviewCollection | None = None
         self._shown: tuple[Path, int] | None = None
 
     def show(self, path: Path | None) -> bool:
-        """Show this PNG, or nothing; whether that is another picture than before.
+        """Show this PNG, or nothing; whether the picture has changed.
 
-        It is read now: the child may replace the file. One that cannot be read leaves the picture that is shown.
+        It is read now, since the child may replace the file. A file that cannot be read changes nothing.
         """
         if path is None:
             changed, self._shown = self._shown is not None, None
@@ -41,7 +41,7 @@ class SoFar:
 
     @property
     def icon(self) -> int:
-        """For `UILayout.template_icon`; 0 when there is none, and without a window."""
+        """For `UILayout.template_icon`; 0 for none, and without a window."""
         return self._collection[_NAME].icon_id if self._shown is not None else 0
 
     @property
@@ -50,7 +50,7 @@ class SoFar:
         return self._shown[0] if self._shown is not None else None
 
     def close(self) -> None:
-        """Give it back."""
+        """Free the picture."""
         if self._collection is not None:
             bpy.utils.previews.remove(self._collection)
         self._collection = self._shown = None
@@ -67,7 +67,7 @@ class Icons:
         self._previews: bpy.utils.previews.ImagePreviewCollection | None = None
 
     def of(self, path: Path | None) -> int:
-        """The number of the icon for `template_icon`; 0, which is empty, without such a file."""
+        """The icon of a file for `template_icon`; 0, which is empty, where there is no file."""
         if path is None or not path.is_file():
             return 0
         if self._previews is None:
@@ -75,11 +75,11 @@ class Icons:
         name = str(path)
         if name not in self._previews:
             preview = self._previews.load(name, name, "IMAGE")
-            _ = preview.image_size[:]  # reads the file now: Blender would do so later, when it may be gone
+            _ = preview.image_size[:]  # reads the file now: later it may be gone
         return self._previews[name].icon_id
 
     def free(self) -> None:
-        """All of them."""
+        """Free all previews."""
         if self._previews is not None:
             bpy.utils.previews.remove(self._previews)
             self._previews = None

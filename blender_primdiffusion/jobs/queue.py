@@ -1,7 +1,8 @@
-"""Jobs queued for the child: one at a time, in order."""
+"""Jobs for the child, what becomes of their results, and the queue that runs one at a time, in order."""
 
 from __future__ import annotations
 
+import abc
 import collections
 import dataclasses
 import itertools
@@ -10,17 +11,72 @@ import tempfile
 import time
 import traceback
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import bpy
 
+from ..backend.client import Died, Silent
+from ..backend.requests import Request
 from ..places import new_backend, preference
-from .job import Job
 from .remedies import defect_in_the_scene, error_in_the_scene
 
 if TYPE_CHECKING:
-    from ..worker.backend import Backend
-    from ..worker.request import Request, RequestError
+    from ..backend.requests import Backend, Request, RequestError
+    from ..scene.human_npz import Destination
+
+
+class Job(abc.ABC):
+    """A request to the child, and what becomes of its result. Holds plain data: undo replaces Blender's objects."""
+
+    kind: ClassVar[str]
+    """Identifies the kind of job, for panels; unique."""
+    method: ClassVar[str]
+    """The child's method."""
+    undo: ClassVar[str] = ""
+    """Name of the undo step that `finish` makes; empty when it leaves the scene as it is."""
+    new_person: str = ""
+    """Name of the human that `finish` builds from the result; empty for jobs that build none."""
+
+    @property
+    @abc.abstractmethod
+    def label(self) -> str:
+        """Shown in panels: Human, seed 7."""
+
+    @abc.abstractmethod
+    def params(self, folder: Path) -> dict[str, Any]:
+        """Parameters of the child's method when the job starts; `folder` is for its files, empty, and removed
+        after `finish`. Raises ValueError or OSError where the job is no longer possible."""
+
+    @abc.abstractmethod
+    def finish(self, context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
+        """Put the child's result into the scene of `context`; returns a message for the panel.
+
+        Runs inside an operator, in object mode where `undo` is given; that operator makes the undo step. ValueError,
+        OSError and RuntimeError become the panel's error, and must leave the scene as it was.
+        """
+
+    def advance(self, folder: Path) -> bool:
+        """Process some of the files that the child has written so far, for a timer's tick at most; whether there is
+        more to do now. Called while the child is running, and afterwards until nothing is left, before `finish`."""
+        return False
+
+    def place(self) -> Destination | None:
+        """Where the result's volumes go, which are written before `finish`; None for jobs that show no human.
+
+        Evaluated when the result has arrived. ValueError and OSError are ignored: `finish` raises them again."""
+        if not self.new_person:
+            return None
+        # needs numpy
+        from ..scene.build import next_folder
+        from ..scene.human_npz import Destination
+
+        return Destination(next_folder(self.new_person))
+
+
+def chosen_checkpoint(name: str) -> str:
+    """The file of the preference `checkpoint` or `encoder`; empty for the bundled one."""
+    return preference(name)
+
 
 CANCELLED = "Cancelled"
 GONE = "The scene {!r} was deleted meanwhile: nothing was added. Undo the deletion and try again."
@@ -32,25 +88,25 @@ class Entry:
     """A queued job, and the scene it was queued for."""
 
     number: int
-    """Its name for buttons."""
+    """Identifies it in operators."""
     job: Job
     scene: str
     scene_uid: int
-    """For as long as the file is open."""
+    """Valid while the file is open."""
     asked_at: float
     """time.monotonic()."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Outcome:
-    """How a job has ended."""
+class JobOutcome:
+    """How a job ended."""
 
     entry: Entry
     notice: str = ""
     """Message, when it succeeded or was cancelled."""
     error: RequestError | None = None
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    """"work" from the click to the child's answer, "finish" in the scene."""
+    """"work" from the click to the child's result, "finish" in the scene."""
 
     @property
     def sentence(self) -> str:
@@ -73,17 +129,17 @@ class Queue:
         self.request: Request | None = None
         """The request of `current`."""
         self.advancing = False
-        """`current` has more to do before its answer may enter the scene."""
-        self.outcomes: dict[str, Outcome] = {}
+        """`current` has more to do before its result may enter the scene."""
+        self.outcomes: dict[str, JobOutcome] = {}
         """The last of each kind of job, for the panels."""
-        self.last: Outcome | None = None
-        self.ended: collections.deque[Outcome] = collections.deque(maxlen=_REMEMBERED)
+        self.last: JobOutcome | None = None
+        self.ended: collections.deque[JobOutcome] = collections.deque(maxlen=_REMEMBERED)
         """The last of any kind, the latest first."""
-        self.child_news = ""
-        """How the child ended between works; empty when it did not."""
+        self.child_message = ""
+        """How the child ended between jobs; empty when it did not."""
         self.idle_since = time.monotonic()
         self.info: dict[str, object] = {}
-        """What the child said of itself; kept when it has ended."""
+        """What the child reported about itself, also after it has ended."""
         self._numbers = itertools.count(1)
         self._folder: Path | None = None
         self._backend: Backend | None = None
@@ -101,7 +157,7 @@ class Queue:
 
     @property
     def ready(self) -> bool:
-        """An answer waits to be put into the scene, by `finish`."""
+        """A result is ready for `finish`, which puts it into the scene."""
         return self.request is not None and self.request.state == "done"
 
     def add(self, context: bpy.types.Context, job: Job) -> Entry:
@@ -113,7 +169,7 @@ class Queue:
         return entry
 
     def tick(self) -> bool:
-        """Take in news of the child, begin the next job; True when something visible changed. Never waits."""
+        """Process the child's messages, start the next job; True when something visible changed. Never waits."""
         if self.current is None:
             if not self.waiting:
                 return False
@@ -121,20 +177,20 @@ class Queue:
             return True
         changed = self.request.tick()
         if self.request.info:
-            self.info, self.child_news = self.request.info, ""
+            self.info, self.child_message = self.request.info, ""
         if self.request.state == "cancelled":
-            self._end(Outcome(self.current, notice=CANCELLED))
+            self._end(JobOutcome(self.current, notice=CANCELLED))
         elif self.request.state == "failed":
-            self._end(Outcome(self.current, error=self.request.error))
+            self._end(JobOutcome(self.current, error=self.request.error))
         else:
             self.advancing = self.current.job.advance(self._folder)
         return changed
 
-    def finish(self, context: bpy.types.Context) -> Outcome:
-        """Put the answer that is `ready` into the scene of `context`. For the operator that makes the undo step."""
+    def finish(self, context: bpy.types.Context) -> JobOutcome:
+        """Put the result that is `ready` into the scene of `context`. For the operator that makes the undo step."""
         entry, began = self.current, time.monotonic()
         if entry is None or not self.ready:
-            raise RuntimeError("no answer waits: call tick until ready")
+            raise RuntimeError("no result is ready: call tick until ready")
         notice, error = "", None
         try:
             notice = entry.job.finish(context, self.request.result or {}, self._folder)
@@ -144,17 +200,17 @@ class Queue:
             traceback.print_exc()
             error = defect_in_the_scene(e)
         seconds = {"work": began - entry.asked_at, "finish": time.monotonic() - began}
-        return self._end(Outcome(entry, notice, error, seconds))
+        return self._end(JobOutcome(entry, notice, error, seconds))
 
-    def refuse(self, error: RequestError) -> Outcome:
-        """End the running job without looking at its answer."""
-        return self._end(Outcome(self.current, error=error))
+    def fail(self, error: RequestError) -> JobOutcome:
+        """End the running job with an error, whatever its result."""
+        return self._end(JobOutcome(self.current, error=error))
 
     def cancel(self, number: int = 0) -> bool:
         """Remove a queued job, or stop the running one (also number 0); whether there was such a job."""
         if self.current is not None and number in (0, self.current.number):
-            if self.ready:  # and waits to enter the scene
-                self._end(Outcome(self.current, notice=CANCELLED))
+            if self.ready:  # about to enter the scene
+                self._end(JobOutcome(self.current, notice=CANCELLED))
             else:
                 self.request.cancel()
             return True
@@ -164,23 +220,21 @@ class Queue:
         return found
 
     def listen(self) -> bool:
-        """Between works: notice that the child has died or hangs; True when something visible changed. Never waits."""
+        """Between jobs: notice that the child has died or hangs; True when something visible changed. Never waits."""
         if self._backend is None or self.request is not None:
             return False
-        from ..worker.client import Died, Silent
-
         for event in self._backend.listen():
             if isinstance(event, Died):
-                self.child_news = event.message
+                self.child_message = event.message
                 return True
             if isinstance(event, Silent):
-                self.child_news = "the backend hung and was ended"
+                self.child_message = "the backend hung and was ended"
                 self.release()
                 return True
         return False
 
     def release(self) -> int | None:
-        """End the child that is idle; its process id, None where there was none or it is running a job."""
+        """End the idle child; returns its process id, None where there was none or it is running a job."""
         pid = self.child_pid
         if pid is None or self.request is not None:
             return None
@@ -191,7 +245,7 @@ class Queue:
         """Drop all jobs and end the child."""
         self.waiting.clear()
         self.current = self.request = None
-        self.child_news = ""
+        self.child_message = ""
         self._clear_folder()
         if self._backend is not None:
             self._backend.shutdown()
@@ -206,7 +260,7 @@ class Queue:
 
     @property
     def child_pid(self) -> int | None:
-        """The process that works or is kept warm."""
+        """Process id of the running child, if any."""
         client = self._backend.client if self._backend is not None else None
         return client.pid if client is not None else None
 
@@ -216,18 +270,16 @@ class Queue:
         return self._backend.log if self._backend is not None else ()
 
     def _begin(self, entry: Entry) -> None:
-        from ..worker.request import Request
-
         self.current = entry
         try:
             self._folder = Path(tempfile.mkdtemp(prefix=f"{entry.job.kind}_", dir=bpy.app.tempdir or None))
             params = entry.job.params(self._folder)
         except (ValueError, OSError) as error:
-            self._end(Outcome(entry, error=error_in_the_scene(error)))
+            self._end(JobOutcome(entry, error=error_in_the_scene(error)))
             return
         self.request = Request(self._backend_for(preference("backend_python")), entry.job.method, params)
 
-    def _end(self, outcome: Outcome) -> Outcome:
+    def _end(self, outcome: JobOutcome) -> JobOutcome:
         self.outcomes[outcome.entry.job.kind] = self.last = outcome
         self.ended.appendleft(outcome)
         self.current = self.request = None
@@ -241,7 +293,7 @@ class Queue:
             self._folder = None
 
     def _backend_for(self, python: str) -> Backend:
-        """The child of this interpreter; changing the preference ends the former one."""
+        """The child of this interpreter; changing the preference ends the one before."""
         if self._backend is not None and python == self._backend_python:
             return self._backend
         if self._backend is not None:

@@ -1,18 +1,19 @@
-"""What can be done about an error: one sentence, and a button that does it."""
+"""Errors of jobs, and the button that helps."""
 
 from __future__ import annotations
 
 import dataclasses
 import errno
 import re
+import traceback
 from typing import TYPE_CHECKING
 
 import bpy
 
-from ..worker.sentence import sentence
+from ..backend.requests import RequestError, sentence
 
 if TYPE_CHECKING:
-    from ..worker.request import RequestError
+    from ..backend.requests import RequestError
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
 
@@ -39,13 +40,13 @@ _REMEDIES = {
     "died": _TRY_AGAIN,
     "hung": _TRY_AGAIN,
 }
-"""By the kind of the error."""
+"""By the kind of error."""
 _OF_PREFERENCES = re.compile("checkpoint|encoder|safetensors")
-"""A missing folder of captures is chosen in its panel."""
+"""Other missing files, such as captures, are chosen in their panels."""
 
 
 def remedy_for(error: RequestError) -> Remedy | None:
-    """The button for an error; None where the sentence must do, or this version has no such button."""
+    """The button for an error, if any that this Blender has."""
     remedy = _REMEDIES.get(error.kind)
     if remedy is None or (error.kind == "missing_file" and not _OF_PREFERENCES.search(error.message)):
         return None
@@ -58,32 +59,26 @@ def remedy_for(error: RequestError) -> Remedy | None:
 
 
 def error_in_the_scene(error: Exception) -> RequestError:
-    """Why a result is not in the scene; an exception may name its kind itself, in an attribute `kind`."""
-    from ..worker.request import RequestError
-
+    """The error of a result that could not enter the scene; an exception may have an attribute `kind`."""
     kind = getattr(error, "kind", "scene")
     cause = error if isinstance(error, OSError) else error.__cause__
     while cause is not None and not getattr(cause, "errno", None):
         cause = cause.__cause__
     if cause is not None and cause.errno in _NO_ROOM:
         return RequestError(
-            sentence(error), "Save the file where there is room and you may write, then try again", "unwritable"
+            sentence(error),
+            "Save the file in a folder with free space and write permission, then try again",
+            "unwritable",
         )
     return RequestError(sentence(error), "", str(kind))
 
 
 def defect_in_the_scene(error: Exception) -> RequestError:
-    """As `error_in_the_scene`, of an exception that is being handled and that nobody foresaw: with its traceback."""
-    import traceback
-
-    from ..worker.request import RequestError
-
+    """As `error_in_the_scene`, of an unexpected exception that is being handled: with its traceback."""
     trace = tuple(traceback.format_exc().splitlines())
     return RequestError(f"the result could not be put into the scene: {sentence(error)}", "", "scene", trace)
 
 
-def refusal_of_the_scene(message: str) -> RequestError:
-    """Why a result could not even begin to enter the scene."""
-    from ..worker.request import RequestError
-
+def error_before_the_scene(message: str) -> RequestError:
+    """The error of a result that could not begin to enter the scene."""
     return RequestError(message, "", "scene")

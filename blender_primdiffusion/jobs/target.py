@@ -1,4 +1,4 @@
-"""Whom an edit is about, from the click until it is done, whatever happens to the scene meanwhile."""
+"""The human that a job is for, from the click until it is done; and the human that the user means."""
 
 from __future__ import annotations
 
@@ -6,35 +6,30 @@ import dataclasses
 
 import bpy
 
-from ..scene.files import person_file, person_file_name
-from ..scene.human import human_of, humans
+from ..scene.human import check_editable, human_of, humans, person_file, person_file_name
 
 
 @dataclasses.dataclass(frozen=True)
-class Target:
-    """A person as they were when the edit began. Undo may replace Blender's objects, so none is kept."""
+class HumanTarget:
+    """A human as it was when the job was queued. Holds no Blender objects, since undo may replace them."""
 
     uid: int
-    """Of the collection, valid while the file is open."""
+    """Of the collection; valid while the file is open."""
     name: str
     file: str
-    """Name of the backend's file of the person."""
+    """Name of the human's own file."""
 
     @classmethod
-    def of(cls, person: bpy.types.Collection) -> Target:
-        """Raises ValueError for a person that cannot be edited."""
-        from ..scene.human import check_editable
-
+    def of(cls, person: bpy.types.Collection) -> HumanTarget:
+        """Raises ValueError for a human that cannot be edited."""
         check_editable(person)
         return cls(person.session_uid, person.name, person_file_name(person))
 
     def found(self) -> bpy.types.Collection:
-        """The person, if still in a scene and the one it was; else ValueError with a sentence."""
-        from ..scene.human import check_editable
-
+        """The human. Raises ValueError where it is no longer in a scene, or has changed."""
         people = [person for scene in bpy.data.scenes for person in humans(scene)]
         person = next((person for person in people if person.session_uid == self.uid), None)
-        if person is None or not any(thing.type == "ARMATURE" for thing in person.objects):
+        if person is None or not any(obj.type == "ARMATURE" for obj in person.objects):
             raise ValueError(
                 f"the person {self.name!r} was removed during the edit; nothing was changed. Undo the "
                 "removal and edit again"
@@ -47,7 +42,7 @@ class Target:
         return person
 
     def file_now(self) -> str:
-        """Path of the backend's file, asked for when it is needed: saving the .blend for the first time moves it.
+        """Path of the human's own file at this time: the first save of the .blend moves it.
 
         Raises as `found` does, and FileNotFoundError.
         """
@@ -55,7 +50,7 @@ class Target:
 
 
 def selected_person(context: bpy.types.Context) -> bpy.types.Collection:
-    """Whom the active object belongs to; without such an object the only person of the scene. Raises ValueError."""
+    """The human of the active object, else the only human of the scene. Raises ValueError."""
     person = human_of(context.view_layer.objects.active, context.scene)
     if person is not None:
         return person
@@ -68,7 +63,7 @@ def selected_person(context: bpy.types.Context) -> bpy.types.Collection:
 
 
 def named_person(context: bpy.types.Context, name: str) -> bpy.types.Collection:
-    """The person of the scene whose collection has this name. Raises ValueError, naming who is there."""
+    """The human of the scene whose collection has this name. Raises ValueError, naming those there are."""
     people = humans(context.scene)
     for person in people:
         if person.name == name:

@@ -1,4 +1,4 @@
-"""Several people at once: the job that makes them and the contact sheet that holds them."""
+"""Variations: the job that generates several humans, and the contact sheet that holds them."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from typing import Any
 
 import bpy
 
-from .job import Job, chosen_checkpoint
 from .pictures import icons
+from .queue import Job, chosen_checkpoint
 
 NAMES = {"human": "human.npz", "person": "person.human.safetensors", "picture": "picture.png"}
-"""Files of a person, by the names that the child's answer has for them."""
+"""Files of a human, by their names in the child's result."""
 
 
 @dataclasses.dataclass
 class Variation:
-    """Somebody to choose."""
+    """A human on the sheet."""
 
     seed: int
     folder: Path
@@ -29,33 +29,29 @@ class Variation:
 
     @property
     def human(self) -> Path:
-        """For building them."""
         return self.folder / NAMES["human"]
 
     @property
     def person(self) -> Path:
-        """The backend's own file."""
         return self.folder / NAMES["person"]
 
     @property
     def picture(self) -> Path:
-        """A PNG."""
         return self.folder / NAMES["picture"]
 
 
 class Sheet:
-    """The people to choose from; all methods are for Blender's main thread."""
+    """The humans to choose from. All methods are for Blender's main thread."""
 
     def __init__(self) -> None:
         self.variations: list[Variation] = []
         self.title = ""
-        """What they are."""
         self.around = False
-        """They are variants of one person."""
+        """They are variants of one human."""
         self._folder: Path | None = None
 
     def fill(self, people: Sequence[Mapping[str, Any]], title: str, *, around: bool = False) -> None:
-        """Take over the files of the child's `people`; those there were go. Raises OSError, and then these stay."""
+        """Move the files of the child's `people` here, replacing those before. Raises OSError before any change."""
         folder = Path(tempfile.mkdtemp(prefix="variation_sheet_", dir=bpy.app.tempdir or None))
         made = []
         try:
@@ -72,20 +68,20 @@ class Sheet:
         self.variations, self.title, self.around, self._folder = made, title, around, folder
 
     def clear(self) -> None:
-        """Nobody is left, and none of their files."""
+        """Remove all variations and their files."""
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
         self.variations, self.title, self.around, self._folder = [], "", False, None
 
     def at(self, index: int) -> Variation:
-        """Raises ValueError, saying how many there are."""
+        """Raises ValueError for an index that does not exist."""
         if not 0 <= index < len(self.variations):
             there = f"there are {len(self.variations)}, counted from 0" if self.variations else "show variations first"
             raise ValueError(f"there is no variation {index}: {there}")
         return self.variations[index]
 
     def chosen(self) -> list[Variation]:
-        """Those that are selected. Raises ValueError for none."""
+        """The selected ones. Raises ValueError for none."""
         found = [variation for variation in self.variations if variation.chosen]
         if not found:
             raise ValueError("no variation is selected: click the seeds below the pictures")
@@ -93,7 +89,7 @@ class Sheet:
 
 
 sheet = Sheet()
-"""Blender has one user: one sheet, the same in all windows and scenes."""
+"""One, for all windows and scenes."""
 
 PICTURE_PX = 256
 
@@ -108,20 +104,18 @@ class VariationsJob(Job):
     steps: int
     sampler: str
     asked: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """attributes and guidance, where something is asked for."""
+    """Attributes and guidance, where given."""
     person: str = ""
-    """The backend's file of whom to vary; empty: new people."""
+    """File of the human to vary; empty for new humans."""
     amount: float = 0.5
     title: str = "New people"
     checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
 
     @property
     def label(self) -> str:
-        """For people."""
         return f"{len(self.seeds)} Variations"
 
     def params(self, folder: Path) -> dict[str, Any]:
-        """Of the child's method variations."""
         params: dict[str, Any] = {"seeds": list(self.seeds), "steps": self.steps, "sampler": self.sampler, **self.asked}
         if self.person:
             if not Path(self.person).is_file():
@@ -132,7 +126,6 @@ class VariationsJob(Job):
         return {**params, "size": PICTURE_PX, "out_dir": str(folder)}
 
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
-        """Put them on the sheet; the scene stays as it is."""
         sheet.fill(result["people"], self.title, around=bool(self.person))
-        icons.free()  # those of the steps
+        icons.free()  # of the steps
         return f"{len(self.seeds)} people in {result['seconds']:.1f} s"

@@ -15,12 +15,23 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from .armature import build_armature
 from .convention import frames_to_blender, matrix_to_quaternion, points_to_blender
-from .files import HOME, PERSON, available_name, folder_of, humans_folder, stored_path
-from .grid_cache import read_headers
-from .human import BETAS, BODY_MARK, MARK, armature_of, humans
+from .human import (
+    BETAS,
+    BODY_MARK,
+    HOME,
+    MARK,
+    PERSON,
+    armature_of,
+    available_name,
+    folder_of,
+    humans,
+    humans_folder,
+    stored_path,
+)
+from .human_npz import Destination, WrittenHuman, write_now
 from .material import volume_material
 from .shape import saved_body
-from .writing import Destination, WrittenHuman, write_now
+from .volumes import read_headers
 
 GAP_M = 0.2
 """Between the hands of two humans in the T pose."""
@@ -36,7 +47,7 @@ def build_human(
 ) -> bpy.types.Collection:
     """Write the volumes of a human.npz and build it in the scene at once, which takes seconds; see `build_written`.
 
-    Raises HumanFileError or VolumeWriteError, and then leaves neither data nor files.
+    Raises HumanNpzError or VolumeWriteError, and then leaves neither data nor files.
     """
     written = write_now(human_npz, Destination(next_folder(name)))
     read_headers(written.files)

@@ -14,8 +14,9 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
-from .files import (
+from .human import (
     HOME,
+    MARK,
     MERGED_VDB,
     PERSON,
     PRIMITIVE_VDB,
@@ -30,7 +31,6 @@ from .files import (
     stored_path,
     volume_path,
 )
-from .human import MARK
 from .shape import BODY_FILE, BODY_NPZ, body_files
 
 _PERSON_FILES = re.compile(r"person(_[0-9a-f]{12})?\.human\.safetensors")

@@ -15,7 +15,7 @@ from pathlib import Path
 import bpy
 
 from ..formats.joints import JOINT_NAMES
-from .files import copy_file
+from .human import copy_file
 
 
 @dataclasses.dataclass(frozen=True)

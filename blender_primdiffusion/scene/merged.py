@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.arrays import ArrayFileError, check_shapes, read_arrays
-from .files import VolumeWriteError, copy_file, folders_of, person_file_name, stored_path
-from .human import armature_of
+from .human import VolumeWriteError, armature_of, copy_file, folders_of, person_file_name, stored_path
 from .material import person_material
 from .volumes import write_vdb
 

@@ -15,8 +15,9 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from .files import (
+from .human import (
     HOME,
+    MARK,
     MERGED_VDB,
     PERSON_FILE,
     PRIMITIVE_VDB,
@@ -28,7 +29,6 @@ from .files import (
     stored_path,
     volume_path,
 )
-from .human import MARK
 from .human_file import read_tensors
 from .shape import BODY_FILE, generated_betas
 

@@ -11,8 +11,7 @@ from .armature import move_rest_joints
 from .convention import frames_to_blender, matrix_to_quaternion, points_to_blender
 from .human import BETA_COUNT, BETAS, LARGEST_BETA, armature_of, body_of, own_data, volumes_of
 from .proxy import follow_shape, proxy_of
-from .shape import generated_betas, shape_model_of
-from .shape_model import Rest
+from .shape import Rest, generated_betas, shape_model_of
 from .surface import scale_surface
 
 _FLOOR_TOLERANCE = 1e-3

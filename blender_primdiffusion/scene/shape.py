@@ -1,12 +1,8 @@
-"""The shape of a human in the scene, and the file of the body that it belongs to.
-
-`armature[BETAS]` is the shape, which the engine draws; it may be animated. `reshape` moves bones, body mesh and volumes
-along. The body's file, body_<hash>.npz beside the humans' folders, holds its ShapeModel, so that reshaping needs no
-backend. Humans on the same body share one file; its name is a hash of its content, so a file never changes.
-"""
+"""The shape of a human, and how its body at rest, joints, primitives, height and weight follow from it."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import json
@@ -16,15 +12,213 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.arrays import read_arrays
-from .files import VolumeWriteError, folders_of
-from .human import BETA_COUNT, BETAS, MARK, armature_of
-from .shape_model import FIELDS, INTEGERS, SAME_BETAS, ShapeModel, faulty_field
+from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, VolumeWriteError, armature_of, folders_of
+
+_TINY = 1e-12
+"""Smallest divisor when normalising, as in the backend."""
+SHARE = 0.5
+"""Boxes grow by the surface's stretch to this power; the backend's `reshaping.SHARE`."""
+SAME_BETAS = 1e-5
+"""Betas that differ by less are the same shape."""
+DENSITY = 985.0
+"""Of a living body with air in the lungs, kg/m^3."""
+MOST_CORRECTIONS = 20
+_TOLERANCE = np.array([1e-4, 1e-2])
+"""Metres, kilograms."""
+DEFAULT_BODY_VERTICES = 12196
+"""By this number of vertices the body that comes with the extension is recognised."""
+_CLEAR = {0: "Stature", 1: "Shoulders", 3: "Waist", 5: "Girth"}
+"""Sliders of betas of the default body with one clear effect; the other betas change several measures a little."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rest:
+    """A human at rest; metres, y up, facing +z."""
+
+    vertices: NDArray[np.float64]
+    """[V, 3]."""
+    joints: NDArray[np.float64]
+    """[24, 3]."""
+    position: NDArray[np.float64]
+    """Centres of the primitives [K, 3]."""
+    rotation: NDArray[np.float64]
+    """Axes T, B, N of the primitives as columns [K, 3, 3]."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ShapeModel:
+    """A body as a function of its shape, and the primitives on it; metres, y up, facing +z."""
+
+    template: NDArray[np.float32]
+    """The mean body at rest [V, 3]."""
+    shape_basis: NDArray[np.float32]
+    """What a unit of each shape coefficient adds [V, 3, 10]."""
+    joint_template: NDArray[np.float32]
+    """The mean body's joints [24, 3]."""
+    joint_basis: NDArray[np.float32]
+    """What a unit of each shape coefficient adds to them [24, 3, 10]."""
+    faces: NDArray[np.int32]
+    """Triangles [F, 3], counter-clockwise seen from outside."""
+    face: NDArray[np.int32]
+    """The triangle of each primitive [K]."""
+    barycentric: NDArray[np.float32]
+    """The primitive's place on it [K, 3]; rows sum to one."""
+    stencil_vertex: NDArray[np.int32]
+    """Vertices that span a primitive's tangent plane [K, m], padded with weight 0."""
+    stencil_du: NDArray[np.float32]
+    """dP/du = sum over m of stencil_du[k, m] * vertices[stencil_vertex[k, m]], metres per cell of the grid."""
+    stencil_dv: NDArray[np.float32]
+    """Likewise dP/dv; du x dv points out of the body."""
+
+    def rest(self, betas: NDArray) -> Rest:
+        """The human of these betas [10] at rest (SMPL eqs. 8 and 10; paper sec. 3.1)."""
+        vertices = self.surface(betas)
+        joints = self.joint_template + self.joint_basis @ np.asarray(betas, np.float64)
+        return Rest(vertices, joints, *self.frames(vertices))
+
+    def surface(self, betas: NDArray) -> NDArray[np.float64]:
+        """Rest vertices [V, 3] at these betas [10]."""
+        return self.template + self.shape_basis @ np.asarray(betas, np.float64)
+
+    def frames(self, vertices: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Centres [K, 3] and axes [K, 3, 3] of the primitives on a body with vertices [V, 3], posed or not.
+
+        T = normalize(dP/du), N = normalize(T x dP/dv), B = N x T (SPEC 1.8, 2), in the axes of the vertices.
+        """
+        du, dv = self._planes(vertices)
+        tangent = _unit(du)
+        normal = _unit(np.cross(tangent, dv))
+        rotation = np.stack([tangent, np.cross(normal, tangent), normal], -1)
+        return np.einsum("kc,kcx->kx", self.barycentric, vertices[self.faces[self.face]]), rotation
+
+    def growth(self, before: NDArray, after: NDArray) -> NDArray[np.float64]:
+        """Scale factors [K, 3] of boxes along T, B, N when the betas [10] change from `before` to `after`.
+
+        Twin of the backend's `reshaping.box_growth`; ones where the betas are the same.
+        """
+        if np.allclose(before, after, rtol=0, atol=SAME_BETAS):
+            return np.ones((len(self.face), 3))
+        stretch = self._sides(after) / np.maximum(self._sides(before), _TINY)
+        return np.concatenate([stretch**SHARE, np.ones_like(stretch[:, :1])], -1)
+
+    def _sides(self, betas: NDArray) -> NDArray[np.float64]:
+        """Lengths of cells along T and widths along B at rest [K, 2], metres."""
+        du, dv = self._planes(self.surface(betas))
+        length = np.linalg.norm(du, axis=-1)
+        area = np.linalg.norm(np.cross(du, dv), axis=-1)
+        return np.stack([length, area / np.maximum(length, _TINY)], -1)
+
+    def _planes(self, vertices: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """dP/du and dP/dv [K, 3] of the cells, metres per cell."""
+        support = vertices[self.stencil_vertex]
+        return np.matmul(self.stencil_du[:, None], support)[:, 0], np.matmul(self.stencil_dv[:, None], support)[:, 0]
+
+
+FIELDS: dict[str, tuple[int | str, ...]] = {
+    "template": ("V", 3), "shape_basis": ("V", 3, BETA_COUNT),
+    "joint_template": (24, 3), "joint_basis": (24, 3, BETA_COUNT),
+    "faces": ("F", 3), "face": ("K",), "barycentric": ("K", 3),
+    "stencil_vertex": ("K", "m"), "stencil_du": ("K", "m"), "stencil_dv": ("K", "m"),
+}  # fmt: skip
+"""Shapes of a ShapeModel's arrays, which files store under the same names."""
+INTEGERS = ("faces", "face", "stencil_vertex")
+
+
+def faulty_field(model: ShapeModel) -> str | None:
+    """The first field that holds impossible values, if any."""
+    for name in FIELDS:
+        if not np.isfinite(getattr(model, name)).all():
+            return name
+    limits = {"faces": len(model.template), "face": len(model.faces), "stencil_vertex": len(model.template)}
+    for name, limit in limits.items():
+        values = getattr(model, name)
+        if values.min() < 0 or values.max() >= limit:
+            return name
+    weights = model.barycentric
+    return "barycentric" if weights.min() < -1e-3 or np.abs(weights.sum(-1) - 1).max() > 1e-3 else None
+
+
+class Measures(NamedTuple):
+    """Of a bare body at rest."""
+
+    height: float
+    """Metres."""
+    weight: float
+    """Kilograms: the volume within the skin times DENSITY."""
+
+
+def measure(model: ShapeModel, betas: NDArray) -> Measures:
+    """Height and weight at these betas [10]."""
+    return _measured(model, tuple(np.asarray(betas, np.float64)))
+
+
+def betas_of_measures(
+    model: ShapeModel, betas: NDArray, height: float | None = None, weight: float | None = None
+) -> NDArray[np.float64]:
+    """The betas [10] nearest to `betas` at which the body has the given height (m) and weight (kg).
+
+    Newton steps of least length, exact to 0.1 mm and 10 g. Raises ValueError where no body within LARGEST_BETA has
+    these measures.
+    """
+    rows = [row for row, value in enumerate((height, weight)) if value is not None]
+    target = np.array([value for value in (height, weight) if value is not None])
+    moved = np.array(betas, np.float64)
+    for _ in range(MOST_CORRECTIONS if rows else 0):
+        missing = target - np.array(measure(model, moved))[rows]
+        if (np.abs(missing) < _TOLERANCE[rows]).all():
+            break
+        slope = _slope(model, moved)[rows]
+        moved = moved + slope.T @ np.linalg.solve(slope @ slope.T, missing)
+        if not np.abs(moved).max() <= LARGEST_BETA:
+            break
+    else:
+        moved = moved if not rows else moved * np.inf
+    if rows and not np.abs(moved).max() <= LARGEST_BETA:
+        names = (("a height of {:.2f} m", height), ("a weight of {:.0f} kg", weight))
+        measures = " with ".join(text.format(value) for text, value in names if value is not None)
+        raise ValueError(f"no body of this model has {measures}: ask for something more usual")
+    return moved
+
+
+def slider_names(model: ShapeModel) -> list[str]:
+    """A name for each beta [10]: its effect where that is clear, else its number, from 1."""
+    clear = _CLEAR if len(model.template) == DEFAULT_BODY_VERTICES else {}
+    return [clear.get(index, f"Shape {index + 1}") for index in range(BETA_COUNT)]
+
+
+@functools.lru_cache(maxsize=64)
+def _measured(model: ShapeModel, betas: tuple[float, ...]) -> Measures:
+    vertices = model.surface(np.array(betas))
+    upright = vertices[:, 1]
+    a, b, c = (vertices[model.faces[:, corner]] for corner in range(3))
+    volume = float(np.einsum("fx,fx->", a, np.cross(b, c))) / 6  # signed tetrahedra to the origin
+    return Measures(float(upright.max() - upright.min()), abs(volume) * DENSITY)
+
+
+def _slope(model: ShapeModel, betas: NDArray) -> NDArray[np.float64]:
+    """Derivatives of height and weight by each beta [2, 10]."""
+    vertices = model.surface(betas)
+    top, sole = np.argmax(vertices[:, 1]), np.argmin(vertices[:, 1])
+    a, b, c = (vertices[model.faces[:, corner]] for corner in range(3))
+    pull = np.zeros_like(vertices)  # of the volume, times 6, by each vertex
+    for corner, cross in enumerate((np.cross(b, c), np.cross(c, a), np.cross(a, b))):
+        for axis in range(3):
+            pull[:, axis] += np.bincount(model.faces[:, corner], cross[:, axis], len(vertices))
+    sign = np.sign(np.einsum("fx,fx->", a, np.cross(b, c)))
+    volume = pull.reshape(-1) @ model.shape_basis.reshape(-1, BETA_COUNT) / 6
+    return np.stack([model.shape_basis[top, 1] - model.shape_basis[sole, 1], sign * DENSITY * volume])
+
+
+def _unit(vectors: NDArray) -> NDArray[np.float64]:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), _TINY)
+
 
 BODY_FILE = "primdiffusion_body_file"
 """Custom property of a human's collection: the name of its body's file."""

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .human import armature_of, body_of, own_data, volumes_of
-from .shape import betas_of, generated_betas, shape_model_of
-from .shape_model import ShapeModel
+from .shape import ShapeModel, betas_of, generated_betas, shape_model_of
 
 MARK = "primdiffusion_surface"
 """Custom property of a carrier."""

@@ -1,14 +1,20 @@
 """What the user sees and presses: a file a panel, with its settings and operators where they fit.
 
-A module lists what Blender must know: CLASSES, PROPERTIES (owner, name, property), HANDLERS (list of bpy.app.handlers,
-function); `register` and `unregister` are for whatever else it needs.
+A module's classes named PRIMDIFFUSION_* are registered in the order in which they are defined, then SUB_PANELS, its
+PROPERTIES (owner, name, property) and HANDLERS (list of bpy.app.handlers, function). `register` and `unregister` do
+the rest.
+
+Blender imports these modules when it starts, without numpy. What needs numpy is imported in functions.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from types import ModuleType
+
 import bpy
 
-from ..jobs import missing_files
+from ..jobs import follow, missing_files
 from . import (
     assets_panel,
     attributes,
@@ -17,12 +23,9 @@ from . import (
     captures_settings,
     edit_operators,
     edit_panel,
-    engine_panels,
     export_operators,
     export_panel,
-    files_panel,
     generate_panel,
-    generate_settings,
     human_panel,
     import_motion,
     jobs_panel,
@@ -32,19 +35,20 @@ from . import (
     reconstruct_panel,
     render_operators,
     render_panel,
-    setup,
     shape_panel,
     shape_settings,
     translations,
     variations_operators,
     variations_panel,
 )
+from .setup import operators as setup_operators
+from .setup import preferences
 
 MODULES = (
-    translations, setup, jobs_panel, attributes, generate_settings, generate_panel, variations_operators,
-    variations_panel, human_panel, shape_settings, edit_operators, shape_panel, edit_panel, missing_files, files_panel,
-    import_motion, motion_panel, pose_panel, assets_panel, engine_panels, render_operators, render_panel,
-    captures_settings, captures_panel, reconstruct_panel, export_operators, export_panel, batch, manual,
+    translations, setup_operators, preferences, follow, jobs_panel, attributes, generate_panel, variations_operators,
+    variations_panel, human_panel, shape_settings, edit_operators, shape_panel, edit_panel, missing_files,
+    import_motion, motion_panel, pose_panel, assets_panel, render_operators, render_panel, captures_settings,
+    captures_panel, reconstruct_panel, export_operators, export_panel, batch, manual,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
 
@@ -52,7 +56,7 @@ MODULES = (
 def register() -> None:
     """Register all modules."""
     for module in MODULES:
-        for cls in getattr(module, "CLASSES", ()):
+        for cls in classes_of(module):
             bpy.utils.register_class(cls)
         for owner, name, prop in getattr(module, "PROPERTIES", ()):
             setattr(owner, name, prop)
@@ -72,5 +76,13 @@ def unregister() -> None:
                 getattr(bpy.app.handlers, name).remove(handler)
         for owner, name, _ in getattr(module, "PROPERTIES", ()):
             delattr(owner, name)
-        for cls in reversed(getattr(module, "CLASSES", ())):
+        for cls in reversed(list(classes_of(module))):
             bpy.utils.unregister_class(cls)
+
+
+def classes_of(module: ModuleType) -> Iterator[type]:
+    """The classes of a module that Blender registers, in order."""
+    for name, value in vars(module).items():
+        if name.startswith("PRIMDIFFUSION_") and value.__module__ == module.__name__:
+            yield value
+    yield from getattr(module, "SUB_PANELS", ())

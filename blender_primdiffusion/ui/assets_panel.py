@@ -6,32 +6,30 @@ from pathlib import Path
 
 import bpy
 
+from ..backend.requests import sentence
 from ..jobs.follow import submit
-from ..jobs.target import Target, selected_person
+from ..jobs.target import HumanTarget, selected_person
 from ..scene.human import humans
-from ..worker.sentence import sentence
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
-from .manual import draw_manual_button
 from .on_person import SKIP, OnPerson
 from .translations import CONTEXT
 
-_PICTURE = "Picture file for the asset; empty: one is drawn"
+_PICTURE = "Image file for the preview; empty: one is drawn"
 
 
 class PRIMDIFFUSION_OT_mark_human_as_asset(OnPerson, bpy.types.Operator):
-    """Make the selected person an asset with a picture, to be dragged from the Asset Browser into any file"""
+    """Mark the selected person as an asset with a preview, to drag from the Asset Browser into any file"""
 
     bl_idname = "primdiffusion.mark_human_as_asset"
     bl_label = "Mark Human as Asset"
-    bl_options: set[str] = set()  # noqa: RUF012  the result makes the undo step
+    bl_options: set[str] = set()  # the result makes the undo step
 
     picture: bpy.props.StringProperty(name="Picture", description=_PICTURE, subtype="FILE_PATH", options=SKIP)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """At once with a picture of the caller's."""
-        from ..jobs.assets import HumanAssetJob, mark_human
+        from ..jobs.assets import HumanAssetJob, mark_human  # needs numpy
 
-        target = Target.of(person)
+        target = HumanTarget.of(person)
         if not self.picture:
             return submit(self, context, HumanAssetJob(target))
         self.report({"INFO"}, mark_human(person, Path(bpy.path.abspath(self.picture))))
@@ -40,18 +38,17 @@ class PRIMDIFFUSION_OT_mark_human_as_asset(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_mark_pose_as_asset(OnPerson, bpy.types.Operator):
-    """Make the selected person's pose an asset that can be applied to any person from the pose library"""
+    """Mark the selected person's pose as an asset, to apply to any person from the pose library"""
 
     bl_idname = "primdiffusion.mark_pose_as_asset"
     bl_label = "Mark Pose as Asset"
-    bl_options: set[str] = set()  # noqa: RUF012  the result makes the undo step
+    bl_options: set[str] = set()  # the result makes the undo step
 
     name: bpy.props.StringProperty(name="Name", description="Of the pose", default="Pose", options=SKIP)
     picture: bpy.props.StringProperty(name="Picture", description=_PICTURE, subtype="FILE_PATH", options=SKIP)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """At once with a picture of the caller's."""
-        from ..jobs.assets import PoseAssetJob
+        from ..jobs.assets import PoseAssetJob  # needs numpy
 
         job = PoseAssetJob.of(person, self.name.strip() or "Pose")
         if not self.picture:
@@ -62,14 +59,13 @@ class PRIMDIFFUSION_OT_mark_pose_as_asset(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_unmark_human_asset(OnPerson, bpy.types.Operator):
-    """Make the selected person an ordinary collection again; nothing of them is removed"""
+    """Unmark the selected person as an asset; the person stays"""
 
     bl_idname = "primdiffusion.unmark_human_asset"
     bl_label = "Unmark Human Asset"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"REGISTER", "UNDO"}
 
     def run(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """At once."""
         if person.library is not None:
             raise ValueError(f"{person.name!r} is linked from {person.library.filepath!r}: unmark it there")
         if person.asset_data is None:
@@ -79,19 +75,18 @@ class PRIMDIFFUSION_OT_unmark_human_asset(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_make_pose_assets(bpy.types.Operator):
-    """Write the built-in poses as assets into a folder of your own, and add it to the asset libraries"""
+    """Write the built-in poses as assets to a folder, and add it to the asset libraries"""
 
     bl_idname = "primdiffusion.make_pose_assets"
     bl_label = "Make Pose Assets"
-    bl_options: set[str] = set()  # noqa: RUF012  the open file stays as it is
+    bl_options: set[str] = set()  # the open file stays as it is
 
     directory: bpy.props.StringProperty(
         name="Folder", description="Empty: in the extension's own folder", subtype="DIR_PATH", options=SKIP
     )
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """A .blend with an action for each pose; one written before is replaced."""
-        from ..jobs.assets import write_pose_library
+        from ..jobs.assets import write_pose_library  # needs numpy
 
         folder = Path(bpy.path.abspath(self.directory)) if self.directory else None
         try:
@@ -110,14 +105,10 @@ class PRIMDIFFUSION_PT_assets(SidebarPanel, bpy.types.Panel):
     bl_translation_context = CONTEXT
     bl_parent_id = "PRIMDIFFUSION_PT_human"
     bl_order = 90
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
-
-    def draw_header_preset(self, _context: bpy.types.Context) -> None:
-        """The manual's page."""
-        draw_manual_button(self.layout, "assets")
+    bl_options = {"DEFAULT_CLOSED"}
+    manual_page = "assets"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads the scene; changes nothing."""
         layout = property_columns(self.layout)
         try:
             person = selected_person(context) if humans(context.scene) else None
@@ -130,12 +121,3 @@ class PRIMDIFFUSION_PT_assets(SidebarPanel, bpy.types.Panel):
             draw_job(layout, "human_asset", "primdiffusion.mark_human_as_asset", "ASSET_MANAGER")
         draw_job(layout, "pose_asset", "primdiffusion.mark_pose_as_asset", "ARMATURE_DATA")
         layout.operator("primdiffusion.make_pose_assets", icon="FILE_FOLDER")
-
-
-CLASSES = (
-    PRIMDIFFUSION_OT_mark_human_as_asset,
-    PRIMDIFFUSION_OT_mark_pose_as_asset,
-    PRIMDIFFUSION_OT_unmark_human_asset,
-    PRIMDIFFUSION_OT_make_pose_assets,
-    PRIMDIFFUSION_PT_assets,
-)

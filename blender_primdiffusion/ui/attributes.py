@@ -1,23 +1,21 @@
-"""What a person may be asked to be: menus of what the checkpoint knows, all of them Any unless chosen."""
+"""Attributes to generate humans with: menus of those that the checkpoint knows, Any by default."""
 
 from __future__ import annotations
 
 import re
+import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
 
+from ..backend.vocabulary import Vocabulary, read_vocabulary
 from ..places import backend_module_path, preference
 from .translations import CONTEXT
 
-if TYPE_CHECKING:
-    from ..worker.vocabulary import Vocabulary
-
 ANY = "ANY"
 CATEGORIES = ("sex", "outfit", "pattern", "shoes", "hair", "hat")
-"""Those that have a menu; scripts may ask for whatever else a checkpoint knows."""
+"""Those with a menu; scripts may use any that the checkpoint has."""
 SCALARS = {"height": "m", "weight": "kg"}
 _DEFAULT_CHECKPOINT = Path("primdiffusion", "weights", "default.safetensors")
 
@@ -25,14 +23,13 @@ Attributes = dict[str, str | float]
 Item = tuple[str, str, str, int]
 
 _read: dict[Path, tuple[float, Vocabulary]] = {}
-"""By path, with the time of the file."""
+"""By path, with the modification time of the file."""
 _items: dict[tuple[str, ...], list[Item]] = {}
-"""Blender does not keep the strings of a menu that is made when it is drawn: they are kept here."""
+"""Holds the strings of dynamic menus, to which Blender holds no references."""
 
 
 def known() -> Vocabulary:
-    """Of the checkpoint that will be used; an empty one where it cannot be read, which generating will explain."""
-    from ..worker.vocabulary import Vocabulary, read_vocabulary
+    """The vocabulary of the current checkpoint; empty where it cannot be read, which generating reports."""
 
     chosen, bundled = preference("checkpoint"), backend_module_path()
     if chosen:
@@ -51,25 +48,23 @@ def known() -> Vocabulary:
 
 
 def menu(name: str) -> list[Item]:
-    """The items of the menu of a category. Their numbers, which a .blend keeps, depend on the value alone, so another
-    checkpoint that knows the same value shows it."""
-    import zlib
-
+    """The items of the menu of a category. Their numbers, which a .blend saves, depend only on the value, so that other
+    checkpoints with the same value show it."""
     values = known().categories.get(name, ())
     if values not in _items:
         numbered = [(value, choice_label(value), "", zlib.crc32(value.encode()) & 0x7FFFFFFF or 1) for value in values]
-        _items[values] = [(ANY, "Any", "Whatever comes", 0), *numbered]
+        _items[values] = [(ANY, "Any", "No preference", 0), *numbered]
     return _items[values]
 
 
 def choice_label(value: str) -> str:
-    """A value of the backend's, for people: side parting -> Side parting, shoes01 -> Shoes 1."""
+    """Label of a value: side parting -> Side parting, shoes01 -> Shoes 1."""
     spaced = re.sub(r"(?<=[a-z])0*(\d+)$", r" \1", value)
     return spaced[:1].upper() + spaced[1:]
 
 
 def title(name: str) -> str:
-    """A name of the backend's, for people."""
+    """Label of an attribute or a part."""
     return name.replace("_", " ").title()
 
 
@@ -81,7 +76,7 @@ def _menu_property(name: str):
 
 
 class PRIMDIFFUSION_PG_attributes(bpy.types.PropertyGroup):
-    """What a person is asked to be; nothing unless something is chosen."""
+    """Attributes to generate a human with; none unless chosen."""
 
     sex: _menu_property("sex")
     outfit: _menu_property("outfit")
@@ -89,18 +84,18 @@ class PRIMDIFFUSION_PG_attributes(bpy.types.PropertyGroup):
     shoes: _menu_property("shoes")
     hair: _menu_property("hair")
     hat: _menu_property("hat")
-    use_height: bpy.props.BoolProperty(name="Ask for a Height", description="Ask for a body of this height")
+    use_height: bpy.props.BoolProperty(name="Use Height", description="Generate a body of this height")
     height: bpy.props.FloatProperty(
         name="Height", description="Metres", default=1.7, min=0.5, max=2.5, step=1, translation_context=CONTEXT
     )
-    use_weight: bpy.props.BoolProperty(name="Ask for a Weight", description="Ask for a body of this weight")
+    use_weight: bpy.props.BoolProperty(name="Use Weight", description="Generate a body of this weight")
     weight: bpy.props.FloatProperty(
         name="Weight", description="Kilograms", default=70.0, min=10.0, max=300.0, step=100, translation_context=CONTEXT
     )
 
 
 def asked(group: PRIMDIFFUSION_PG_attributes) -> Attributes:
-    """What is chosen in `group` of what the checkpoint knows, as the child wants it."""
+    """The chosen attributes that the checkpoint knows, as parameters of the child."""
     vocabulary = known()
     chosen: Attributes = {}
     for name in CATEGORIES:
@@ -113,7 +108,7 @@ def asked(group: PRIMDIFFUSION_PG_attributes) -> Attributes:
 
 
 def parsed(text: str) -> Attributes:
-    """Attributes as scripts write them: "sex=female, height=1.7"; empty asks for nothing. Raises ValueError."""
+    """Attributes as scripts write them: "sex=female, height=1.7"; empty for none. Raises ValueError."""
     found: Attributes = {}
     for part in filter(None, re.split(r"[,;]\s*", text.strip())):
         name, equals, value = (piece.strip() for piece in part.partition("="))
@@ -127,7 +122,7 @@ def parsed(text: str) -> Attributes:
 
 
 def draw_attributes(layout: bpy.types.UILayout, group: PRIMDIFFUSION_PG_attributes) -> None:
-    """Menus and numbers of what the checkpoint knows."""
+    """Menus and fields of the attributes that the checkpoint knows."""
     vocabulary = known()
     for name in CATEGORIES:
         if name in vocabulary.categories:
@@ -140,7 +135,4 @@ def draw_attributes(layout: bpy.types.UILayout, group: PRIMDIFFUSION_PG_attribut
             number.enabled = getattr(group, f"use_{name}")
             number.prop(group, name, text="")
     if not (vocabulary.categories or vocabulary.scalars):
-        layout.label(text="This checkpoint knows no attributes", icon="INFO")
-
-
-CLASSES = (PRIMDIFFUSION_PG_attributes,)
+        layout.label(text="This checkpoint has no attributes", icon="INFO")

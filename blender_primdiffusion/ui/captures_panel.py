@@ -15,7 +15,6 @@ from ..jobs.follow import redraw
 from .captures_session import Busy, captures
 from .captures_settings import words_of
 from .drawing import SidebarPanel, draw_lines, property_columns
-from .manual import draw_manual_button
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,9 +22,10 @@ if TYPE_CHECKING:
 
 RIG = "Capture Rig"
 _TICK_S = 0.1
-_TOLD_S = 1.0
+_PRINT_S = 1.0
+"""Between lines of progress in background mode."""
 _PERSON_M = 1.1
-"""Radius of the sphere around a person in the T-pose about the world's origin, where there is nothing to look at."""
+"""Radius of the sphere around a human in T pose at the world's origin, where nothing is selected."""
 
 
 class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
@@ -33,15 +33,15 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
 
     bl_idname = "primdiffusion.render_captures"
     bl_label = "Render Captures"
-    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO: the scene stays as it is
+    bl_options: set[str] = set()  # neither REGISTER (redo) nor UNDO: the scene stays as it is
 
     people: bpy.props.StringProperty(name="People", description="Empty: the panel's")
     out: bpy.props.StringProperty(name="Captures", description="Empty: the panel's")
     options: bpy.props.StringProperty(name="Options", description="More words, as on the command line")
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """With a window a Blender of its own renders and a timer follows it; in background mode this one renders."""
-        from ..capture.options import parse, settings_of
+        """With a window another Blender renders and a timer follows it; in background mode this one renders."""
+        from ..capture.options import parse, settings_of  # needs numpy
 
         try:
             if captures.busy:
@@ -52,7 +52,7 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
             words += shlex.split(self.options)
             if bpy.app.background:
                 return self._render_here(context, words)
-            settings_of(parse(words))  # what is impossible is said at once
+            settings_of(parse(words))  # report impossible settings at once
             captures.start(words)
         except (Busy, OSError, ValueError, RuntimeError) as error:
             self.report({"ERROR"}, str(error))
@@ -61,6 +61,7 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
         return {"FINISHED"}
 
     def _render_here(self, context: bpy.types.Context, words: list[str]) -> set[str]:
+        # needs numpy
         from ..capture.command import describe, scans_in
         from ..capture.job import run
         from ..capture.options import parse, settings_of
@@ -74,7 +75,7 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
             for progress in steps:
                 for line in progress.news:
                     print(f"PrimDiffusion: {line}", flush=True)
-                if time.monotonic() - printed > _TOLD_S:
+                if time.monotonic() - printed > _PRINT_S:
                     printed = time.monotonic()
                     print(f"PrimDiffusion: {describe(progress)}", flush=True)
         if report.failed:
@@ -90,16 +91,14 @@ class PRIMDIFFUSION_OT_cancel_captures(bpy.types.Operator):
 
     bl_idname = "primdiffusion.cancel_captures"
     bl_label = "Cancel"
-    bl_options: set[str] = set()  # noqa: RUF012
+    bl_options: set[str] = set()
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        """Only while something runs."""
         cls.poll_message_set("No captures are being rendered")
         return captures.busy
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        """Ask; the timer sees it through."""
         captures.cancel()
         return {"FINISHED"}
 
@@ -109,7 +108,7 @@ class PRIMDIFFUSION_OT_verify_captures(bpy.types.Operator):
 
     bl_idname = "primdiffusion.verify_captures"
     bl_label = "Verify"
-    bl_options: set[str] = set()  # noqa: RUF012
+    bl_options: set[str] = set()
 
     out: bpy.props.StringProperty(name="Captures", description="Empty: the panel's")
     repair: bpy.props.BoolProperty(
@@ -117,9 +116,10 @@ class PRIMDIFFUSION_OT_verify_captures(bpy.types.Operator):
     )
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """With a window in a Blender of its own; in background mode here, and it fails where something is wrong."""
+        """With a window another Blender verifies; in background mode this one, failing on damage."""
+        # needs numpy
         from ..capture.options import parse
-        from ..capture.verify import repair, verify
+        from ..capture.subject import repair, verify
 
         out = bpy.path.abspath(self.out or context.scene.primdiffusion_captures.out)
         try:
@@ -148,11 +148,10 @@ class PRIMDIFFUSION_OT_preview_rig(bpy.types.Operator):
 
     bl_idname = "primdiffusion.preview_rig"
     bl_label = "Preview Cameras"
-    bl_options = {"UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """A collection of camera objects; they are only for looking at."""
-        from ..capture.blender_camera import aim
+        from ..capture.blender_camera import aim  # needs numpy
 
         collection = context.scene.collection.children.get(RIG)
         if collection is not None:
@@ -175,34 +174,35 @@ class PRIMDIFFUSION_OT_preview_rig(bpy.types.Operator):
 
 
 def remove_rig(collection: bpy.types.Collection) -> None:
-    """Take the preview out of the file, and nothing that the user has put into its collection."""
+    """Remove the preview, but no objects that the user has added to its collection."""
     ours = [obj for obj in collection.objects if obj.type == "CAMERA" and obj.name.startswith("Capture ")]
-    cameras = [thing.data for thing in ours]
+    cameras = [obj.data for obj in ours]
     bpy.data.batch_remove([*ours, *cameras, collection])
 
 
 def follow() -> float | None:
-    """The timer: take in what the child has said, draw it."""
+    """The timer: process the child's output, redraw."""
     if captures.tick():
         redraw()
     return _TICK_S if captures.busy else None
 
 
 def _sphere_around(context: bpy.types.Context) -> tuple[NDArray[np.float64], float]:
-    """Of the active object and what hangs on it; of a person at the origin where there is none."""
-    import numpy as np
+    """Bounding sphere of the active object and its children, else of a human at the origin."""
+    import numpy as np  # needs numpy
 
+    # needs numpy
     from ..formats.camera_rig import bounding_sphere
     from ..scene.convention import points_to_backend
 
     active = context.active_object
-    things = [active, *active.children_recursive] if active is not None and active.type != "CAMERA" else []
+    objects = [active, *active.children_recursive] if active is not None and active.type != "CAMERA" else []
     depsgraph = context.evaluated_depsgraph_get()
     corners = [
-        thing.matrix_world @ corner
-        for thing in (thing.evaluated_get(depsgraph) for thing in things)
-        for corner in map(Vector, thing.bound_box)
-        if thing.type in ("MESH", "ARMATURE")
+        obj.matrix_world @ corner
+        for obj in (obj.evaluated_get(depsgraph) for obj in objects)
+        for corner in map(Vector, obj.bound_box)
+        if obj.type in ("MESH", "ARMATURE")
     ]
     if not corners:
         return np.zeros(3), _PERSON_M
@@ -218,14 +218,10 @@ class PRIMDIFFUSION_PT_captures(SidebarPanel, bpy.types.Panel):
 
     bl_label = "Captures"
     bl_order = 5
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
-
-    def draw_header_preset(self, _context: bpy.types.Context) -> None:
-        """The manual's page."""
-        draw_manual_button(self.layout, "captures")
+    bl_options = {"DEFAULT_CLOSED"}
+    manual_page = "captures"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads the session; starts nothing."""
         layout, asked = property_columns(self.layout), context.scene.primdiffusion_captures
         column = layout.column()
         column.enabled = not captures.busy
@@ -245,11 +241,11 @@ class PRIMDIFFUSION_PT_captures(SidebarPanel, bpy.types.Panel):
 
 
 def _sub_panel(name: str, label: str, content: Callable) -> type:
-    class SubPanel(SidebarPanel, bpy.types.Panel):
+    class CapturesSubPanel(SidebarPanel, bpy.types.Panel):
         bl_idname = f"PRIMDIFFUSION_PT_captures_{name}"
         bl_label = label
         bl_parent_id = "PRIMDIFFUSION_PT_captures"
-        bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+        bl_options = {"DEFAULT_CLOSED"}
         __doc__ = content.__doc__
 
         def draw(self, context: bpy.types.Context) -> None:
@@ -257,8 +253,8 @@ def _sub_panel(name: str, label: str, content: Callable) -> type:
             layout.enabled = not captures.busy
             content(layout, context.scene.primdiffusion_captures, context)
 
-    SubPanel.__name__ = SubPanel.bl_idname
-    return SubPanel
+    CapturesSubPanel.__name__ = CapturesSubPanel.bl_idname
+    return CapturesSubPanel
 
 
 def _draw_input(layout: bpy.types.UILayout, asked, _context) -> None:
@@ -331,16 +327,6 @@ SUB_PANELS = (
 def _minutes(seconds: float) -> str:
     minutes = round(seconds / 60)
     return f"{seconds:.0f} s" if seconds < 90 else f"{minutes} min" if minutes < 120 else f"{minutes / 60:.1f} h"
-
-
-CLASSES = (
-    PRIMDIFFUSION_OT_render_captures,
-    PRIMDIFFUSION_OT_cancel_captures,
-    PRIMDIFFUSION_OT_verify_captures,
-    PRIMDIFFUSION_OT_preview_rig,
-    PRIMDIFFUSION_PT_captures,
-    *SUB_PANELS,
-)
 
 
 def unregister() -> None:

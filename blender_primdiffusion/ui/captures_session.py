@@ -1,4 +1,4 @@
-"""The one capture that may run at a time: a Blender of its own, so that this one stays free."""
+"""The running capture, one at a time: another Blender, so that this one stays responsive."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from pathlib import Path
 
 import bpy
 
-from ..worker.child_streams import Output
+from ..backend.child_streams import Output
+from ..console import CANCELLED, DONE
 
 PATIENCE_S = 0.7
-"""After this a child that was asked to stop is ended: its views are written whole or not at all."""
-_KEPT_LINES = 200
+"""After this a child that was asked to stop is killed: its views are written whole or not at all."""
+_MOST_LINES = 200
 
 
 class Busy(RuntimeError):
@@ -38,8 +39,8 @@ class CaptureSession:
         self.message = ""
         self.fraction = 0.0
         self.eta_s: float | None = None
-        self.lines: collections.deque[str] = collections.deque(maxlen=_KEPT_LINES)
-        """What the child told, newest last."""
+        self.lines: collections.deque[str] = collections.deque(maxlen=_MOST_LINES)
+        """Lines of the child, newest last."""
         self.exit_code: int | None = None
         """Of the last run."""
         self._process: subprocess.Popen[bytes] | None = None
@@ -54,7 +55,7 @@ class CaptureSession:
         return self._process is not None
 
     def new_folder(self) -> Path:
-        """For files of the next run; gone when it ends."""
+        """A folder for files of the next run, removed when it ends."""
         if self._folder is None:
             self._folder = Path(tempfile.mkdtemp(prefix="primdiffusion_captures_"))
         return self._folder
@@ -83,7 +84,7 @@ class CaptureSession:
             raise
 
     def tick(self) -> bool:
-        """Take in what the child has said; True when something visible changed. Never waits."""
+        """Process the child's output; True when something visible changed. Never waits."""
         if self._process is None:
             return False
         before = (self.message, self.fraction, len(self.lines), self.busy)
@@ -97,7 +98,7 @@ class CaptureSession:
         return before != (self.message, self.fraction, len(self.lines), self.busy)
 
     def cancel(self) -> None:
-        """Ask the child to stop; it ends within a second. What is rendered stays, and the next run goes on there."""
+        """Ask the child to stop; it ends within a second. Rendered views stay, and the next run resumes there."""
         if self._process is None or self._asked_to_stop_at is not None:
             return
         self._asked_to_stop_at = time.monotonic()
@@ -106,7 +107,7 @@ class CaptureSession:
             self._process.stdin.close()
 
     def close(self) -> None:
-        """End the child at once: the extension is going, or another file is loaded."""
+        """Kill the child: the extension is being disabled, or another file is loaded."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -119,10 +120,10 @@ class CaptureSession:
             self._take(line.decode("utf-8", "replace"))
 
     def _take(self, line: str) -> None:
-        from ..capture.options import MARK
+        from ..capture.options import MARK  # needs numpy
 
         if not line.startswith(MARK):
-            return  # Blender's own
+            return  # printed by Blender
         progress = json.loads(line[len(MARK) :])
         if "line" in progress:
             self.lines.append(progress["line"])
@@ -133,8 +134,6 @@ class CaptureSession:
             self.message = f"{progress['subject']}: view {progress['done']} of {progress['total']}"
 
     def _finish(self, code: int) -> None:
-        from ..console import CANCELLED, DONE
-
         self.exit_code, stopped = code, self._asked_to_stop_at is not None
         complaints = self._errors.log()
         with contextlib.suppress(OSError):
@@ -163,8 +162,8 @@ class CaptureSession:
 
 
 def child_command() -> list[str]:
-    """What starts a Blender for captures; the extension's words follow."""
-    from ..capture import launch
+    """The command that starts a Blender for captures, without its options."""
+    from ..capture import launch  # needs numpy
 
     script = str(Path(launch.__file__).resolve())
     if bpy.app.binary_path:
@@ -173,4 +172,4 @@ def child_command() -> list[str]:
 
 
 captures = CaptureSession()
-"""Blender has one main thread and one user: one session."""
+"""One for all windows."""

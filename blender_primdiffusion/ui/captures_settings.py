@@ -40,7 +40,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     body: bpy.props.StringProperty(
         name="Body", description="Your SMPL body as .npz of plain arrays; empty: the default body", subtype="FILE_PATH"
     )
-    shard: bpy.props.IntProperty(name="Shard", description="Which part of the people this machine renders", min=0)
+    shard: bpy.props.IntProperty(name="Shard", description="Part of the people that this machine renders", min=0)
     shards: bpy.props.IntProperty(
         name="of", description="Number of parts the people are divided into", min=1, default=1
     )
@@ -59,9 +59,9 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         description="Where the cameras stand",
         items=[
             ("rings", "Rings", "Rings at several heights"),
-            ("sphere", "Sphere", "Evenly all round (Fibonacci)"),
+            ("sphere", "Sphere", "Evenly on all sides (Fibonacci)"),
             ("hemisphere", "Hemisphere", "Evenly from above and the sides"),
-            ("custom", "Cameras of the Scene", "The cameras of a collection; they stay fixed for all people"),
+            ("custom", "Cameras of the Scene", "The cameras of a collection, fixed for all people"),
         ],
     )
     camera_count: bpy.props.IntProperty(
@@ -117,14 +117,14 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     )
 
     width: bpy.props.IntProperty(
-        name="Width", description="Of the pictures", default=512, min=1, max=16384, subtype="PIXEL"
+        name="Width", description="Size of the pictures", default=512, min=1, max=16384, subtype="PIXEL"
     )
     height: bpy.props.IntProperty(
-        name="Height", description="Of the pictures", default=512, min=1, max=16384, subtype="PIXEL"
+        name="Height", description="Size of the pictures", default=512, min=1, max=16384, subtype="PIXEL"
     )
     background: bpy.props.EnumProperty(
         name="Background",
-        description="Behind the people",
+        description="What is behind the people",
         items=[("black", "Black", ""), ("transparent", "Transparent", "One more pass: PNG with straight alpha")],
     )
     passes: bpy.props.EnumProperty(
@@ -154,7 +154,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
 
     def rig(self) -> Rig:
         """The rig asked for. Raises ValueError where it is the scene's cameras, or impossible."""
-        from ..formats.camera_rig import Rig
+        from ..formats.camera_rig import Rig  # needs numpy
 
         if self.arrangement == "custom":
             raise ValueError("the scene's own cameras need no preview: choose another arrangement")
@@ -201,12 +201,12 @@ def _rig_words(rig: Rig) -> list[str]:
 
 
 def _custom_words(asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, folder: Path) -> list[str]:
-    from ..capture.blender_camera import CameraError, view_of
+    from ..capture.blender_camera import CameraError, view_of  # needs numpy
 
     depsgraph, render = context.evaluated_depsgraph_get(), context.scene.render
     aspect = (render.pixel_aspect_x, render.pixel_aspect_y)
-    things = asked.cameras.all_objects if asked.cameras is not None else context.selected_objects
-    cameras = sorted((thing for thing in things if thing.type == "CAMERA"), key=lambda thing: thing.name)
+    objects = asked.cameras.all_objects if asked.cameras is not None else context.selected_objects
+    cameras = sorted((obj for obj in objects if obj.type == "CAMERA"), key=lambda obj: obj.name)
     if not cameras:
         raise CameraError("no camera takes pictures: choose a collection with cameras, or select some")
     views = [view_of(camera, depsgraph, (asked.width, asked.height), aspect) for camera in cameras]
@@ -219,5 +219,4 @@ def _custom_words(asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, 
     return ["--camera-file", str(path)]
 
 
-CLASSES = (PRIMDIFFUSION_PG_captures,)
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_captures", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_captures)),)

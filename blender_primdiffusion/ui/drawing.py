@@ -1,4 +1,4 @@
-"""How works look in panels: button, progress, line, errors and what to do about them."""
+"""How jobs look in panels: button, progress, queue, errors and their remedies."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ..jobs.building import building
-from ..jobs.follow import in_the_way
+from ..jobs.follow import building, in_the_way
 from ..jobs.pictures import so_far
-from ..jobs.queue import Outcome, queue
+from ..jobs.queue import JobOutcome, queue
 from ..jobs.remedies import remedy_for
 from ..places import EXTENSION
+from .manual import draw_manual_button
 
 if TYPE_CHECKING:
-    from ..worker.request import RequestError
+    from ..backend.requests import RequestError
 
 _LINE = 34
-"""Letters that fit a sidebar as wide as Blender makes it, beside an icon."""
+"""Characters that fit a sidebar of default width, beside an icon."""
 _QUANTITY = re.compile(r"\d (s|min|mm|MB|GB)\b")
 _NO_BREAK = "\N{NO-BREAK SPACE}"
 _PICTURE_SCALE = 8.0
@@ -27,11 +27,18 @@ _MINUTES_FROM_S = 90.0
 
 
 class SidebarPanel:
-    """A panel of the sidebar's tab PrimDiffusion."""
+    """A panel in the sidebar tab PrimDiffusion."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "PrimDiffusion"
+    manual_page = ""
+    """Of the manual, opened by a button in the header."""
+    manual_section = ""
+
+    def draw_header_preset(self, _context: bpy.types.Context) -> None:
+        if self.manual_page:
+            draw_manual_button(self.layout, self.manual_page, self.manual_section)
 
 
 def property_columns(layout: bpy.types.UILayout) -> bpy.types.UILayout:
@@ -44,10 +51,9 @@ def property_columns(layout: bpy.types.UILayout) -> bpy.types.UILayout:
 def draw_job(
     layout: bpy.types.UILayout, kind: str, operator_idname: str, icon: str, ready: bool = True
 ) -> bpy.types.OperatorProperties | None:
-    """The button of an operator that submits works of `kind`, the progress of one, and how the last one ended.
+    """The button of an operator that submits jobs of `kind`, the progress of such a job, and how the last one ended.
 
-    The one place where that is shown; the panel Jobs names what is in line. `ready`: whether what the button needs has
-    been chosen; it is grey until then. Returns the button's properties, to be filled in.
+    The button is greyed out unless `ready`. Returns its properties, for the caller to set.
     """
     button = layout.row()
     button.enabled = ready
@@ -64,7 +70,7 @@ def draw_job(
 
 
 def draw_lines(layout: bpy.types.UILayout, text: str, icon: str) -> None:
-    """A sentence in the interface's language, on as many lines as it needs."""
+    """A sentence on as many lines as it needs."""
     column = layout.column(align=True)
     for number, line in enumerate(_wrapped(text)):
         column.label(text=line, icon=icon if number == 0 else "BLANK1", translate=False)
@@ -88,7 +94,7 @@ def _draw_progress(layout: bpy.types.UILayout) -> None:
 def draw_queue(layout: bpy.types.UILayout) -> None:
     """The running job and the queued ones, each with a button to remove it."""
     if not queue.busy:
-        return  # an empty column would leave a gap
+        return  # an empty column leaves a gap
     column = layout.column(align=True)
     for entry in queue.queued:
         row = column.row(align=True)
@@ -98,7 +104,7 @@ def draw_queue(layout: bpy.types.UILayout) -> None:
 
 
 def draw_ended(layout: bpy.types.UILayout) -> None:
-    """What has ended of late, and how; the news are beside the button that asked."""
+    """The last jobs that ended, and how; messages are shown below their buttons."""
     if not queue.ended:
         return
     column = layout.column(align=True)
@@ -107,13 +113,13 @@ def draw_ended(layout: bpy.types.UILayout) -> None:
         column.label(text=outcome.entry.job.label, icon=icon, translate=False)
 
 
-def _draw_outcome(layout: bpy.types.UILayout, outcome: Outcome) -> None:
-    """News, or an error with what can be done about it."""
+def _draw_outcome(layout: bpy.types.UILayout, outcome: JobOutcome) -> None:
+    """The message, or the error with its remedy."""
     if outcome.error is None:
         draw_lines(layout, outcome.notice, "INFO")
         return
     draw_lines(layout, outcome.sentence, "ERROR")
-    column = layout.column(align=True)  # beside each other their words would be cut
+    column = layout.column(align=True)  # side by side the labels would be cut
     _draw_remedy(column, outcome.error, outcome.entry.job.kind)
     column.operator("primdiffusion.copy_diagnostics", icon="COPYDOWN")
 
@@ -132,8 +138,8 @@ def _draw_remedy(layout: bpy.types.UILayout, error: RequestError, kind: str) -> 
 def _progress_text() -> str:
     job = queue.request
     if queue.ready:
-        waits_for = in_the_way()
-        return f"Done; waiting for {waits_for}" if waits_for else "Adding it to the scene"
+        blocker = in_the_way()
+        return f"Done; waiting for {blocker}" if blocker else "Adding it to the scene"
     if not job.eta_s:
         return job.message
     left = f"{job.eta_s:.0f} s" if job.eta_s < _MINUTES_FROM_S else f"{job.eta_s / 60:.0f} min"

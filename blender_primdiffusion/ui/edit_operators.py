@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 
 from ..formats.requests import AMOUNT, FRACTION, PARTS, STEPS, TRANSFERS
 from ..jobs.follow import submit
 from ..jobs.target import named_person, selected_person
-from ..scene.files import person_file
-from ..scene.human import BODY_MARK, MARK, body_of, humans
+from ..scene.human import BODY_MARK, MARK, body_of, humans, person_file
 from .attributes import PRIMDIFFUSION_PG_attributes, asked, parsed, title
 from .on_person import PANELS, SKIP, OnPerson
 from .translations import CONTEXT
-
-if TYPE_CHECKING:
-    pass
 
 PAINTED_GROUP = "PrimDiffusion Region"
 """Vertex group of the body mesh that Paint Region makes."""
@@ -29,11 +25,11 @@ TRANSFER_ITEMS = [(name, *_TRANSFERS[name]) for name in TRANSFERS]
 
 
 def parts_property():
-    """Several parts of the body may be chosen."""
+    """A choice of several body parts."""
     return bpy.props.EnumProperty(
         name="Parts",
         translation_context=CONTEXT,
-        description="What to change: Shift-click for several. A person's left and right",
+        description="Parts to change: Shift-click for several. Left and right are the person's",
         items=[(name, title(name), "", 1 << i) for i, name in enumerate(PARTS)],
         options={"ENUM_FLAG", "SKIP_SAVE"},
         default={"top"},
@@ -102,11 +98,10 @@ class PRIMDIFFUSION_OT_paint_region(bpy.types.Operator):
 
     bl_idname = "primdiffusion.paint_region"
     bl_label = "Paint Region"
-    bl_options = {"UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """To Weight Paint mode, with the panel's vertex group, made if there is none."""
-        from ..scene.painting import start_painting
+        from ..scene.edit import start_painting  # needs numpy
 
         settings = context.scene.primdiffusion_edit
         try:
@@ -123,58 +118,56 @@ class PRIMDIFFUSION_OT_paint_region(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_finish_painting(bpy.types.Operator):
-    """Back to Object mode; the body mesh is hidden again, its vertex group stays"""
+    """Return to Object mode and hide the body mesh; its vertex group stays"""
 
     bl_idname = "primdiffusion.finish_painting"
     bl_label = "Finish Painting"
-    bl_options = {"UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO"}
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Only while a body mesh is painted."""
         cls.poll_message_set("No region is being painted: press Paint Region first")
         return painting(context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """The active object is the body mesh."""
-        from ..scene.painting import end_painting
+        from ..scene.edit import end_painting  # needs numpy
 
         end_painting(context, context.view_layer.objects.active)
         return {"FINISHED"}
 
 
 def painting(context: bpy.types.Context) -> bool:
-    """A person's body mesh is being weight painted."""
+    """Whether a body mesh is being weight painted."""
     active = context.view_layer.objects.active
     return active is not None and active.mode == "WEIGHT_PAINT" and BODY_MARK in active
 
 
 class _Edit(OnPerson):
-    """What a script does not give is the panel's."""
+    """Base of the edits; properties that are not given are the panel's."""
 
-    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo would start the job again) nor UNDO (the result has one)
+    bl_options: set[str] = set()  # neither REGISTER (redo would start the job again) nor UNDO (the result has one)
     job: str
     """Class of `jobs.edit`."""
     seed: bpy.props.IntProperty(name="Seed", min=0, description=PANELS, options=SKIP)
     steps: bpy.props.IntProperty(name="Steps", min=1, max=1000, default=STEPS, description=PANELS, options=SKIP)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..jobs import edit
+        from ..jobs import edit  # needs numpy
 
         steps = self.chosen("steps", context.scene.primdiffusion)
         return submit(self, context, getattr(edit, self.job).of(person, steps, self.params(context, person)))
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
-        """Of the child's method, with the edit's own ones only (see `EditJob.asked`)."""
+        """The edit's parameters of the child's method: see `EditJob.asked`."""
         raise NotImplementedError
 
     def chosen(self, name: str, settings: bpy.types.PropertyGroup) -> Any:
-        """What the script gives, else what the panel holds."""
+        """The operator's property if set, else the panel's."""
         return getattr(self if self.properties.is_property_set(name) else settings, name)
 
 
 class _Region:
-    """Where to edit."""
+    """Operators with a region."""
 
     parts: parts_property()
     vertex_group: bpy.props.StringProperty(
@@ -185,7 +178,7 @@ class _Region:
         self, settings: bpy.types.PropertyGroup, person: bpy.types.Collection
     ) -> list[str] | dict[str, list[float]]:
         """Names of parts, or painted weights [V]."""
-        from ..scene.painting import painted_weights
+        from ..scene.edit import painted_weights  # needs numpy
 
         given = self.properties.is_property_set
         if given("vertex_group") or (not given("parts") and settings.region == "PAINTED"):
@@ -213,7 +206,6 @@ class PRIMDIFFUSION_OT_vary(_Edit, bpy.types.Operator):
     guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=PANELS, options=SKIP)
 
     def params(self, context: bpy.types.Context, _person: bpy.types.Collection) -> dict[str, Any]:
-        """Of the child's method vary."""
         settings = context.scene.primdiffusion_edit
         params = {"amount": self.chosen("amount", settings), "seed": self.chosen("seed", settings)}
         wanted = parsed(self.attributes)
@@ -235,7 +227,6 @@ class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
     guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=PANELS, options=SKIP)
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
-        """Of the child's method inpaint."""
         settings = context.scene.primdiffusion_edit
         params: dict[str, Any] = {"region": self.region(settings, person), "seed": self.chosen("seed", settings)}
         given = self.properties.is_property_set("attributes")
@@ -257,7 +248,6 @@ class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
     harmonise: bpy.props.FloatProperty(name="Harmonise", min=0.0, max=1.0, description=PANELS, options=SKIP)
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
-        """Of the child's method transfer."""
         settings = context.scene.primdiffusion_edit
         return {
             "source": _other(context, person, self.source),
@@ -281,7 +271,6 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
     )
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
-        """Of the child's method interpolate."""
         settings = context.scene.primdiffusion_edit
         other = _other(context, person, self.other)
         return {"other": other, "fraction": self.chosen("fraction", settings)}
@@ -298,13 +287,4 @@ def _other(context: bpy.types.Context, person: bpy.types.Collection, name: str) 
     return str(person_file(other))
 
 
-CLASSES = (
-    PRIMDIFFUSION_PG_edit,
-    PRIMDIFFUSION_OT_paint_region,
-    PRIMDIFFUSION_OT_finish_painting,
-    PRIMDIFFUSION_OT_vary,
-    PRIMDIFFUSION_OT_redress,
-    PRIMDIFFUSION_OT_transfer_texture,
-    PRIMDIFFUSION_OT_blend,
-)
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_edit", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_edit)),)

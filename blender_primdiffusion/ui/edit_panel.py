@@ -15,12 +15,12 @@ from .edit_operators import painting
 
 
 def _sub_panel(name: str, label: str, order: int, content: Callable) -> type:
-    class SubPanel(SidebarPanel, bpy.types.Panel):
+    class EditSubPanel(SidebarPanel, bpy.types.Panel):
         bl_idname = f"PRIMDIFFUSION_PT_edit_{name}"
         bl_label = label
         bl_parent_id = "PRIMDIFFUSION_PT_human"
         bl_order = order
-        bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+        bl_options = {"DEFAULT_CLOSED"}
         __doc__ = content.__doc__
 
         @classmethod
@@ -31,8 +31,8 @@ def _sub_panel(name: str, label: str, order: int, content: Callable) -> type:
             property_columns(self.layout)
             content(self.layout, context.scene.primdiffusion_edit, context)
 
-    SubPanel.__name__ = SubPanel.bl_idname
-    return SubPanel
+    EditSubPanel.__name__ = EditSubPanel.bl_idname
+    return EditSubPanel
 
 
 def _draw_vary(layout: bpy.types.UILayout, settings, _context) -> None:
@@ -108,6 +108,3 @@ SUB_PANELS = (
     _sub_panel("blend", "Blend", 23, _draw_blend),
     _sub_panel("files", "Files", 91, _draw_files),
 )
-
-
-CLASSES = (*SUB_PANELS,)

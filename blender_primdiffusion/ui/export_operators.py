@@ -10,14 +10,14 @@ import bpy
 
 from ..formats import requests
 from ..jobs.follow import submit
-from ..jobs.target import Target
+from ..jobs.target import HumanTarget
 from ..scene.human import armature_of
 from .on_person import PANELS, SKIP, OnPerson
 from .translations import CONTEXT
 
 
 def destination(filepath: str, endings: Sequence[str]) -> Path:
-    """The file to write, with the first ending where it has none. Raises ValueError or OSError with what to do."""
+    """The file to write, with the first extension where it has none. Raises ValueError or OSError."""
     if not filepath or filepath.endswith(("/", "\\")):
         raise ValueError("name a file to export to")
     path = Path(bpy.path.abspath(filepath))
@@ -38,7 +38,7 @@ def destination(filepath: str, endings: Sequence[str]) -> Path:
 
 
 def check_writable(folder: Path) -> None:
-    """Raises FileNotFoundError or PermissionError, with what to do, for a folder that takes no files."""
+    """Raises FileNotFoundError or PermissionError for a folder that cannot be written to."""
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no folder {str(folder)!r}: make it first, or choose another")
     if not os.access(folder, os.W_OK):
@@ -51,7 +51,7 @@ FORMATS = (
     ("USD", "USD", "A .usd file with its texture beside it, or one .usdz file"),
 )
 MODEL_ENDINGS = {"GLB": (".glb",), "FBX": (".fbx",), "USD": (".usdc", ".usda", ".usd", ".usdz")}
-"""Of files, by the format; the first is the usual one."""
+"""File extensions by format; the first is the default."""
 HUMAN_ENDINGS = (".human", ".safetensors")
 SHOWN = (
     ("VOLUMES", "Volumes", "Show and render the volumes; the mesh proxy is hidden"),
@@ -78,14 +78,14 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
     triangles: bpy.props.IntProperty(
         name="Triangles",
         translation_context=CONTEXT,
-        description="Largest number of triangles of the mesh proxy",
+        description="Maximum number of triangles of the mesh proxy",
         default=requests.TRIANGLES,
         min=500,
         max=1_000_000,
     )
     gaussians: bpy.props.IntProperty(
         name="Gaussians",
-        description="Largest number of Gaussians; a person has about 130,000 that can be seen",
+        description="Maximum number of Gaussians; about 130,000 of a person are visible",
         default=requests.GAUSSIANS,
         min=1000,
         max=1_000_000,
@@ -108,24 +108,23 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
 
 
 class _Export(OnPerson):
-    """Not redoable: a redo slider must not start the job again."""
+    """Base of the exports; not redoable, since a redo slider must not start the job again."""
 
-    bl_options: set[str] = set()  # noqa: RUF012  no UNDO either: those that change the scene make a step
+    bl_options: set[str] = set()  # no UNDO either: those that change the scene make a step
 
     def chosen(self, context: bpy.types.Context, name: str):
-        """What the script gives, else what the panel holds."""
+        """The operator's property if set, else the panel's."""
         given = self.properties.is_property_set(name)
         return getattr(self if given else context.scene.primdiffusion_export, name)
 
 
 class _ToFile(_Export):
-    """Exports that ask for a file."""
+    """Base of the exports to one file."""
 
     filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH", options=SKIP)
     check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        """The file browser, at the person's name; it asks before it replaces a file."""
         try:
             person = self.person(context)
         except ValueError as error:
@@ -137,7 +136,6 @@ class _ToFile(_Export):
         return {"RUNNING_MODAL"}
 
     def check(self, context: bpy.types.Context) -> bool:
-        """Keep the ending that belongs to the format."""
         endings = self.endings(context)
         if self.filepath and Path(self.filepath).suffix.lower() not in endings:
             self.filepath = bpy.path.ensure_ext(self.filepath, endings[0])
@@ -159,12 +157,12 @@ class PRIMDIFFUSION_OT_export_mesh(_ToFile, bpy.types.Operator):
     )
 
     def endings(self, context: bpy.types.Context) -> tuple[str, ...]:
-        """Of the format."""
         return MODEL_ENDINGS[self.chosen(context, "format")]
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """A format that is not given follows the file's ending."""
-        from ..jobs.export_mesh import ExportMeshJob, scene_frames
+        """Without a format, the file's extension decides."""
+        # needs numpy
+        from ..jobs.export import ExportMeshJob, scene_frames
         from ..scene.export_model import check_ready
 
         kind = self.chosen(context, "format")
@@ -172,7 +170,7 @@ class PRIMDIFFUSION_OT_export_mesh(_ToFile, bpy.types.Operator):
             ending = Path(self.filepath).suffix.lower()
             kind = next((name for name, endings in MODEL_ENDINGS.items() if ending in endings), kind)
         path = destination(self.filepath, MODEL_ENDINGS[kind])
-        target, frames = Target.of(person), scene_frames(context.scene, self.chosen(context, "animation"))
+        target, frames = HumanTarget.of(person), scene_frames(context.scene, self.chosen(context, "animation"))
         check_ready(armature_of(person))
         px, triangles = int(self.chosen(context, "texture_px")), self.chosen(context, "triangles")
         return submit(self, context, ExportMeshJob(target, px, triangles, path, kind, frames))
@@ -190,11 +188,11 @@ class PRIMDIFFUSION_OT_add_proxy(_Export, bpy.types.Operator):
     )
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """In line."""
-        from ..jobs.export_mesh import AddProxyJob
+        # needs numpy
+        from ..jobs.export import AddProxyJob
         from ..scene.export_model import check_ready
 
-        target = Target.of(person)
+        target = HumanTarget.of(person)
         check_ready(armature_of(person))
         px, triangles = int(self.chosen(context, "texture_px")), self.chosen(context, "triangles")
         return submit(self, context, AddProxyJob(target, px, triangles))
@@ -205,15 +203,14 @@ class PRIMDIFFUSION_OT_show_proxy(_Export, bpy.types.Operator):
 
     bl_idname = "primdiffusion.show_proxy"
     bl_label = "Show Volumes or Mesh"
-    bl_options = {"UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO"}
 
     shown: bpy.props.EnumProperty(
-        name="Show", translation_context=CONTEXT, description="What is seen of the person", items=SHOWN
+        name="Show", translation_context=CONTEXT, description="How the person is shown", items=SHOWN
     )
 
     def run(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """At once."""
-        from ..jobs.export_mesh import show
+        from ..jobs.export import show  # needs numpy
 
         show(person, self.shown)
         return {"FINISHED"}
@@ -224,11 +221,11 @@ class PRIMDIFFUSION_OT_remove_proxy(_Export, bpy.types.Operator):
 
     bl_idname = "primdiffusion.remove_proxy"
     bl_label = "Remove Mesh Proxy"
-    bl_options = {"UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO"}
 
     def run(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """At once."""
-        from ..jobs.export_mesh import show
+        # needs numpy
+        from ..jobs.export import show
         from ..scene.proxy import proxy_of, remove_proxy
 
         show(person, "VOLUMES")
@@ -245,15 +242,15 @@ class PRIMDIFFUSION_OT_export_gaussians(_ToFile, bpy.types.Operator):
     gaussians: bpy.props.IntProperty(name="Gaussians", description=PANELS, min=1, options=SKIP)
 
     def endings(self, _context: bpy.types.Context) -> tuple[str, ...]:
-        """Of PLY."""
         return (".ply",)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """In line, in the pose of now."""
-        from ..jobs.export_person import ExportGaussiansJob, posed_now
+        from ..jobs.export import ExportGaussiansJob, posed_now  # needs numpy
 
         path = destination(self.filepath, self.endings(context))
-        job = ExportGaussiansJob(Target.of(person), path, posed_now(context, person), self.chosen(context, "gaussians"))
+        job = ExportGaussiansJob(
+            HumanTarget.of(person), path, posed_now(context, person), self.chosen(context, "gaussians")
+        )
         return submit(self, context, job)
 
 
@@ -270,13 +267,11 @@ class PRIMDIFFUSION_OT_export_vdb_sequence(_Export, bpy.types.Operator):
     voxel: bpy.props.FloatProperty(name="Voxel Size", description=PANELS, min=0.002, max=0.05, options=SKIP)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        """The file browser, for a folder."""
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """In line, with the poses of now."""
-        from ..jobs.export_person import ExportVdbSequenceJob, posed_frames
+        from ..jobs.export import ExportVdbSequenceJob, posed_frames  # needs numpy
 
         if not self.directory:
             raise ValueError("name a folder to export to")
@@ -287,7 +282,7 @@ class PRIMDIFFUSION_OT_export_vdb_sequence(_Export, bpy.types.Operator):
         last = self.last if given("last") else scene.frame_end
         if last < first:
             raise ValueError(f"the last frame {last} is before the first, {first}: swap them")
-        target, stem = Target.of(person), bpy.path.clean_name(person.name)
+        target, stem = HumanTarget.of(person), bpy.path.clean_name(person.name)
         people = posed_frames(context, person, range(first, last + 1))
         job = ExportVdbSequenceJob(target, folder, stem, people, first, self.chosen(context, "voxel"))
         return submit(self, context, job)
@@ -302,13 +297,10 @@ class PRIMDIFFUSION_OT_export_human(_ToFile, bpy.types.Operator):
     motion: bpy.props.BoolProperty(name="With Motion", description=PANELS, options=SKIP)
 
     def endings(self, _context: bpy.types.Context) -> tuple[str, ...]:
-        """Of people."""
         return HUMAN_ENDINGS
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """At once: it needs no backend."""
-        from ..jobs.export_mesh import scene_frames
-        from ..jobs.export_person import write_human
+        from ..jobs.export import scene_frames, write_human  # needs numpy
 
         path = destination(self.filepath, HUMAN_ENDINGS)
         write_human(
@@ -323,7 +315,7 @@ class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
 
     bl_idname = "primdiffusion.import_human"
     bl_label = "Import Human File"
-    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO (the result has one)
+    bl_options: set[str] = set()  # neither REGISTER (redo) nor UNDO (the result has one)
 
     filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH", options=SKIP)
     filter_glob: bpy.props.StringProperty(
@@ -337,15 +329,15 @@ class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
     )
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        """A dropped file is taken at once; otherwise the file browser asks for one."""
+        """Import a dropped file at once; otherwise open the file browser."""
         if self.filepath:
             return self.execute(context)
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Look into the file, then put it in line; in background mode this waits for the person."""
-        from ..jobs.export_person import ImportHumanJob
+        # needs numpy
+        from ..jobs.export import ImportHumanJob
         from ..scene.human_file import motion_in, read_tensors
 
         path = Path(bpy.path.abspath(self.filepath))
@@ -360,15 +352,4 @@ class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
         return submit(self, context, ImportHumanJob(str(path), at))
 
 
-CLASSES = (
-    PRIMDIFFUSION_PG_export,
-    PRIMDIFFUSION_OT_export_mesh,
-    PRIMDIFFUSION_OT_add_proxy,
-    PRIMDIFFUSION_OT_show_proxy,
-    PRIMDIFFUSION_OT_remove_proxy,
-    PRIMDIFFUSION_OT_export_gaussians,
-    PRIMDIFFUSION_OT_export_vdb_sequence,
-    PRIMDIFFUSION_OT_export_human,
-    PRIMDIFFUSION_OT_import_human,
-)
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_export", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_export)),)

@@ -6,7 +6,6 @@ import bpy
 
 from ..jobs.target import selected_person
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
-from .manual import draw_manual_button
 
 
 class PRIMDIFFUSION_PT_export(SidebarPanel, bpy.types.Panel):
@@ -14,14 +13,10 @@ class PRIMDIFFUSION_PT_export(SidebarPanel, bpy.types.Panel):
 
     bl_label = "Export"
     bl_order = 6
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
-
-    def draw_header_preset(self, _context: bpy.types.Context) -> None:
-        """The manual."""
-        draw_manual_button(self.layout, "export")
+    bl_options = {"DEFAULT_CLOSED"}
+    manual_page = "export"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads the scene; changes nothing."""
         layout, settings = property_columns(self.layout), context.scene.primdiffusion_export
         layout.prop(settings, "motion")
         layout.operator("primdiffusion.export_human", icon="EXPORT")
@@ -33,10 +28,9 @@ class PRIMDIFFUSION_PT_export_mesh(SidebarPanel, bpy.types.Panel):
 
     bl_label = "Textured Mesh"
     bl_parent_id = "PRIMDIFFUSION_PT_export"
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads the scene; changes nothing."""
         layout, settings = property_columns(self.layout), context.scene.primdiffusion_export
         for name in ("texture_px", "triangles", "format", "animation"):
             layout.prop(settings, name)
@@ -50,7 +44,8 @@ class PRIMDIFFUSION_PT_export_mesh(SidebarPanel, bpy.types.Panel):
             person = selected_person(context)
         except ValueError:
             return
-        from ..jobs.export_mesh import shown
+        # needs numpy
+        from ..jobs.export import shown
         from ..scene.proxy import is_outdated, proxy_of
         from ..scene.shape import betas_of
 
@@ -73,10 +68,9 @@ class PRIMDIFFUSION_PT_export_volumes(SidebarPanel, bpy.types.Panel):
 
     bl_label = "Gaussians and Volumes"
     bl_parent_id = "PRIMDIFFUSION_PT_export"
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads the scene; changes nothing."""
         layout, settings = property_columns(self.layout), context.scene.primdiffusion_export
         layout.prop(settings, "gaussians")
         draw_job(layout, "export_gaussians", "primdiffusion.export_gaussians", "POINTCLOUD_DATA")
@@ -98,13 +92,4 @@ class PRIMDIFFUSION_FH_human(bpy.types.FileHandler):
 
     @classmethod
     def poll_drop(cls, context: bpy.types.Context) -> bool:
-        """Onto a 3D view."""
         return context.area is not None and context.area.type == "VIEW_3D"
-
-
-CLASSES = (
-    PRIMDIFFUSION_PT_export,
-    PRIMDIFFUSION_PT_export_mesh,
-    PRIMDIFFUSION_PT_export_volumes,
-    PRIMDIFFUSION_FH_human,
-)

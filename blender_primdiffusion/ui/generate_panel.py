@@ -1,29 +1,171 @@
-"""The sidebar panel Generate: presets, Generate Human, Random Seed."""
+"""The sidebar panel Generate: settings, presets, Generate Human, Random Seed."""
 
 from __future__ import annotations
 
+import random
 from pathlib import Path
+from typing import Any
 
 import bpy
 from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
 
+from ..formats import requests
 from ..jobs.follow import submit
 from ..jobs.memory import device_line
 from ..jobs.queue import queue
-from ..jobs.seeds import last_seed, random_seed
-from . import setup
-from .attributes import CATEGORIES, SCALARS, draw_attributes
+from .attributes import CATEGORIES, SCALARS, PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
-from .generate_settings import Asking
 from .manual import draw_manual_button
+from .setup.preferences import draw_set_up
 from .translations import CONTEXT
+
+LARGEST_SEED = 2**31 - 1
+"""The backend itself takes seeds up to 2^63 - 1."""
+
+
+def random_seed() -> int:
+    """A random seed."""
+    return random.randrange(LARGEST_SEED + 1)
+
+
+def last_seed(seed: int, count: int) -> int:
+    """The last of `count` consecutive seeds. Raises ValueError beyond LARGEST_SEED."""
+    last = seed + count - 1
+    if last > LARGEST_SEED:
+        raise ValueError(f"{count} seeds from {seed} on go beyond {LARGEST_SEED}: choose a smaller seed")
+    return last
+
+
+STEPS_AND_SAMPLER = {"DRAFT": (8, "dpmpp_2m"), "STANDARD": (30, "ddim"), "HIGH": (60, "ddim")}
+CUSTOM = "CUSTOM"
+ITEMS = [
+    ("DRAFT", "Draft", "8 steps of DPM-Solver++: quick and softer; the same seed sometimes gives another person"),
+    ("STANDARD", "Standard", "30 steps of DDIM"),
+    ("HIGH", "High", "60 steps of DDIM: twice the time of Standard for a little more detail"),
+    (CUSTOM, "Custom", "Steps and sampler as chosen below"),
+]
+
+
+def apply_quality(settings: bpy.types.PropertyGroup, _context: bpy.types.Context) -> None:
+    """Steps and sampler of the chosen quality. The update function of `quality`."""
+    if settings.quality != CUSTOM and quality_of(settings) != settings.quality:
+        settings.steps, settings.sampler = STEPS_AND_SAMPLER[settings.quality]
+
+
+def name_quality(settings: bpy.types.PropertyGroup, _context: bpy.types.Context) -> None:
+    """The quality with these steps and this sampler. The update function of both."""
+    if settings.quality != quality_of(settings):
+        settings.quality = quality_of(settings)
+
+
+def quality_of(settings: bpy.types.PropertyGroup) -> str:
+    """The quality with these steps and this sampler, else CUSTOM."""
+    chosen = (settings.steps, settings.sampler)
+    return next((name for name, both in STEPS_AND_SAMPLER.items() if both == chosen), CUSTOM)
+
+
+_SAMPLERS = {
+    "ddim": ("DDIM", "No noise besides the seed's: the paper's sampler"),
+    "dpmpp_2m": ("DPM-Solver++(2M)", "Second-order multistep: good with few steps"),
+    "ddpm": ("DDPM", "New noise at each step; needs many steps"),
+}
+SAMPLER_ITEMS = [(name, *_SAMPLERS[name]) for name in requests.SAMPLERS]
+
+
+class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
+    """`scene.primdiffusion`."""
+
+    seed: bpy.props.IntProperty(
+        name="Seed",
+        description="Another seed gives another person; the same seed gives the same person",
+        default=7,
+        min=0,
+    )
+    keep_seed: bpy.props.BoolProperty(
+        name="Lock Seed", description="Keep the seed; otherwise it is set to a new random one after each person"
+    )
+    count: bpy.props.IntProperty(
+        name="Count",
+        description="How many people: from this seed and the following ones, placed side by side",
+        default=1,
+        min=1,
+        max=1000,
+        soft_max=20,
+    )
+    quality: bpy.props.EnumProperty(
+        name="Quality",
+        description="Steps and sampler",
+        items=ITEMS,
+        default="STANDARD",
+        update=apply_quality,
+    )
+    steps: bpy.props.IntProperty(
+        name="Steps",
+        description="Denoising steps: more take longer and add detail",
+        default=requests.STEPS,
+        min=1,
+        max=1000,
+        soft_max=100,
+        update=name_quality,
+    )
+    sampler: bpy.props.EnumProperty(
+        name="Sampler", description="How the noise is removed", items=SAMPLER_ITEMS, update=name_quality
+    )
+    guidance: bpy.props.FloatProperty(
+        name="Guidance",
+        description="How strongly the attributes are followed: 1 as in the training data, "
+        "more exaggerates; no effect without attributes",
+        default=requests.GUIDANCE,
+        min=0.0,
+        max=20.0,
+        soft_min=1.0,
+        soft_max=5.0,
+    )
+    attributes: bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_attributes)
+
+
+_PANELS = "Not given: the panel's"
+_SKIP = {"SKIP_SAVE"}
+
+
+class GenerateOptions:
+    """Properties of operators that generate. None is redoable: a redo slider must not start an expensive job again."""
+
+    bl_options: set[str] = set()  # neither REGISTER (redo) nor UNDO (the result has one)
+
+    seed: bpy.props.IntProperty(
+        name="Seed", default=-1, min=-1, max=LARGEST_SEED, description="-1: the panel's", options=_SKIP
+    )
+    steps: bpy.props.IntProperty(name="Steps", default=0, min=0, max=1000, description="0: the panel's", options=_SKIP)
+    sampler: bpy.props.EnumProperty(name="Sampler", items=SAMPLER_ITEMS, description=_PANELS, options=_SKIP)
+    guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=_PANELS, options=_SKIP)
+    attributes: bpy.props.StringProperty(
+        name="Attributes",
+        description="For example sex=female, height=1.7; empty: no restriction. Not given: the panel's",
+        options=_SKIP,
+    )
+
+    def given(self, name: str) -> bool:
+        """Whether a script or a button has set the property."""
+        return self.properties.is_property_set(name)
+
+    def sampling(self, settings: bpy.types.PropertyGroup) -> dict[str, Any]:
+        """Fields `steps`, `sampler` and `asked` of a job. Raises ValueError for attributes that are not name=value."""
+        wanted = parsed(self.attributes) if self.given("attributes") else asked(settings.attributes)
+        guidance = self.guidance if self.given("guidance") else settings.guidance
+        return {
+            "steps": self.steps or settings.steps,
+            "sampler": self.sampler if self.given("sampler") else settings.sampler,
+            "asked": {"attributes": wanted, "guidance": guidance} if wanted else {},
+        }
+
 
 SUBDIR = "primdiffusion/generate"
 _ASKED = (*CATEGORIES, *(part for name in SCALARS for part in (f"use_{name}", name)))
 
 NO_PRESET = "Generate Presets"
-"""What the menu says before one is chosen; it shows the name of the one in use, as Blender's own do."""
+"""Label of the menu before a preset is chosen; afterwards the preset's name, as in Blender's own menus."""
 
 
 class PRIMDIFFUSION_PT_generate_presets(PresetPanel, bpy.types.Panel):
@@ -42,13 +184,19 @@ class PRIMDIFFUSION_OT_add_generate_preset(AddPresetBase, bpy.types.Operator):
     bl_label = "Add Generate Preset"
     preset_menu = "PRIMDIFFUSION_PT_generate_presets"
     preset_subdir = SUBDIR
-    preset_defines = ["settings = bpy.context.scene.primdiffusion"]  # noqa: RUF012
-    preset_values = [  # noqa: RUF012
+    preset_defines = ["settings = bpy.context.scene.primdiffusion"]
+    preset_values = [
         "settings.steps",
         "settings.sampler",
         "settings.guidance",
         *(f"settings.attributes.{name}" for name in _ASKED),
     ]
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        if not (self.remove_name or self.remove_active or self.as_filename(self.name)):
+            self.report({"ERROR"}, "The preset has no name: type one")
+            return {"CANCELLED"}
+        return AddPresetBase.execute(self, context)
 
 
 class PRIMDIFFUSION_OT_use_generate_preset(bpy.types.Operator):
@@ -56,12 +204,12 @@ class PRIMDIFFUSION_OT_use_generate_preset(bpy.types.Operator):
 
     bl_idname = "primdiffusion.use_generate_preset"
     bl_label = "Use Generate Preset"
-    bl_options = {"UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO"}
 
     filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE"})
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        """A checkpoint may not know what a preset asks for; what comes before it is then taken over."""
+        """A preset may ask for attributes that the checkpoint lacks; the settings before them are applied."""
         path = Path(self.filepath)
         try:
             bpy.utils.execfile(str(path))
@@ -76,7 +224,7 @@ class PRIMDIFFUSION_OT_use_generate_preset(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_generate(Asking, bpy.types.Operator):
+class PRIMDIFFUSION_OT_generate(GenerateOptions, bpy.types.Operator):
     """Generate people from the seed and add them to the scene with armatures, side by side"""
 
     bl_idname = "primdiffusion.generate"
@@ -87,12 +235,11 @@ class PRIMDIFFUSION_OT_generate(Asking, bpy.types.Operator):
     )
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Put them in line; in background mode this waits for all."""
-        from ..jobs.generate import GenerateJob
+        from ..jobs.generate import GenerateJob  # needs numpy
 
         settings = context.scene.primdiffusion
         from_panel = self.seed < 0
-        # a script that names the seed means this one person, whatever the panel's number is
+        # a seed given by a script means one human, whatever the panel's count
         count = self.count or (settings.count if from_panel else 1)
         if from_panel and not settings.keep_seed and settings.seed in _queued_seeds():
             settings.seed = random_seed()
@@ -104,8 +251,9 @@ class PRIMDIFFUSION_OT_generate(Asking, bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         for each in range(seed, last + 1):
-            renews = from_panel and not settings.keep_seed and each == last
-            if submit(self, context, GenerateJob(each, **sampling, renews_seed=renews)) == {"CANCELLED"}:
+            renew_seed = from_panel and not settings.keep_seed and each == last
+            next_seed = random_seed() if renew_seed else None
+            if submit(self, context, GenerateJob(each, **sampling, next_seed=next_seed)) == {"CANCELLED"}:
                 return {"CANCELLED"}
         return {"FINISHED"}
 
@@ -115,16 +263,15 @@ class PRIMDIFFUSION_OT_random_seed(bpy.types.Operator):
 
     bl_idname = "primdiffusion.random_seed"
     bl_label = "Random Seed"
-    bl_options = {"UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Also when the seed is locked: the button says so."""
         context.scene.primdiffusion.seed = random_seed()
         return {"FINISHED"}
 
 
 def _queued_seeds() -> set[int]:
-    """Seeds of humans that are queued: a second press of the button means another human."""
+    """Seeds of queued humans: a second press of the button means another human."""
     return {entry.job.seed for entry in queue.queued if entry.job.kind == "generate"}
 
 
@@ -135,14 +282,12 @@ class PRIMDIFFUSION_PT_generate(SidebarPanel, bpy.types.Panel):
     bl_order = 0
 
     def draw_header_preset(self, _context: bpy.types.Context) -> None:
-        """The menu of presets, and the manual's page."""
         PRIMDIFFUSION_PT_generate_presets.draw_panel_header(self.layout)
         draw_manual_button(self.layout, "first_human")
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads what is in line; starts nothing."""
         layout, settings = property_columns(self.layout), context.scene.primdiffusion
-        ready = setup.draw_set_up(layout)
+        ready = draw_set_up(layout)
         column = layout.column()
         row = column.row(align=True)
         row.prop(settings, "seed")
@@ -159,31 +304,22 @@ class PRIMDIFFUSION_PT_generate(SidebarPanel, bpy.types.Panel):
 
 
 class PRIMDIFFUSION_PT_attributes(SidebarPanel, bpy.types.Panel):
-    """What the person is asked to be; nothing is asked for unless something is chosen."""
+    """Attributes to generate with; none unless chosen."""
 
     bl_label = "Attributes"
     bl_translation_context = CONTEXT
     bl_parent_id = "PRIMDIFFUSION_PT_generate"
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads the checkpoint's card; starts nothing."""
         layout, settings = property_columns(self.layout), context.scene.primdiffusion
         draw_attributes(layout, settings.attributes)
         layout.prop(settings, "guidance")
 
 
-CLASSES = (
-    PRIMDIFFUSION_PT_generate_presets,
-    PRIMDIFFUSION_OT_add_generate_preset,
-    PRIMDIFFUSION_OT_use_generate_preset,
-    PRIMDIFFUSION_OT_generate,
-    PRIMDIFFUSION_OT_random_seed,
-    PRIMDIFFUSION_PT_generate,
-    PRIMDIFFUSION_PT_attributes,
-)
+PROPERTIES = ((bpy.types.Scene, "primdiffusion", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_settings)),)
 
 
 def unregister() -> None:
-    """The menu of presets shows its own name again."""
+    """Restore the label of the presets menu."""
     PRIMDIFFUSION_PT_generate_presets.bl_label = NO_PRESET

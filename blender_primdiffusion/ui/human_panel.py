@@ -1,16 +1,186 @@
-"""The sidebar panel Human: the selected person as a whole; what can be changed is in its sub-panels."""
+"""The sidebar panel Human: the selected human as a whole, and the files of humans."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import bpy
 
-from ..jobs.target import selected_person
-from ..scene.human import armature_of, humans, remove_human
-from ..worker.sentence import sentence
-from .drawing import SidebarPanel, draw_lines
-from .files_panel import draw_missing
-from .manual import draw_manual_button
+from ..backend.requests import sentence
+from ..jobs.follow import submit
+from ..jobs.missing_files import look, state
+from ..jobs.target import HumanTarget, selected_person
+from ..scene.human import armature_of, check_editable, humans, humans_folder, person_file, remove_human
+from .drawing import SidebarPanel, draw_job, draw_lines
 from .on_person import OnPerson
+
+
+class _Find:
+    """Base of the operators that look for files."""
+
+    bl_options: set[str] = set()  # neither REGISTER nor UNDO: each result makes its own step
+
+    directory: bpy.props.StringProperty(
+        name="Folder",
+        description="Where to look too, and in the folders inside. Empty: beside this file, where it was last saved "
+        "and in the folders of other people",
+        subtype="DIR_PATH",
+        options={"SKIP_SAVE"},
+    )
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        from ..scene.missing import copy_back, find_files, missing_files, repair  # needs numpy
+
+        directory = Path(bpy.path.abspath(self.directory)) if self.directory else None
+        try:
+            lost = missing_files()
+            found = find_files(lost, directory)
+            repaired = repair(lost, found)
+            copied = copy_back(lost, found, directory)
+            if repaired:
+                bpy.ops.ed.undo_push(message="Find Missing Volumes")
+            restored, left = self._restore(context, directory)
+        except OSError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        finally:
+            look()
+        if left:
+            done = repaired or copied or restored
+            self.report({"WARNING" if done else "ERROR"}, "; ".join(left))
+            return {"FINISHED"} if done else {"CANCELLED"}
+        message = f"{repaired + copied} files found" if lost else "No files of people are missing"
+        self.report({"INFO"}, message)
+        return {"FINISHED"}
+
+    def _restore(self, context: bpy.types.Context, directory: Path | None) -> tuple[int, list[str]]:
+        """Queue jobs for humans whose files were not found; returns how many, and sentences on humans that are lost."""
+        # needs numpy
+        from ..jobs.edit import RestoreJob
+        from ..scene.missing import find_person, missing_files
+
+        jobs, left = [], []
+        for one in missing_files():
+            source = find_person(one, directory)
+            if one.linked:
+                left.append(
+                    f"{one.summary()}, linked from {one.linked!r}, cannot be found: open that file and search there"
+                )
+            elif source is None:
+                left.append(
+                    f"{one.summary()} cannot be found: put them back, choose the folder that they are in, or press "
+                    "Generate Again where a seed made them"
+                )
+            elif one.merged and not (one.volumes or one.person_file or one.body_file):
+                left.append(f"{one.summary()} cannot be found: press Merge again")
+            else:
+                try:
+                    jobs.append(RestoreJob(HumanTarget.of(one.person), str(source)))
+                except ValueError as error:
+                    left.append(str(error))
+        done = [job for job in jobs if submit(self, context, job) == {"FINISHED"}]
+        return len(done), left
+
+
+class PRIMDIFFUSION_OT_find_missing_volumes(_Find, bpy.types.Operator):
+    """Find missing files of people, and restore those that cannot be found"""
+
+    bl_idname = "primdiffusion.find_missing_volumes"
+    bl_label = "Find Missing Volumes"
+
+
+class PRIMDIFFUSION_OT_find_volumes_in_folder(_Find, bpy.types.Operator):
+    """Choose a folder to search for missing files of people"""
+
+    bl_idname = "primdiffusion.find_volumes_in_folder"
+    bl_label = "Find Volumes in Folder"
+
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+
+class PRIMDIFFUSION_OT_generate_again(OnPerson, bpy.types.Operator):
+    """Generate this person again from their seed, when all of their files are lost"""
+
+    bl_idname = "primdiffusion.generate_again"
+    bl_label = "Generate Again"
+    bl_options: set[str] = set()  # neither REGISTER (redo) nor UNDO (the result has one)
+
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        from ..jobs.edit import RegenerateJob, made_from_seed  # needs numpy
+
+        try:
+            there = person_file(person)
+        except FileNotFoundError:
+            return submit(self, context, RegenerateJob(HumanTarget.of(person), made_from_seed(person)))
+        raise ValueError(f"the file of {person.name!r} is there, {there.name!r}: press Find Missing Volumes")
+
+
+class PRIMDIFFUSION_OT_collect_files(bpy.types.Operator):
+    """Copy the files of all people next to this .blend, so that it can be moved or sent with one folder"""
+
+    bl_idname = "primdiffusion.collect_files"
+    bl_label = "Collect Files"
+    bl_options = {"UNDO"}
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        from ..scene.collect import collect_files  # needs numpy
+
+        try:
+            done = collect_files()
+        except (OSError, ValueError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        look()
+        where = humans_folder().name
+        if done.volumes:
+            size = f"{done.files} files, {done.size / 1e6:.1f} MB"
+            self.report({"INFO"}, f"{done.volumes} volumes are in {where!r} now ({size} copied); save this file")
+        else:
+            self.report({"INFO"}, f"All files of people are in {where!r} already")
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_remove_unused_files(bpy.types.Operator):
+    """Delete files in the folder beside this .blend that it does not use. Undo of edits, and other .blend \
+files that share the folder, may need them"""
+
+    bl_idname = "primdiffusion.remove_unused_files"
+    bl_label = "Remove Unused Files"
+    bl_options: set[str] = set()  # files cannot be undone
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_confirm(self, event)
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        from ..scene.collect import unused  # needs numpy
+
+        removed = size = 0
+        for path in unused(humans_folder()):
+            try:
+                size += path.stat().st_size
+                path.unlink()
+                removed += 1
+            except OSError as error:
+                self.report({"WARNING"}, f"{str(path)!r} could not be removed ({error})")
+        self.report({"INFO"}, f"Removed {removed} files ({size / 1e6:.1f} MB) from {str(humans_folder())!r}")
+        return {"FINISHED"}
+
+
+def draw_missing(layout: bpy.types.UILayout) -> None:
+    """What is missing and what can be done about it; nothing when all files are there."""
+    if not state.summary:
+        return
+    box = layout.box()
+    draw_lines(box, f"Missing: {state.summary}", "ERROR")
+    row = box.row(align=True)
+    draw_job(row.column(), "restore_volumes", "primdiffusion.find_missing_volumes", "VIEWZOOM")
+    row.operator("primdiffusion.find_volumes_in_folder", text="", icon="FILE_FOLDER")
+    for name in state.without_person_file:
+        draw_job(box, "regenerate", "primdiffusion.generate_again", "FILE_REFRESH").human = name
 
 
 class PRIMDIFFUSION_OT_select_human(OnPerson, bpy.types.Operator):
@@ -18,7 +188,7 @@ class PRIMDIFFUSION_OT_select_human(OnPerson, bpy.types.Operator):
 
     bl_idname = "primdiffusion.select_human"
     bl_label = "Select Human"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"REGISTER", "UNDO"}
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         select(context, person)
@@ -26,14 +196,14 @@ class PRIMDIFFUSION_OT_select_human(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_frame_human(OnPerson, bpy.types.Operator):
-    """Select this person and move the view so that they fill it"""
+    """Select this person and frame it in the view"""
 
     bl_idname = "primdiffusion.frame_human"
     bl_label = "Frame Human"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"REGISTER", "UNDO"}
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """In the 3D viewport that this was pressed in, else in the first."""
+        """In the viewport that the button was pressed in, else in the first one."""
         place = _viewport(context)
         if place is None:
             raise ValueError("no 3D viewport is open: open one")
@@ -44,18 +214,17 @@ class PRIMDIFFUSION_OT_frame_human(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_duplicate_human(OnPerson, bpy.types.Operator):
-    """Duplicate this person, with an armature and body of their own and the same files"""
+    """Duplicate this person, with a separate armature and body but the same files"""
 
     bl_idname = "primdiffusion.duplicate_human"
     bl_label = "Duplicate Human"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"REGISTER", "UNDO"}
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """The new person is selected."""
+        # needs numpy
         from ..scene.build import stand_beside_others
         from ..scene.duplicate import duplicate_human
-        from ..scene.human import check_editable
-        from ..scene.painting import leave_mode
+        from ..scene.edit import leave_mode
 
         check_editable(person)
         leave_mode(context)
@@ -71,10 +240,9 @@ class PRIMDIFFUSION_OT_delete_human(OnPerson, bpy.types.Operator):
 
     bl_idname = "primdiffusion.delete_human"
     bl_label = "Delete Human"
-    bl_options = {"UNDO"}  # noqa: RUF012  nothing to redo
+    bl_options = {"UNDO"}  # nothing to redo
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Ask first."""
         try:
             title = f"Delete {self.person(context).name}?"
         except ValueError:
@@ -83,22 +251,23 @@ class PRIMDIFFUSION_OT_delete_human(OnPerson, bpy.types.Operator):
         return context.window_manager.invoke_confirm(self, event, title=title, message=message)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """Linked people are unlinked by the Outliner, not here: they belong to another file."""
-        from ..scene.grid_cache import free_unused_grids
-        from ..scene.painting import leave_mode
+        """Linked humans belong to another file: the Outliner unlinks them."""
+        # needs numpy
+        from ..scene.edit import leave_mode
+        from ..scene.volumes import free_unused_grids
 
         if person.library is not None:
             raise ValueError(f"the person {person.name!r} is linked: remove them in the Outliner with Unlink")
         leave_mode(context)
         remove_human(person)
-        context.view_layer.update()  # what is evaluated holds grids too
+        context.view_layer.update()  # evaluated data holds grids too
         free_unused_grids()
         return {"FINISHED"}
 
 
 def select(context: bpy.types.Context, person: bpy.types.Collection) -> None:
     """Make a person's armature active. Raises ValueError for one that cannot be selected in this view layer."""
-    from ..scene.painting import leave_mode
+    from ..scene.edit import leave_mode  # needs numpy
 
     armature = armature_of(person)
     if context.view_layer.objects.get(armature.name) != armature:
@@ -125,7 +294,6 @@ class PRIMDIFFUSION_MT_people(bpy.types.Menu):
     bl_label = "People"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Choosing one selects them."""
         for person in humans(context.scene):
             choice = self.layout.operator("primdiffusion.select_human", text=person.name, icon="OUTLINER_OB_ARMATURE")
             choice.human = person.name
@@ -136,13 +304,9 @@ class PRIMDIFFUSION_PT_human(SidebarPanel, bpy.types.Panel):
 
     bl_label = "Human"
     bl_order = 2
-
-    def draw_header_preset(self, _context: bpy.types.Context) -> None:
-        """The manual's page."""
-        draw_manual_button(self.layout, "editing")
+    manual_page = "editing"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads the scene; changes nothing."""
         draw_missing(self.layout)
         row = self.layout.row(align=True)
         if humans(context.scene):
@@ -157,13 +321,3 @@ class PRIMDIFFUSION_PT_human(SidebarPanel, bpy.types.Panel):
         row.operator("primdiffusion.frame_human", text="", icon="ZOOM_SELECTED")
         row.operator("primdiffusion.duplicate_human", text="", icon="DUPLICATE")
         row.operator("primdiffusion.delete_human", text="", icon="TRASH")
-
-
-CLASSES = (
-    PRIMDIFFUSION_OT_select_human,
-    PRIMDIFFUSION_OT_frame_human,
-    PRIMDIFFUSION_OT_duplicate_human,
-    PRIMDIFFUSION_OT_delete_human,
-    PRIMDIFFUSION_MT_people,
-    PRIMDIFFUSION_PT_human,
-)

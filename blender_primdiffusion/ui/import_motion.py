@@ -1,4 +1,4 @@
-"""Who is under the mouse: volumes cannot be hit by rays, so the skeleton as it is drawn decides."""
+"""Import Motion: the operator, its options, and files dropped onto humans."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ from typing import TYPE_CHECKING
 import bpy
 from bpy_extras.io_utils import ImportHelper
 
+from ..backend.requests import sentence
 from ..formats.joints import JOINT_NAMES
 from ..scene.human import armature_of, humans
-from ..worker.sentence import sentence
 from .drawing import draw_lines, property_columns
-from .motion_armatures import OnArmature, WhereTo, target_armature
+from .on_person import OnArmature, WhereTo, target_armature
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _MARGIN = 0.12
-"""How far around the joints' rectangle still counts as the person, of its height."""
+"""Margin around the joints' rectangle that still counts as the human, as a share of its height."""
 
 
 def person_under(context: bpy.types.Context, event: bpy.types.Event) -> str:
-    """Name of the person under the mouse in the 3D view; empty where there is none."""
+    """Name of the human under the mouse in the 3D view, by its joints (rays do not hit volumes); empty for none."""
+    # needs numpy
     import numpy as np
     from bpy_extras.view3d_utils import location_3d_to_region_2d
 
@@ -44,8 +45,8 @@ def person_under(context: bpy.types.Context, event: bpy.types.Event) -> str:
 
 
 def nearest_to(mouse: tuple[float, float], seen: dict[str, NDArray]) -> str:
-    """Of people's joints in the picture [n, 2], pixels, the name of those around the mouse; the closest of several."""
-    import numpy as np
+    """The name whose joints on screen [n, 2], in pixels, surround the mouse; the closest of several."""
+    import numpy as np  # needs numpy
 
     best, name = np.inf, ""
     for person, spots in seen.items():
@@ -71,28 +72,29 @@ _UP_ITEMS = [
 
 
 @dataclasses.dataclass(frozen=True)
-class Look:
-    """What a file holds, for the options beside the file browser."""
+class FileFacts:
+    """Content of a file, shown beside the file browser."""
 
     facts: dict[str, str]
     bones: tuple[str, ...]
     """Of a .bvh."""
     found: dict[str, str]
-    """SMPL's joint -> bone, as far as the names tell."""
+    """SMPL's joint -> bone, as recognised by name."""
     error: str = ""
 
 
-def look_at(filepath: str, up: str = "") -> Look:
-    """What is in a file; kept until the file changes. Raises nothing: faults are told in `error`."""
+def look_at(filepath: str, up: str = "") -> FileFacts:
+    """What is in a file; cached until the file changes. Does not raise: `error` holds what is wrong."""
     path = Path(bpy.path.abspath(filepath))
     if path.suffix.lower() not in SUFFIXES or not path.is_file():
-        return Look({}, (), {})
+        return FileFacts({}, (), {})
     stat = path.stat()
     return _look_at(str(path), up, stat.st_mtime_ns, stat.st_size)
 
 
 @functools.lru_cache(maxsize=8)
-def _look_at(path: str, up: str, _changed: int, _size: int) -> Look:
+def _look_at(path: str, up: str, _changed: int, _size: int) -> FileFacts:
+    # needs numpy
     from ..motion.bvh import BvhError, bone_names, parse_bvh
     from ..motion.files import MotionFileError, read_motion
     from ..motion.rigs import UnknownBonesError, map_bones
@@ -105,8 +107,8 @@ def _look_at(path: str, up: str, _changed: int, _size: int) -> Look:
             map_bones(bones)
         motion = read_motion(path, up)
     except (MotionFileError, UnknownBonesError, BvhError, OSError) as error:
-        return Look({}, bones, {}, str(error))
-    return Look(facts(motion), bones, dict(motion.detected.bones))
+        return FileFacts({}, bones, {}, str(error))
+    return FileFacts(facts(motion), bones, dict(motion.detected.bones))
 
 
 def bone_property(joint: str) -> str:
@@ -136,7 +138,7 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
 
     bl_idname = "primdiffusion.import_motion"
     bl_label = "Import Motion"
-    bl_options = {"UNDO", "PRESET"}  # noqa: RUF012
+    bl_options = {"UNDO", "PRESET"}
 
     filename_ext = ""
     filepath: bpy.props.StringProperty(
@@ -160,7 +162,7 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
         ],
     )
     first: bpy.props.IntProperty(name="From", description="First frame of the file, counted from 1", default=1, min=1)
-    last: bpy.props.IntProperty(name="To", description="Last frame of the file; 0: all there are", default=0, min=0)
+    last: bpy.props.IntProperty(name="To", description="Last frame of the file; 0: to its end", default=0, min=0)
     stride: bpy.props.IntProperty(name="Step", description="Take every n-th frame of the file", default=1, min=1)
     scale: bpy.props.FloatProperty(
         name="Scale Path",
@@ -189,7 +191,7 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
     )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """A dropped file asks for options at the cursor and goes to the person under it; else the file browser."""
+        """Show the options of a dropped file at the cursor, for the human there; else open the file browser."""
         if self.filepath:
             self.person = person_under(context, event) or self.person
             title = f"Import {Path(self.filepath).name}"
@@ -197,7 +199,7 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
         return ImportHelper.invoke(self, context, event)
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        """Read, fit, key."""
+        # needs numpy
         from ..motion.files import read_motion
         from .motion_placing import Placement, extend_range, place_motion
 
@@ -226,7 +228,6 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
         return "" if self.up == "AUTO" else self.up.lower().replace("minus_", "-")
 
     def draw(self, context: bpy.types.Context) -> None:
-        """What was found, then what can be changed."""
         layout = property_columns(self.layout)
         look = look_at(self.filepath, self.axis())
         self._draw_found(context, look)
@@ -253,7 +254,7 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
                 for joint in JOINT_NAMES:
                     column.prop(self, bone_property(joint), placeholder=look.found.get(joint, ""))
 
-    def _draw_found(self, context: bpy.types.Context, look: Look) -> None:
+    def _draw_found(self, context: bpy.types.Context, look: FileFacts) -> None:
         box = self.layout.box().column(align=True)
         try:
             box.label(text=target_armature(context, self.person).name, icon="OUTLINER_OB_ARMATURE")
@@ -277,11 +278,4 @@ class PRIMDIFFUSION_FH_motion(bpy.types.FileHandler):
 
     @classmethod
     def poll_drop(cls, context: bpy.types.Context) -> bool:
-        """Onto a 3D view; without a person the operator says what is missing."""
         return context.area is not None and context.area.type == "VIEW_3D"
-
-
-CLASSES = (
-    PRIMDIFFUSION_OT_import_motion,
-    PRIMDIFFUSION_FH_motion,
-)

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 import bpy
 from bpy.app.handlers import persistent
 
+from ..backend.redact import redact
 from ..jobs import follow, memory
-from ..jobs.building import building
-from ..jobs.follow import PRIMDIFFUSION_OT_take_result, redraw, submit
+from ..jobs.follow import building, redraw, submit
 from ..jobs.memory import device_line
 from ..jobs.pictures import so_far
 from ..jobs.queue import queue
@@ -26,8 +26,6 @@ _PATHS = ("backend_python", "checkpoint", "encoder")
 
 def diagnostics() -> str:
     """Versions, device, memory, the last job, its error and the end of the child's log; redacted."""
-    from ..worker.redact import redact
-
     return redact("\n".join(_lines()), _names())
 
 
@@ -60,7 +58,7 @@ def _lines() -> Iterator[str]:
 def _version() -> str:
     manifest = os.path.join(os.path.dirname(os.path.dirname(__file__)), "blender_manifest.toml")
     try:
-        import tomllib
+        import tomllib  # for reports alone
 
         with open(manifest, "rb") as file:
             return tomllib.load(file)["version"]
@@ -73,7 +71,8 @@ def _window() -> str:
 
 
 def _names() -> set[str]:
-    """Of the user and the machine; those of the home folder too, which may differ."""
+    """Names of the user, the home folder and the machine."""
+    # for reports alone
     import getpass
     import socket
 
@@ -89,10 +88,10 @@ class PRIMDIFFUSION_OT_copy_diagnostics(bpy.types.Operator):
 
     bl_idname = "primdiffusion.copy_diagnostics"
     bl_label = "Copy Diagnostics"
-    bl_options: set[str] = set()  # noqa: RUF012
+    bl_options: set[str] = set()
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Without a window there is no clipboard: then a text block of the file holds it."""
+        """Without a window there is no clipboard: a text block holds the diagnostics instead."""
         text = diagnostics()
         if bpy.app.background:
             block = bpy.data.texts.get(TEXT) or bpy.data.texts.new(TEXT)
@@ -112,7 +111,7 @@ class PRIMDIFFUSION_OT_cancel(bpy.types.Operator):
 
     bl_idname = "primdiffusion.cancel"
     bl_label = "Cancel"
-    bl_options: set[str] = set()  # noqa: RUF012
+    bl_options: set[str] = set()
 
     number: bpy.props.IntProperty(
         name="Number", description="Number of the queued job; 0 is the running one", min=0, options=_SKIP
@@ -120,12 +119,10 @@ class PRIMDIFFUSION_OT_cancel(bpy.types.Operator):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        """Only while a job is running or queued."""
         cls.poll_message_set("No job is queued")
         return queue.busy
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        """Ask; the timer sees it through."""
         if not queue.cancel(self.number):
             which = f"job {self.number} is no longer queued" if self.number else "no job is running yet"
             self.report({"ERROR"}, which)
@@ -139,7 +136,7 @@ class PRIMDIFFUSION_OT_try_again(bpy.types.Operator):
 
     bl_idname = "primdiffusion.try_again"
     bl_label = "Try Again"
-    bl_options: set[str] = set()  # noqa: RUF012
+    bl_options: set[str] = set()
 
     kind: bpy.props.StringProperty(
         name="Kind", description="Kind of job, such as generate; empty: the last one that ended", options=_SKIP
@@ -147,12 +144,10 @@ class PRIMDIFFUSION_OT_try_again(bpy.types.Operator):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        """Only after something has failed."""
         cls.poll_message_set("No job has failed")
         return any(outcome.error is not None for outcome in queue.outcomes.values())
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Queue the failed job again, for the current scene."""
         outcome = queue.outcomes.get(self.kind) if self.kind else queue.last
         if outcome is None or outcome.error is None:
             why = f"no job {self.kind!r} has failed" if self.kind else "the last job did not fail"
@@ -162,14 +157,13 @@ class PRIMDIFFUSION_OT_try_again(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_release_memory(bpy.types.Operator):
-    """End the processes that generate and draw to release their memory; they start again with the next person"""
+    """End the processes that generate and draw, to release their memory; they restart when needed"""
 
     bl_idname = "primdiffusion.release_memory"
     bl_label = "Release Memory"
-    bl_options: set[str] = set()  # noqa: RUF012
+    bl_options: set[str] = set()
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        """Tell what was freed."""
         try:
             freed = memory.release()
         except RuntimeError as error:
@@ -188,11 +182,9 @@ class PRIMDIFFUSION_PT_jobs(SidebarPanel, bpy.types.Panel):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        """Something is in line or has ended, or holds memory, or has died."""
-        return queue.busy or bool(queue.ended) or queue.child_pid is not None or bool(queue.child_news)
+        return queue.busy or bool(queue.ended) or queue.child_pid is not None or bool(queue.child_message)
 
     def draw(self, _context: bpy.types.Context) -> None:
-        """Reads what is in line; starts nothing."""
         layout = self.layout
         draw_queue(layout)
         draw_ended(layout)
@@ -200,16 +192,6 @@ class PRIMDIFFUSION_PT_jobs(SidebarPanel, bpy.types.Panel):
         column = layout.column(align=True)
         column.operator("primdiffusion.release_memory", icon="TRASH")
         column.operator("primdiffusion.copy_diagnostics", icon="COPYDOWN")
-
-
-CLASSES = (
-    PRIMDIFFUSION_OT_copy_diagnostics,
-    PRIMDIFFUSION_OT_take_result,
-    PRIMDIFFUSION_OT_cancel,
-    PRIMDIFFUSION_OT_try_again,
-    PRIMDIFFUSION_OT_release_memory,
-    PRIMDIFFUSION_PT_jobs,
-)
 
 
 @persistent

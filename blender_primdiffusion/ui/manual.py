@@ -12,17 +12,16 @@ _FOLDERS = (("manual", ".html"), ("../docs/manual", ".md"))
 
 
 class PRIMDIFFUSION_OT_open_manual(bpy.types.Operator):
-    """Open the manual's page about this in the browser; no network is needed"""
+    """Open the manual page in the browser; needs no network"""
 
     bl_idname = "primdiffusion.open_manual"
     bl_label = "Open Manual"
-    bl_options: set[str] = set()  # noqa: RUF012
+    bl_options: set[str] = set()
 
     page: bpy.props.StringProperty(name="Page", description="Name of the page, such as first_human", default="index")
-    anchor: bpy.props.StringProperty(name="Section", description="Heading on the page; empty: its beginning")
+    anchor: bpy.props.StringProperty(name="Section", description="Heading on the page; empty: its start")
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        """The user's browser shows the file."""
         import webbrowser  # slow to import, and not needed to register
 
         path = page_file(self.page) or page_file("index")
@@ -68,12 +67,10 @@ def manual_map() -> tuple[str, list[tuple[str, str]]]:
 
 
 def register() -> None:
-    """Make the button and the map known to Blender."""
-    bpy.utils.register_class(PRIMDIFFUSION_OT_open_manual)
+    """Register the map of the manual's pages."""
     bpy.utils.register_manual_map(manual_map)
 
 
 def unregister() -> None:
     """Undo `register`."""
     bpy.utils.unregister_manual_map(manual_map)
-    bpy.utils.unregister_class(PRIMDIFFUSION_OT_open_manual)

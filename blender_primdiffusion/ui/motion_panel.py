@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
-from pathlib import Path
 
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
-from ..scene.actions import action_curves, loops
-from ..worker.sentence import sentence
+from ..backend.requests import sentence
+from ..scene.actions import action_curves, end_repeat, loops, repeat
 from .drawing import SidebarPanel, draw_lines, property_columns
-from .manual import draw_manual_button
-from .motion_armatures import FACTS, OnArmature, WhereTo, scene_fps, target_armature
+from .export_operators import destination
+from .on_person import FACTS, OnArmature, WhereTo, scene_fps, target_armature
 from .translations import CONTEXT
 
 _BUILT_IN = [
@@ -28,13 +28,12 @@ class PRIMDIFFUSION_OT_use_action(bpy.types.Operator):
 
     bl_idname = "primdiffusion.use_action"
     bl_label = "Use Motion"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"REGISTER", "UNDO"}
 
     action: bpy.props.StringProperty(name="Action", description="Name of the action", options={"SKIP_SAVE"})
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Give the armature the action and a slot of it that fits."""
-        from ..motion.pose_library import check_posable
+        from ..motion.pose_library import check_posable  # needs numpy
 
         action = bpy.data.actions.get(self.action)
         try:
@@ -70,18 +69,16 @@ class PRIMDIFFUSION_OT_add_motion(OnArmature, WhereTo, bpy.types.Operator):
 
     bl_idname = "primdiffusion.add_motion"
     bl_label = "Add Motion"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"REGISTER", "UNDO"}
 
     motion: bpy.props.EnumProperty(
         name="Motion", translation_context=CONTEXT, description="What the person does", items=_BUILT_IN
     )
-    rounds: bpy.props.IntProperty(name="Rounds", description="How often, in a row", default=2, min=1, max=500)
+    rounds: bpy.props.IntProperty(name="Rounds", description="Number of repetitions", default=2, min=1, max=500)
     speed: bpy.props.FloatProperty(name="Speed", description="2 is twice as fast", default=1.0, min=0.1, max=10.0)
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        """Make it at the scene's rate and key it."""
-        import dataclasses
-
+        # needs numpy
         from ..motion.built_in_motions import built_in_motion
         from .motion_placing import Placement, extend_range, place_motion
 
@@ -99,10 +96,10 @@ class PRIMDIFFUSION_OT_clear_motion(OnArmature, bpy.types.Operator):
 
     bl_idname = "primdiffusion.clear_motion"
     bl_label = "Clear Motion"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"REGISTER", "UNDO"}
 
     def on(self, _context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        """The action and the tracks of the nonlinear animation."""
+        # needs numpy
         from ..motion.pose_library import check_posable
         from ..scene.armature import pose_from_joint_rotations
 
@@ -113,7 +110,7 @@ class PRIMDIFFUSION_OT_clear_motion(OnArmature, bpy.types.Operator):
         animation.action = None
         for track in list(animation.nla_tracks):
             animation.nla_tracks.remove(track)
-        import numpy as np
+        import numpy as np  # needs numpy
 
         pose_from_joint_rotations(armature, np.tile(np.eye(3), (24, 1, 1)))
         return {"FINISHED"}
@@ -124,12 +121,9 @@ class PRIMDIFFUSION_OT_loop_motion(OnArmature, bpy.types.Operator):
 
     bl_idname = "primdiffusion.loop_motion"
     bl_label = "Loop"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"REGISTER", "UNDO"}
 
     def on(self, _context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        """Cycles modifiers on all curves, or none."""
-        from ..scene.actions import action_curves, end_repeat, loops, repeat
-
         if action_curves(armature) is None:
             raise ValueError(f"{armature.name!r} has no action to loop: import or add a motion first")
         (end_repeat if loops(armature) else repeat)(armature)
@@ -141,7 +135,7 @@ class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operato
 
     bl_idname = "primdiffusion.export_motion"
     bl_label = "Export Motion"
-    bl_options: set[str] = set()  # noqa: RUF012  changes nothing
+    bl_options: set[str] = set()  # changes nothing
 
     filename_ext = ".npz"
     filter_glob: bpy.props.StringProperty(default="*.npz", options={"HIDDEN"})
@@ -151,16 +145,16 @@ class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operato
     last: bpy.props.IntProperty(name="To", description="Last frame", default=0)
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        """Sample the evaluated bones on every frame, write the file."""
+        # needs numpy
         from ..motion.files import write_amass
         from .motion_placing import sample_motion
 
         scene = context.scene
         first, last = (self.first, self.last) if self.first or self.last else (scene.frame_start, scene.frame_end)
         if last < first:
-            raise ValueError(f"frames {first} to {last} were wanted: give a last frame that is not before the first")
+            raise ValueError(f"the last frame {last} is before the first, {first}: swap them")
         motion, betas, pelvis = sample_motion(context, armature, first, last)
-        path = Path(bpy.path.abspath(self.filepath))
+        path = destination(self.filepath, (".npz",))
         write_amass(path, motion, betas, pelvis)
         self.report({"INFO"}, f"{len(motion)} frames of {armature.name!r} written to {path.name!r}")
         return {"FINISHED"}
@@ -171,14 +165,10 @@ class PRIMDIFFUSION_PT_motion(SidebarPanel, bpy.types.Panel):
 
     bl_label = "Motion"
     bl_order = 3
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
-
-    def draw_header_preset(self, _context: bpy.types.Context) -> None:
-        """The manual."""
-        draw_manual_button(self.layout, "motion")
+    bl_options = {"DEFAULT_CLOSED"}
+    manual_page = "motion"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads the scene; changes nothing."""
         layout = property_columns(self.layout)
         layout.operator("primdiffusion.import_motion", icon="IMPORT")
         layout.operator_menu_enum("primdiffusion.add_motion", "motion", text="Add Built-in Motion", icon="ADD")
@@ -219,7 +209,6 @@ class PRIMDIFFUSION_MT_actions(bpy.types.Menu):
     bl_label = "Motions"
 
     def draw(self, _context: bpy.types.Context) -> None:
-        """A row for each."""
         actions = [action for action in bpy.data.actions if moves_bones(action)]
         for action in actions:
             self.layout.operator("primdiffusion.use_action", text=action.name, icon="ACTION").action = action.name
@@ -234,14 +223,3 @@ def facts_of(action: bpy.types.Action) -> dict[str, str]:
     except (ValueError, TypeError):
         return {}
     return {str(k): str(v) for k, v in found.items()} if isinstance(found, dict) else {}
-
-
-CLASSES = (
-    PRIMDIFFUSION_OT_use_action,
-    PRIMDIFFUSION_OT_add_motion,
-    PRIMDIFFUSION_OT_clear_motion,
-    PRIMDIFFUSION_OT_loop_motion,
-    PRIMDIFFUSION_OT_export_motion,
-    PRIMDIFFUSION_PT_motion,
-    PRIMDIFFUSION_MT_actions,
-)

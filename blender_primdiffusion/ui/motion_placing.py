@@ -18,11 +18,10 @@ from ..motion.pose_library import check_posable, rest_joints
 from ..motion.rotation import nearest
 from ..motion.skeleton import unchain
 from ..scene.actions import last_key, push_to_strip
-from ..scene.armature import rest_rotations
+from ..scene.armature import append_poses, keyframe_poses, rest_rotations
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
 from ..scene.human import BETAS
-from ..scene.keyframes import append_poses, keyframe_poses
-from .motion_armatures import FACTS, scene_fps
+from .on_person import FACTS, scene_fps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +29,7 @@ class Placement:
     """How a motion is to be put onto an armature."""
 
     start: float = 1.0
-    """Frame of the first key; what is appended comes a frame after the last key instead."""
+    """Frame of the first key; ignored for APPEND, which begins a frame after the last key."""
     timing: str = "SCENE"
     """SCENE: a key on every frame of the scene; SOURCE: one for every frame of the motion."""
     first: int = 1
@@ -41,11 +40,11 @@ class Placement:
     scale: float = 1.0
     """Of the path."""
     fit_stride: bool = True
-    """Whether the path is made as long as the armature's legs go, before `scale`."""
+    """Whether the path is scaled to the armature's legs, before `scale`."""
     root: str = "ORIGIN"
-    """ORIGIN: the path begins at the person; KEEP: it is left alone; PLACE: they stay where they are."""
+    """ORIGIN: the path begins at the human; KEEP: it stays as in the file; PLACE: the human stays in place."""
     ground: bool = True
-    """Whether the whole motion is raised or lowered onto the floor."""
+    """Whether the whole motion is moved onto the floor."""
     into: str = "NEW"
     """NEW: an action; APPEND: to the one there is; STRIP: a strip of the nonlinear animation."""
 
@@ -53,7 +52,7 @@ class Placement:
 def place_motion(
     context: bpy.types.Context, armature: bpy.types.Object, motion: Motion, how: Placement
 ) -> tuple[float, float]:
-    """Put the keys in; returns the first and last frame. Raises ValueError before anything is changed."""
+    """Set the keys; returns the first and last frame. Raises ValueError before anything is changed."""
     check_posable(armature)
     rest = rest_joints(armature)
     ratio = stride_ratio(motion, rest) if how.fit_stride else None
@@ -77,7 +76,7 @@ def place_motion(
 
 
 def fit(motion: Motion, rest: NDArray, scene_rate: float, how: Placement) -> tuple[Motion, NDArray[np.float64]]:
-    """The motion as it is to be keyed on a skeleton at rest [24, 3], and frames of the scene [F] from 0."""
+    """The motion fitted to a skeleton at rest [24, 3], and its frames in the scene [F], from 0."""
     fitted = cut(motion, how.first, how.last, how.stride)
     if how.timing == "SCENE":
         fitted = resample(fitted, scene_rate)
@@ -90,22 +89,22 @@ def fit(motion: Motion, rest: NDArray, scene_rate: float, how: Placement) -> tup
 
 
 def facts(motion: Motion) -> dict[str, str]:
-    """What people want to know of a motion, label to text."""
+    """Facts about a motion for display, label to text."""
     found = motion.detected
-    told = f"{motion.fps:.4g}" + ("" if found.fps else " (assumed)")
+    rate = f"{motion.fps:.4g}" + ("" if found.fps else " (assumed)")
     bones = {"Bones": f"{len(found.bones)} of 24"} if found.bones else {}
     return {
         "Rig": found.rig or "unknown",
         **bones,
         "Up Axis": found.up or "not found, y assumed",
         "Frames": f"{len(motion)} ({len(motion) / motion.fps:.1f} s)",
-        "Frame Rate": told,
+        "Frame Rate": rate,
         "Units": found.unit,
     }
 
 
 def extend_range(scene: bpy.types.Scene, last: float) -> None:
-    """The scene ends no earlier than the motion."""
+    """Extend the scene to the end of the motion."""
     scene.frame_end = max(scene.frame_end, int(np.ceil(last)))
 
 
@@ -114,11 +113,11 @@ def sample_motion(
 ) -> tuple[Motion, NDArray[np.float64], NDArray[np.float64]]:
     """The motion on frames `first` to `last` in the armature's own space, the shape [n], the rest pelvis [3].
 
-    Where the object itself is moved or scaled does not count. Raises ValueError where one of SMPL's joints lacks.
+    The object's own transform is left out. Raises ValueError where one of SMPL's joints is missing.
     """
     rest, pelvis = rest_rotations(armature), rest_joints(armature)[0]
     matrices = []
-    with _scene_of_its_own(context, armature) as scene:
+    with _separate_scene(context, armature) as scene:
         for frame in range(first, last + 1):
             scene.frame_set(frame)
             posed = armature.evaluated_get(scene.view_layers[0].depsgraph).pose.bones
@@ -132,8 +131,8 @@ def sample_motion(
 
 
 @contextmanager
-def _scene_of_its_own(context: bpy.types.Context, armature: bpy.types.Object) -> Iterator[bpy.types.Scene]:
-    """A scene with nothing but the armature: a frame of a person's takes as long as a thousand volumes."""
+def _separate_scene(context: bpy.types.Context, armature: bpy.types.Object) -> Iterator[bpy.types.Scene]:
+    """A scene with nothing but the armature: with a human's thousand volumes a frame takes far longer."""
     scene = bpy.data.scenes.new("sampling")
     render = context.scene.render
     scene.render.fps, scene.render.fps_base = render.fps, render.fps_base

@@ -1,18 +1,19 @@
-"""What operators on one person of the scene have in common."""
+"""Bases of operators on one human, or on one armature with SMPL's joints."""
 
 from __future__ import annotations
 
 import bpy
 
+from ..formats.joints import JOINT_NAMES
 from ..jobs.target import named_person, selected_person
-from ..scene.human import humans
+from ..scene.human import armature_of, human_of, humans
 
 SKIP = {"SKIP_SAVE"}
 PANELS = "Not given: the panel's"
 
 
 class OnPerson:
-    """Finds the person and turns errors into reports; subclasses define `run`."""
+    """Base of operators on one human: finds it and turns errors into reports; subclasses define `run`."""
 
     human: bpy.props.StringProperty(
         name="Person", description="Name of the person's collection; empty: the selected person", options=SKIP
@@ -20,7 +21,6 @@ class OnPerson:
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """There is a person in the scene."""
         cls.poll_message_set("There is no person in the scene: generate one first")
         return bool(humans(context.scene))
 
@@ -32,9 +32,97 @@ class OnPerson:
             return {"CANCELLED"}
 
     def person(self, context: bpy.types.Context) -> bpy.types.Collection:
-        """The person named, else the selected one. Raises ValueError."""
+        """The human named, else the selected one. Raises ValueError."""
         return named_person(context, self.human) if self.human else selected_person(context)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """The operator's own part; ValueError and OSError become reports."""
+        """The operator itself; ValueError and OSError become reports."""
         raise NotImplementedError
+
+
+FACTS = "primdiffusion_motion"
+"""Custom property of an action: what its motion is, as JSON."""
+
+
+def target_armature(context: bpy.types.Context, person: str = "") -> bpy.types.Object:
+    """The armature of the person named, else the active armature if it has SMPL's joints, else the selected person's.
+
+    Raises ValueError; for an active armature with some of SMPL's bones it names the first one missing.
+    """
+    if person:
+        return armature_of(named_person(context, person))
+    active = context.view_layer.objects.active
+    if active is not None and active.type == "ARMATURE":
+        missing = [name for name in JOINT_NAMES if name not in active.data.bones]
+        if not missing:
+            return active
+        if len(missing) < len(JOINT_NAMES) or human_of(active, context.scene) is not None:
+            raise ValueError(f"the armature {active.name!r} has no bone {missing[0]!r}: rename it back, or undo")
+    return armature_of(selected_person(context))
+
+
+def warn_of_rest(operator: bpy.types.Operator, armature: bpy.types.Object) -> None:
+    """Warn where the armature is shown in its rest position."""
+    if armature.data.pose_position == "REST":
+        operator.report({"WARNING"}, f"{armature.name!r} shows its rest position: switch it to Pose Position")
+
+
+def scene_fps(scene: bpy.types.Scene) -> float:
+    """Frames per second, such as 23.976."""
+    return scene.render.fps / scene.render.fps_base
+
+
+class OnArmature:
+    """Base of operators on one armature: finds it and turns errors into reports; subclasses define `on`."""
+
+    person: bpy.props.StringProperty(
+        name="Person",
+        description="Name of the person's collection; empty: the active armature or the selected person",
+        options={"SKIP_SAVE"},
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        active = context.view_layer.objects.active
+        cls.poll_message_set("There is no person in the scene: generate one, or select an armature with SMPL's joints")
+        return bool(humans(context.scene)) or (active is not None and active.type == "ARMATURE")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            return self.on(context, target_armature(context, self.person))
+        except (ValueError, OSError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+
+    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+        """The operator itself; ValueError and OSError become reports."""
+        raise NotImplementedError
+
+
+class WhereTo:
+    """Properties of operators that key a motion, with the values of `motion_placing.Placement`."""
+
+    start: bpy.props.IntProperty(name="Start Frame", description="Scene frame of the first pose", default=1)
+    root: bpy.props.EnumProperty(
+        name="Root Motion",
+        description="What happens to the path through space",
+        items=[
+            ("ORIGIN", "From the Person", "The path begins where the person is"),
+            ("KEEP", "As It Is", "The path stays as in the file, maybe metres away"),
+            ("PLACE", "In Place", "The person stays in place; only the height of the path is used"),
+        ],
+    )
+    into: bpy.props.EnumProperty(
+        name="Into",
+        description="Where the keys go",
+        items=[
+            ("NEW", "New Action", "A new action; the previous one stays in the file"),
+            ("APPEND", "Append", "After the last key of the person's current action"),
+            ("STRIP", "NLA Strip", "A strip on a new track of the nonlinear animation"),
+        ],
+    )
+    extend: bpy.props.BoolProperty(
+        name="Extend Scene",
+        description="Move the end of the scene to the end of the motion if it is later",
+        default=True,
+    )

@@ -2,20 +2,94 @@
 
 from __future__ import annotations
 
+import zlib
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import bpy
+from bpy.utils import previews
 
 from ..formats.joints import JOINT_NAMES
-from ..motion.own_poses import delete_pose, load_pose, own_poses, save_pose
+from ..motion.own_poses import delete_pose, load_pose, own_poses, picture_of, save_pose
+from ..places import own_folder
 from .drawing import SidebarPanel, property_columns
-from .manual import draw_manual_button
-from .motion_armatures import OnArmature, warn_of_rest
-from .pose_pictures import draw_picture, free, look_again, pose_items, poses_folder
+from .on_person import OnArmature, warn_of_rest
 from .translations import CONTEXT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+_PICTURES = Path(__file__).parents[1] / "motion" / "data" / "thumbnails"
+_collections: list = []
+"""The collection of previews, once it is loaded."""
+_items: list[tuple[str, str, str, int, int]] = []
+"""Holds the strings of the dynamic menu, to which Blender holds no references."""
+
+
+def poses_folder() -> Path:
+    """Folder of the user's poses."""
+    return own_folder() / "poses"
+
+
+def pose_items(_self, _context: bpy.types.Context) -> list[tuple[str, str, str, int, int]]:
+    """Built-in poses first, then the user's own."""
+    from ..motion.poses import LIBRARY  # needs numpy
+
+    own = own_poses(poses_folder())
+    wanted = [*LIBRARY, *(name for name in own if name not in LIBRARY)]
+    if [item[0] for item in _items] != wanted:
+        built_in = [
+            (name, name, "A built-in pose", _icon(_PICTURES / f"{name}.png"), number)
+            for number, name in enumerate(LIBRARY)
+        ]
+        _items[:] = built_in + [
+            (name, name, "A pose of your own", _icon(picture_of(own[name])), _number(name))
+            for name in wanted[len(LIBRARY) :]
+        ]
+    return _items
+
+
+def draw_picture(pose: Path, rotations: NDArray) -> None:
+    """Draw the picture of a saved pose, joint rotations [24, 3, 3], beside its file. Raises OSError."""
+    import numpy as np  # needs numpy
+
+    # needs numpy
+    from ..formats.picture_files import write_png
+    from ..jobs.assets import clay_figure
+    from ..motion.skeleton import joint_positions
+
+    picture = clay_figure(joint_positions(np.asarray(rotations)))[::-1]  # PNG files begin with the top row
+    write_png(picture_of(pose), np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8))
+
+
+def reload_poses() -> None:
+    """Read the list again after a pose was saved or deleted."""
+    _items.clear()
+
+
+def _number(name: str) -> int:
+    """The number that a .blend saves: depends only on the name, and is beyond those of the built-in poses."""
+    return zlib.crc32(name.encode()) & 0x3FFFFFFF | 0x40000000
+
+
+def _icon(picture: Path) -> int:
+    try:
+        key = f"{picture} {picture.stat().st_mtime_ns}"
+    except OSError:  # a pose without a picture
+        return bpy.types.UILayout.bl_rna.functions["prop"].parameters["icon"].enum_items["ARMATURE_DATA"].value
+    if not _collections:
+        _collections.append(previews.new())
+    loaded = _collections[0]
+    if key not in loaded:
+        loaded.load(key, str(picture), "IMAGE")
+    return loaded[key].icon_id
+
+
+def free() -> None:
+    """Free the pictures."""
+    _items.clear()
+    while _collections:
+        previews.remove(_collections.pop())
 
 
 class PRIMDIFFUSION_PG_motion(bpy.types.PropertyGroup):
@@ -43,16 +117,16 @@ _SKIP = {"SKIP_SAVE"}
 
 
 class _Posing(OnArmature):
-    """What the operators that change a pose have in common."""
+    """Base of the operators that change a pose."""
 
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"REGISTER", "UNDO"}
     only_selected: bpy.props.BoolProperty(
         name="Only Selected Bones", description="Change only the selected bones", default=False
     )
 
     def joints(self, armature: bpy.types.Object) -> list[str]:
         """Which to change. Raises ValueError where none is selected."""
-        from ..motion.pose_library import selected_joints
+        from ..motion.pose_library import selected_joints  # needs numpy
 
         if not self.only_selected:
             return list(JOINT_NAMES)
@@ -70,7 +144,7 @@ class _Posing(OnArmature):
         amount: float,
     ) -> set[str]:
         """Apply, and key where auto keying is on."""
-        from ..motion.pose_library import apply_pose, key_pose
+        from ..motion.pose_library import apply_pose, key_pose  # needs numpy
 
         joints = self.joints(armature)
         changed = apply_pose(armature, pose, translation, amount, joints)
@@ -106,7 +180,6 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
     )
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        """From the panel's settings."""
         settings = context.scene.primdiffusion_motion
         if not self.pose_name:
             self.pose_name = settings.pose
@@ -116,8 +189,7 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
         return self.execute(context)
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        """Find the pose and apply it."""
-        from ..motion.pose_library import builtin_poses, mirrored, standing
+        from ..motion.pose_library import builtin_poses, mirrored, standing  # needs numpy
 
         name = self.pose_name or context.scene.primdiffusion_motion.pose
         own = own_poses(poses_folder())
@@ -142,7 +214,7 @@ class PRIMDIFFUSION_OT_mirror_pose(_Posing, bpy.types.Operator):
     bl_label = "Mirror Pose"
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        """Turn the present pose over."""
+        # needs numpy
         from ..motion.pose_library import current_pose, mirrored
         from ..motion.rotation import to_axis_angle
 
@@ -157,8 +229,7 @@ class PRIMDIFFUSION_OT_reset_pose(_Posing, bpy.types.Operator):
     bl_label = "Reset to Rest"
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        """No turn and no move."""
-        import numpy as np
+        import numpy as np  # needs numpy
 
         return self.pose(context, armature, np.zeros((len(JOINT_NAMES), 3)), np.zeros(3), 1.0)
 
@@ -168,11 +239,10 @@ class PRIMDIFFUSION_OT_key_pose(OnArmature, bpy.types.Operator):
 
     bl_idname = "primdiffusion.key_pose"
     bl_label = "Key Pose"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"REGISTER", "UNDO"}
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        """All of SMPL's joints, and where the pelvis is."""
-        from ..motion.pose_library import key_pose
+        from ..motion.pose_library import key_pose  # needs numpy
 
         key_pose(armature, context.scene.frame_current)
         return {"FINISHED"}
@@ -183,16 +253,17 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
 
     bl_idname = "primdiffusion.save_pose"
     bl_label = "Save Pose"
-    bl_options: set[str] = set()  # noqa: RUF012  a file cannot be undone
+    bl_options: set[str] = set()  # a file cannot be undone
 
-    pose_name: bpy.props.StringProperty(name="Name", description="Of the new pose", default="My Pose", options=_SKIP)
+    pose_name: bpy.props.StringProperty(
+        name="Name", description="Name of the new pose", default="My Pose", options=_SKIP
+    )
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        """Ask for a name."""
         return context.window_manager.invoke_props_dialog(self)
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        """Write the file and choose it in the panel."""
+        # needs numpy
         from ..motion.pose_library import builtin_poses, current_pose
         from ..motion.rotation import to_axis_angle
 
@@ -205,7 +276,7 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
             draw_picture(path, rotations)
         except OSError as error:
             self.report({"WARNING"}, f"The pose {name!r} has no picture: {error}")
-        look_again()
+        reload_poses()
         context.scene.primdiffusion_motion.pose = name
         self.report({"INFO"}, f"The pose {name!r} is in the library")
         return {"FINISHED"}
@@ -216,16 +287,14 @@ class PRIMDIFFUSION_OT_delete_pose(bpy.types.Operator):
 
     bl_idname = "primdiffusion.delete_pose"
     bl_label = "Delete Pose"
-    bl_options: set[str] = set()  # noqa: RUF012  a file cannot be undone
+    bl_options: set[str] = set()  # a file cannot be undone
 
     pose_name: bpy.props.StringProperty(name="Pose", description="Empty: the panel's", options=_SKIP)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Ask first."""
         return context.window_manager.invoke_confirm(self, event)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Remove the file."""
         settings = context.scene.primdiffusion_motion
         name = self.pose_name or settings.pose
         own = own_poses(poses_folder())
@@ -234,7 +303,7 @@ class PRIMDIFFUSION_OT_delete_pose(bpy.types.Operator):
             return {"CANCELLED"}
         try:
             delete_pose(own[name])
-            look_again()
+            reload_poses()
         except OSError as error:
             self.report({"ERROR"}, f"{str(own[name])!r} could not be deleted ({error.strerror or error})")
             return {"CANCELLED"}
@@ -248,14 +317,10 @@ class PRIMDIFFUSION_PT_poses(SidebarPanel, bpy.types.Panel):
     bl_label = "Pose Library"
     bl_parent_id = "PRIMDIFFUSION_PT_human"
     bl_order = 1
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
-
-    def draw_header_preset(self, _context: bpy.types.Context) -> None:
-        """The manual."""
-        draw_manual_button(self.layout, "posing")
+    bl_options = {"DEFAULT_CLOSED"}
+    manual_page = "posing"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads the scene; changes nothing."""
         layout = property_columns(self.layout)
         settings = context.scene.primdiffusion_motion
         layout.template_icon_view(settings, "pose", show_labels=True, scale=6.0, scale_popup=5.0)
@@ -273,19 +338,9 @@ class PRIMDIFFUSION_PT_poses(SidebarPanel, bpy.types.Panel):
             row.operator("primdiffusion.delete_pose", icon="TRASH")
 
 
-CLASSES = (
-    PRIMDIFFUSION_PG_motion,
-    PRIMDIFFUSION_OT_apply_pose,
-    PRIMDIFFUSION_OT_mirror_pose,
-    PRIMDIFFUSION_OT_reset_pose,
-    PRIMDIFFUSION_OT_key_pose,
-    PRIMDIFFUSION_OT_save_pose,
-    PRIMDIFFUSION_OT_delete_pose,
-    PRIMDIFFUSION_PT_poses,
-)
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_motion", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_motion)),)
 
 
 def unregister() -> None:
-    """Release the pictures."""
+    """Free the pictures."""
     free()

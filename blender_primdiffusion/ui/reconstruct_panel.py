@@ -16,7 +16,7 @@ _CAMERAS_FILE = "cameras.json"
 
 def subjects_in(folder: Path) -> list[str]:
     """Names of the people in a dataset of captures; none where the folder is one subject's own, or cannot be read."""
-    from ..formats.capture_layout import LIST_FILE
+    from ..formats.capture_layout import LIST_FILE  # needs numpy
 
     try:
         if (folder / _CAMERAS_FILE).is_file():
@@ -67,7 +67,7 @@ class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
 
     bl_idname = "primdiffusion.human_from_captures"
     bl_label = "Human from Captures"
-    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO: the result has one
+    bl_options: set[str] = set()  # neither REGISTER (redo) nor UNDO: the result has one
 
     directory: bpy.props.StringProperty(
         name="Captures", description="Empty: the panel's", subtype="DIR_PATH", options={"SKIP_SAVE"}
@@ -78,15 +78,14 @@ class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        """Where the panel names no folder, the file browser asks for one."""
+        """Open the file browser where the panel names no folder."""
         if self.directory or context.scene.primdiffusion_reconstruct.capture:
             return self.execute(context)
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Put it in line; in background mode this waits for the person."""
-        from ..jobs.reconstruct import ReconstructJob
+        from ..jobs.generate import ReconstructJob  # needs numpy
 
         asked = context.scene.primdiffusion_reconstruct
         folder = bpy.path.abspath(self.directory or asked.capture)
@@ -103,10 +102,9 @@ class PRIMDIFFUSION_PT_human_from_captures(SidebarPanel, bpy.types.Panel):
 
     bl_label = "Human from Captures"
     bl_parent_id = "PRIMDIFFUSION_PT_captures"
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads what is in line; starts nothing."""
         layout, asked = property_columns(self.layout), context.scene.primdiffusion_reconstruct
         column = layout.column()
         for name in ("capture", "subject", "frame", "views"):
@@ -114,11 +112,6 @@ class PRIMDIFFUSION_PT_human_from_captures(SidebarPanel, bpy.types.Panel):
         draw_job(layout, "reconstruct", "primdiffusion.human_from_captures", "OUTLINER_OB_ARMATURE")
 
 
-CLASSES = (
-    PRIMDIFFUSION_PG_reconstruct,
-    PRIMDIFFUSION_OT_human_from_captures,
-    PRIMDIFFUSION_PT_human_from_captures,
-)
 PROPERTIES = (
     (bpy.types.Scene, "primdiffusion_reconstruct", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_reconstruct)),
 )

@@ -8,7 +8,7 @@ import bpy
 
 from ..formats.requests import VOXEL
 from ..jobs.follow import submit
-from ..jobs.target import Target
+from ..jobs.target import HumanTarget
 from ..scene.attachment import attachment_before_merge, attachment_of, set_attachment
 from ..scene.human import armature_of
 from .on_person import SKIP, OnPerson
@@ -29,7 +29,7 @@ class PRIMDIFFUSION_OT_set_attachment(OnPerson, bpy.types.Operator):
 
     bl_idname = "primdiffusion.set_attachment"
     bl_label = "Set Attachment"
-    bl_options = {"UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO"}
 
     mode: bpy.props.EnumProperty(
         name="Attachment", description="How volumes follow the body", items=ATTACHMENT_ITEMS, default="ARMATURE"
@@ -37,17 +37,15 @@ class PRIMDIFFUSION_OT_set_attachment(OnPerson, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        """The mode's own."""
         return next(text for name, _, text in ATTACHMENT_ITEMS if name == properties.mode)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """Switch."""
         set_attachment(person, self.mode)
         return {"FINISHED"}
 
 
 class _Merging(OnPerson):
-    bl_options: set[str] = set()  # noqa: RUF012  neither REGISTER (redo) nor UNDO (the result has one)
+    bl_options: set[str] = set()  # neither REGISTER (redo) nor UNDO (the result has one)
 
     voxel: bpy.props.FloatProperty(
         name="Voxel Size",
@@ -70,11 +68,10 @@ class PRIMDIFFUSION_OT_merge(_Merging, bpy.types.Operator):
     bl_label = "Merge Pose"
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """Put it in line; in background mode this waits for the merged volume."""
-        from ..jobs.merge import MergeJob
+        from ..jobs.merge import MergeJob  # needs numpy
 
         moment = _moment(person, context.evaluated_depsgraph_get())
-        return submit(self, context, MergeJob(Target.of(person), moment, self.chosen_voxel(context)))
+        return submit(self, context, MergeJob(HumanTarget.of(person), moment, self.chosen_voxel(context)))
 
 
 class PRIMDIFFUSION_OT_merge_frames(_Merging, bpy.types.Operator):
@@ -87,8 +84,7 @@ class PRIMDIFFUSION_OT_merge_frames(_Merging, bpy.types.Operator):
     frame_end: bpy.props.IntProperty(name="End", description="Not given: the scene's", options=SKIP)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """Put it in line; in background mode this waits for the merged volumes."""
-        from ..jobs.merge import MergeFramesJob
+        from ..jobs.merge import MergeFramesJob  # needs numpy
 
         given = self.properties.is_property_set
         start, end = (getattr(self if given(name) else context.scene, name) for name in ("frame_start", "frame_end"))
@@ -97,7 +93,7 @@ class PRIMDIFFUSION_OT_merge_frames(_Merging, bpy.types.Operator):
                 f"frames {start} to {end} are no sequence: give a start and a later end, of at most {_MOST_FRAMES}"
             )
         moments = _moments(context, person, range(start, end + 1))
-        return submit(self, context, MergeFramesJob(Target.of(person), moments, start, self.chosen_voxel(context)))
+        return submit(self, context, MergeFramesJob(HumanTarget.of(person), moments, start, self.chosen_voxel(context)))
 
 
 class PRIMDIFFUSION_OT_unmerge(OnPerson, bpy.types.Operator):
@@ -105,11 +101,10 @@ class PRIMDIFFUSION_OT_unmerge(OnPerson, bpy.types.Operator):
 
     bl_idname = "primdiffusion.unmerge"
     bl_label = "Unmerge"
-    bl_options = {"UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO"}
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """Files stay, for undo."""
-        from ..scene.merged import merged_of, remove_merged
+        from ..scene.merged import merged_of, remove_merged  # needs numpy
 
         if merged_of(person) is None:
             raise ValueError(f"{person.name!r} has no merged volume")
@@ -124,18 +119,17 @@ class PRIMDIFFUSION_OT_fit_density_gain(OnPerson, bpy.types.Operator):
 
     bl_idname = "primdiffusion.fit_density_gain"
     bl_label = "Fit Density Gain"
-    bl_options: set[str] = set()  # noqa: RUF012  the result has an undo step
+    bl_options: set[str] = set()  # the result has an undo step
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """Put it in line; in background mode this waits for the gain."""
-        from ..jobs.merge import FitGainJob
+        from ..jobs.merge import FitGainJob  # needs numpy
 
         graph = context.evaluated_depsgraph_get()
-        return submit(self, context, FitGainJob(Target.of(person), _moment(person, graph)))
+        return submit(self, context, FitGainJob(HumanTarget.of(person), _moment(person, graph)))
 
 
 def _moment(person: bpy.types.Collection, graph: bpy.types.Depsgraph) -> Moment:
-    from ..jobs.merge import Moment
+    from ..jobs.merge import Moment  # needs numpy
 
     return Moment.now(person, armature_of(person).evaluated_get(graph))
 
@@ -151,12 +145,3 @@ def _moments(context: bpy.types.Context, person: bpy.types.Collection, frames: r
     finally:
         scene.frame_set(now)
     return moments
-
-
-CLASSES = (
-    PRIMDIFFUSION_OT_set_attachment,
-    PRIMDIFFUSION_OT_merge,
-    PRIMDIFFUSION_OT_merge_frames,
-    PRIMDIFFUSION_OT_unmerge,
-    PRIMDIFFUSION_OT_fit_density_gain,
-)

@@ -1,22 +1,104 @@
-"""The sidebar panel Render: which engine draws people, how volumes follow the body, what Cycles needs."""
+"""The sidebar panel Render, and the engine's panels in the properties editor."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import bpy
 from mathutils import Euler, Vector
 
+from ..backend.requests import sentence
 from ..engine.engine import ENGINE
 from ..formats.requests import DENSITY_GAIN, VOXEL
 from ..jobs.target import selected_person
 from ..scene.attachment import MODES, attachment_of
 from ..scene.human import human_of, humans
 from ..scene.material import density_gain, set_density_gain
-from ..worker.sentence import sentence
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
-from .manual import draw_manual_button
 from .render_operators import ATTACHMENT_ITEMS
+
+_FROM_EEVEE = frozenset(
+    {
+        "EEVEE_MATERIAL_PT_context_material",
+        "EEVEE_MATERIAL_PT_surface",
+        "EEVEE_WORLD_PT_surface",
+        "MATERIAL_PT_preview",
+    }
+)
+"""Panels whose values this engine draws, too."""
+_NOT_OURS = ("FREESTYLE", "freestyle", "RENDER_PT_gpencil", "RENDER_PT_grease_pencil", "PARTICLE_PT_", "stereoscopy")
+
+
+class _OfEngine:
+    bl_space_type = "PROPERTIES"
+    bl_region_type = "WINDOW"
+    COMPAT_ENGINES = frozenset({ENGINE})
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return context.engine in cls.COMPAT_ENGINES
+
+
+class PRIMDIFFUSION_PT_marching(_OfEngine, bpy.types.Panel):
+    """Render tab: what is drawn, and how finely."""
+
+    bl_label = "Marching"
+    bl_context = "render"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, settings = property_columns(self.layout), context.scene.primdiffusion_render
+        layout.prop(settings, "view")
+        layout.prop(settings, "step")
+        layout.prop(settings, "solids")
+
+
+class PRIMDIFFUSION_PT_film(_OfEngine, bpy.types.Panel):
+    """Render tab: the background."""
+
+    bl_label = "Film"
+    bl_context = "render"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = property_columns(self.layout)
+        layout.prop(context.scene.render, "film_transparent", text="Transparent")
+
+
+class PRIMDIFFUSION_PT_passes(_OfEngine, bpy.types.Panel):
+    """View layer tab: the passes the engine fills."""
+
+    bl_label = "Passes"
+    bl_context = "view_layer"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = property_columns(self.layout)
+        layout.prop(context.view_layer, "use_pass_z", text="Depth")
+
+
+def fitting_panels() -> Iterator[type]:
+    """Blender's panels that make sense with this engine."""
+    for panel in bpy.types.Panel.__subclasses__():
+        engines = getattr(panel, "COMPAT_ENGINES", None)
+        if isinstance(engines, set) and (panel.__name__ in _FROM_EEVEE or _suits_any_engine(panel)):
+            yield panel
+
+
+def _suits_any_engine(panel: type) -> bool:
+    return "BLENDER_RENDER" in panel.COMPAT_ENGINES and not any(word in panel.__name__ for word in _NOT_OURS)
+
+
+def register() -> None:
+    """Show Blender's own panels that suit the engine."""
+    for panel in fitting_panels():
+        panel.COMPAT_ENGINES.add(ENGINE)
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    for panel in bpy.types.Panel.__subclasses__():
+        engines = getattr(panel, "COMPAT_ENGINES", None)
+        if isinstance(engines, set):
+            engines.discard(ENGINE)
 
 
 class PRIMDIFFUSION_PG_merging(bpy.types.PropertyGroup):
@@ -74,10 +156,9 @@ class PRIMDIFFUSION_OT_set_up_engine(bpy.types.Operator):
 
     bl_idname = "primdiffusion.set_up_engine"
     bl_label = "PrimDiffusion (Exact)"
-    bl_options = {"UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """The engine, and the view transform in which its colours are those of the people."""
         context.scene.render.engine = ENGINE
         _plain_colours(context.scene)
         return {"FINISHED"}
@@ -88,11 +169,11 @@ class PRIMDIFFUSION_OT_set_up_cycles(bpy.types.Operator):
 
     bl_idname = "primdiffusion.set_up_cycles"
     bl_label = "Cycles (Approximate)"
-    bl_options = {"UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Settings fit for a thousand volumes; camera, world, film and bounces of light between objects stay."""
-        from ..scene.preview import fit_cycles_to_volumes
+        """Camera, world, film and bounces of light between other objects stay as they are."""
+        from ..scene.cycles import fit_cycles_to_volumes  # needs numpy
 
         scene = context.scene
         if not hasattr(scene, "cycles"):
@@ -111,11 +192,10 @@ class PRIMDIFFUSION_OT_add_camera(bpy.types.Operator):
 
     bl_idname = "primdiffusion.add_camera"
     bl_label = "Add Camera and Light"
-    bl_options = {"UNDO"}  # noqa: RUF012
+    bl_options = {"UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """The camera becomes the scene's."""
-        from ..scene.preview import frame_box, humans_extent, new_camera, posed_extent
+        from ..scene.cycles import frame_box, humans_extent, new_camera, posed_extent  # needs numpy
 
         scene = context.scene
         person = human_of(context.view_layer.objects.active, scene)
@@ -147,14 +227,10 @@ class PRIMDIFFUSION_PT_render(SidebarPanel, bpy.types.Panel):
 
     bl_label = "Render"
     bl_order = 4
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
-
-    def draw_header_preset(self, _context: bpy.types.Context) -> None:
-        """The manual's page."""
-        draw_manual_button(self.layout, "rendering")
+    bl_options = {"DEFAULT_CLOSED"}
+    manual_page = "rendering"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Buttons of the engines."""
         engine = context.scene.render.engine
         column = self.layout.column(align=True)
         column.operator("primdiffusion.set_up_engine", depress=engine == ENGINE, icon="SHADING_RENDERED")
@@ -167,11 +243,9 @@ class _OfPerson(SidebarPanel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Only if the scene has a human."""
         return bool(humans(context.scene))
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Of the selected person, or why there is none."""
         property_columns(self.layout)
         try:
             person = selected_person(context)
@@ -187,8 +261,7 @@ class PRIMDIFFUSION_PT_attachment(_OfPerson, bpy.types.Panel):
     bl_label = "Attachment"
 
     def draw_person(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
-        """A button for each mode; merged where there is something merged."""
-        from ..scene.merged import merged_of
+        from ..scene.merged import merged_of  # needs numpy
 
         now = attachment_of(person)
         row = self.layout.row(align=True)
@@ -203,8 +276,7 @@ class PRIMDIFFUSION_PT_merge(_OfPerson, bpy.types.Panel):
     bl_label = "Merge for Cycles"
 
     def draw_person(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
-        """Voxel size, a pose, frames; whether what is merged is still the person."""
-        from ..scene.merged import merged_of
+        from ..scene.merged import merged_of  # needs numpy
 
         layout = self.layout
         layout.prop(context.scene.primdiffusion_merging, "voxel")
@@ -220,11 +292,10 @@ class PRIMDIFFUSION_PT_cycles_look(_OfPerson, bpy.types.Panel):
     """What brings Cycles near the exact picture."""
 
     bl_label = "Look in Cycles"
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+    bl_options = {"DEFAULT_CLOSED"}
 
     def draw_person(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
-        """The gain, and a warning where volumes are dropped."""
-        from ..scene.overlap import overlap_warning  # numpy, which Blender starts without
+        from ..scene.cycles import overlap_warning  # numpy, which Blender starts without
 
         if density_gain(person) is None:
             draw_lines(self.layout, "The person's material has no node Density Gain", "INFO")
@@ -240,11 +311,10 @@ class PRIMDIFFUSION_PT_memory(_OfPerson, bpy.types.Panel):
     """What the person takes."""
 
     bl_label = "Memory"
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+    bl_options = {"DEFAULT_CLOSED"}
 
     def draw_person(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
-        """On disk, and in memory where drawn as volumes; the engine needs none of it."""
-        from ..scene.grid_cache import person_memory
+        from ..scene.volumes import person_memory  # needs numpy
 
         memory = person_memory(person)
         column = self.layout.column(align=True)
@@ -254,26 +324,16 @@ class PRIMDIFFUSION_PT_memory(_OfPerson, bpy.types.Panel):
 
 def outdated(person: bpy.types.Collection, scene: bpy.types.Scene) -> bool:
     """Whether the merged volume shows another pose, shape or person than the armature as it is now."""
+    # needs numpy
     from ..jobs.merge import Moment
     from ..scene.merged import merged_of, merged_state
 
     try:
         return not merged_state(merged_of(person)).shows(Moment.now(person).digest, scene.frame_current)
-    except (ValueError, OSError):  # broken bones or files are other panels' to tell
+    except (ValueError, OSError):  # other panels report broken bones and files
         return True
 
 
-CLASSES = (
-    PRIMDIFFUSION_PG_merging,
-    PRIMDIFFUSION_OT_set_up_engine,
-    PRIMDIFFUSION_OT_set_up_cycles,
-    PRIMDIFFUSION_OT_add_camera,
-    PRIMDIFFUSION_PT_render,
-    PRIMDIFFUSION_PT_attachment,
-    PRIMDIFFUSION_PT_merge,
-    PRIMDIFFUSION_PT_cycles_look,
-    PRIMDIFFUSION_PT_memory,
-)
 PROPERTIES = (
     (bpy.types.Scene, "primdiffusion_merging", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_merging)),
     (bpy.types.Collection, "primdiffusion_density_gain", gain_property()),

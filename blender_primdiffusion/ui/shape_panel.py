@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import bpy
 from bpy.app.translations import pgettext_iface
 
+from ..backend.requests import sentence
 from ..jobs.target import named_person, selected_person
 from ..scene.human import BETA_COUNT, BETAS, MARK, armature_of
-from ..worker.sentence import sentence
 from .drawing import SidebarPanel, draw_lines, property_columns
 from .on_person import SKIP, OnPerson
 from .translations import CONTEXT
@@ -23,12 +23,12 @@ _FARTHEST = 3.0
 
 
 class _Shape(OnPerson):
-    """Quick, so that it can be redone with other settings."""
+    """Base of the operators that change the shape; fast enough to be redone with other settings."""
 
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"REGISTER", "UNDO"}
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..scene.reshape import reshape
+        from ..scene.reshape import reshape  # needs numpy
 
         warning = reshape(person, self.betas_for(context, person))
         if warning:
@@ -56,11 +56,9 @@ class PRIMDIFFUSION_OT_reshape(_Shape, bpy.types.Operator):
     weight: bpy.props.FloatProperty(name="Weight (kg)", description="Not given: any", options=SKIP)
 
     def betas_for(self, _context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
-        """Those given, then moved to the measures."""
-        import numpy as np
+        import numpy as np  # needs numpy
 
-        from ..scene.shape import betas_of, shape_model_of
-        from ..scene.shape_model import betas_of_measures
+        from ..scene.shape import betas_of, betas_of_measures, shape_model_of  # needs numpy
 
         given = self.properties.is_property_set
         betas = np.array(self.betas) if given("betas") else betas_of(person)
@@ -69,14 +67,13 @@ class PRIMDIFFUSION_OT_reshape(_Shape, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_reset_shape(_Shape, bpy.types.Operator):
-    """Reset the selected person to the shape they were generated with, or to that of their last edit"""
+    """Reset the selected person to the shape of the last edit, or of generation"""
 
     bl_idname = "primdiffusion.reset_shape"
     bl_label = "Reset Shape"
 
     def betas_for(self, _context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
-        """From the person's provenance."""
-        from ..scene.shape import generated_betas
+        from ..scene.shape import generated_betas  # needs numpy
 
         return generated_betas(person)
 
@@ -98,13 +95,11 @@ class PRIMDIFFUSION_OT_random_shape(_Shape, bpy.types.Operator):
     )
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        """Each press of the button is another body."""
         self.seed = random.randrange(2**31)
         return self.execute(context)
 
     def betas_for(self, _context: bpy.types.Context, _person: bpy.types.Collection) -> NDArray:
-        """Normal, kept within what looks like people."""
-        import numpy as np
+        import numpy as np  # needs numpy
 
         drawn = np.random.default_rng(self.seed).normal(0.0, self.spread, BETA_COUNT)
         return np.clip(drawn, -_FARTHEST, _FARTHEST)
@@ -121,8 +116,7 @@ class PRIMDIFFUSION_OT_copy_shape(_Shape, bpy.types.Operator):
     )
 
     def betas_for(self, context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
-        """As the engine draws the other person now."""
-        from ..scene.shape import betas_of, shape_model_of
+        from ..scene.shape import betas_of, shape_model_of  # needs numpy
 
         picked = context.scene.primdiffusion_edit.other
         if not self.source and picked is None:
@@ -138,7 +132,7 @@ class PRIMDIFFUSION_OT_copy_shape(_Shape, bpy.types.Operator):
 
 
 _SHOWN = ("seed", "steps", "sampler", "guidance", "checkpoint", "version")
-"""Of the provenance, in this order."""
+"""Fields of the provenance, in this order."""
 _ANIMATED = "The shape is animated: the exact engine draws it in each frame; bones and volumes keep one shape"
 
 
@@ -147,7 +141,6 @@ class _InHuman(SidebarPanel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """A human is selected."""
         try:
             selected_person(context)
         except ValueError:
@@ -162,10 +155,9 @@ class PRIMDIFFUSION_PT_shape(_InHuman, bpy.types.Panel):
     bl_order = 0
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads the scene; changes nothing."""
+        # needs numpy
         from ..scene.reshape import check_shapeable
-        from ..scene.shape import has_custom_shape, shape_model_of
-        from ..scene.shape_model import slider_names
+        from ..scene.shape import has_custom_shape, shape_model_of, slider_names
 
         layout = property_columns(self.layout)
         person = selected_person(context)
@@ -199,14 +191,13 @@ class PRIMDIFFUSION_PT_shape(_InHuman, bpy.types.Panel):
 
 
 class PRIMDIFFUSION_PT_details(_InHuman, bpy.types.Panel):
-    """Where the selected person comes from and what they take."""
+    """Provenance and memory of the selected human."""
 
     bl_label = "Details"
     bl_order = 90
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads the scene; changes nothing."""
         person = selected_person(context)
         column = self.layout.column(align=True)
         for name, value in details(person):
@@ -214,9 +205,10 @@ class PRIMDIFFUSION_PT_details(_InHuman, bpy.types.Panel):
 
 
 def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
-    """What Details says: names and values."""
-    from ..scene.grid_cache import person_memory
-    from ..scene.overlap import current_overlap
+    """Names and values that Details shows."""
+    # needs numpy
+    from ..scene.cycles import current_overlap
+    from ..scene.volumes import person_memory
 
     provenance = json.loads(person[MARK])
     lines = [(name.capitalize(), f"{provenance[name]}") for name in _SHOWN if provenance.get(name) not in (None, "")]
@@ -239,7 +231,7 @@ def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
 
 
 def in_the_scene(scene: bpy.types.Scene, armature: bpy.types.Object, height: float) -> str:
-    """How tall that is in the scene's units, with the armature's scale; empty where it is metres as they are."""
+    """The height in the scene's units, with the armature's scale; empty where that is the same in metres."""
     units, scale = scene.unit_settings, armature.matrix_world.to_scale().z
     metric = units.system == "METRIC" and units.length_unit in ("METERS", "ADAPTIVE")
     if metric and abs(units.scale_length * scale - 1) < 1e-4:
@@ -250,7 +242,7 @@ def in_the_scene(scene: bpy.types.Scene, armature: bpy.types.Object, height: flo
 
 
 def _animated(armature: bpy.types.Object) -> bool:
-    """Keys or drivers move the betas."""
+    """Whether keys or drivers move the betas."""
     animation = armature.animation_data
     if animation is None:
         return False
@@ -261,13 +253,3 @@ def _animated(armature: bpy.types.Object) -> bool:
                 bag = strip.channelbag(animation.action_slot)
                 curves += bag.fcurves if bag is not None else ()
     return any(curve.data_path == f'["{BETAS}"]' for curve in curves)
-
-
-CLASSES = (
-    PRIMDIFFUSION_OT_reshape,
-    PRIMDIFFUSION_OT_reset_shape,
-    PRIMDIFFUSION_OT_random_shape,
-    PRIMDIFFUSION_OT_copy_shape,
-    PRIMDIFFUSION_PT_shape,
-    PRIMDIFFUSION_PT_details,
-)

@@ -1,5 +1,4 @@
-"""A person's name and shape as properties of the armature: what one reads is what is in the scene, what one sets is
-done at once."""
+"""A human's name and shape as properties of its armature: read from the scene, and applied to it at once."""
 
 from __future__ import annotations
 
@@ -11,14 +10,14 @@ import bpy
 from ..scene.human import BETA_COUNT, LARGEST_BETA, MARK
 
 if TYPE_CHECKING:
-    from ..scene.shape_model import Measures
+    from ..scene.shape import Measures
 
 _NOT_ANIMATED: set[str] = set()
-"""Options: each frame would move the bones' rest; the custom property with the betas may be animated instead."""
+"""Options: an animation would move the rest bones in each frame; the custom property can be animated instead."""
 
 
 def person_of(armature: bpy.types.Object) -> bpy.types.Collection:
-    """The person whose armature this is. Raises ValueError for another object."""
+    """The human whose armature this is. Raises ValueError for another object."""
     for collection in armature.users_collection:
         if MARK in collection:
             return collection
@@ -26,9 +25,8 @@ def person_of(armature: bpy.types.Object) -> bpy.types.Collection:
 
 
 def measures_of(armature: bpy.types.Object) -> Measures:
-    """Height and weight as the sliders set them. Raises ValueError or FileNotFoundError where these are not known."""
-    from ..scene.shape import betas_of, shape_model_of
-    from ..scene.shape_model import measure
+    """Height and weight as set by the sliders. Raises ValueError or FileNotFoundError where they are unknown."""
+    from ..scene.shape import betas_of, measure, shape_model_of  # needs numpy
 
     person = person_of(armature)
     return measure(shape_model_of(person), betas_of(person))
@@ -42,13 +40,13 @@ def _name(self: PRIMDIFFUSION_PG_human) -> str:
 
 
 def _rename(self: PRIMDIFFUSION_PG_human, name: str) -> None:
-    from ..scene.duplicate import rename_human
+    from ..scene.duplicate import rename_human  # needs numpy
 
-    _said(lambda: rename_human(person_of(self.id_data), name))
+    _printed(lambda: rename_human(person_of(self.id_data), name))
 
 
 def _betas(self: PRIMDIFFUSION_PG_human) -> Sequence[float]:
-    from ..scene.shape import betas_of
+    from ..scene.shape import betas_of  # needs numpy
 
     try:
         return betas_of(person_of(self.id_data)).tolist()
@@ -57,15 +55,15 @@ def _betas(self: PRIMDIFFUSION_PG_human) -> Sequence[float]:
 
 
 def _set_betas(self: PRIMDIFFUSION_PG_human, betas: Sequence[float]) -> None:
-    import numpy as np
+    import numpy as np  # needs numpy
 
-    from ..scene.reshape import reshape
+    from ..scene.reshape import reshape  # needs numpy
 
-    _said(lambda: reshape(person_of(self.id_data), np.clip(list(betas), -LARGEST_BETA, LARGEST_BETA)))
+    _printed(lambda: reshape(person_of(self.id_data), np.clip(list(betas), -LARGEST_BETA, LARGEST_BETA)))
 
 
 def _measure(self: PRIMDIFFUSION_PG_human) -> Measures:
-    from ..scene.shape_model import Measures
+    from ..scene.shape import Measures  # needs numpy
 
     try:
         return measures_of(self.id_data)
@@ -82,27 +80,27 @@ def _weight(self: PRIMDIFFUSION_PG_human) -> float:
 
 
 def _set_height(self: PRIMDIFFUSION_PG_human, height: float) -> None:
-    _said(lambda: set_measures(person_of(self.id_data), height=height))
+    _printed(lambda: set_measures(person_of(self.id_data), height=height))
 
 
 def _set_weight(self: PRIMDIFFUSION_PG_human, weight: float) -> None:
-    _said(lambda: set_measures(person_of(self.id_data), measures_of(self.id_data).height, weight))
+    _printed(lambda: set_measures(person_of(self.id_data), measures_of(self.id_data).height, weight))
 
 
 def set_measures(person: bpy.types.Collection, height: float | None = None, weight: float | None = None) -> str:
-    """Reshape a person as little as possible until they are `height` metres tall and weigh `weight` kilograms.
+    """Reshape a human as little as possible to `height` metres and `weight` kilograms.
 
-    Raises ValueError where no body does, and as `reshape`.
+    Raises ValueError where no body has these, and as `reshape`.
     """
+    # needs numpy
     from ..scene.reshape import reshape
-    from ..scene.shape import betas_of, shape_model_of
-    from ..scene.shape_model import betas_of_measures
+    from ..scene.shape import betas_of, betas_of_measures, shape_model_of
 
     return reshape(person, betas_of_measures(shape_model_of(person), betas_of(person), height, weight))
 
 
-def _said(change) -> None:
-    """Setters cannot fail: Blender would print a traceback. The panel says beforehand what cannot be set."""
+def _printed(change) -> None:
+    """Print errors: setters must not raise, and the panel shows beforehand what cannot be set."""
     try:
         change()
     except (OSError, ValueError) as error:
@@ -157,5 +155,4 @@ class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
     )
 
 
-CLASSES = (PRIMDIFFUSION_PG_human,)
 PROPERTIES = ((bpy.types.Object, "primdiffusion_human", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_human)),)

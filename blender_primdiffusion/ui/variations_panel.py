@@ -13,7 +13,6 @@ from ..jobs.pictures import icons
 from ..jobs.queue import queue
 from ..jobs.variations import sheet
 from .drawing import SidebarPanel, draw_job, property_columns
-from .manual import draw_manual_button
 
 if TYPE_CHECKING:
     from ..jobs.variations import VariationsJob
@@ -28,18 +27,14 @@ _UNIT_PX = 20
 
 
 class PRIMDIFFUSION_PT_variations(SidebarPanel, bpy.types.Panel):
-    """Many people to choose from."""
+    """Humans to choose from."""
 
     bl_label = "Variations"
     bl_order = 1
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
-
-    def draw_header_preset(self, _context: bpy.types.Context) -> None:
-        """The manual's page."""
-        draw_manual_button(self.layout, "first_human", "variations")
+    bl_options = {"DEFAULT_CLOSED"}
+    manual_page, manual_section = "first_human", "variations"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Reads the sheet and what is in line; starts nothing."""
         layout, settings = property_columns(self.layout), context.scene.primdiffusion_variations
         column = layout.column()
         column.row().prop(settings, "count", expand=True)
@@ -48,14 +43,14 @@ class PRIMDIFFUSION_PT_variations(SidebarPanel, bpy.types.Panel):
         draw_job(layout, "variations", "primdiffusion.variations", "LIGHTPROBE_VOLUME")
         job = queue.current.job if queue.current is not None else None
         if job is not None and job.kind == "variations":
-            _draw_coming(layout, _columns(context), job)
+            _draw_progress(layout, _columns(context), job)
         elif sheet.variations:
             _draw_sheet(layout, _columns(context))
             _draw_choice(layout, settings)
 
 
 def _columns(context: bpy.types.Context) -> tuple[int, float]:
-    """How many pictures stand side by side, and their size in units."""
+    """Number of columns, and the size of a picture in interface units."""
     scale = context.preferences.system.ui_scale or 1.0  # 0 without a window
     width = (context.region.width if context.region is not None else 300 * scale) / scale - _MARGIN_PX
     number = max(2, min(MOST_COLUMNS, int(width // CELL_PX)))
@@ -66,8 +61,8 @@ def _grid(layout: bpy.types.UILayout, columns: int) -> bpy.types.UILayout:
     return layout.grid_flow(row_major=True, columns=columns, even_columns=True, even_rows=True, align=False)
 
 
-def _draw_coming(layout: bpy.types.UILayout, columns: tuple[int, float], job: VariationsJob) -> None:
-    """Those who are being made, as far as they are."""
+def _draw_progress(layout: bpy.types.UILayout, columns: tuple[int, float], job: VariationsJob) -> None:
+    """The humans that are being generated, so far."""
     grid = _grid(layout, columns[0])
     for index, seed in enumerate(job.seeds):
         cell = grid.column(align=True)
@@ -113,9 +108,6 @@ def _draw_choice(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) 
     seed.enabled = not sheet.around
     seed.operator("primdiffusion.use_variation_seed", icon="COPYDOWN")
     column.prop(settings, "amount")
-
-
-CLASSES = (PRIMDIFFUSION_PT_variations,)
 
 
 @persistent

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 
@@ -71,13 +72,12 @@ def _registered(classes: Iterable[type]) -> Iterator[type]:
 def _operator(cls: type[bpy.types.Operator]) -> list[str]:
     name = cls.bl_idname.partition(".")[2]
     rna = getattr(bpy.ops.primdiffusion, name).get_rna_type()
-    wanted = _docstring(cls, "poll")
+    message = _poll_message(cls)
     return [
         f"### {name}",
         "",
         f"**{cls.bl_label}.** {_sentence(rna.description)}",
-        *([f"Needs: {_lower(wanted)}"] if wanted else []),
-        *filter(None, [_docstring(cls, "execute")]),
+        *([f"Where disabled, its tooltip says: {_sentence(message)}"] if message else []),
         "",
         *_table(properties(rna)),
     ]
@@ -134,20 +134,18 @@ def _default(prop: bpy.types.Property) -> str:
     return f"`({shown})`" if len(value) > 1 else f"`{shown}`"
 
 
-def _docstring(cls: type, method: str) -> str:
-    """Of a method of ours; empty where Blender's own serves."""
-    found = getattr(cls, method, None)
-    ours = getattr(found, "__module__", "") and found.__module__.startswith("blender_primdiffusion")
-    return _sentence(found.__doc__ or "") if ours else ""
+def _poll_message(cls: type[bpy.types.Operator]) -> str:
+    """What `poll` says where it disables the operator; empty without one of ours."""
+    said: list[str] = []
+    poll = getattr(cls, "poll", None)
+    if getattr(poll, "__module__", "").startswith("blender_primdiffusion"):
+        poll.__func__(SimpleNamespace(poll_message_set=said.append), bpy.context)
+    return said[0] if said else ""
 
 
 def _sentence(text: str) -> str:
     text = re.sub(r"\s+", " ", text).strip().rstrip(".")
     return f"{text}." if text else ""
-
-
-def _lower(text: str) -> str:
-    return text[:1].lower() + text[1:]
 
 
 def _cell(text: str) -> str:

@@ -27,7 +27,7 @@ def set_up_real(module: str, _python: str) -> Steps:
     window = _preferences_window(module)
     yield 1.0
     yield "set_up_real_before"
-    session = import_module(f"{module}.ui.setup.session").session
+    session = import_module(f"{module}.ui.setup.operators").session
     began = time.monotonic()
     press("primdiffusion.set_up_backend")
     yield from wait(lambda: not session.busy or session.fraction > 0.1, _MOST_S)

@@ -34,7 +34,7 @@ def set_up(module: str, python: str) -> Steps:
     preferences.backend_python = python
     yield 0.5
     press("primdiffusion.test_backend")
-    session = import_module(f"{module}.ui.setup.session").session
+    session = import_module(f"{module}.ui.setup.operators").session
     yield 2.0
     yield "set_up_testing"
     yield from wait(lambda: not session.busy, 240)

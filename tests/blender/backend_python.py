@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 
-from blender_primdiffusion.worker.environment import BackendPython
+from blender_primdiffusion.backend.environment import BackendPython
 
 
 def found(python: BackendPython) -> Callable[..., Generator[None, None, BackendPython]]:

@@ -67,12 +67,12 @@ def addon(saved_scene, tmp_path, monkeypatch):
 
     import blender_primdiffusion
     from blender_primdiffusion import places
+    from blender_primdiffusion.backend.environment import BackendPython
     from blender_primdiffusion.jobs.queue import queue
-    from blender_primdiffusion.worker.environment import BackendPython
 
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic.write(tmp_path / "prepared.npz", 8)))
     python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", found(python))
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", found(python))
     monkeypatch.setattr(places, "backend_module_path", lambda: Path(__file__).parent / "fake_backend")
     queue.outcomes.clear()
     queue.info = {}

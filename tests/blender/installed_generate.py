@@ -36,8 +36,8 @@ report = {
     "bones": len(armature.data.bones),
     "files": len(list(Path(blend).parent.rglob("*.vdb"))),
     "written_into_the_addon": [p.name for p in installed.rglob("*") if p.suffix in (".nbi", ".nbc")]
-    + [str(p) for p in (installed / "backend").rglob("*.pyc") if "formats" not in p.parts],  # which Blender imports
-    "backend_in_zip": (installed / "backend" / "primdiffusion" / "human.py").is_file(),
+    + [str(p) for p in (installed / "bundled").rglob("*.pyc") if "formats" not in p.parts],  # which Blender imports
+    "backend_in_zip": (installed / "bundled" / "primdiffusion" / "human.py").is_file(),
     "seconds": seconds,
 }
 bpy.ops.preferences.addon_disable(module=module)

@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 
 from blender_primdiffusion.scene.edit import Replaced, edit_destination, replace_person
-from blender_primdiffusion.scene.writing import write_now
+from blender_primdiffusion.scene.human_npz import write_now
 
 
 def replace(collection: bpy.types.Collection, human_npz: Path, person: Path) -> Replaced:

@@ -39,14 +39,14 @@ def test_the_same_tree_gives_the_same_bytes(archive, tmp_path):
 def test_the_zip_holds_addon_backend_and_licence_and_nothing_stray(archive):
     names = zipfile.ZipFile(archive).namelist()
     assert names == sorted(names)
-    wanted = {"blender_manifest.toml", "__init__.py", "LICENSE", "worker/client.py", "scene/human.py"}
-    wanted |= {"backend/primdiffusion/human.py", "backend/primdiffusion/body/data/body.npz"}
+    wanted = {"blender_manifest.toml", "__init__.py", "LICENSE", "backend/client.py", "scene/human.py"}
+    wanted |= {"bundled/primdiffusion/human.py", "bundled/primdiffusion/body/data/body.npz"}
     assert wanted <= set(names)
     assert not [name for name in names if "__pycache__" in name or name.endswith((".pyc", ".nbi", ".nbc"))]
-    assert WEIGHTS.is_file() == ("backend/primdiffusion/weights/default.safetensors" in names)
+    assert WEIGHTS.is_file() == ("bundled/primdiffusion/weights/default.safetensors" in names)
 
 
-def test_blenders_own_tool_accepts_the_zip_and_refuses_one_without_a_licence(archive, tmp_path):
+def test_blenders_own_tool_accepts_the_zip_and_rejects_one_without_a_licence(archive, tmp_path):
     tool = build_addon.blender_extension_tool()
     assert tool is not None
     build_addon.validate(archive, tool)

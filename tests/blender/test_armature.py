@@ -8,7 +8,7 @@ import pytest
 import synthetic
 from oracle import TOLERANCE_M, Z_UP, blended_vertices
 
-from blender_primdiffusion.scene.armature import build_armature, pose_from_joint_rotations
+from blender_primdiffusion.scene.armature import build_armature, keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_body_mesh
 from blender_primdiffusion.scene.convention import (
     continuous_quaternions,
@@ -17,7 +17,6 @@ from blender_primdiffusion.scene.convention import (
     points_to_blender,
     rotations_to_blender,
 )
-from blender_primdiffusion.scene.keyframes import keyframe_poses
 
 
 @pytest.fixture
@@ -135,7 +134,7 @@ def test_a_long_motion_is_keyed_on_every_frame(armature):
 
 
 @pytest.mark.parametrize("frames", [[1, 1], [2, 1], [1, 2, 3]])
-def test_frames_that_do_not_increase_or_do_not_match_are_refused(armature, frames):
+def test_frames_that_do_not_increase_or_do_not_match_are_rejected(armature, frames):
     with pytest.raises(ValueError, match="frame"):
         keyframe_poses(armature, np.array(frames), np.tile(np.eye(3), (2, 24, 1, 1)), np.zeros((2, 3)))
     assert len(bpy.data.actions) == 0

@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 import synthetic
 
-from blender_primdiffusion.jobs.thumbnails import SIDE, clay_figure, picture_of_file
+from blender_primdiffusion.jobs.assets import SIDE, clay_figure, picture_of_file
 from blender_primdiffusion.motion.pose_library import builtin_poses, current_pose
 from blender_primdiffusion.motion.rotation import from_axis_angle
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.files import person_file, volume_path
-from blender_primdiffusion.scene.human import MARK, armature_of, humans
+from blender_primdiffusion.scene.human import MARK, armature_of, humans, person_file, volume_path
 from blender_primdiffusion.ui.assets_panel import PRIMDIFFUSION_PT_assets
 
 PICTURE = Path(__file__).parent / "fake_backend" / "primdiffusion" / "picture.png"
@@ -52,7 +51,7 @@ def rendered(tmp_path) -> dict:
 def test_a_person_becomes_an_asset_with_words_and_a_drawn_picture(person, tmp_path):
     assert ops.mark_human_as_asset() == {"FINISHED"}
     about = person.asset_data
-    assert about.description == "Generated person, seed 0, asked to be: sex female, height 1.7"
+    assert about.description == "Generated human, seed 0, sex female, height 1.7"
     assert {tag.name for tag in about.tags} == {"human", "female"}
     assert about.author == ""
     assert np.abs(preview(person) - picture_of_file(PICTURE)).max() < 0.01
@@ -111,7 +110,7 @@ def test_another_file_finds_the_volumes_of_a_person_it_appends_or_links(person, 
             ops.unmark_human_asset()
 
 
-def test_a_pose_becomes_an_action_that_gives_it_to_anybody(person, tmp_path):
+def test_a_pose_becomes_an_action_that_gives_it_to_any_human(person, tmp_path):
     armature = armature_of(person)
     pose_from_joint_rotations(armature, waving())
     assert ops.mark_pose_as_asset(name="Waving") == {"FINISHED"}
@@ -160,7 +159,7 @@ def test_the_built_in_poses_become_a_library_and_the_open_file_stays(addon, tmp_
     libraries.remove(libraries[len(libraries) - 1])
 
 
-def test_what_cannot_be_an_asset_is_said(addon, tmp_path):
+def test_what_cannot_be_an_asset_is_reported(addon, tmp_path):
     for operator in (ops.mark_human_as_asset, ops.mark_pose_as_asset, ops.unmark_human_asset):
         with pytest.raises(RuntimeError, match=r"poll\(\) .*no person in the scene"):
             operator()

@@ -13,9 +13,9 @@ from blender_primdiffusion.engine.solids import scene_solids
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import MODES, set_attachment
 from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.cycles import setup_cycles_preview
 from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.merged import MergedGrid, MergedState, merged_folder, publish, show_merged, write_grid
-from blender_primdiffusion.scene.preview import setup_cycles_preview
 
 COUNT = 6
 SIZE = 64

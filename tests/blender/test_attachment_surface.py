@@ -15,8 +15,7 @@ from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import ATTACHMENT, attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.duplicate import duplicate_human
-from blender_primdiffusion.scene.files import folder_of
-from blender_primdiffusion.scene.human import armature_of, body_of, humans, volumes_of
+from blender_primdiffusion.scene.human import armature_of, body_of, folder_of, humans, volumes_of
 from blender_primdiffusion.scene.surface import GROUP_NAME, carrier_of
 
 COUNT = 12
@@ -194,7 +193,7 @@ def test_a_duplicate_on_the_surface_follows_its_own_bones(person):
             np.testing.assert_allclose(found[objects[0].name][:3, 3], expected[k, :3, 3], atol=1e-5)
 
 
-def test_a_person_of_an_earlier_version_is_refused(saved_scene, tmp_path):
+def test_a_person_of_an_earlier_version_is_rejected(saved_scene, tmp_path):
     collection = build_human(saved_scene, synthetic.write(tmp_path / "old.npz", 4))
     with pytest.raises(ValueError, match="earlier version"):
         set_attachment(collection, "SURFACE")
@@ -202,14 +201,14 @@ def test_a_person_of_an_earlier_version_is_refused(saved_scene, tmp_path):
     assert len(shown()) == 4
 
 
-def test_a_deleted_body_is_refused_with_what_to_do(person):
+def test_a_deleted_body_is_rejected_with_what_to_do(person):
     bpy.data.objects.remove(body_of(person[0]))
     with pytest.raises(ValueError, match=r"was deleted.*undo"):
         set_attachment(person[0], "SURFACE")
     assert len(shown()) == COUNT
 
 
-def test_unknown_modes_and_what_is_not_merged_are_refused(person):
+def test_unknown_modes_and_what_is_not_merged_are_rejected(person):
     with pytest.raises(ValueError, match="choose from ARMATURE, SURFACE, MERGED"):
         set_attachment(person[0], "BONES")
     with pytest.raises(ValueError, match="press Merge"):

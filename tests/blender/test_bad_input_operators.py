@@ -21,8 +21,7 @@ from test_missing_volumes import write_person
 
 from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.generate import GenerateJob
-from blender_primdiffusion.jobs.job import Job
-from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.jobs.queue import Job, queue
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of, body_of, humans
 
@@ -173,8 +172,8 @@ def never_saved(person) -> None:
 
 
 def backend_missing(_person) -> None:
-    from blender_primdiffusion.worker import environment
-    from blender_primdiffusion.worker.environment import BackendNotFound
+    from blender_primdiffusion.backend import environment
+    from blender_primdiffusion.backend.environment import BackendNotFound
 
     def nowhere(*_, **__):
         raise BackendNotFound("the preferences name the Python '/nowhere/python', which does not exist: set it up")
@@ -202,7 +201,7 @@ SOURCE: dict[str, Path] = {}
 
 @pytest.fixture
 def anna(addon, tmp_path, monkeypatch):
-    from blender_primdiffusion.worker import environment
+    from blender_primdiffusion.backend import environment
 
     monkeypatch.setattr(environment, "search", environment.search)  # after `backend_missing`
     npz = synthetic_shape.write(tmp_path / "human.npz", 8)
@@ -224,14 +223,14 @@ def anna(addon, tmp_path, monkeypatch):
 def outside(anna, monkeypatch):
     """No browser opens, nothing is downloaded or installed; libraries are small and written where tests write."""
     from blender_primdiffusion.jobs import assets
-    from blender_primdiffusion.ui.setup.session import SetUpSession
+    from blender_primdiffusion.ui.setup.operators import SetUpSession
 
     def start(session: SetUpSession, _steps: object) -> None:
         session.notice = "as if it were done"
 
     monkeypatch.setattr("webbrowser.open", lambda _: True)
     monkeypatch.setattr(SetUpSession, "start", start)
-    monkeypatch.setattr("blender_primdiffusion.worker.setup.short_root", lambda *_: anna / "set up")
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.short_root", lambda *_: anna / "set up")
     monkeypatch.setattr(assets, "own_folder", lambda: anna / "own")
     two = dict(list(assets.builtin_poses().items())[:2])  # a picture of each is drawn
     monkeypatch.setattr(assets, "builtin_poses", lambda: two)
@@ -246,7 +245,7 @@ def outside(anna, monkeypatch):
 def _asked(monkeypatch, folder: Path) -> None:
     """Works are asked for their parameters, and then end well: what the child does is for other tests."""
     from blender_primdiffusion.jobs import follow
-    from blender_primdiffusion.jobs.queue import Outcome, queue
+    from blender_primdiffusion.jobs.queue import JobOutcome, queue
     from blender_primdiffusion.jobs.remedies import error_in_the_scene
 
     def wait_for(entry):
@@ -254,8 +253,8 @@ def _asked(monkeypatch, folder: Path) -> None:
         try:
             entry.job.params(folder)
         except (ValueError, OSError) as error:
-            return Outcome(entry, error=error_in_the_scene(error))
-        return Outcome(entry, "done")
+            return JobOutcome(entry, error=error_in_the_scene(error))
+        return JobOutcome(entry, "done")
 
     monkeypatch.setattr(follow, "_wait_for", wait_for)
 

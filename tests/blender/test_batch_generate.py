@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 import synthetic
 
+from blender_primdiffusion.backend.environment import BackendNotFound
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, NO_BACKEND, UNUSABLE
-from blender_primdiffusion.scene.files import person_file, volume_path
-from blender_primdiffusion.scene.human import armature_of, humans
-from blender_primdiffusion.ui.batch.asking import NoBackend, ask
-from blender_primdiffusion.ui.batch.command import execute
-from blender_primdiffusion.worker.environment import BackendNotFound
+from blender_primdiffusion.scene.human import armature_of, humans, person_file, volume_path
+from blender_primdiffusion.ui.batch import execute
+from blender_primdiffusion.ui.batch.running import NoBackend, ask
 
 pytestmark = pytest.mark.any_blender
 
@@ -43,7 +42,7 @@ def out(addon, tmp_path) -> Path:
     return tmp_path / "Leute in Köln"
 
 
-def test_everybody_has_a_folder_named_by_their_seed(out, capfd):
+def test_all_humans_has_a_folder_named_by_their_seed(out, capfd):
     assert generate(out, "--count", 2, "--seed", 7, "--attributes", "sex=female", "height=1.7") == DONE
     assert sorted(path.name for path in out.iterdir()) == [
         "person_000007",
@@ -56,10 +55,10 @@ def test_everybody_has_a_folder_named_by_their_seed(out, capfd):
     assert (asked["attributes"], asked["guidance"]) == ({"sex": "female", "height": 1.7}, 1.5)
     assert (out / "person_000007" / "human.npz").is_file()
     assert report(out)["done"] == ["person_000007", "person_000008"]
-    assert "2/2 person_000008 is there" in capfd.readouterr().out
+    assert "2/2 person_000008 done" in capfd.readouterr().out
 
 
-def test_the_same_command_goes_on_and_leaves_what_is_there(out):
+def test_the_same_command_continues_and_leaves_what_is_there(out):
     assert generate(out, "--seed", 7) == DONE
     before = (out / "person_000007" / "human.npz").stat()
     assert generate(out, "--seed", 7, "--count", 2) == DONE
@@ -68,7 +67,7 @@ def test_the_same_command_goes_on_and_leaves_what_is_there(out):
     assert (report(out)["done"], report(out)["skipped"]) == (["person_000008"], ["person_000007"])
 
 
-def test_other_settings_are_refused_until_told_to_go_on(out, capfd):
+def test_other_settings_are_rejected_without_resume(out, capfd):
     assert generate(out, "--seed", 7) == DONE
     assert generate(out, "--seed", 8, "--sampler", "ddpm") == UNUSABLE
     assert "was made with sampler = ddim, not ddpm" in capfd.readouterr().err
@@ -130,11 +129,11 @@ def test_ctrl_c_ends_the_batch_and_leaves_nothing_half_made(out, capfd):
     assert report(out)["done"] == []
 
 
-def test_without_a_backend_everybody_is_spared_the_attempt(out, monkeypatch, capfd):
+def test_without_a_backend_no_human_is_tried(out, monkeypatch, capfd):
     def nowhere(*_, **__):
         raise BackendNotFound("No Python for the backend: /nowhere does not exist")
 
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", nowhere)
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", nowhere)
     assert generate(out, "--count", 3) == NO_BACKEND
     assert "/nowhere does not exist" in capfd.readouterr().err
     assert not out.exists()
@@ -184,13 +183,13 @@ def test_a_folder_that_cannot_be_is_a_sentence(addon, tmp_path, capfd):
         (["--blend", "--no-blend"], "not allowed with"),
     ],
 )
-def test_wrong_words_are_named_before_anything_is_made(out, words, sentence, capfd):
+def test_wrong_options_are_named_before_anything_is_written(out, words, sentence, capfd):
     assert generate(out, *words) == UNUSABLE
     assert sentence in capfd.readouterr().err
     assert not list(out.glob("person*"))
 
 
-def test_a_pose_without_a_blend_is_refused(out, tmp_path, capfd):
+def test_a_pose_without_a_blend_is_rejected(out, tmp_path, capfd):
     np.save(tmp_path / "pose.npy", np.zeros(72))
     assert generate(out, "--pose", tmp_path / "pose.npy") == UNUSABLE
     assert "add --blend" in capfd.readouterr().err

@@ -13,10 +13,10 @@ from bpy_extras.object_utils import world_to_camera_view
 from engine_stage import pixels
 from mathutils import Vector
 
+from blender_primdiffusion.backend.environment import BackendNotFound
 from blender_primdiffusion.console import DONE, FAILED, NO_BACKEND, UNUSABLE
-from blender_primdiffusion.ui.batch.command import execute
+from blender_primdiffusion.ui.batch import execute
 from blender_primdiffusion.ui.batch.people import go_round, moving_extent
-from blender_primdiffusion.worker.environment import BackendNotFound
 
 pytestmark = pytest.mark.any_blender
 
@@ -122,7 +122,7 @@ def test_one_who_fails_is_named_and_does_not_stop_the_others(people, out, capfd)
     assert not list(out.rglob(".*"))
 
 
-def test_missing_volumes_are_said_before_cycles_draws_nobody(people, out):
+def test_missing_volumes_are_reported_before_cycles_renders(people, out):
     folder = people / "person_000007"
     next((folder / "person_humans").rglob("*.vdb")).unlink()
     assert render(folder / "person.blend", out, *SMALL, "--engine", "cycles") == FAILED
@@ -133,7 +133,7 @@ def test_without_a_backend_it_says_so_at_once(people, out, monkeypatch, capfd):
     def nowhere(*_, **__):
         raise BackendNotFound("No Python for the backend: /nowhere does not exist")
 
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", nowhere)
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", nowhere)
     assert render(people, out, *SMALL) == NO_BACKEND
     assert "/nowhere does not exist" in capfd.readouterr().err
     assert pictures(out) == []

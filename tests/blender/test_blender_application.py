@@ -89,7 +89,7 @@ def _complaints(done: subprocess.CompletedProcess) -> list[str]:
     return [line for line in lines if "Traceback" in line or "Error" in line or "rror:" in line]
 
 
-def test_blender_validates_the_zip_and_refuses_a_spoiled_one(bare, archive, tmp_path):
+def test_blender_validates_the_zip_and_rejects_a_spoiled_one(bare, archive, tmp_path):
     assert bare("--command", "extension", "validate", archive).returncode == 0
     (tmp_path / "spoiled.zip").write_bytes(archive.read_bytes()[:1000])
     assert bare("--command", "extension", "validate", tmp_path / "spoiled.zip").returncode != 0
@@ -101,7 +101,7 @@ def test_the_command_makes_people_with_pictures_and_a_blend(people):
         assert {"person.human.safetensors", "human.npz", "front.png", "person.blend", "person_humans"} <= there
 
 
-def test_the_same_command_goes_on_with_the_python_that_preferences_name(installed, people):
+def test_the_same_command_continues_with_the_python_that_preferences_name(installed, people):
     import engine_stage
 
     preferences = (

@@ -72,7 +72,7 @@ def test_pose_blend_shapes_are_those_of_smplx(tmp_path):
     np.testing.assert_allclose(joints, twin_joints[0].numpy(), atol=1e-6)
 
 
-def test_betas_that_lack_are_zero_and_betas_too_many_are_refused(body):
+def test_betas_that_lack_are_zero_and_betas_too_many_are_rejected(body):
     few, _ = body.rest([1.0, -1.0])
     all_of_them, _ = body.rest([1.0, -1.0, *[0.0] * 30])
     np.testing.assert_array_equal(few, all_of_them)

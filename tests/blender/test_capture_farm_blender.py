@@ -16,7 +16,7 @@ import pytest
 import scan_fixtures
 
 from blender_primdiffusion.capture.body import read_body
-from blender_primdiffusion.capture.verify import verify
+from blender_primdiffusion.capture.subject import verify
 from blender_primdiffusion.formats import capture_layout
 
 pytest.importorskip("ray", reason="Ray is not installed")

@@ -28,11 +28,11 @@ from capture_child import PEOPLE, small
 from capture_person import NamedPerson, files_of, load_painted, plain, two_poses
 
 from blender_primdiffusion.capture import passes
-from blender_primdiffusion.capture.belongings import data_blocks
 from blender_primdiffusion.capture.job import CaptureError, run
 from blender_primdiffusion.capture.report import Report
 from blender_primdiffusion.capture.settings import CaptureSettings
-from blender_primdiffusion.capture.verify import repair, verify
+from blender_primdiffusion.capture.stage import data_blocks
+from blender_primdiffusion.capture.subject import repair, verify
 from blender_primdiffusion.motion.motion import Motion
 
 pytestmark = pytest.mark.any_blender
@@ -109,7 +109,7 @@ def test_joints_are_those_of_the_body_in_every_picture(whole):
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_killed_capture_goes_on_and_ends_in_the_same_files(whole, empty_scene, tmp_path, seed):
+def test_a_killed_capture_continues_and_ends_in_the_same_files(whole, empty_scene, tmp_path, seed):
     out, dice = tmp_path / "captures", random.Random(seed)
     child = start_child(out)
     assert child.stderr is not None
@@ -172,7 +172,7 @@ def test_files_cut_short_are_made_anew_even_without_repair(copy, whole, empty_sc
     assert verify(copy) == []
 
 
-def test_an_unfinished_subject_is_said_to_be(copy):
+def test_an_unfinished_subject_is_reported(copy):
     (copy / "bert" / COMPLETE_FILE).unlink()
     picture_path(copy / "bert", "part", 0, 0).unlink()
     assert verify(copy)[0] == f"{copy / 'bert'}: not finished: 19 of 20 pictures are there"
@@ -204,7 +204,7 @@ def test_nothing_stays_in_the_file(empty_scene, tmp_path):
     assert not list(Path(bpy.app.tempdir).glob("primdiffusion_capture_*"))
 
 
-def test_somebody_who_fails_leaves_the_others_alone(empty_scene, tmp_path):
+def test_a_failing_subject_does_not_affect_the_others(empty_scene, tmp_path):
     def load(context, scan_file, body):
         if scan_file.name == "anna":
             raise ValueError("anna.glb holds no person: export it again")
@@ -219,7 +219,7 @@ def test_somebody_who_fails_leaves_the_others_alone(empty_scene, tmp_path):
     assert {(block.id_type, block.name) for block in data_blocks()} == before
 
 
-def test_progress_counts_everybody_to_the_end(empty_scene, tmp_path):
+def test_progress_counts_all_subjects(empty_scene, tmp_path):
     def load(context, scan_file, body):
         if scan_file.name == "anna":
             raise ValueError("no person")
@@ -254,21 +254,21 @@ def test_the_released_codes_reference_is_there_when_asked_for(empty_scene, tmp_p
 
 
 @pytest.mark.parametrize("change", [{"seed": 5}, {"samples": 3}, {"light": "dome"}, {"passes": ("img",)}])
-def test_a_folder_with_other_captures_is_refused(copy, empty_scene, change):
+def test_a_folder_with_other_captures_is_rejected(copy, empty_scene, change):
     before = files_of(copy)
     with pytest.raises(CaptureFolderError, match="another folder"):
         capture(empty_scene, small(copy, **change))
     assert files_of(copy) == before
 
 
-def test_other_poses_are_refused_before_anything_is_overwritten(copy, empty_scene):
+def test_other_poses_are_rejected_before_anything_is_overwritten(copy, empty_scene):
     (copy / "anna" / COMPLETE_FILE).unlink()
     report = capture(empty_scene, small(copy), poses=POSES.frames([1, 0]))
     assert "other poses" in report.failed[0]["why"]
     assert report.skipped == ["bert"]
 
 
-def test_poses_that_are_not_finite_are_refused(empty_scene, tmp_path):
+def test_poses_that_are_not_finite_are_rejected(empty_scene, tmp_path):
     rotations = POSES.rotations.copy()
     rotations[1, 3] = np.nan
     with pytest.raises(CaptureError, match="not finite"):
@@ -276,14 +276,14 @@ def test_poses_that_are_not_finite_are_refused(empty_scene, tmp_path):
     assert not (tmp_path / "a").exists()
 
 
-def test_a_camera_inside_somebody_fails_that_person(empty_scene, tmp_path):
+def test_a_camera_inside_of_a_human_fails_that_subject(empty_scene, tmp_path):
     inside = look_at(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, 5.0]), 0.5, 64, 64)
     outside = look_at(np.array([0.0, 0.0, 4.0]), np.zeros(3), 0.5, 64, 64)
     report = capture(empty_scene, small(tmp_path, cameras=(outside, inside)), PEOPLE[:1])
-    assert report.failed[0]["why"].startswith("camera 1 is inside the person in frame 0")
+    assert report.failed[0]["why"].startswith("camera 1 is inside the human in frame 0")
 
 
-def test_cameras_that_stand_still_are_used_for_everybody(empty_scene, tmp_path):
+def test_fixed_cameras_are_used_for_all_subjects(empty_scene, tmp_path):
     views = Rig(count=2, width=64, height=64).views(np.array([0.0, 0.1, 0.0]), 1.3)
     capture(empty_scene, small(tmp_path, cameras=tuple(views)), poses=POSES.frames([0]))
     for name in ("anna", "bert"):
@@ -327,7 +327,7 @@ def test_without_room_the_batch_ends_and_says_so(empty_scene, tmp_path, monkeypa
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="a file system of a few kilobytes needs root")
-def test_a_disk_that_is_full_is_said_to_be(empty_scene, tmp_path):
+def test_a_disk_that_is_full_is_reported(empty_scene, tmp_path):
     disk = tmp_path / "disk"
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", str(disk)]

@@ -20,12 +20,11 @@ from scipy.ndimage import center_of_mass, grey_dilation
 
 from blender_primdiffusion.capture.blender_camera import aim, view_of
 from blender_primdiffusion.capture.body import read_body
-from blender_primdiffusion.capture.inside import cameras_inside
 from blender_primdiffusion.capture.job import run
 from blender_primdiffusion.capture.passes import srgb_bytes
 from blender_primdiffusion.capture.settings import CaptureSettings
-from blender_primdiffusion.capture.shots import shoot_centres, shoot_colours
-from blender_primdiffusion.capture.stage import Stage
+from blender_primdiffusion.capture.skinned_surface import cameras_inside
+from blender_primdiffusion.capture.stage import Stage, shoot_centres, shoot_colours
 from blender_primdiffusion.capture.surfaces import mark_parts, prepare_materials
 from blender_primdiffusion.scene.convention import points_to_blender
 

@@ -19,9 +19,9 @@ from capture_person import FACES, _few_faces, chequers, files_of
 
 import blender_primdiffusion
 from blender_primdiffusion.capture import launch
-from blender_primdiffusion.capture.belongings import data_blocks
 from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.capture.options import MARK, UsageError, parse, settings_of
+from blender_primdiffusion.capture.stage import data_blocks
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
@@ -142,7 +142,7 @@ def test_the_operator_fails_in_one_sentence(extension, people, tmp_path):
 
 
 @pytest.mark.timeout(300)
-def test_a_batch_goes_on_past_a_broken_scan_reports_it_and_exits_with_1(people, tmp_path):
+def test_a_batch_continues_past_a_broken_scan_reports_it_and_exits_with_1(people, tmp_path):
     out = tmp_path / "captures"
     done = command("--people", str(people), "--out", str(out), *SMALL.split())
     assert done.returncode == FAILED, done.stdout + done.stderr
@@ -296,7 +296,7 @@ def test_the_preview_shows_the_rig_and_goes_again(extension):
     assert {(block.id_type, block.name) for block in data_blocks()} == before
 
 
-def test_hostile_camera_files_are_refused(tmp_path):
+def test_hostile_camera_files_are_rejected(tmp_path):
     path = tmp_path / "cameras.json"
     eye, twice = [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[2, 0, 0], [0, 1, 0], [0, 0, 1]]
     stretched = json.dumps({"a": {"K": eye, "R": twice, "T": [0, 0, 0]}})
@@ -306,7 +306,7 @@ def test_hostile_camera_files_are_refused(tmp_path):
             settings_of(parse(["--out", "a", "--camera-file", str(path)]))
 
 
-def test_words_that_are_no_options_are_refused():
+def test_unknown_options_are_rejected():
     with pytest.raises(UsageError):
         parse(["--out", "a", "--rm", "-rf"])
 

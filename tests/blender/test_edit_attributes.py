@@ -12,8 +12,7 @@ import bpy
 import pytest
 from blender_primdiffusion.formats.requests import PARTS
 
-from blender_primdiffusion.scene.files import person_file
-from blender_primdiffusion.scene.human import humans
+from blender_primdiffusion.scene.human import humans, person_file
 from blender_primdiffusion.ui import attributes, edit_operators
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_attributes
 
@@ -112,7 +111,7 @@ def test_a_checkpoint_that_cannot_be_read_or_knows_nothing_leaves_the_menus_empt
     monkeypatch.setattr(attributes, "preference", lambda _: str(path))
     layout = MagicMock()
     PRIMDIFFUSION_PT_attributes.draw(SimpleNamespace(layout=layout), addon)
-    assert layout.label.call_args.kwargs["text"] == "This checkpoint knows no attributes"
+    assert layout.label.call_args.kwargs["text"] == "This checkpoint has no attributes"
     assert attributes.asked(addon.scene.primdiffusion.attributes) == {}
 
 

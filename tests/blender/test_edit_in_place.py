@@ -15,9 +15,19 @@ from scene_stage import replace
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving, unused
-from blender_primdiffusion.scene.files import VolumeWriteError, folder_of, person_file
-from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of, check_editable, human_of, humans
-from blender_primdiffusion.scene.human_npz import HumanFileError
+from blender_primdiffusion.scene.human import (
+    BETAS,
+    MARK,
+    VolumeWriteError,
+    armature_of,
+    body_of,
+    check_editable,
+    folder_of,
+    human_of,
+    humans,
+    person_file,
+)
+from blender_primdiffusion.scene.human_npz import HumanNpzError
 
 COUNT = 12
 TALLER = 1.1
@@ -185,7 +195,7 @@ def test_a_duplicate_that_shares_volumes_is_not_edited_with_the_original(person,
 def test_a_damaged_result_leaves_scene_and_disk_as_they_were(person, saved_scene, tmp_path):
     before, files = paths(person), sorted(tmp_path.rglob("*.*"))
     (tmp_path / "bad.npz").write_bytes(b"PK no more")
-    with pytest.raises(HumanFileError):
+    with pytest.raises(HumanNpzError):
         replace(person, tmp_path / "bad.npz", tmp_path / "first" / "person.human.safetensors")
     (tmp_path / "bad.npz").unlink()
     assert paths(person) == before
@@ -234,7 +244,7 @@ def test_an_edit_before_the_first_save_is_collected_without_the_states_before_it
     assert all(volume.grids.load() for volume in bpy.data.volumes)
 
 
-def test_a_linked_person_is_refused_with_what_to_do(person, tmp_path):
+def test_a_linked_person_is_rejected_with_what_to_do(person, tmp_path):
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.read_homefile(use_empty=True)
     with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True) as (_, wanted):
@@ -255,7 +265,7 @@ def test_files_of_earlier_states_are_unused_and_those_shown_are_not(person, save
     assert unused(tmp_path / "nowhere") == []
 
 
-def test_every_part_of_a_person_leads_to_it_and_other_things_do_not(person, saved_scene):
+def test_every_part_of_a_human_leads_to_it_and_other_objects_do_not(person, saved_scene):
     hat = bpy.data.objects.new("hat", None)
     hat.parent = armature_of(person)
     cube = bpy.data.objects.new("cube", None)

@@ -13,9 +13,8 @@ from jobs_driven import drive, error_of, notice_of, shown, until_running
 from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.files import person_file
-from blender_primdiffusion.scene.human import armature_of, body_of, humans, remove_human
-from blender_primdiffusion.scene.painting import painted_weights
+from blender_primdiffusion.scene.edit import painted_weights
+from blender_primdiffusion.scene.human import armature_of, body_of, humans, person_file, remove_human
 from blender_primdiffusion.ui import edit_operators, edit_panel
 
 DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
@@ -171,7 +170,7 @@ def test_a_failure_raises_one_sentence_and_leaves_the_person_as_it_was(person, s
     assert sentence not in texts(edit_panel.SUB_PANELS[1], bpy.context)
 
 
-def test_a_person_removed_while_the_job_runs_is_said_so_and_the_other_is_untouched(person):
+def test_a_human_removed_during_the_job_is_reported_and_the_other_is_untouched(person):
     other = paths(humans(bpy.context.scene)[1])
     start(person)
     until_running()
@@ -203,7 +202,7 @@ def test_undo_of_something_else_during_the_job_does_not_lose_the_person(person):
     assert not set(paths(humans(bpy.context.scene)[0])) & set(before)
 
 
-def test_undo_of_an_earlier_edit_during_the_job_refuses_the_result(person):
+def test_undo_of_an_earlier_edit_during_the_job_rejects_the_result(person):
     before = paths(person)
     ops.vary(seed=FINE, steps=1)
     start(person, FINE + 1)
@@ -267,7 +266,7 @@ def test_locked_hidden_people_are_edited(person):
     assert not set(paths(person)) & set(before)
 
 
-def test_who_cannot_be_edited_is_said_before_a_job_begins(addon, tmp_path):
+def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(addon, tmp_path):
     assert not ops.vary.poll()
     for _ in range(2):
         ops.generate(seed=7, steps=1)
@@ -289,7 +288,7 @@ def test_who_cannot_be_edited_is_said_before_a_job_begins(addon, tmp_path):
         ops.vary(human="Human")
 
 
-def test_a_panel_shows_its_own_work_alone_and_cancels_it(person):
+def test_a_panel_shows_only_its_own_job_and_cancels_it(person):
     start(person, TAKES_LONG)
     until_running()
     shown_by_vary = texts(edit_panel.SUB_PANELS[0], bpy.context)

@@ -13,11 +13,10 @@ from backend_python import found
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 
 import blender_primdiffusion
-from blender_primdiffusion.jobs import job
-from blender_primdiffusion.scene.files import person_file
-from blender_primdiffusion.scene.human import MARK, armature_of, body_of, humans
-from blender_primdiffusion.worker.client import BackendClient
-from blender_primdiffusion.worker.environment import BackendPython
+from blender_primdiffusion.backend.client import BackendClient
+from blender_primdiffusion.backend.environment import BackendPython
+from blender_primdiffusion.jobs import queue
+from blender_primdiffusion.scene.human import MARK, armature_of, body_of, humans, person_file
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 ops = bpy.ops.primdiffusion
@@ -30,11 +29,11 @@ def people(saved_scene, tmp_path, monkeypatch):
 
     checkpoint = save_tiny_checkpoint(tmp_path / "tiny.safetensors")
     python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", found(python))
-    monkeypatch.setattr(job, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", found(python))
+    monkeypatch.setattr(queue, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
     # With a cache in Blender's temporary folder the child would compile its marcher anew for each test.
     monkeypatch.setattr(
-        "blender_primdiffusion.worker.client.BackendClient",
+        "blender_primdiffusion.backend.client.BackendClient",
         lambda python, module, cache_dir: BackendClient(python, module),
     )
     blender_primdiffusion.register()
@@ -125,7 +124,7 @@ def test_vary_transfer_and_blend_follow_one_another_and_undo_goes_back_through_t
         assert all(Path(bpy.path.abspath(volume.filepath)).is_file() for volume in bpy.data.volumes)
 
 
-def test_what_the_child_refuses_is_one_sentence(people):
+def test_what_the_child_rejects_is_one_sentence(people):
     refused = {
         "1 steps were asked for": lambda: ops.blend(human="Human", other="Human.001", steps=1),
         "knows no attribute 'wings'": lambda: ops.redress(human="Human", attributes="wings=two", steps=2),

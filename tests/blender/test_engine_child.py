@@ -19,9 +19,9 @@ from engine_stage import pixels
 
 import blender_primdiffusion
 from blender_primdiffusion import places
+from blender_primdiffusion.backend.environment import BackendPython
 from blender_primdiffusion.engine import final, studio
-from blender_primdiffusion.engine.frames import CHANNELS, Frames
-from blender_primdiffusion.worker.environment import BackendPython
+from blender_primdiffusion.engine.frames import CHANNELS, SharedFrames
 
 pytestmark = pytest.mark.any_blender
 
@@ -35,7 +35,7 @@ COLOUR = np.round(255 * np.array([0.5372549, 0.7372549, 0.88235295, 1.0]))
 def stage(saved_scene, tmp_path, monkeypatch):
     """The engine on the fake child, with a camera."""
     python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", found(python))
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", found(python))
     monkeypatch.setattr(places, "backend_module_path", lambda: FAKE)
     blender_primdiffusion.register()
     scene = saved_scene.scene
@@ -93,7 +93,7 @@ def test_a_second_picture_uses_the_same_child_and_the_same_file(stage):
     assert sorted(studio.frames.folder.iterdir()) == files
 
 
-def test_progress_and_seconds_left_are_told_band_by_band(stage, monkeypatch):
+def test_progress_and_seconds_left_are_reported_band_by_band(stage, monkeypatch):
     monkeypatch.setenv("FAKE_BAND_S", "0.15")
     engine = Engine()
     drawing = final.render_layer(engine, bpy.context.evaluated_depsgraph_get())
@@ -118,7 +118,7 @@ def test_a_cancel_does_not_wait_for_a_child_that_is_still_being_started(stage, m
         while True:
             yield
 
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", forever)
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", forever)
     drawing = final.render_layer(Engine(stop_after_s=0.0), bpy.context.evaluated_depsgraph_get())
     assert drawing.state in ("starting", "cancelled")
 
@@ -160,13 +160,13 @@ def test_an_error_of_the_child_keeps_its_remedy_and_ends_an_animation(stage, mon
 
 
 def test_without_a_backend_the_error_names_what_was_tried(stage, monkeypatch):
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", find_nothing)
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", find_nothing)
     with pytest.raises(RuntimeError, match="extension's preferences"):
         render()
 
 
 def find_nothing(*_: object, **__: object) -> BackendPython:
-    from blender_primdiffusion.worker.environment import BackendNotFound
+    from blender_primdiffusion.backend.environment import BackendNotFound
 
     raise BackendNotFound("No Python for the backend; name one in the extension's preferences.")
 
@@ -192,7 +192,7 @@ def test_a_camera_that_shows_nothing_is_one_clear_error(stage):
         render()
 
 
-def test_blender_itself_refuses_a_picture_without_camera_or_pixels_and_the_next_one_works(stage):
+def test_blender_itself_rejects_a_picture_without_camera_or_pixels_and_the_next_one_works(stage):
     camera, settings = stage.scene.camera, stage.scene.render
     stage.scene.camera = None
     with pytest.raises(RuntimeError, match="no camera"):
@@ -252,8 +252,8 @@ import sys, os, threading, time
 from pathlib import Path
 import bpy, blender_primdiffusion as b
 from blender_primdiffusion import places
-from blender_primdiffusion.worker import environment
-from blender_primdiffusion.worker.environment import BackendPython
+from blender_primdiffusion.backend import environment
+from blender_primdiffusion.backend.environment import BackendPython
 def search(*_, **__):
     yield
     return BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
@@ -282,14 +282,14 @@ def test_blender_that_ends_while_a_picture_is_drawn_leaves_no_process_and_no_mem
         time.sleep(0.05)
     assert not Path(f"/proc/{pid}").exists()
     if how == "killed":
-        frames = Frames()  # nobody could: the next Blender does
+        frames = SharedFrames()  # nobody could: the next Blender does
         assert frames.folder.exists()
         frames.close()
     assert not Path(folder).exists()
 
 
 def test_a_frame_is_reused_for_its_size_and_replaced_for_another():
-    frames = Frames()
+    frames = SharedFrames()
     try:
         first = frames.take("a", 8, 4)
         assert first.path.stat().st_size == 8 * 4 * CHANNELS * 4
@@ -306,7 +306,7 @@ def test_a_frame_is_reused_for_its_size_and_replaced_for_another():
 
 
 def test_threads_share_one_folder():
-    frames, folders = Frames(), set()
+    frames, folders = SharedFrames(), set()
     threads = [threading.Thread(target=lambda: folders.add(frames.folder)) for _ in range(8)]
     for thread in threads:
         thread.start()
@@ -322,7 +322,7 @@ def test_what_a_killed_blender_left_in_memory_is_removed(tmp_path, monkeypatch):
     left, ours = tmp_path / f"primdiffusion_{int(dead.stdout)}_x", tmp_path / f"primdiffusion_{os.getpid()}_x"
     for folder in (left, ours):
         folder.mkdir()
-    frames = Frames()
+    frames = SharedFrames()
     assert frames.folder.parent == tmp_path
     assert not left.exists()
     assert ours.exists()
@@ -337,7 +337,7 @@ def test_a_full_memory_file_system_gives_way_to_the_disk(tmp_path, monkeypatch):
             raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "posix_fallocate", fallocate)
-    frames = Frames()
+    frames = SharedFrames()
     monkeypatch.setattr("numpy.memmap", lambda *_, **__: np.zeros(8 * 4 * CHANNELS, np.float32))
     assert tmp_path not in frames.take("a", 8, 4).path.parents
     frames.close()

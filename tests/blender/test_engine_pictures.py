@@ -26,10 +26,9 @@ from engine_stage import (
 from mathutils import Euler, Matrix
 
 import blender_primdiffusion
-from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of, remove_human
-from blender_primdiffusion.scene.keyframes import keyframe_poses
 
 SIZE = (120, 90)
 REST = np.tile(np.eye(3), (24, 1, 1))

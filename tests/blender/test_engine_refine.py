@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from blender_primdiffusion.backend.drawing import Drawing
+from blender_primdiffusion.backend.requests import RequestError
 from blender_primdiffusion.engine.refine import COARSENESS, REST_S, Refinement, ViewRequest
 from blender_primdiffusion.engine.view import PinholeView, view_from_matrices, without_scale
-from blender_primdiffusion.worker.drawing import Drawing
-from blender_primdiffusion.worker.request import RequestError
 
 pytestmark = pytest.mark.any_blender
 
@@ -105,14 +105,14 @@ def test_the_frame_on_show_is_never_drawn_into(bench):
         bench.now += REST_S
 
 
-def test_the_same_wish_again_asks_for_nothing(bench):
+def test_the_same_request_again_draws_nothing(bench):
     for _ in range(5):
         bench.refinement.want(wish("a"))
         bench.refinement.advance()
     assert len(bench.asked) == 1
 
 
-def test_an_error_is_told_once_and_another_wish_is_tried_anew(bench):
+def test_an_error_is_reported_once_and_another_request_is_tried(bench):
     bench.refinement.want(wish("a"))
     bench.refinement.advance()
     answer(bench, "failed", error=RequestError("no backend", "set it up", "environment"))
@@ -126,7 +126,7 @@ def test_an_error_is_told_once_and_another_wish_is_tried_anew(bench):
     assert len(bench.asked) == 2
 
 
-def test_a_child_that_died_is_replaced_once_before_the_user_is_told(bench):
+def test_a_child_that_died_is_replaced_once_before_the_user_is_reported(bench):
     bench.refinement.want(wish("a"))
     bench.refinement.advance()
     for _ in range(2):

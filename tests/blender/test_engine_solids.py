@@ -267,7 +267,7 @@ def test_every_view_shows_the_person_in_its_own_way(pair, view):
         assert np.abs(picture[..., 0] - colour[..., 3]).max() <= 1
 
 
-def test_a_scene_with_nobody_and_nothing_is_its_background(stage):
+def test_an_empty_scene_is_its_background(stage):
     assert not render_png(stage.out).any()
     stage.scene.render.film_transparent = False
     stage.scene.world = None

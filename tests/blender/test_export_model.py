@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import synthetic
 
+from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.export_model import FrameRange, write_model
 from blender_primdiffusion.scene.human import armature_of
-from blender_primdiffusion.scene.keyframes import keyframe_poses
 from blender_primdiffusion.scene.proxy import build_proxy, read_proxy, remove_proxy
 
 EXACT = 1e-4
@@ -120,7 +120,7 @@ def test_an_exporter_that_is_disabled_is_enabled_for_the_moment(moving, store, t
         addon_utils.enable("io_scene_fbx")
 
 
-def test_an_armature_in_edit_mode_or_without_a_bone_is_refused(moving, store, tmp_path):
+def test_an_armature_in_edit_mode_or_without_a_bone_is_rejected(moving, store, tmp_path):
     proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
     armature = armature_of(moving)
     armature.data.bones["head"].name = "skull"
@@ -134,7 +134,7 @@ def test_an_armature_in_edit_mode_or_without_a_bone_is_refused(moving, store, tm
 
 
 @pytest.mark.parametrize("field", ["faces", "skin_weights", "joint_names"])
-def test_a_damaged_proxy_is_refused(store, tmp_path, field):
+def test_a_damaged_proxy_is_rejected(store, tmp_path, field):
     with np.load(store / "proxy.npz") as archive:
         arrays = dict(archive)
     arrays[field] = arrays[field][:-1] if field != "faces" else arrays[field] + 10**6

@@ -13,9 +13,9 @@ import pytest
 import synthetic
 from backend_python import found
 
+from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.human import BETAS, armature_of, humans
 from blender_primdiffusion.scene.human_file import read_tensors
-from blender_primdiffusion.scene.keyframes import keyframe_poses
 from blender_primdiffusion.scene.proxy import proxy_of
 from blender_primdiffusion.scene.surface import primitives_of
 
@@ -27,14 +27,14 @@ def store(saved_scene, tmp_path, monkeypatch):
     """The add-on registered on an interpreter that runs the child of this file."""
     import blender_primdiffusion
     from blender_primdiffusion import places
-    from blender_primdiffusion.worker.environment import BackendPython
+    from blender_primdiffusion.backend.environment import BackendPython
 
     folder = tmp_path / "store"
     folder.mkdir()
     exporting.write_store(folder)
     monkeypatch.setenv("EXPORT_FOLDER", str(folder))
     python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", found(python))
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", found(python))
     monkeypatch.setattr(places, "backend_module_path", lambda: Path(__file__).parent / "export_backend")
     blender_primdiffusion.register()
     yield folder
@@ -106,13 +106,13 @@ def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
         ("import_human", {"filepath": "OUT/none.human"}, "there is no file"),
     ],
 )
-def test_what_cannot_be_done_is_said_in_a_sentence(anna, out, operator, properties, sentence):
+def test_what_cannot_be_done_is_reported_in_a_sentence(anna, out, operator, properties, sentence):
     given = {name: v.replace("OUT", str(out)) if isinstance(v, str) else v for name, v in properties.items()}
     refused(sentence, getattr(OPERATORS, operator), **given)
     assert not list(out.iterdir())
 
 
-def test_without_anybody_there_is_nothing_to_export(store, out):
+def test_without_a_human_there_is_nothing_to_export(store, out):
     refused("poll", OPERATORS.export_mesh, filepath=str(out / "a.glb"))
 
 
@@ -207,7 +207,7 @@ def test_a_person_is_put_where_they_were_dropped(store):
 
 
 @pytest.mark.parametrize("damage", ["short", "text", "cut", "other"])
-def test_a_file_that_holds_no_person_is_refused_before_any_work(store, out, damage):
+def test_a_file_that_holds_no_person_is_rejected_before_any_work(store, out, damage):
     path = out / "a.human"
     exporting.write_person(path)
     whole = path.read_bytes()

@@ -8,7 +8,7 @@ import pytest
 import synthetic_shape
 
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.files import person_file
+from blender_primdiffusion.scene.human import person_file
 from blender_primdiffusion.scene.human_file import HumanTensors, read_tensors, write_tensors
 from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import BODY_FILE, betas_of

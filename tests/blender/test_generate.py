@@ -17,8 +17,7 @@ from blender_primdiffusion.jobs import queue as queue_module
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.files import folder_of
-from blender_primdiffusion.scene.human import humans
+from blender_primdiffusion.scene.human import folder_of, humans
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_OT_generate, PRIMDIFFUSION_PT_generate
 
 DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
@@ -94,7 +93,7 @@ def test_a_killed_child_is_reported(addon):
     assert not humans(addon.scene)
 
 
-def test_a_second_click_waits_in_line_and_does_not_disturb_the_first(addon):
+def test_a_second_click_is_queued_and_does_not_disturb_the_first(addon):
     ask(addon, 7, 2)
     assert bpy.ops.primdiffusion.generate(seed=8, steps=1) == {"FINISHED"}
     assert len(humans(addon.scene)) == 2

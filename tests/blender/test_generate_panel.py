@@ -16,9 +16,8 @@ from jobs_driven import drive, shown
 
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.build import GAP_M
-from blender_primdiffusion.scene.files import person_file
-from blender_primdiffusion.scene.human import armature_of, humans
-from blender_primdiffusion.scene.preview import posed_extent
+from blender_primdiffusion.scene.cycles import posed_extent
+from blender_primdiffusion.scene.human import armature_of, humans, person_file
 from blender_primdiffusion.ui import generate_panel
 
 FAILS = 2
@@ -82,7 +81,7 @@ def test_pressing_twice_asks_for_two_different_people(addon, panel_settings, in_
     assert second != 7
 
 
-def test_a_count_is_as_many_works_in_line_of_seeds_that_follow_on_each_other(addon, panel_settings, in_line):
+def test_a_count_queues_as_many_jobs_with_consecutive_seeds(addon, panel_settings, in_line):
     panel_settings.count = 3
     bpy.ops.primdiffusion.generate(steps=1)
     assert [entry.job.label for entry in queue.waiting] == [f"Human, seed {seed}" for seed in (7, 8, 9)]
@@ -112,7 +111,7 @@ def test_a_new_person_takes_the_free_place_in_the_middle(addon):
     assert armature_of(humans(addon.scene)[2]).location.x == 0.0, "the one far behind is not in the way"
 
 
-def test_seeds_beyond_blenders_numbers_are_refused(addon):
+def test_seeds_beyond_blenders_numbers_are_rejected(addon):
     with pytest.raises(RuntimeError, match="2 seeds from 2147483647 on go beyond 2147483647: choose a smaller seed"):
         bpy.ops.primdiffusion.generate(seed=2**31 - 1, steps=1, count=2)
     assert not humans(addon.scene)
@@ -151,6 +150,8 @@ def test_a_preset_holds_everything_but_the_seed(panel_settings, presets_folder):
     assert panel_settings.attributes.use_height
     bpy.ops.primdiffusion.add_generate_preset(name="Tall Ones", remove_name=True)
     assert not list(presets_folder.glob("*.py"))
+    with pytest.raises(RuntimeError, match="The preset has no name"):
+        bpy.ops.primdiffusion.add_generate_preset(name=" ")
 
 
 @pytest.mark.parametrize(
@@ -180,7 +181,7 @@ def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_o
     assert drawn() == ["count", "quality"]
     panel_settings.quality = "CUSTOM"
     assert drawn() == ["count", "quality", "steps", "sampler"]
-    monkeypatch.setattr(generate_panel.setup, "draw_set_up", lambda layout: layout.label(text="not set up"))
+    monkeypatch.setattr(generate_panel, "draw_set_up", lambda layout: layout.label(text="not set up"))
     texts = shown(generate_panel.PRIMDIFFUSION_PT_generate, addon)
     assert texts[0] == "not set up"
     assert {"primdiffusion.random_seed", "primdiffusion.generate"} <= set(texts)

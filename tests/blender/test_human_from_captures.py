@@ -14,14 +14,13 @@ from backend_python import found
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 import blender_primdiffusion
-from blender_primdiffusion.jobs import job, reconstruct
+from blender_primdiffusion.backend.environment import BackendPython
+from blender_primdiffusion.jobs import generate
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.files import folder_of
-from blender_primdiffusion.scene.human import humans
+from blender_primdiffusion.scene.human import folder_of, humans
 from blender_primdiffusion.ui import reconstruct_panel
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
 from blender_primdiffusion.ui.reconstruct_panel import PRIMDIFFUSION_PT_human_from_captures
-from blender_primdiffusion.worker.environment import BackendPython
 
 pytestmark = pytest.mark.any_blender
 
@@ -56,7 +55,7 @@ def test_the_operator_builds_a_person_of_what_was_asked_for(addon, captures):
     assert notice_of("reconstruct").startswith("Reconstructed in ")
 
 
-def test_what_the_operator_is_not_told_is_the_panels(addon, captures):
+def test_properties_that_are_not_given_are_the_panels(addon, captures):
     panel = addon.scene.primdiffusion_reconstruct
     panel.capture, panel.subject, panel.frame, panel.views = "//captures", "berta", 3, 4
     assert bpy.ops.primdiffusion.human_from_captures() == {"FINISHED"}
@@ -119,7 +118,7 @@ def test_a_warning_of_the_backend_is_shown(addon, captures):
 
 def test_the_panel_shows_progress_and_cancel_ends_the_job_without_a_person(addon, captures):
     assert "primdiffusion.human_from_captures" in shown(PRIMDIFFUSION_PT_human_from_captures, addon)
-    queue.add(addon, reconstruct.ReconstructJob(str(order(captures, "take long")), "", 0, 8))
+    queue.add(addon, generate.ReconstructJob(str(order(captures, "take long")), "", 0, 8))
     until_running()
     texts = shown(PRIMDIFFUSION_PT_human_from_captures, addon)
     assert texts == ["primdiffusion.human_from_captures", "Reconstructing", "primdiffusion.cancel"]
@@ -130,7 +129,7 @@ def test_the_panel_shows_progress_and_cancel_ends_the_job_without_a_person(addon
 
 
 def test_the_timer_builds_the_person(addon, captures):
-    queue.add(addon, reconstruct.ReconstructJob(str(captures), "", 0, 8))
+    queue.add(addon, generate.ReconstructJob(str(captures), "", 0, 8))
     drive()
     assert len(humans(addon.scene)) == 1
 
@@ -161,8 +160,10 @@ def test_the_real_child_makes_a_person_of_real_captures(saved_scene, tmp_path, m
     encoder = save_tiny_encoder(tmp_path / "encoder.safetensors")
     folder = captured(tmp_path / "made", people=2, frames=1, passes=("img", "mask"))
     python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", found(python))
-    monkeypatch.setattr(job, "preference", lambda name: str(encoder) if name == "encoder" else "")
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", found(python))
+    monkeypatch.setattr(
+        "blender_primdiffusion.jobs.queue.preference", lambda name: str(encoder) if name == "encoder" else ""
+    )
     blender_primdiffusion.register()
     try:
         with pytest.raises(RuntimeError, match=r"holds several subjects: name one of them \(person_000000"):

@@ -13,14 +13,12 @@ import synthetic_shape
 from jobs_driven import shown
 from oracle import evaluated_matrices
 
+from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.attachment import set_attachment
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.files import folder_of, person_file
-from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of, humans
-from blender_primdiffusion.scene.keyframes import keyframe_poses
+from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of, folder_of, humans, person_file
 from blender_primdiffusion.scene.reshape import reshape
-from blender_primdiffusion.scene.shape import betas_of, generated_betas, shape_model_of
-from blender_primdiffusion.scene.shape_model import measure, slider_names
+from blender_primdiffusion.scene.shape import betas_of, generated_betas, measure, shape_model_of, slider_names
 from blender_primdiffusion.scene.surface import node_inputs
 from blender_primdiffusion.ui.human_panel import PRIMDIFFUSION_MT_people, PRIMDIFFUSION_PT_human
 from blender_primdiffusion.ui.shape_panel import (
@@ -81,7 +79,7 @@ def test_height_and_weight_are_what_is_asked_for(person):
     assert height(person) == pytest.approx(1.65, abs=3e-4)
 
 
-def test_heights_nobody_has_leave_the_person_as_they_are(person, capsys):
+def test_impossible_heights_leave_the_human_unchanged(person, capsys):
     before = surface(person)
     settings(person).height = 2.9
     assert surface(person) == before
@@ -117,14 +115,14 @@ def test_sliders_of_a_person_who_cannot_follow_do_nothing_and_the_panel_says_why
     bpy.ops.object.mode_set(mode="OBJECT")
 
 
-def test_people_of_earlier_versions_are_told_to_be_generated_again(addon, tmp_path):
+def test_humans_of_earlier_versions_have_to_be_generated_again(addon, tmp_path):
     build_human(addon, synthetic.write(tmp_path / "old.npz", 8))
     assert "generate the person again" in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
     with pytest.raises(RuntimeError, match="generate the person again"):
         ops.random_shape()
 
 
-def test_an_animated_shape_is_told(person, addon):
+def test_an_animated_shape_is_reported(person, addon):
     armature_of(person).keyframe_insert(f'["{BETAS}"]', frame=1)
     assert "animated" in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
 
@@ -168,7 +166,7 @@ def test_a_shape_is_copied_from_the_other_person(person, other):
     ("given", "sentence"),
     [({}, "choose the other person"), ({"source": "Human"}, "cannot be the other"), ({"source": "Eve"}, "not in the")],
 )
-def test_copying_from_nobody_is_refused(person, given, sentence):
+def test_copying_without_another_human_is_rejected(person, given, sentence):
     with pytest.raises(RuntimeError, match=sentence):
         ops.copy_shape(**given)
 
@@ -196,7 +194,7 @@ def test_a_new_name_is_the_collections_and_its_parts_but_not_of_those_renamed_by
     assert sorted(files[0].parent.iterdir()) == files
 
 
-def test_an_empty_name_is_refused_and_a_taken_one_gets_a_number(person, other, capsys):
+def test_an_empty_name_is_rejected_and_a_taken_one_gets_a_number(person, other, capsys):
     settings(person).person = "  "
     assert "needs a name" in capsys.readouterr().out
     settings(person).person = "Ötzi"
@@ -224,7 +222,7 @@ def test_a_person_outside_the_view_layer_cannot_be_selected(person, addon):
         ops.select_human()
 
 
-def test_a_view_is_needed_to_frame_somebody(person, addon):
+def test_a_view_is_needed_to_frame_a_human(person, addon):
     for window in addon.window_manager.windows:
         for area in window.screen.areas:
             area.type = "CONSOLE"
@@ -314,7 +312,7 @@ def linked(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["duplicate_human", "delete_human", "reset_shape"])
-def test_linked_people_are_refused_with_what_to_do(person, tmp_path, name):
+def test_linked_people_are_rejected_with_what_to_do(person, tmp_path, name):
     linked(tmp_path)
     with pytest.raises(RuntimeError, match="linked"):
         getattr(ops, name)()
@@ -325,7 +323,7 @@ def test_a_linked_person_keeps_their_name(person, tmp_path, capsys):
     assert "is linked from" in capsys.readouterr().out
 
 
-def test_a_frame_is_put_around_somebody_where_a_viewport_is_open(person, addon):
+def test_a_frame_is_put_around_a_human_where_a_viewport_is_open(person, addon):
     area = next(iter(addon.window_manager.windows)).screen.areas[0]
     area.type = "VIEW_3D"
     view = area.spaces.active.region_3d
@@ -348,7 +346,7 @@ def test_the_panels_show_height_provenance_and_counts(person, addon):
         assert text in details
 
 
-def test_a_scaled_person_is_told_as_tall_as_the_scene_has_them(person, addon):
+def test_a_scaled_human_shows_its_height_in_the_scene(person, addon):
     assert "In the scene" not in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
     armature_of(person).scale = (2, 2, 2)
     addon.view_layer.update()

@@ -19,8 +19,16 @@ from blender_primdiffusion.engine.picture import posed_humans
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_files
-from blender_primdiffusion.scene.files import VolumeWriteError, folder_of, humans_folder, person_file, volume_path
-from blender_primdiffusion.scene.human import MARK, armature_of, humans
+from blender_primdiffusion.scene.human import (
+    MARK,
+    VolumeWriteError,
+    armature_of,
+    folder_of,
+    humans,
+    humans_folder,
+    person_file,
+    volume_path,
+)
 from blender_primdiffusion.scene.missing import missing_files
 
 ops = bpy.ops.primdiffusion
@@ -107,7 +115,7 @@ def test_undo_and_redo_across_generate_edit_reshape_and_delete(source, addon):
     assert whole(humans(bpy.context.scene)[0], reshaped)
 
 
-def test_somebody_generated_after_a_deletion_leaves_the_file_of_the_deleted(source, addon):
+def test_a_human_generated_after_a_deletion_leaves_the_file_of_the_deleted(source, addon):
     step("empty")
     ops.generate(seed=7)
     ops.delete_human()
@@ -238,7 +246,7 @@ def linked(tmp_path, folder="other"):
     return wanted.collections[0]
 
 
-def test_linked_people_are_whole_and_refuse_edits(person, tmp_path):
+def test_linked_people_are_whole_and_reject_edits(person, tmp_path):
     where = places(person)
     anna = linked(tmp_path)
     assert whole(anna, where)
@@ -361,7 +369,7 @@ def test_purging_and_packing_take_nothing_away(person):
 def test_a_full_disk_while_saving_or_collecting_leaves_people_as_they_are(person, tmp_path, monkeypatch):
     import errno
 
-    from blender_primdiffusion.scene import files
+    from blender_primdiffusion.scene import human
 
     where, other = places(person), tmp_path / "other"
     other.mkdir()
@@ -374,7 +382,7 @@ def test_a_full_disk_while_saving_or_collecting_leaves_people_as_they_are(person
             raise OSError(errno.ENOSPC, "No space left on device")
         copied.append(copy(source, destination))
 
-    monkeypatch.setattr(files.shutil, "copyfile", full)
+    monkeypatch.setattr(human.shutil, "copyfile", full)
     with pytest.raises(VolumeWriteError, match="free space"):
         collect_files()
     copied.clear()
@@ -386,7 +394,7 @@ def test_a_full_disk_while_saving_or_collecting_leaves_people_as_they_are(person
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_read_only_folder_is_told(person, tmp_path):
+def test_a_read_only_folder_is_reported(person, tmp_path):
     other = tmp_path / "other"
     other.mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(other / "b.blend"))

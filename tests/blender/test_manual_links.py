@@ -35,7 +35,7 @@ def test_for_a_page_that_is_not_there_the_list_of_pages_is_shown(addon, opened, 
     assert opened[0].endswith("/docs/manual/index.md")
 
 
-def test_an_installation_without_its_manual_is_said_to_be_so(addon, opened, monkeypatch):
+def test_an_installation_without_its_manual_is_reported(addon, opened, monkeypatch):
     monkeypatch.setattr(manual, "page_file", lambda _page: None)
     with pytest.raises(RuntimeError, match="page 'batch' is not there: install"):
         bpy.ops.primdiffusion.open_manual(page="batch")
@@ -62,7 +62,7 @@ def test_f1_on_what_is_ours_leads_to_its_section(addon, opened, thing, section):
     assert f"### {section}" in manual.page_file("api").read_text().lower()
 
 
-def test_f1_on_blenders_own_things_is_left_to_blender(addon):
+def test_f1_on_blenders_own_types_is_left_to_blender(addon):
     prefix, mapping = manual.manual_map()
     assert prefix.startswith("file:///")
     assert all("primdiffusion" in pattern for pattern, _ in mapping)

@@ -18,13 +18,19 @@ from blender_primdiffusion.jobs import merge
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.merge import MergeFramesJob, MergeJob, Moment
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.jobs.target import Target
-from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.jobs.target import HumanTarget
+from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import attachment_of
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.files import folder_of, sequence_files, volume_path
-from blender_primdiffusion.scene.human import MARK, armature_of, humans, remove_human
-from blender_primdiffusion.scene.keyframes import keyframe_poses
+from blender_primdiffusion.scene.human import (
+    MARK,
+    armature_of,
+    folder_of,
+    humans,
+    remove_human,
+    sequence_files,
+    volume_path,
+)
 from blender_primdiffusion.scene.material import density_gain
 from blender_primdiffusion.scene.merged import merged_of, merged_state
 from blender_primdiffusion.ui import render_panel
@@ -133,7 +139,7 @@ def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(perso
     assert not merged_of(person).data.is_sequence
 
 
-def test_a_range_that_is_none_is_refused(person):
+def test_a_range_that_is_none_is_rejected(person):
     with pytest.raises(RuntimeError, match="frames 7 to 7 are no sequence"):
         ops.merge_frames(frame_start=7, frame_end=7)
     assert merged_of(person) is None
@@ -143,7 +149,7 @@ def test_a_cancelled_sequence_leaves_nothing(person, monkeypatch):
     monkeypatch.setenv("FAKE_MERGE", "takes long")
     moment = Moment.now(person)
     before = sorted(folder_of(person).iterdir())
-    queue.add(bpy.context, MergeFramesJob(Target.of(person), [moment, moment], 1, 0.02))
+    queue.add(bpy.context, MergeFramesJob(HumanTarget.of(person), [moment, moment], 1, 0.02))
     until_running()
     queue.cancel()
     drive()
@@ -156,7 +162,7 @@ def test_the_frames_of_a_sequence_are_written_one_at_a_tick(person, monkeypatch)
     write_grid = merge.write_grid
     monkeypatch.setattr(merge, "write_grid", lambda *args: written.append(ticks[0]) or write_grid(*args))
     moment = Moment.now(person)
-    queue.add(bpy.context, MergeFramesJob(Target.of(person), [moment] * 5, 1, 0.02))
+    queue.add(bpy.context, MergeFramesJob(HumanTarget.of(person), [moment] * 5, 1, 0.02))
     while follow() is not None:
         ticks[0] += 1
     assert len(written) == len(set(written)) == 5
@@ -176,15 +182,15 @@ def test_a_child_that_misbehaves_leaves_the_person_as_they_were(person, monkeypa
     assert sorted(folder_of(person).iterdir()) == before
 
 
-def test_somebody_removed_meanwhile_is_not_merged(person):
-    queue.add(bpy.context, MergeJob(Target.of(person), Moment.now(person), 0.02))
+def test_a_human_removed_meanwhile_is_not_merged(person):
+    queue.add(bpy.context, MergeJob(HumanTarget.of(person), Moment.now(person), 0.02))
     remove_human(person)
     drive()
     assert "was removed" in error_of("merge")
     assert not bpy.data.volumes
 
 
-def test_a_renamed_bone_is_refused_with_what_to_do(person):
+def test_a_renamed_bone_is_rejected_with_what_to_do(person):
     armature_of(person).data.bones["left_knee"].name = "knee"
     with pytest.raises(RuntimeError, match=r"no bone 'left_knee': give it this name again"):
         ops.merge()
@@ -260,7 +266,7 @@ def test_a_camera_is_added_that_sees_the_whole_person(person):
     assert any(light.type == "SUN" for light in bpy.data.lights)
 
 
-def test_nobody_to_look_at_is_refused(addon):
+def test_a_scene_without_humans_is_rejected(addon):
     with pytest.raises(RuntimeError, match="no person in the scene"):
         ops.add_camera()
     assert not ops.merge.poll()

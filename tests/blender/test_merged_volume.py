@@ -12,8 +12,7 @@ from blender_primdiffusion.scene.attachment import attachment_before_merge, atta
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving, unused
 from blender_primdiffusion.scene.duplicate import duplicate_human
-from blender_primdiffusion.scene.files import VolumeWriteError, folder_of, sequence_files, volume_path
-from blender_primdiffusion.scene.grid_cache import person_memory
+from blender_primdiffusion.scene.human import VolumeWriteError, folder_of, sequence_files, volume_path
 from blender_primdiffusion.scene.material import (
     density_gain,
     person_material,
@@ -34,6 +33,7 @@ from blender_primdiffusion.scene.merged import (
     show_merged,
     write_grid,
 )
+from blender_primdiffusion.scene.volumes import person_memory
 
 bpy.utils.expose_bundled_modules()
 import openvdb  # noqa: E402
@@ -177,7 +177,7 @@ def test_a_folder_that_cannot_be_written_leaves_nothing(person, tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"PK\x03\x04 no more", b""])
-def test_a_damaged_grid_is_refused_with_what_to_do(tmp_path, content):
+def test_a_damaged_grid_is_rejected_with_what_to_do(tmp_path, content):
     (tmp_path / "grid.npz").write_bytes(content)
     with pytest.raises(ValueError, match=r"damaged.*merge again"):
         read_grid(tmp_path / "grid.npz")
@@ -213,7 +213,7 @@ def test_a_duplicate_s_gain_is_its_own(person):
     assert {volume_path(data) for data in bpy.data.volumes} == set(folder_of(person).glob("prim_*.vdb"))
 
 
-def test_a_material_without_the_factor_is_refused(person):
+def test_a_material_without_the_factor_is_rejected(person):
     other = bpy.data.materials.new("Smoke")
     for thing in person.all_objects:
         if thing.type == "VOLUME":
@@ -233,7 +233,7 @@ def test_memory_is_what_openvdb_says_of_the_loaded_grids(person):
 def test_missing_files_take_no_memory(person):
     for path in folder_of(person).glob("prim_*.vdb"):
         path.rename(path.with_suffix(".gone"))
-    from blender_primdiffusion.scene import grid_cache
+    from blender_primdiffusion.scene import volumes
 
-    grid_cache._memory_of.cache_clear()
+    volumes._memory_of.cache_clear()
     assert person_memory(person).files == 0

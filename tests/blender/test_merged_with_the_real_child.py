@@ -11,15 +11,14 @@ import pytest
 from backend_python import found
 
 import blender_primdiffusion
-from blender_primdiffusion.jobs import job
+from blender_primdiffusion.backend.client import BackendClient
+from blender_primdiffusion.backend.environment import BackendPython
+from blender_primdiffusion.jobs import queue
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import attachment_of, set_attachment
-from blender_primdiffusion.scene.files import sequence_files, volume_path
-from blender_primdiffusion.scene.human import armature_of, humans
+from blender_primdiffusion.scene.human import armature_of, humans, sequence_files, volume_path
 from blender_primdiffusion.scene.material import density_gain
 from blender_primdiffusion.scene.merged import merged_of
-from blender_primdiffusion.worker.client import BackendClient
-from blender_primdiffusion.worker.environment import BackendPython
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 ops = bpy.ops.primdiffusion
@@ -31,11 +30,11 @@ def person(saved_scene, tmp_path, monkeypatch):
 
     checkpoint = save_tiny_checkpoint(tmp_path / "tiny.safetensors")
     python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.worker.environment.search", found(python))
-    monkeypatch.setattr(job, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", found(python))
+    monkeypatch.setattr(queue, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
     # With a cache in Blender's temporary folder the child would compile its marcher anew for each test.
     monkeypatch.setattr(
-        "blender_primdiffusion.worker.client.BackendClient",
+        "blender_primdiffusion.backend.client.BackendClient",
         lambda python, module, cache_dir: BackendClient(python, module),
     )
     blender_primdiffusion.register()
@@ -82,7 +81,7 @@ def test_frames_and_the_gain_come_from_the_child(person):
     assert 0.1 <= density_gain(person) <= 20
 
 
-def test_voxels_too_small_for_the_machine_are_refused_with_a_size_to_choose(person):
+def test_voxels_too_small_for_the_machine_are_rejected_with_a_size_to_choose(person):
     with pytest.raises(RuntimeError, match=r"choose .* mm or more"):
         ops.merge(voxel=0.0005)
     assert merged_of(person) is None

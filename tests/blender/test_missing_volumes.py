@@ -14,8 +14,7 @@ from jobs_driven import shown
 
 from blender_primdiffusion.jobs.missing_files import look, state
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.files import HOME, folder_of, person_file, volume_path
-from blender_primdiffusion.scene.human import MARK, humans
+from blender_primdiffusion.scene.human import HOME, MARK, folder_of, humans, person_file, volume_path
 from blender_primdiffusion.scene.missing import missing_files
 from blender_primdiffusion.ui.human_panel import PRIMDIFFUSION_PT_human
 
@@ -62,9 +61,9 @@ def whole(person) -> bool:
     return all(volume.grids.load() for volume in volumes) and person_file(person).is_file() and not missing_files()
 
 
-def test_nobody_misses_anything_and_nothing_is_drawn(person, addon):
+def test_nothing_is_drawn_when_no_file_is_missing(person, addon):
     look()
-    assert state.told == ""
+    assert state.summary == ""
     assert "primdiffusion.find_missing_volumes" not in shown(PRIMDIFFUSION_PT_human, addon)
     assert ops.find_missing_volumes() == {"FINISHED"}
 
@@ -72,11 +71,11 @@ def test_nobody_misses_anything_and_nothing_is_drawn(person, addon):
 def test_a_folder_that_was_renamed_is_found_in_one_click(person, tmp_path):
     shutil.move(tmp_path / "shot_humans", tmp_path / "backup_humans")
     anna = reopened()
-    assert state.told == f"{COUNT} volumes, person.human.safetensors, {anna['primdiffusion_body_file']} of 'Anna'"
+    assert state.summary == f"{COUNT} volumes, person.human.safetensors, {anna['primdiffusion_body_file']} of 'Anna'"
     assert "primdiffusion.find_missing_volumes" in shown(PRIMDIFFUSION_PT_human, bpy.context)
     assert ops.find_missing_volumes() == {"FINISHED"}
     assert whole(anna)
-    assert state.told == ""
+    assert state.summary == ""
     assert all(volume.filepath.startswith("//backup_humans/Anna/") for volume in bpy.data.volumes)
 
 
@@ -85,7 +84,7 @@ def test_a_blend_moved_alone_finds_people_where_they_were_when_it_was_saved(pers
     elsewhere.mkdir()
     shutil.move(tmp_path / "shot.blend", elsewhere / "neu.blend")
     anna = reopened(elsewhere / "neu.blend")
-    assert state.told
+    assert state.summary
     assert ops.find_missing_volumes() == {"FINISHED"}
     assert whole(anna)
     assert volume_path(bpy.data.volumes[0]).resolve().parent == tmp_path / "shot_humans" / "Anna"
@@ -106,7 +105,7 @@ def test_a_folder_may_be_named_and_undo_goes_back(person, tmp_path):
     assert whole(anna)
     bpy.ops.ed.undo()
     assert len(missing_files()) == 1
-    assert state.told
+    assert state.summary
 
 
 def test_volumes_that_are_nowhere_are_made_again_from_the_persons_file(person):
@@ -115,7 +114,7 @@ def test_volumes_that_are_nowhere_are_made_again_from_the_persons_file(person):
         path.unlink()
     next(folder_of(person).parent.glob("body_*")).unlink()
     anna = reopened()
-    assert state.told.startswith("3 volumes, body_")
+    assert state.summary.startswith("3 volumes, body_")
     assert ops.find_missing_volumes() == {"FINISHED"}
     assert whole(anna)
     assert {volume.name: volume.filepath for volume in bpy.data.volumes} == before
@@ -142,7 +141,7 @@ def test_all_of_a_person_lost_but_their_file_elsewhere(person, store, tmp_path):
     assert whole(anna)
 
 
-def test_a_person_of_whom_nothing_is_left_is_generated_again(person, tmp_path):
+def test_a_human_without_any_file_left_is_generated_again(person, tmp_path):
     shutil.rmtree(tmp_path / "shot_humans")
     anna = reopened()
     assert "primdiffusion.generate_again" in shown(PRIMDIFFUSION_PT_human, bpy.context)
@@ -163,7 +162,7 @@ def test_a_person_of_whom_nothing_is_left_is_generated_again(person, tmp_path):
         ({"checkpoint": "another"}, "another person"),
     ],
 )
-def test_people_whom_no_seed_makes_again_are_refused(person, tmp_path, changes, sentence):
+def test_humans_that_no_seed_reproduces_are_rejected(person, tmp_path, changes, sentence):
     shutil.rmtree(tmp_path / "shot_humans")
     person[MARK] = json.dumps({**json.loads(person[MARK]), **changes})
     with pytest.raises(RuntimeError, match=sentence):
@@ -171,7 +170,7 @@ def test_people_whom_no_seed_makes_again_are_refused(person, tmp_path, changes, 
     assert not (tmp_path / "shot_humans").exists()
 
 
-def test_a_person_in_a_lost_folder_of_a_linked_blend_is_told(person, tmp_path):
+def test_a_person_in_a_lost_folder_of_a_linked_blend_is_reported(person, tmp_path):
     shutil.move(tmp_path / "shot_humans", tmp_path / "gone")
     bpy.ops.wm.read_homefile(use_empty=True)
     with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True) as (_, wanted):
@@ -189,7 +188,7 @@ def test_missing_files_of_a_thousand_volumes_are_one_entry(person):
     assert len(lost.volumes) == 1024
 
 
-def test_a_missing_file_offers_the_button_where_a_work_fails(person):
+def test_a_missing_file_offers_the_button_where_a_job_fails(person):
     from blender_primdiffusion.jobs.remedies import error_in_the_scene, remedy_for
 
     person_file(person).unlink()

@@ -94,7 +94,7 @@ def test_joints_of_a_skeleton_are_those_of_skinning():
     np.testing.assert_allclose(motion.joints()[0], expected, atol=1e-12)
 
 
-def test_a_motion_of_unlike_lengths_is_refused():
+def test_a_motion_of_unlike_lengths_is_rejected():
     with pytest.raises(ValueError, match="a motion of 2 frames"):
         Motion(np.tile(np.eye(3), (2, 24, 1, 1)), np.zeros((3, 3)), 30.0, "x")
 
@@ -153,7 +153,7 @@ def test_no_built_in_pose_puts_a_hand_or_a_forearm_into_the_trunk():
         assert max(deep, default=0) < 0.02, name
 
 
-def test_more_poses_than_are_built_in_are_refused():
+def test_more_poses_than_are_built_in_are_rejected():
     with pytest.raises(ValueError, match="poses, not 21"):
         built_in_poses(21)
 
@@ -170,7 +170,7 @@ def test_picked_poses_begin_near_t_and_are_spread_better_than_chance():
     assert apart[~np.eye(12, dtype=bool)].min() > 0.1
 
 
-def test_without_a_frame_near_t_the_first_is_built_in_and_said_so():
+def test_without_a_frame_near_t_the_first_is_built_in_and_reported():
     bent = about_axis(0, -1.5) @ np.eye(3)
     rotations = random_motion(30, 4).rotations
     rotations[:, JOINT_NAMES.index("left_hip")] = bent
@@ -187,7 +187,7 @@ def test_the_same_seed_picks_the_same_poses_of_a_long_motion():
     assert not np.array_equal(first.rotations, other.rotations)
 
 
-def test_too_few_frames_are_refused():
+def test_too_few_frames_are_rejected():
     with pytest.raises(ValueError, match="20 poses cannot be picked from 3"):
         pick_poses([random_motion(3, 0)], 20)
 

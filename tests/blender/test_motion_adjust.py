@@ -88,13 +88,13 @@ def test_a_given_up_axis_is_turned_up(tmp_path, axis):
     assert motion.detected.up == axis
 
 
-def test_an_axis_that_is_none_is_refused(tmp_path):
+def test_an_axis_that_is_none_is_rejected(tmp_path):
     np.save(tmp_path / "p.npy", np.zeros(72))
     with pytest.raises(MotionFileError, match="the axis 'w' cannot be up"):
         read_motion(tmp_path / "p.npy", "w")
 
 
-def test_the_up_axis_of_a_bvh_is_told_and_taken_in_the_files_own_axes(tmp_path):
+def test_the_up_axis_of_a_bvh_is_reported_and_taken_in_the_files_own_axes(tmp_path):
     rotations, moves = motion_of(0.2)
     z_up = about_axis(0, np.pi / 2)
     rest = REST_JOINTS @ z_up.T

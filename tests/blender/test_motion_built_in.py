@@ -41,7 +41,7 @@ def test_no_joint_jumps(name):
 
 
 @pytest.mark.parametrize("name", MOTIONS)
-def test_nobody_sinks_into_the_floor_or_floats(name):
+def test_feet_neither_sink_into_the_floor_nor_float(name):
     joints = built_in_motion(name, 1, 30.0).joints()
     ball = joints[:, FEET, 1] - (REST_JOINTS[FEET[0], 1] - FLOOR)
     assert (ball.min(1) > FLOOR - 0.025).all()

@@ -14,9 +14,8 @@ from blender_primdiffusion.motion.bvh import parse_bvh
 from blender_primdiffusion.motion.files import MotionFileError, read_motion
 from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, to_axis_angle
 from blender_primdiffusion.motion.skeleton import REST_JOINTS, chain, joint_positions
-from blender_primdiffusion.scene.armature import build_armature
+from blender_primdiffusion.scene.armature import build_armature, keyframe_poses
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.keyframes import keyframe_poses
 
 Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
 FRAMES = 6

@@ -121,7 +121,7 @@ def test_json_is_read(tmp_path, content):
     np.testing.assert_allclose(read_motion(tmp_path / "p.json").axis_angle(), THETA, atol=1e-9)
 
 
-def test_the_released_plain_twin_is_read_and_the_pickled_one_refused(tmp_path):
+def test_the_released_plain_twin_is_read_and_the_pickled_one_rejected(tmp_path):
     from blender_primdiffusion.formats.capture_layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE, write_smpl
 
     write_smpl(tmp_path, THETA[:, 0], THETA[:, 1:].reshape(FRAMES, 69), np.zeros(10), MOVE)
@@ -190,7 +190,7 @@ def bomb(claimed: tuple[int, ...], size: int) -> bytes:
     return stream.getvalue() + bytes(size)
 
 
-def test_an_array_larger_than_its_file_is_refused_before_memory_is_taken(tmp_path):
+def test_an_array_larger_than_its_file_is_rejected_before_memory_is_taken(tmp_path):
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w") as archive:
         archive.writestr("poses.npy", bomb((10**9, 72), 100))
     with pytest.raises(MotionFileError, match="its header promises 576000000000 bytes"):
@@ -200,7 +200,7 @@ def test_an_array_larger_than_its_file_is_refused_before_memory_is_taken(tmp_pat
         read_motion(tmp_path / "bomb.npy")
 
 
-def test_a_zip_bomb_is_refused(tmp_path):
+def test_a_zip_bomb_is_rejected(tmp_path):
     with (
         zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive,
         archive.open("poses.npy", "w", force_zip64=True) as member,

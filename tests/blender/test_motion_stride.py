@@ -16,8 +16,8 @@ from blender_primdiffusion.motion.motion import Detected, Motion
 from blender_primdiffusion.motion.skeleton import REST_JOINTS, joint_positions
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.ui.motion_armatures import FACTS
 from blender_primdiffusion.ui.motion_placing import Placement, place_motion
+from blender_primdiffusion.ui.on_person import FACTS
 
 pytestmark = pytest.mark.any_blender
 
@@ -74,7 +74,7 @@ def test_lengths_of_an_average_person_need_no_guess(walk):
 
 
 @pytest.mark.parametrize("name", ["IDLE", "WAVE"])
-def test_who_goes_nowhere_tells_nothing(name):
+def test_a_motion_in_place_gives_no_stride(name):
     assert stride_ratio(unknown(built_in_motion(name, 4, 30.0)), longer_legs(1.15)) is None
 
 
@@ -92,7 +92,7 @@ def test_skaters_and_walkers_on_treadmills_slide_on_purpose(walk):
     assert stride_ratio(scale_places(walk, 4.0), longer_legs(1.15)) is None
 
 
-def test_a_fast_camera_that_trembles_by_a_millimetre_tells_nearly_the_same():
+def test_a_fast_camera_that_trembles_by_a_millimetre_gives_nearly_the_same():
     walk = unknown(built_in_motion("WALK", STEPS // 2, 120.0))
     shake = np.random.default_rng(0).normal(0, 0.001, walk.translations.shape)
     shaken = dataclasses.replace(walk, translations=walk.translations + shake)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from blender_primdiffusion import places
+from blender_primdiffusion.backend import setup
 from blender_primdiffusion.ui.setup import operators
-from blender_primdiffusion.worker import setup
 
 pytestmark = pytest.mark.any_blender
 

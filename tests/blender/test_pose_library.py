@@ -12,7 +12,7 @@ import pytest
 import synthetic
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 
-from blender_primdiffusion.jobs.thumbnails import clay_figure, picture_of_file
+from blender_primdiffusion.jobs.assets import clay_figure, picture_of_file
 from blender_primdiffusion.motion.own_poses import PoseFileError, load_pose, own_poses, save_pose
 from blender_primdiffusion.motion.pose_library import (
     apply_pose,
@@ -26,7 +26,7 @@ from blender_primdiffusion.motion.skeleton import joint_positions
 from blender_primdiffusion.scene.actions import action_curves
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of
-from blender_primdiffusion.ui import pose_pictures
+from blender_primdiffusion.ui import pose_panel
 from blender_primdiffusion.ui.pose_panel import PRIMDIFFUSION_PT_poses
 
 ops = bpy.ops.primdiffusion
@@ -35,7 +35,7 @@ REST = np.tile(np.eye(3), (24, 1, 1))
 
 @pytest.fixture
 def armature(addon, tmp_path, monkeypatch):
-    monkeypatch.setattr(pose_pictures, "own_folder", lambda: tmp_path / "eigene Dateien")
+    monkeypatch.setattr(pose_panel, "own_folder", lambda: tmp_path / "eigene Dateien")
     return armature_of(build_human(addon, synthetic.write(tmp_path / "p.npz", 8), "Ann"))
 
 
@@ -45,8 +45,8 @@ def test_every_built_in_pose_is_finite_and_has_a_picture(addon):
     for name, pose in poses.items():
         assert pose.shape == (24, 3)
         assert np.isfinite(pose).all()
-        assert (pose_pictures._PICTURES / f"{name}.png").is_file()
-    pictures = list(pose_pictures._PICTURES.iterdir())
+        assert (pose_panel._PICTURES / f"{name}.png").is_file()
+    pictures = list(pose_panel._PICTURES.iterdir())
     assert {path.stem for path in pictures} == set(poses)
     assert sum(path.stat().st_size for path in pictures) < 300_000
     np.testing.assert_array_equal(poses["T"], np.zeros((24, 3)))
@@ -136,7 +136,7 @@ def test_a_saved_pose_is_in_the_library_and_comes_back_exactly(addon, armature, 
 
 def previews_of(name: str) -> set[str]:
     """Without a window all icons are 0."""
-    return {key for key in pose_pictures._collections[0] if f"{name}.pose.png" in key}
+    return {key for key in pose_panel._collections[0] if f"{name}.pose.png" in key}
 
 
 def test_a_saved_pose_has_a_picture_of_itself_at_once(addon, armature, tmp_path):
@@ -152,10 +152,10 @@ def test_a_saved_pose_has_a_picture_of_itself_at_once(addon, armature, tmp_path)
     drawn = np.round(clay_figure(joint_positions(rotations)) * 255) / 255
     assert np.abs(picture_of_file(picture) - drawn).max() < 0.02
     assert not [path for path in folder.iterdir() if "part" in path.name]
-    items = {item[0]: item for item in pose_pictures.pose_items(None, addon)}
+    items = {item[0]: item for item in pose_panel.pose_items(None, addon)}
     assert previews_of("mine")
     ops.save_pose(pose_name="another, before it")
-    assert {item[0]: item for item in pose_pictures.pose_items(None, addon)}["mine"][4] == items["mine"][4]
+    assert {item[0]: item for item in pose_panel.pose_items(None, addon)}["mine"][4] == items["mine"][4]
     ops.delete_pose(pose_name="mine")
     assert not picture.exists()
 
@@ -164,7 +164,7 @@ def test_another_pose_of_the_same_name_has_another_picture(addon, armature):
     for pose in ("Sitting", "Dancing"):
         ops.apply_pose(pose_name=pose)
         ops.save_pose(pose_name="mine")
-        pose_pictures.pose_items(None, addon)
+        pose_panel.pose_items(None, addon)
         ops.delete_pose(pose_name="mine")
     assert len(previews_of("mine")) == 2
 
@@ -178,11 +178,11 @@ def test_a_pose_whose_picture_cannot_be_written_or_is_missing_is_in_the_library_
     monkeypatch.setattr("blender_primdiffusion.formats.picture_files.write_png", full)
     assert ops.save_pose(pose_name="mine") == {"FINISHED"}
     assert "The pose 'mine' has no picture: [Errno 28] No space left" in capfd.readouterr().out
-    assert "mine" in [item[0] for item in pose_pictures.pose_items(None, addon)]
+    assert "mine" in [item[0] for item in pose_panel.pose_items(None, addon)]
 
 
 @pytest.mark.parametrize("name", ["T", "", "../x", "a" * 61, "."])
-def test_names_that_cannot_be_are_refused(armature, name):
+def test_names_that_cannot_be_are_rejected(armature, name):
     with pytest.raises(RuntimeError, match=r"built-in pose|cannot be called"):
         ops.save_pose(pose_name=name)
 
@@ -204,7 +204,7 @@ def test_a_damaged_pose_file_is_named(armature, tmp_path, content):
     np.testing.assert_allclose(current_pose(armature)[0], REST, atol=1e-5)
 
 
-def test_a_folder_that_cannot_be_written_is_said(tmp_path):
+def test_a_folder_that_cannot_be_written_is_reported(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(PoseFileError, match="could not be written"):
         save_pose(tmp_path / "file", "a", np.zeros((24, 3)), np.zeros(3))
@@ -213,12 +213,12 @@ def test_a_folder_that_cannot_be_written_is_said(tmp_path):
     assert list(own_poses(tmp_path / "poses")) == ["a"]
 
 
-def test_poses_of_wrong_shape_are_refused(armature):
+def test_poses_of_wrong_shape_are_rejected(armature):
     with pytest.raises(ValueError, match="24 axis-angle vectors"):
         apply_pose(armature, np.zeros((23, 3)))
 
 
-def test_edit_mode_and_a_renamed_bone_are_refused(addon, armature):
+def test_edit_mode_and_a_renamed_bone_are_rejected(addon, armature):
     addon.view_layer.objects.active = armature
     bpy.ops.object.mode_set(mode="EDIT")
     for operator in (ops.apply_pose, ops.mirror_pose, ops.reset_pose, ops.key_pose):
@@ -242,4 +242,4 @@ def test_the_panel_shows_pictures_and_offers_to_delete_only_own_poses(addon, arm
     assert "primdiffusion.delete_pose" not in buttons()
     ops.save_pose(pose_name="mine")
     assert "primdiffusion.delete_pose" in buttons()
-    assert "mine" in [item[0] for item in pose_pictures.pose_items(None, addon)]
+    assert "mine" in [item[0] for item in pose_panel.pose_items(None, addon)]

@@ -9,8 +9,8 @@ import pytest
 import synthetic_shape
 from scene_stage import replace
 
-from blender_primdiffusion.jobs.export_mesh import AddProxyJob
-from blender_primdiffusion.jobs.target import Target
+from blender_primdiffusion.jobs.export import AddProxyJob
+from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.human import body_of
@@ -96,11 +96,11 @@ def test_a_proxy_that_cannot_follow_stays_and_is_outdated(person, lock, tmp_path
         bpy.ops.object.mode_set(mode="OBJECT")
 
 
-def test_who_is_reshaped_while_the_child_works_gets_a_proxy_of_the_body_of_now(person, tmp_path):
+def test_a_human_reshaped_during_the_job_gets_a_proxy_of_its_new_body(person, tmp_path):
     before = betas_of(person)
     followed = proxy_of(person)
     reshape(person, before + TALLER)
     result = {"proxy": str(tmp_path / "proxy.npz"), "texture": str(tmp_path / "proxy.png"), "betas": before.tolist()}
-    made = AddProxyJob(Target.of(person), 64, 500).built(person, result)
+    made = AddProxyJob(HumanTarget.of(person), 64, 500).built(person, result)
     np.testing.assert_allclose(places(made), places(followed), atol=1e-5)
     assert not is_outdated(person, made, betas_of(person))

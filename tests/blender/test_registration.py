@@ -10,11 +10,10 @@ ROOT = Path(__file__).parents[2]
 MOST_MODULES = 120
 """Of ours. Each costs about half a millisecond; what works, as against what is drawn, is imported when asked for."""
 LATE = (
-    "scene.build", "scene.edit", "scene.merged", "scene.shape", "scene.shape_model", "scene.surface", "scene.volumes",
-    "scene.human_npz", "scene.grid_cache", "scene.collect", "scene.human_file", "scene.proxy", "scene.reshape",
-    "capture.settings", "formats.camera_rig", "motion.poses", "engine.viewport", "engine.studio", "worker.client",
-    "worker.environment", "worker.request", "jobs.generate", "jobs.edit", "jobs.assets",
-    "jobs.export_person", "ui.motion_placing",
+    "scene.build", "scene.edit", "scene.merged", "scene.shape", "scene.surface", "scene.volumes", "scene.human_npz",
+    "scene.collect", "scene.human_file", "scene.proxy", "scene.reshape", "capture.settings", "formats.camera_rig",
+    "motion.poses", "engine.viewport", "engine.studio", "jobs.generate", "jobs.edit", "jobs.assets", "jobs.export",
+    "ui.motion_placing",
 )  # fmt: skip
 """Modules of ours that registering must not import: they bring others along, or numpy."""
 CHILD = """

@@ -10,10 +10,10 @@ import pytest
 import scan_fixtures
 from test_scan_rigs import BETAS, BODY, load
 
+from blender_primdiffusion.capture.registration import unit_of
 from blender_primdiffusion.capture.scan import ScanError, find_scans
 from blender_primdiffusion.capture.scan_files import own_betas
-from blender_primdiffusion.capture.textures import choose_picture
-from blender_primdiffusion.capture.upright import unit_of
+from blender_primdiffusion.capture.surfaces import choose_picture
 
 pytestmark = pytest.mark.any_blender
 
@@ -67,7 +67,7 @@ def test_the_released_parameters_and_a_lone_npz_are_found(tmp_path):
     assert [scan.parameters for scan in find_scans(tmp_path)] == [released, tmp_path / "s2" / "smpl_param.npz"]
 
 
-def test_folders_and_files_without_anybody_are_named(tmp_path):
+def test_folders_and_files_without_scans_are_named(tmp_path):
     with pytest.raises(ScanError, match="there is no folder of scans"):
         find_scans(tmp_path / "none")
     with pytest.raises(ScanError, match="holds no scans"):
@@ -94,7 +94,7 @@ def test_people_are_between_half_a_metre_and_two_and_a_half(height, scale):
 
 
 @pytest.mark.parametrize("height", [0.0, 0.3, 3.5, 1e6, float("nan")])
-def test_other_heights_are_refused(height):
+def test_other_heights_are_rejected(height):
     with pytest.raises(ScanError, match="no change of units"):
         unit_of(height, "x")
 
@@ -122,7 +122,7 @@ def base_image(thing: bpy.types.Object) -> str:
     return Path(shader.inputs["Base Color"].links[0].from_node.image.filepath).name
 
 
-def test_a_texture_beside_the_file_is_shown_and_told(tmp_path, empty_scene):
+def test_a_texture_beside_the_file_is_shown_and_reported(tmp_path, empty_scene):
     scan_fixtures.person(BODY, BETAS, None, scan_fixtures.RENDERPEOPLE)
     path = scan_fixtures.save(tmp_path / "rp_anna_rigged_001.fbx")
     scan_fixtures.checker(tmp_path / "tex" / "rp_anna_dif.png")
@@ -144,7 +144,7 @@ def test_a_texture_whose_path_is_another_computers_is_found_by_its_name(tmp_path
     assert base_image(scan.objects[0]) == "colours of anna.png"
 
 
-def test_a_scan_without_a_texture_is_told(tmp_path, empty_scene):
+def test_a_scan_without_a_texture_is_reported(tmp_path, empty_scene):
     scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
     scan = load(scan_fixtures.save(tmp_path / "anna.glb"))
     assert "no texture (skin): drawn in its base colour" in scan.notes

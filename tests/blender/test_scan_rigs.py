@@ -86,7 +86,7 @@ def test_a_rig_is_posed_as_the_body_is(tmp_path, empty_scene, case):
     assert any("mm off on average" in note for note in scan.notes) or any("file tells" in note for note in scan.notes)
 
 
-def test_units_and_axes_that_were_corrected_are_told(tmp_path, empty_scene):
+def test_units_and_axes_that_were_corrected_are_reported(tmp_path, empty_scene):
     _, armature = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
     scan_fixtures.move([armature], quarter(0) @ np.diag([10.0, 10, 10, 1]))
     scan = load(scan_fixtures.save(tmp_path / "anna.glb"))
@@ -173,7 +173,7 @@ def test_an_animated_person_with_a_bone_glued_to_its_parent_is_still_posed(tmp_p
     assert np.nanmax(np.abs(bone_heads(scan) - joints)) < 1e-4
 
 
-def test_a_lamp_and_a_mesh_that_nothing_moves_are_left_out_and_told(tmp_path, empty_scene):
+def test_a_lamp_and_a_mesh_that_nothing_moves_are_left_out_and_reported(tmp_path, empty_scene):
     scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
     bpy.ops.mesh.primitive_cube_add()
     bpy.ops.object.light_add(type="POINT")
@@ -236,7 +236,7 @@ def test_every_rigs_own_names_are_known_with_any_prefix(rig):
     assert len(found.joints) >= 22
 
 
-def test_names_that_are_no_rigs_are_refused():
+def test_names_that_are_no_rigs_are_rejected():
     with pytest.raises(UnknownBonesError, match="no bone is known to be 'pelvis'"):
         map_bones(["a", "b"])
     with pytest.raises(UnknownBonesError, match="'left_knee'"):
@@ -250,7 +250,7 @@ def test_a_lost_vertex_is_named(tmp_path, empty_scene):
         load(scan_fixtures.save(tmp_path / "anna.glb"))
 
 
-def test_an_importers_failure_is_told_by_its_exception_not_its_place(tmp_path, empty_scene):
+def test_an_importers_failure_is_reported_by_its_exception_not_its_place(tmp_path, empty_scene):
     (tmp_path / "anna.glb").write_bytes(glb_of({"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [7]}]}))
     with pytest.raises(ScanError, match=r"cannot be imported: KeyError"):
         load(tmp_path / "anna.glb")

@@ -68,7 +68,7 @@ def test_betas_of_another_body_give_way_to_those_of_the_surface(tmp_path, empty_
     assert distance_m(scan, vertices).mean() < 0.004
 
 
-def test_a_scan_elsewhere_than_its_parameters_is_moved_and_that_is_told(tmp_path, empty_scene):
+def test_a_scan_elsewhere_than_its_parameters_is_moved_and_that_is_reported(tmp_path, empty_scene):
     scan = load(write_scan(tmp_path / "anna.obj", transl=np.array([[5.0, 0, 0]])))
     assert any(note.startswith("moved by") for note in scan.notes)
     expected = BODY.pose(BETAS, ROTATIONS, MOVE)[1]

@@ -14,14 +14,12 @@ from mathutils import Vector
 from oracle import TOLERANCE_M, blended_frames, evaluated_matrices
 
 from blender_primdiffusion.scene import build
-from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import attach_volumes, build_human
 from blender_primdiffusion.scene.collect import collect_before_saving
-from blender_primdiffusion.scene.files import VolumeWriteError, folder_of
-from blender_primdiffusion.scene.human import MARK, armature_of, humans, remove_human
-from blender_primdiffusion.scene.human_npz import HumanFileError
-from blender_primdiffusion.scene.keyframes import keyframe_poses
-from blender_primdiffusion.scene.overlap import overlap_warning, overlap_warning_in
+from blender_primdiffusion.scene.cycles import overlap_warning, overlap_warning_in
+from blender_primdiffusion.scene.human import MARK, VolumeWriteError, armature_of, folder_of, humans, remove_human
+from blender_primdiffusion.scene.human_npz import HumanNpzError
 
 KINDS = ("objects", "collections", "volumes", "meshes", "armatures", "materials", "actions")
 
@@ -120,7 +118,7 @@ def test_provenance_and_overlaps_are_kept_on_the_collection(person):
     assert "draws only 31" in overlap_warning(collection)
 
 
-def test_overlaps_are_told_to_those_who_render_with_cycles_alone(person):
+def test_overlaps_are_reported_only_when_rendering_with_cycles(person):
     collection, _ = person
     collection[MARK] = json.dumps({**json.loads(collection[MARK]), "most_overlapping": 40})
     scene = bpy.context.scene
@@ -185,7 +183,7 @@ def test_a_corrupted_file_leaves_scene_and_disk_as_they_were(saved_scene, tmp_pa
     else:
         synthetic.write(path, 8, position=np.full((8, 3), np.nan))
     files = sorted(tmp_path.rglob("*"))
-    with pytest.raises(HumanFileError):
+    with pytest.raises(HumanNpzError):
         build_human(saved_scene, path)
     assert not any(datablocks().values())
     assert sorted(tmp_path.rglob("*")) == files

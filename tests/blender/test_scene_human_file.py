@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import synthetic
 
-from blender_primdiffusion.scene.human_npz import HumanFileError, read_human
+from blender_primdiffusion.scene.human_npz import HumanNpzError, read_human
 
 pytestmark = pytest.mark.any_blender
 
@@ -37,7 +37,7 @@ def test_a_good_file_gives_back_its_arrays(tmp_path):
 @pytest.mark.parametrize("sentence", SPOILED)
 def test_a_spoiled_field_is_named_in_one_sentence(tmp_path, sentence):
     path = synthetic.write(tmp_path / "human.npz", 4, **SPOILED[sentence])
-    with pytest.raises(HumanFileError, match=sentence) as caught:
+    with pytest.raises(HumanNpzError, match=sentence) as caught:
         read_human(path)
     assert "\n" not in str(caught.value)
     assert ";" in str(caught.value)  # the remedy
@@ -47,7 +47,7 @@ def test_a_missing_field_is_named(tmp_path):
     arrays = synthetic.arrays(4)
     del arrays["density"]
     np.savez(tmp_path / "human.npz", **arrays)
-    with pytest.raises(HumanFileError, match="no field 'density'"):
+    with pytest.raises(HumanNpzError, match="no field 'density'"):
         read_human(tmp_path / "human.npz")
 
 
@@ -56,7 +56,7 @@ def test_a_truncated_file_is_damaged(tmp_path, keep):
     path = synthetic.write(tmp_path / "human.npz", 4)
     contents = path.read_bytes()
     path.write_bytes(contents[: keep if isinstance(keep, int) else int(len(contents) * keep)])
-    with pytest.raises(HumanFileError, match="damaged"):
+    with pytest.raises(HumanNpzError, match="damaged"):
         read_human(path)
 
 
@@ -65,16 +65,16 @@ def test_a_flipped_byte_inside_an_array_is_damaged(tmp_path):
     contents = bytearray(path.read_bytes())
     contents[len(contents) // 2] ^= 255
     path.write_bytes(contents)
-    with pytest.raises(HumanFileError, match="damaged"):
+    with pytest.raises(HumanNpzError, match="damaged"):
         read_human(path)
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(HumanFileError, match=r"no human file at .*nobody\.npz"):
+    with pytest.raises(HumanNpzError, match=r"no human file at .*nobody\.npz"):
         read_human(tmp_path / "nobody.npz")
 
 
 def test_pickles_are_never_opened(tmp_path):
     np.savez(tmp_path / "human.npz", **{**synthetic.arrays(4), "betas": np.array([{"a": 1}], dtype=object)})
-    with pytest.raises(HumanFileError, match="damaged"):
+    with pytest.raises(HumanNpzError, match="damaged"):
         read_human(tmp_path / "human.npz")

@@ -18,10 +18,10 @@ from tiny_packages import BACKEND, own_index, served, until, with_this_pip, writ
 import blender_primdiffusion
 import build_addon
 from blender_primdiffusion import places
-from blender_primdiffusion.ui.setup import drawing, known, operators, preferences
-from blender_primdiffusion.ui.setup.session import session
-from blender_primdiffusion.worker import setup
-from blender_primdiffusion.worker.environment import VARIABLE
+from blender_primdiffusion.backend import setup
+from blender_primdiffusion.backend.environment import VARIABLE
+from blender_primdiffusion.ui.setup import known, operators, preferences
+from blender_primdiffusion.ui.setup.operators import session
 
 pytestmark = pytest.mark.any_blender
 
@@ -36,7 +36,7 @@ def wheels(empty_scene, tmp_path, monkeypatch) -> Path:
     monkeypatch.delenv(VARIABLE, raising=False)
     own_index(monkeypatch)
     with_this_pip(monkeypatch, setup)
-    monkeypatch.setattr("blender_primdiffusion.worker.setup.short_root", lambda *_: tmp_path / "eigener ordner")
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.short_root", lambda *_: tmp_path / "eigener ordner")
     monkeypatch.setattr(places, "backend_module_path", lambda: BACKEND)
     monkeypatch.setattr("blender_primdiffusion.ui.setup.operators.backend_module_path", lambda: BACKEND)
     monkeypatch.setattr(known, "_has_torch", lambda: False)
@@ -100,7 +100,7 @@ def draw_preferences() -> Layout:
 
 def test_from_no_backend_to_a_backend_and_back(wheels):
     layout = Layout()
-    assert not drawing.draw_set_up(layout)
+    assert not preferences.draw_set_up(layout)
     assert "The backend is not set up yet" in layout.said
     assert "Downloads" in layout.said
     assert "primdiffusion.set_up_backend" in layout.buttons
@@ -109,7 +109,7 @@ def test_from_no_backend_to_a_backend_and_back(wheels):
     assert known.known().state == "ready"
     assert session.notice.startswith("The backend is ready: torch 0-tiny")
     layout = Layout()
-    assert drawing.draw_set_up(layout)
+    assert preferences.draw_set_up(layout)
     assert not layout.texts
     said = draw_preferences()
     assert "Ready: torch 0-tiny" in said.said
@@ -133,11 +133,11 @@ def test_set_up_backend_downloads_when_blender_may_use_the_network(online, monke
     assert list(places.set_up_folder().environment.rglob("tiny.py"))
 
 
-def test_without_online_access_set_up_is_refused_and_says_how_to_allow_it(wheels):
+def test_without_online_access_set_up_is_rejected_and_says_how_to_allow_it(wheels):
     with pytest.raises(RuntimeError, match=r"Preferences > System > Network > Allow Online Access"):
         press.set_up_backend()
     layout = Layout()
-    drawing.draw_set_up(layout)
+    preferences.draw_set_up(layout)
     assert "Allow Online Access" in layout.said
     assert not places.set_up_folder().root.exists()
 
@@ -146,14 +146,14 @@ def test_a_failure_raises_and_stays_in_the_panel(online):
     with pytest.raises(RuntimeError, match="The package index cannot be reached"):
         press.set_up_backend()
     layout = Layout()
-    drawing.draw_set_up(layout)
+    preferences.draw_set_up(layout)
     assert "cannot be reached" in layout.said
     assert "Half installed" in layout.said
     assert "wm.path_open" in draw_preferences().buttons
 
 
 @pytest.mark.parametrize("folder", ["", "/no/such/folder"])
-def test_a_folder_that_is_none_is_refused(wheels, folder):
+def test_a_folder_that_is_none_is_rejected(wheels, folder):
     with pytest.raises(RuntimeError, match="is no folder: choose the one that holds the wheels"):
         press.install_from_folder(directory=folder)
 
@@ -181,7 +181,7 @@ def test_an_environment_of_other_packages_than_todays_says_so(wheels, monkeypatc
     assert known.known().state == "outdated"  # still there, and it works
 
 
-def test_nothing_to_remove_test_or_cancel_is_refused(wheels):
+def test_nothing_to_remove_test_or_cancel_is_rejected(wheels):
     with pytest.raises(RuntimeError, match="There is no backend to remove"):
         press.remove_backend()
     with pytest.raises(RuntimeError, match="not set up yet: press Set Up Backend first"):
@@ -190,13 +190,13 @@ def test_nothing_to_remove_test_or_cancel_is_refused(wheels):
         press.cancel_set_up()
 
 
-def test_while_one_is_under_way_a_second_is_refused_and_cancel_ends_it(online, tmp_path, monkeypatch):
+def test_while_one_is_under_way_a_second_is_rejected_and_cancel_ends_it(online, tmp_path, monkeypatch):
     with served(online, stalls="torch") as (index, handler):
         own_index(monkeypatch, index)
         session.start(operators.installing())
         until(lambda: session.tick() is None or any(path.startswith("/torch-") for path in handler.asked))
         layout = Layout()
-        assert not drawing.draw_set_up(layout)
+        assert not preferences.draw_set_up(layout)
         assert layout.buttons == ["primdiffusion.cancel_set_up"]
         with pytest.raises(RuntimeError, match="being set up already"):
             press.repair_backend()
@@ -213,16 +213,16 @@ def test_an_existing_python_goes_first_and_is_tried(wheels, monkeypatch):
         press.test_backend()
 
 
-def test_a_machine_without_packages_is_told_what_to_do(online, monkeypatch):
+def test_a_machine_without_packages_gets_an_error_with_a_remedy(online, monkeypatch):
     monkeypatch.setattr(known, "available", dict)
     with pytest.raises(RuntimeError, match="make an environment by hand and name its Python"):
         press.set_up_backend()
     layout = Layout()
-    drawing.draw_set_up(layout)
+    preferences.draw_set_up(layout)
     assert "There are no packages for" in layout.said
 
 
-def test_set_up_is_refused_while_a_person_is_made(online, monkeypatch):
+def test_set_up_is_rejected_while_a_person_is_made(online, monkeypatch):
     from blender_primdiffusion.jobs.queue import Queue
 
     monkeypatch.setattr(Queue, "busy", property(lambda self: True))
@@ -255,7 +255,7 @@ def test_the_zip_holds_the_locks_and_asks_for_the_network():
     assert len(reason[1]) <= 64
 
 
-def test_registration_imports_nothing_that_sets_up():
+def test_registration_imports_no_heavy_modules():
     program = (
         "import sys, bpy; before = set(sys.modules); import blender_primdiffusion as addon; addon.register(); "
         "new = set(sys.modules) - before; addon.unregister(); print(*sorted(new))"
@@ -267,5 +267,3 @@ def test_registration_imports_nothing_that_sets_up():
     assert "blender_primdiffusion.ui.setup.operators" in loaded, done.stderr
     heavy = {"torch", "scipy", "numba", "ssl", "http.client", "urllib.request", "email", "asyncio", "multiprocessing"}
     assert not heavy & loaded
-    ours = {name for name in loaded if name.startswith("blender_primdiffusion.worker.setup")}
-    assert not ours

@@ -11,11 +11,9 @@ import synthetic_shape
 from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.build import attach_volumes, build_human
 from blender_primdiffusion.scene.collect import collect_before_saving, unused
-from blender_primdiffusion.scene.files import folder_of
-from blender_primdiffusion.scene.human import humans, remove_human
-from blender_primdiffusion.scene.human_npz import HumanFileError, read_human
-from blender_primdiffusion.scene.shape import read_body_file, shape_model_of
-from blender_primdiffusion.scene.shape_model import FIELDS
+from blender_primdiffusion.scene.human import folder_of, humans, remove_human
+from blender_primdiffusion.scene.human_npz import HumanNpzError, read_human
+from blender_primdiffusion.scene.shape import FIELDS, read_body_file, shape_model_of
 
 SPOILED = {
     "'shape_basis'.*instead of numbers of shape": {"shape_basis": np.zeros((7, 3, 10))},
@@ -48,14 +46,14 @@ def test_the_shape_model_gives_the_persons_own_surface_joints_and_frames(tmp_pat
 @pytest.mark.parametrize("sentence", SPOILED)
 def test_a_spoiled_field_is_named_in_one_sentence(tmp_path, sentence):
     path = synthetic_shape.write(tmp_path / "human.npz", **SPOILED[sentence])
-    with pytest.raises(HumanFileError, match=sentence) as caught:
+    with pytest.raises(HumanNpzError, match=sentence) as caught:
         read_human(path)
     assert "\n" not in str(caught.value)
     assert ";" in str(caught.value)
 
 
-def test_a_file_of_version_2_without_its_fields_is_refused(tmp_path):
-    with pytest.raises(HumanFileError, match="no field 'template'"):
+def test_a_file_of_version_2_without_its_fields_is_rejected(tmp_path):
+    with pytest.raises(HumanNpzError, match="no field 'template'"):
         read_human(synthetic.write(tmp_path / "human.npz", 4, format_version=np.array(2)))
 
 
@@ -74,7 +72,7 @@ def test_people_on_one_body_share_its_file_and_nothing_else_is_left_beside_them(
     ]  # fmt: skip
 
 
-def test_a_person_of_an_earlier_version_is_told_to_be_generated_again(saved_scene, tmp_path):
+def test_a_human_of_an_earlier_version_has_to_be_generated_again(saved_scene, tmp_path):
     person = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 8))
     with pytest.raises(ValueError, match=r"'Human' was made by an earlier version"):
         shape_model_of(person)
@@ -106,7 +104,7 @@ def test_a_failure_while_building_leaves_no_file(saved_scene, tmp_path, monkeypa
     assert not (tmp_path / "shot_humans").exists()
 
 
-def test_the_file_is_unused_only_when_nobody_stands_on_that_body(person):
+def test_the_file_is_unused_only_when_no_human_has_that_body(person):
     assert unused(folder_of(person).parent) == []
     path = body_file(person)
     remove_human(person)

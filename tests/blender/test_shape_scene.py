@@ -12,13 +12,12 @@ import synthetic_shape
 from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices
 from scene_stage import replace
 
-from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.duplicate import rename_human
 from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of, humans
-from blender_primdiffusion.scene.keyframes import keyframe_poses
 from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, has_custom_shape
 from blender_primdiffusion.scene.surface import build_surface
@@ -173,7 +172,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("sentence", REFUSED)
-def test_what_cannot_be_reshaped_is_refused_untouched(person, saved_scene, sentence):
+def test_what_cannot_be_reshaped_is_rejected_untouched(person, saved_scene, sentence):
     change, betas = REFUSED[sentence]
     change(saved_scene, person)
     before = list(armature_of(person)[BETAS])
@@ -184,7 +183,7 @@ def test_what_cannot_be_reshaped_is_refused_untouched(person, saved_scene, sente
         bpy.ops.object.mode_set(mode="OBJECT")
 
 
-def test_a_linked_person_is_refused_with_what_to_do(person, tmp_path):
+def test_a_linked_person_is_rejected_with_what_to_do(person, tmp_path):
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.read_homefile(use_empty=True)
     with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True) as (_, wanted):
@@ -236,7 +235,7 @@ def test_a_shape_of_ones_own_outlives_an_edit_that_changes_the_shape(person, tmp
     assert not has_custom_shape(person)
 
 
-def test_a_shape_nobody_has_chosen_follows_the_edit(person, tmp_path):
+def test_a_shape_that_was_not_chosen_follows_the_edit(person, tmp_path):
     assert replace(person, *edited_file(tmp_path, SHAPE)).reshaped
     np.testing.assert_allclose(betas_of(person), SHAPE)
     np.testing.assert_allclose(heads(person), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)

@@ -20,7 +20,7 @@ from primdiffusion.primitives.primitives import K, Payload
 from primdiffusion.reshaping import box_growth
 
 from blender_primdiffusion.scene.human_npz import read_human
-from blender_primdiffusion.scene.shape_model import betas_of_measures, measure, slider_names
+from blender_primdiffusion.scene.shape import betas_of_measures, measure, slider_names
 
 pytestmark = pytest.mark.any_blender
 
@@ -90,7 +90,7 @@ def test_bodies_of_given_measures_are_the_backends(model, height, weight):
     assert weight is None or measured.weight == pytest.approx(weight, abs=1e-2)
 
 
-def test_measures_nobody_has_are_refused_with_them(model):
+def test_impossible_measures_are_rejected_and_named(model):
     with pytest.raises(ValueError, match=r"a height of 3\.00 m with a weight of 40 kg.*more usual"):
         betas_of_measures(model, np.zeros(10), 3.0, 40.0)
 

@@ -38,7 +38,7 @@ def composed() -> set[str]:
     facts |= {"Volumes", "Files", "Memory once drawn"} | {name.capitalize() for name in _SHOWN}
     menus = {item[1] for name in CATEGORIES for item in menu(name)} | set(LIBRARY)
     buttons = {remedy.label for remedy in _REMEDIES.values()}
-    menus |= {"Whatever comes", "A pose of your own", "A built-in pose"}
+    menus |= {"No preference", "A pose of your own", "A built-in pose"}
     return (
         sliders
         | facts

@@ -12,8 +12,7 @@ from jobs_driven import drive, error_of, shown, until_running
 from blender_primdiffusion.jobs.pictures import icons
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.jobs.variations import VariationsJob, sheet
-from blender_primdiffusion.scene.files import person_file
-from blender_primdiffusion.scene.human import armature_of, humans
+from blender_primdiffusion.scene.human import armature_of, humans, person_file
 from blender_primdiffusion.ui import variations_operators, variations_panel
 
 FAILS, TAKES_LONG = 2, 4
@@ -99,7 +98,7 @@ def test_whom_files_are_missing_of_is_not_built_and_those_before_stay(addon, sho
     assert len(humans(addon.scene)) == 1
 
 
-def test_nothing_selected_a_wrong_number_and_no_sheet_are_refused(addon):
+def test_nothing_selected_a_wrong_number_and_no_sheet_are_rejected(addon):
     for operator in (ops.build_variation, ops.more_like_variation, ops.use_variation_seed, ops.clear_variations):
         assert not operator.poll()
     assert not ops.select_variation.poll()

@@ -10,8 +10,8 @@ import pytest
 import synthetic
 
 from blender_primdiffusion.scene import volumes
-from blender_primdiffusion.scene.files import VolumeWriteError
-from blender_primdiffusion.scene.overlap import max_overlap
+from blender_primdiffusion.scene.cycles import max_overlap
+from blender_primdiffusion.scene.human import VolumeWriteError
 from blender_primdiffusion.scene.volumes import FAINTEST, bake, file_name, index_to_local, staged, window
 
 bpy.utils.expose_bundled_modules()

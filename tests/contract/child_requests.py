@@ -6,9 +6,8 @@ import sys
 from collections.abc import Generator
 from pathlib import Path
 
-from worker.backend import Backend
-from worker.client import BackendClient
-from worker.request import Request
+from backend.client import BackendClient
+from backend.requests import Backend, Request
 
 _PICTURE_PX = 16
 

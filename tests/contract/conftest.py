@@ -1,4 +1,4 @@
-"""The real child and the real client, without Blender: the extension's worker package is loaded by itself."""
+"""The real child and the real client, without Blender: the extension's package `backend` is loaded by itself."""
 
 import sys
 from pathlib import Path

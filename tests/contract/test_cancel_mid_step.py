@@ -7,8 +7,8 @@ import sys
 import time
 
 import pytest
+from backend.requests import Request
 from child_requests import generate_request, this_pythons_backend
-from worker.request import Request
 
 TICK_S = 0.1
 """Of Blender's timer."""

@@ -7,12 +7,11 @@ import time
 from pathlib import Path
 
 import pytest
+from backend.client import BackendClient
+from backend.environment import BackendNotFound
+from backend.requests import Backend, Request
 from child_requests import generate_request, this_pythons_backend
 from conversation import BUSY_STEPS
-from worker.backend import Backend
-from worker.client import BackendClient
-from worker.environment import BackendNotFound
-from worker.request import Request
 
 PYTHON = Path(sys.executable)
 

@@ -9,18 +9,18 @@ import time
 from pathlib import Path
 
 import pytest
-from conversation import BUSY_STEPS
-from worker.child_streams import LONGEST_LINE
-from worker.client import (
+from backend.child_streams import LONGEST_LINE
+from backend.client import (
     BackendClient,
     Died,
-    Failure,
+    ErrorResponse,
     Notification,
     Response,
     Silent,
     child_environment,
     death_sentence,
 )
+from conversation import BUSY_STEPS
 
 PYTHON = Path(sys.executable)
 
@@ -119,7 +119,7 @@ def test_a_cancel_fails_the_request_with_its_code(client, checkpoint, tmp_path):
     id = client.request("generate", params)
     wait_for(client, sampling)
     client.cancel(id)
-    failure = wait_for(client, lambda e: isinstance(e, Failure))
+    failure = wait_for(client, lambda e: isinstance(e, ErrorResponse))
     assert (failure.id, failure.code) == (id, -32001)
     assert not out.exists()
 
@@ -210,7 +210,7 @@ def test_polling_a_child_that_reads_nothing_never_waits(fake_child):
 
 
 def test_a_poll_ends_when_its_time_is_over_and_a_flood_loses_no_message(fake_child, monkeypatch):
-    monkeypatch.setattr("worker.client.POLL_S", 0.0)
+    monkeypatch.setattr("backend.client.POLL_S", 0.0)
     count = 20_000
     client = fake_child(f"""
         for i in range({count}):

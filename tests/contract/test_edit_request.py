@@ -4,10 +4,10 @@ import time
 from pathlib import Path
 
 import pytest
+from backend.requests import Request
 from child_requests import edit_request, generate_request, this_pythons_backend
 from conversation import BUSY_STEPS
 from primdiffusion.human_file import load_human
-from worker.request import Request
 
 PART = {"region": ["hair"], "seed": 2}
 PARAMS = {

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from worker.environment import (
+from backend.environment import (
     MARK,
     TRIAL,
     VARIABLE,
@@ -16,7 +16,7 @@ from worker.environment import (
     python_of_environment,
     search,
 )
-from worker.polling import run_to_end
+from backend.requests import run_to_end
 
 PYTHON = Path(sys.executable)
 

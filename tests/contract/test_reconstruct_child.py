@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from backend.requests import Request
 from capture_scenes import captured
 from child_requests import reconstruct_request, this_pythons_backend
 from conversation import Conversation
 from tiny_encoder import save_tiny_encoder
-from worker.request import Request
 
 CANCELLED, DOMAIN_ERROR, INVALID_PARAMS = -32001, -32002, -32602
 FIRST = "person_000000"

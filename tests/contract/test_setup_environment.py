@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 import psutil
 import pytest
+from backend.environment import MARK, VARIABLE, SetUpFolder, candidates
+from backend.packages import SetUpFailed, read_lock
+from backend.requests import run_to_end
+from backend.setup import Steps, state_of
 from tiny_packages import BACKEND, own_index, served, until, with_this_pip, write_lock, write_packages, write_wheel
-from worker import setup
-from worker.environment import MARK, VARIABLE, candidates
-from worker.polling import run_to_end
-from worker.setup import SetUpFolder, Steps, state_of
-from worker.setup_packages import read_lock
-from worker.setup_pip import SetUpFailed
+
+from backend import setup
 
 
 class Place(NamedTuple):

@@ -1,19 +1,47 @@
-"""People and pictures without a window: `blender -c primdiffusion ...`."""
+"""The extension's command line: `blender -c primdiffusion ...`, `python -m blender_primdiffusion ...`."""
 
 from __future__ import annotations
 
-from . import command
+import sys
+from collections.abc import Sequence
 
-_commands: list[object] = []
-"""Of Blender's command line, while they are known to it."""
+import bpy
+
+from ...console import DONE, UNUSABLE
+
+COMMAND = "primdiffusion"
+_HELP = """\
+blender -c primdiffusion generate --count 50 --seed 7 --out PEOPLE     humans in folders
+blender -c primdiffusion render PEOPLE --out PICTURES                  pictures of them, or of a .blend
+blender -c primdiffusion capture --people SCANS --out CAPTURES         captures from all sides, to train on
+Each has more options: see --help.
+Exit codes: 0 all done, 1 some failed, 2 usage error, 3 no Python runs the backend, 130 stopped by Ctrl-C."""
+_handles: list[object] = []
+"""Of the command, while it is registered."""
+
+
+def execute(argv: Sequence[str]) -> int:
+    """Run a command; returns its exit code."""
+    command, words = argv[:1], list(argv[1:])
+    if command == ["generate"]:
+        from .generate import main  # needs numpy
+    elif command == ["render"]:
+        from .render import main  # needs numpy
+    elif command == ["capture"]:
+        from ...capture.command import main  # needs numpy
+    else:
+        asked = command in (["--help"], ["-h"])
+        print(_HELP, file=sys.stdout if asked else sys.stderr, flush=True)
+        return DONE if asked else UNUSABLE
+    return main(words)
 
 
 def register() -> None:
-    """Make the command known to Blender."""
-    _commands.append(command.register())
+    """Register the command with Blender."""
+    _handles.append(bpy.utils.register_cli_command(COMMAND, execute))
 
 
 def unregister() -> None:
     """Undo `register`."""
-    while _commands:
-        command.unregister(_commands.pop())
+    while _handles:
+        bpy.utils.unregister_cli_command(_handles.pop())

@@ -12,20 +12,19 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from ...backend.requests import Backend, Request
 from ...capture.report import Report
 from ...console import Stop, duration
 from ...places import preference
-from ...worker.backend import Backend
-from ...worker.request import Request
 from ..attributes import Attributes, parsed
-from .asking import NoBackend, Stopped, ask, backend_of
 from .people import NPZ_FILE, PERSON_FILE, Movement, motion_name, movement_of, person_blend
-from .running import Clock, Say, begun, publish, reason, run, staging
+from .running import Clock, NoBackend, Say, Stopped, ask, backend_of, begun, publish, reason, run, staging
 from .words import parse_generate
 
 SETTINGS = "settings.json"
-"""How the people of a folder were made."""
-_TOLD_S = 2.0
+"""The settings of a folder's humans."""
+_PRINT_S = 2.0
+"""Between lines of progress."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -53,12 +52,12 @@ def _generate(options: argparse.Namespace, say: Say, stop: Stop) -> Report:
 
 
 def person_name(seed: int) -> str:
-    """The folder of a seed's person."""
+    """Name of the folder for a seed."""
     return f"person_{seed:06d}"
 
 
 def _params(options: argparse.Namespace, attributes: Attributes) -> dict[str, object]:
-    """Of the child's method, those that are everybody's."""
+    """Parameters of the child's method that all humans share."""
     checkpoint = options.checkpoint.resolve() if options.checkpoint is not None else preference("checkpoint")
     return {
         "steps": options.steps,
@@ -81,22 +80,22 @@ class _Person:
         self.say, self.which = say, which
         self._folder: Path = options.out / self.name
         self._blend, self._params, self._movement, self._stop = options.blend, params, movement, stop
-        self._told = 0.0
+        self._printed = 0.0
 
     def make(self, backend: Backend) -> None:
-        """Their folder, or the .blend that is missing in it. Raises what `ask` does, ValueError and OSError."""
+        """Write the folder, or the .blend that is missing in it. Raises as `ask`, and ValueError and OSError."""
         with staging(self._folder) as made:
             source = self._folder
             if not (source / PERSON_FILE).is_file():
-                ask(backend, "generate", {**self._params, "out_dir": str(made)}, self._stop, self._tell)
+                ask(backend, "generate", {**self._params, "out_dir": str(made)}, self._stop, self._print_progress)
                 source = made
             if self._blend is not None:
                 person_blend(source / NPZ_FILE, source / PERSON_FILE, made / self._blend, self.name, self._movement)
             publish(made, self._folder, last=self._blend or PERSON_FILE)
 
-    def _tell(self, job: Request) -> None:
-        if not job.finished and time.monotonic() - self._told > _TOLD_S:
-            self._told = time.monotonic()
+    def _print_progress(self, job: Request) -> None:
+        if not job.finished and time.monotonic() - self._printed > _PRINT_S:
+            self._printed = time.monotonic()
             left = f" ({duration(job.eta_s)} left)" if job.eta_s else ""
             self.say(f"{self.which} {self.name}: {job.message}{left}")
 
@@ -106,9 +105,9 @@ def _try(person: _Person, backend: Backend, report: Report, clock: Clock) -> Non
         person.make(backend)
     except (NoBackend, Stopped):
         raise
-    except Exception as error:  # a batch of a night must not end for one person, whatever is wrong with it
+    except Exception as error:  # one human must not end the batch of a night
         report.fail(person.name, "generate", reason(error))
         person.say(f"{person.which} {person.name} failed: {reason(error)}{clock.piece_made()}")
     else:
         report.done.append(person.name)
-        person.say(f"{person.which} {person.name} is there{clock.piece_made()}")
+        person.say(f"{person.which} {person.name} done{clock.piece_made()}")

@@ -1,4 +1,4 @@
-"""People in Blender without a window: a file of their own, moved, with a camera that sees them."""
+"""Humans in background mode: built in a file, posed or moved, in front of a camera."""
 
 from __future__ import annotations
 
@@ -13,22 +13,21 @@ import numpy as np
 from ...engine.engine import ENGINE
 from ...motion.files import read_motion
 from ...motion.motion import Motion
-from ...scene.armature import pose_from_joint_rotations
+from ...scene.armature import keyframe_poses, pose_from_joint_rotations
 from ...scene.build import build_human
-from ...scene.files import PERSON_FILE as PERSON_FILE
+from ...scene.cycles import frame_box, framing_distance, humans_extent, setup_cycles_preview
+from ...scene.human import PERSON_FILE as PERSON_FILE
 from ...scene.human import armature_of, humans
-from ...scene.keyframes import keyframe_poses
-from ...scene.preview import frame_box, framing_distance, humans_extent, setup_cycles_preview
 
 NPZ_FILE = "human.npz"
 """The person for Blender, beside `PERSON_FILE`."""
-_LOOKED_AT = 24
-"""Frames of a motion by which the camera finds its distance."""
+_SAMPLED = 24
+"""Frames of a motion that determine the distance of the camera."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Movement:
-    """What everybody does: a pose of one frame, or a motion."""
+    """What all humans do: a pose of one frame, or a motion."""
 
     motion: Motion
     still: bool
@@ -59,26 +58,26 @@ def motion_name(options: argparse.Namespace) -> str | None:
 
 
 def person_blend(npz: Path, person: Path, blend: Path, name: str, movement: Movement | None) -> None:
-    """Save a .blend that holds one person, ready to be rendered. The open file makes way for it.
+    """Save a .blend with one human, ready to render. Replaces the open file.
 
-    Raises HumanFileError, VolumeWriteError, OSError.
+    Raises HumanNpzError, VolumeWriteError, OSError.
     """
     new_file()
     _save(blend)  # where the volumes go
     build_person(bpy.context, npz, person, name, movement)
     _save(blend)
-    blend.with_name(f"{blend.name}1").unlink(missing_ok=True)  # Blender's copy of what was there before
+    blend.with_name(f"{blend.name}1").unlink(missing_ok=True)  # Blender's backup
 
 
 def new_file() -> None:
-    """An empty file with nothing unsaved in it; preferences and add-ons stay."""
+    """Open an empty file; preferences and add-ons stay."""
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
 
 
 def build_person(
     context: bpy.types.Context, npz: Path, person: Path, name: str, movement: Movement | None
 ) -> bpy.types.Collection:
-    """The person of two files in the open file, moved, before a camera and in front of nothing."""
+    """Build the human of two files in the open file, moved, with a camera and a transparent background."""
     collection = build_human(context, npz, name, [person])
     if movement is not None:
         movement.apply(context, collection)
@@ -90,11 +89,11 @@ def build_person(
 
 
 def moving_extent(scene: bpy.types.Scene) -> tuple[np.ndarray, np.ndarray]:
-    """The corners of the box that everybody stays in from the scene's first frame to its last, as far as looked at."""
+    """Corners of the box that contains all humans over the scene's frames, of which some are sampled."""
     if not any(armature_of(person).animation_data for person in humans(scene)):
         return humans_extent(scene)
     before, lows, highs = scene.frame_current, [], []
-    for frame in np.unique(np.linspace(scene.frame_start, scene.frame_end, _LOOKED_AT).round().astype(int)):
+    for frame in np.unique(np.linspace(scene.frame_start, scene.frame_end, _SAMPLED).round().astype(int)):
         scene.frame_set(int(frame))
         low, high = humans_extent(scene)
         lows.append(low)
@@ -104,7 +103,7 @@ def moving_extent(scene: bpy.types.Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def look_from(scene: bpy.types.Scene, degrees: float, extent: tuple[np.ndarray, np.ndarray]) -> None:
-    """Turn the scene's camera to people's left of the front by so much, as near as shows them all."""
+    """Move the scene's camera to `degrees` from the front towards the humans' left, as near as shows all of them."""
     frame_box(scene.camera, extent, math.radians(degrees), _size(scene))
 
 

@@ -17,16 +17,14 @@ from pathlib import Path
 
 import bpy
 
+from ...backend.requests import Backend
 from ...capture.report import Report
 from ...console import Stop
 from ...engine import studio
 from ...engine.engine import ENGINE
 from ...formats.capture_layout import replacing
-from ...scene.files import PERSON_FILE, humans_folder, volume_path
-from ...scene.human import humans
-from ...scene.preview import fit_cycles_to_volumes, new_camera
-from ...worker.backend import Backend
-from .asking import NoBackend, Stopped, ask, backend_of, check_backend, everywhere
+from ...scene.cycles import fit_cycles_to_volumes, new_camera
+from ...scene.human import PERSON_FILE, humans, humans_folder, volume_path
 from .people import (
     NPZ_FILE,
     Movement,
@@ -38,15 +36,27 @@ from .people import (
     moving_extent,
     new_file,
 )
-from .running import Clock, Say, begun, reason, run
+from .running import (
+    Clock,
+    NoBackend,
+    Say,
+    Stopped,
+    ask,
+    backend_of,
+    begun,
+    check_backend,
+    python_for_engine,
+    reason,
+    run,
+)
 from .words import ENGINES, parse_render
 
 PERSON_ENDINGS = (".human.safetensors", ".human")
 
 
 @dataclasses.dataclass(frozen=True)
-class Source:
-    """One of them."""
+class RenderSource:
+    """A .blend or a human's file."""
 
     name: str
     """Of the pictures."""
@@ -63,7 +73,7 @@ class Source:
         return self.path.name == PERSON_FILE
 
 
-def sources(path: Path) -> list[Source]:
+def sources(path: Path) -> list[RenderSource]:
     """All human files that `path` names, sorted by name. Raises ValueError if there are none."""
     path = path.resolve()
     if path.is_dir():
@@ -72,23 +82,23 @@ def sources(path: Path) -> list[Source]:
             raise ValueError(f"{path} contains no people: name a folder that `generate` wrote, or of .human files")
         return found
     if path.suffix == ".blend":
-        return [Source(path.stem, path)]
+        return [RenderSource(path.stem, path)]
     if path.name.endswith(PERSON_ENDINGS):
-        return [Source(path.parent.name if path.name == PERSON_FILE else _stem(path), path)]
+        return [RenderSource(path.parent.name if path.name == PERSON_FILE else _stem(path), path)]
     raise ValueError(f"{path} is neither a .blend nor a person (.human, .human.safetensors): name one of these")
 
 
-def _in_folder(folder: Path) -> Iterator[Source]:
+def _in_folder(folder: Path) -> Iterator[RenderSource]:
     if (folder / PERSON_FILE).is_file():
-        yield Source(folder.name, folder / PERSON_FILE)
+        yield RenderSource(folder.name, folder / PERSON_FILE)
         return
     for path in folder.iterdir():
         if path.name.startswith("."):
             continue
         if (path / PERSON_FILE).is_file():
-            yield Source(path.name, path / PERSON_FILE)
+            yield RenderSource(path.name, path / PERSON_FILE)
         elif path.is_file() and path.name.endswith(PERSON_ENDINGS):
-            yield Source(_stem(path), path)
+            yield RenderSource(_stem(path), path)
 
 
 def _stem(path: Path) -> str:
@@ -97,7 +107,7 @@ def _stem(path: Path) -> str:
 
 
 SETTINGS = "pictures.json"
-"""How the pictures of a folder were drawn."""
+"""The settings of a folder's pictures."""
 _PICTURE = (512, 512)
 _SAMPLES = 4
 
@@ -118,44 +128,44 @@ class _Shot:
 
 
 def _render(options: argparse.Namespace, say: Say, stop: Stop) -> Report:
-    movement, everybody = movement_of(options), sources(options.source)
+    movement, found = movement_of(options), sources(options.source)
     names = ("engine", "size", "frames", "yaw", "turntable", "transparent", "samples")
     drawn = {name: getattr(options, name) for name in names}
-    report, clock = Report(), Clock(len(everybody))
+    report, clock = Report(), Clock(len(found))
     settings = {**drawn, "motion": motion_name(options)}
     with (
         begun(report, options.out / SETTINGS, settings, options.resume),
         contextlib.closing(studio),
-        everywhere(options.python),
+        python_for_engine(options.python),
         backend_of(options.python) as backend,
     ):
         drawing = _Drawing(options, movement, backend, stop, say)
-        for source in everybody:
+        for source in found:
             if stop.is_set():
                 raise Stopped
             _try(drawing, source, report, clock)
     return report
 
 
-def _try(drawing: _Drawing, source: Source, report: Report, clock: Clock) -> None:
+def _try(drawing: _Drawing, source: RenderSource, report: Report, clock: Clock) -> None:
     try:
         count = drawing.draw(source)
     except (NoBackend, Stopped):
         raise
-    except Exception as error:  # a batch of a night must not end for one person, whatever is wrong with it
+    except Exception as error:  # one human must not end the batch of a night
         report.fail(source.name, "render", reason(error))
         drawing.say(f"{source.name} failed: {reason(error)}{clock.piece_made()}")
         return
     if count:
         report.done.append(source.name)
-        drawing.say(f"{source.name} is there{clock.piece_made()}")
+        drawing.say(f"{source.name} done{clock.piece_made()}")
     else:
         report.skipped.append(source.name)
         clock.piece_skipped()
 
 
 class _Drawing:
-    """Draws one after the other as the options say."""
+    """Renders sources one after the other."""
 
     def __init__(
         self,
@@ -169,8 +179,7 @@ class _Drawing:
         self._options, self._movement, self._backend, self._stop = options, movement, backend, stop
         self._checked = False
 
-    def draw(self, source: Source) -> int:
-        """The pictures of somebody that are not there yet; how many these were."""
+    def draw(self, source: RenderSource) -> int:
         if source.is_blend:
             bpy.ops.wm.open_mainfile(filepath=str(source.path), load_ui=False, use_scripts=False)
             self._prepare_blend()
@@ -223,7 +232,7 @@ class _Drawing:
             scene.camera = new_camera(scene)
             look_from(scene, self._options.yaw or 0.0, moving_extent(scene))
 
-    def _build(self, source: Source) -> None:
+    def _build(self, source: RenderSource) -> None:
         """The person of a file, in an empty .blend; the volumes lie in a temporary folder."""
         new_file()
         shutil.rmtree(humans_folder(""), ignore_errors=True)
@@ -250,7 +259,7 @@ class _Drawing:
         if render.engine == "CYCLES":
             if options.engine or options.samples:
                 fit_cycles_to_volumes(scene, options.samples or _SAMPLES)
-            _refuse_missing_volumes(scene)
+            _check_volumes(scene)
         elif render.engine == ENGINE and not self._checked:
             check_backend(options.python)
             self._checked = True
@@ -261,8 +270,8 @@ class _Drawing:
         render.use_file_extension = False
 
 
-def _refuse_missing_volumes(scene: bpy.types.Scene) -> None:
-    volumes = {thing.data for person in humans(scene) for thing in person.all_objects if thing.type == "VOLUME"}
+def _check_volumes(scene: bpy.types.Scene) -> None:
+    volumes = {obj.data for person in humans(scene) for obj in person.all_objects if obj.type == "VOLUME"}
     missing = [path for path in (volume_path(volume) for volume in volumes if volume.filepath) if not path.is_file()]
     if missing:
         raise FileNotFoundError(

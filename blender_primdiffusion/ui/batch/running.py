@@ -1,4 +1,4 @@
-"""What commands have in common: options, lines on stdout, files written whole, report, exit codes."""
+"""What the commands share: requests to the child, lines on stdout, files written whole, the report, exit codes."""
 
 from __future__ import annotations
 
@@ -13,6 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import bpy
+
+from ...backend.environment import VARIABLE
+from ...backend.requests import Backend, Request
 from ...capture.report import Report, report_path
 from ...console import (
     CANCELLED,
@@ -21,18 +25,98 @@ from ...console import (
     NO_BACKEND,
     UNUSABLE,
     Stop,
+    UsageError,
     duration,
-    stdout_of_our_own,
+    separate_stdout,
     stopped_by_signals,
 )
 from ...formats.capture_layout import replacing
-from .asking import NoBackend, Stopped
-from .words import UsageError
+from ...places import EXTENSION, new_backend, preference
+
+_TICK_S = 0.03
+
+
+class NoBackend(RuntimeError):
+    """No Python runs the backend; the message names those that were tried."""
+
+
+class ChildFailed(RuntimeError):
+    """The child could not do what it was asked for; the message is for the user."""
+
+
+class Stopped(Exception):
+    """The command was asked to stop."""
+
+
+@contextmanager
+def backend_of(python: Path | None) -> Iterator[Backend]:
+    """A child on this Python, or the preferences'; started at first use, ended with the block."""
+    backend = new_backend(str(python) if python is not None else preference("backend_python"))
+    try:
+        yield backend
+    finally:
+        backend.shutdown()
+
+
+@contextmanager
+def python_for_engine(python: Path | None) -> Iterator[None]:
+    """Use this Python for the render engine too, which reads the preferences and the environment."""
+    if python is None:
+        yield
+        return
+    addon = bpy.context.preferences.addons.get(EXTENSION)
+    before, variable = (addon.preferences.backend_python if addon else ""), os.environ.get(VARIABLE)
+    os.environ[VARIABLE] = str(python)
+    if addon is not None:
+        addon.preferences.backend_python = str(python)
+    try:
+        yield
+    finally:
+        if addon is not None:
+            addon.preferences.backend_python = before
+        if variable is None:
+            del os.environ[VARIABLE]
+        else:
+            os.environ[VARIABLE] = variable
+
+
+def check_backend(python: Path | None) -> None:
+    """Raises NoBackend where no child can be started."""
+    with backend_of(python) as backend:
+        try:
+            backend.connect()
+        except (RuntimeError, OSError) as error:
+            raise NoBackend(str(error)) from error
+
+
+def ask(
+    backend: Backend,
+    method: str,
+    params: Mapping[str, Any],
+    stop: Stop,
+    on_progress: Callable[[Request], None] = lambda _request: None,
+) -> dict[str, Any]:
+    """The child's result; `on_progress` is called with the request whenever it changes.
+
+    Raises NoBackend, ChildFailed, and Stopped once `stop` is set, within a second; then no file is left.
+    """
+    request = Request(backend, method, params)
+    while not request.finished:
+        if stop.is_set():
+            request.cancel()
+        if request.tick():
+            on_progress(request)
+        time.sleep(_TICK_S)
+    if request.state == "cancelled":
+        raise Stopped
+    if request.error is not None:
+        raise (NoBackend if request.error.kind == "environment" else ChildFailed)(str(request.error))
+    return request.result or {}
 
 
 @contextmanager
 def staging(folder: Path) -> Iterator[Path]:
-    """An empty folder beside `folder`, to be published; gone after the block, and first if a killed run left one."""
+    """An empty folder beside `folder`, to be published; removed after the block. A killed run may have left one."""
     made = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(made, ignore_errors=True)
     made.mkdir(parents=True)
@@ -43,7 +127,7 @@ def staging(folder: Path) -> Iterator[Path]:
 
 
 def publish(made: Path, folder: Path, last: str) -> None:
-    """Give what is in `made` to `folder`: at once where that is new, else piece by piece, the file `last` last."""
+    """Move the content of `made` to `folder`: at once if that is new, else piece by piece, `last` last."""
     if not folder.exists():
         os.replace(made, folder)
         return
@@ -57,7 +141,7 @@ def publish(made: Path, folder: Path, last: str) -> None:
 def claim(path: Path, settings: Mapping[str, Any], whatever_is_there: bool) -> None:
     """Write the settings of a batch to the .json at `path`. Raises ValueError where other ones are there, and OSError.
 
-    `whatever_is_there`: the settings are then those of what is still to come.
+    `whatever_is_there`: accept other settings, of what was made before.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -87,9 +171,9 @@ def _unwritable(folder: Path, error: OSError) -> OSError:
 
 
 Say = Callable[[str], None]
-"""Takes a line for people."""
+"""Prints a line."""
 _ALL = (0, 1)
-"""The shard of a batch that is not shared out."""
+"""The shard of a batch that is not divided."""
 
 
 def run(
@@ -105,19 +189,19 @@ def run(
     try:
         options = parse(argv)
     except UsageError as error:
-        return _refused(name, f"{error}; --help names all options", UNUSABLE)
+        return _failed(name, f"{error}; --help names all options", UNUSABLE)
     except SystemExit as asked_for_help:
         return int(asked_for_help.code or DONE)
-    with stdout_of_our_own() as say, stopped_by_signals() as stop:
+    with separate_stdout() as say, stopped_by_signals() as stop:
         try:
             report = work(options, say, stop)
         except Stopped:
             say("Stopped; the same command resumes from here.")
             return CANCELLED
         except NoBackend as error:
-            return _refused(name, str(error), NO_BACKEND)
+            return _failed(name, str(error), NO_BACKEND)
         except (OSError, ValueError) as error:
-            return _refused(name, str(error), UNUSABLE)
+            return _failed(name, str(error), UNUSABLE)
         say(f"{len(report.done)} done, {len(report.skipped)} were there, {len(report.failed)} failed")
         if report.failed:
             say(f"What failed and why: {report_path(options.out, _ALL)}")
@@ -126,10 +210,9 @@ def run(
 
 @contextmanager
 def begun(report: Report, claimed: Path, settings: Mapping[str, Any], whatever_is_there: bool) -> Iterator[None]:
-    """A batch under way: its settings are claimed (see `claim`), its report is written beside them in the end.
+    """A running batch: claims its settings (see `claim`), and writes its report beside them in the end.
 
-    Neither stays where no backend was found for the first of it: another try may have other settings. Raises ValueError
-    and OSError as `claim` does.
+    Neither stays where no backend was found for the first human. Raises ValueError and OSError as `claim` does.
     """
     out, nothing = claimed.parent, False
     is_new, is_new_folder = not claimed.is_file(), not out.exists()
@@ -149,24 +232,24 @@ def begun(report: Report, claimed: Path, settings: Mapping[str, Any], whatever_i
 
 
 def reason(error: Exception) -> str:
-    """What an error says, in a line; with its kind where it was not meant for people."""
-    meant = isinstance(error, (ValueError, OSError, RuntimeError)) and str(error).strip()
-    return " ".join((str(error) if meant else f"{type(error).__name__}: {error}").split()).removeprefix("Error: ")
+    """The message of an error on one line; with its class where it is unexpected."""
+    expected = isinstance(error, (ValueError, OSError, RuntimeError)) and str(error).strip()
+    return " ".join((str(error) if expected else f"{type(error).__name__}: {error}").split()).removeprefix("Error: ")
 
 
-def _refused(name: str, sentence: str, code: int) -> int:
+def _failed(name: str, sentence: str, code: int) -> int:
     print(f"{name}: {sentence}", file=sys.stderr, flush=True)
     return code
 
 
 class Clock:
-    """How long a batch will still take, by what its pieces took so far."""
+    """Estimates how long a batch will take, from its pieces so far."""
 
     def __init__(self, pieces: int):
         self._left, self._made, self._began = pieces, 0, time.monotonic()
 
     def piece_made(self) -> str:
-        """One more is there; the time that is left, in words."""
+        """Count a finished piece; returns the time left as text."""
         self._made += 1
         self._left -= 1
         if not self._left:
@@ -175,5 +258,5 @@ class Clock:
         return f", {duration(self._left * each)} left"
 
     def piece_skipped(self) -> None:
-        """One was there already."""
+        """Count a piece that existed before."""
         self._left -= 1

@@ -1,36 +1,31 @@
-"""The words of the commands `generate` and `render`."""
+"""The options of the commands `generate` and `render`."""
 
 from __future__ import annotations
 
+import argparse
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn
 
+from ...console import UsageError
 from ...formats.requests import GUIDANCE, PICTURE_SIZE, SAMPLERS, STEPS
 
-if TYPE_CHECKING:
-    import argparse  # takes a fifth of what registering may take; imported where it is used
-
 ENGINES = {"primdiffusion": "PRIMDIFFUSION", "cycles": "CYCLES"}
-"""What the command line calls render engines, and what Blender does."""
+"""Names of render engines on the command line -> Blender's."""
 _ENDS = (
     "exit codes: 0 all is done, 1 some failed (report.json says which and why), 2 usage error, 3 no Python runs the "
     "backend, 130 stopped by Ctrl-C; the same command resumes"
 )
 
 
-class UsageError(ValueError):
-    """Words that a command does not understand."""
-
-
 def parse_generate(argv: Sequence[str]) -> argparse.Namespace:
     """The options of `generate`. Raises UsageError; SystemExit after --help."""
-    made = _parser("generate", "Generate people, a folder each: the person, the person for Blender, pictures.")
+    made = _parser("generate", "Generate humans, a folder each: the human, its files for Blender, pictures.")
     add = made.add_argument
-    add("--out", type=Path, required=True, help="folder for all of them; an unfinished one is resumed")
+    add("--out", type=Path, required=True, help="folder for the humans; an unfinished one is resumed")
     add("--count", type=_whole(1), default=1, help="how many (default %(default)s)")
-    add("--seed", type=_whole(0), default=0, help="of the first; the next ones follow (default %(default)s)")
+    add("--seed", type=_whole(0), default=0, help="of the first; the others follow on it (default %(default)s)")
     add("--steps", type=_whole(1), default=STEPS, help="denoising steps (default %(default)s)")
     add("--sampler", choices=SAMPLERS, default=SAMPLERS[0], help="(default %(default)s)")
     add("--attributes", nargs="+", default=[], metavar="NAME=VALUE", help='like sex=female height=1.7 "hair=long bob"')
@@ -44,7 +39,7 @@ def parse_generate(argv: Sequence[str]) -> argparse.Namespace:
     blend.add_argument("--no-blend", dest="blend", action="store_const", const=None, help="none (the default)")
     _add_motion(made)
     _add_python(made)
-    add("--resume", action="store_true", help="keep people there who were made with other settings than these")
+    add("--resume", action="store_true", help="keep humans in the folder that were generated with other settings")
     options = made.parse_args(list(argv))
     if options.blend is not None and (Path(options.blend).name != options.blend or not options.blend.strip(".")):
         raise UsageError(f"--blend {options.blend!r} is no file name: name one without folders")
@@ -58,7 +53,7 @@ def parse_generate(argv: Sequence[str]) -> argparse.Namespace:
 
 def parse_render(argv: Sequence[str]) -> argparse.Namespace:
     """The options of `render`. Raises UsageError; SystemExit after --help."""
-    made = _parser("render", "Draw a .blend, a person's file, or everybody in a folder of people.")
+    made = _parser("render", "Render a .blend, a human's file, or all humans in a folder.")
     add = made.add_argument
     add("source", type=Path, metavar="SOURCE", help=".blend, .human, .human.safetensors, or a folder of people")
     add("--out", type=Path, required=True, help="folder for the pictures; those that are there stay")
@@ -71,7 +66,7 @@ def parse_render(argv: Sequence[str]) -> argparse.Namespace:
     add("--transparent", action="store_true", help="no background")
     add("--samples", type=_whole(1), help="of Cycles, for each pixel (default 4)")
     _add_python(made)
-    add("--resume", action="store_true", help="keep pictures there that were drawn with other settings than these")
+    add("--resume", action="store_true", help="keep pictures in the folder that were rendered with other settings")
     options = made.parse_args(list(argv))
     if options.turntable and options.frames:
         raise UsageError("--turntable and --frames ask for different pictures: give one of them")
@@ -84,10 +79,8 @@ def parse_render(argv: Sequence[str]) -> argparse.Namespace:
 
 
 def _parser(name: str, description: str) -> argparse.ArgumentParser:
-    import argparse
-
     made = argparse.ArgumentParser(prog=f"primdiffusion {name}", description=description, epilog=_ENDS)
-    made.error = _refuse
+    made.error = _raise_usage_error
     return made
 
 
@@ -101,7 +94,7 @@ def _add_python(made: argparse.ArgumentParser) -> None:
     made.add_argument("--python", type=Path, metavar="PATH", help="the backend's Python instead of the preferences'")
 
 
-def _refuse(message: str) -> NoReturn:
+def _raise_usage_error(message: str) -> NoReturn:
     raise UsageError(message)
 
 

@@ -1,4 +1,4 @@
-"""What is known of the backend without starting it, cheap enough for drawing; and what setting it up would take."""
+"""What is known of the backend without starting it, fast enough for drawing; and the cost of a set-up."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import bpy
 
+from ...backend.environment import VARIABLE
+from ...backend.packages import chosen_compute, locks_for, read_lock, this_machine
+from ...backend.setup import state_of
 from ...places import EXTENSION, preference, set_up_folder
 
 if TYPE_CHECKING:
-    from ...worker.setup_packages import Lock, Machine
+    from ...backend.packages import Lock, Machine
 
 LOCKS = Path(__file__).resolve().parents[2] / "requirements"
 _LINE_BYTES_PER_S = 50e6 / 8
@@ -36,10 +39,7 @@ class Known:
 
 
 def known() -> Known:
-    """Follows the order in which a Python is looked for when the backend starts."""
-    from ...worker.environment import VARIABLE
-    from ...worker.setup import state_of
-
+    """Which Python would run the backend, in the order in which it is searched."""
     if named := preference("backend_python"):
         return Known("named", True, f"Uses {named}")
     if named := os.environ.get(VARIABLE):
@@ -60,7 +60,7 @@ def known() -> Known:
 
 @functools.cache
 def _has_torch() -> bool:
-    """Blender's own Python has it: Blender as a module, in an environment of ours."""
+    """Whether Blender's own Python has torch, as in an environment with Blender as a module."""
     return importlib.util.find_spec("torch") is not None
 
 
@@ -72,34 +72,26 @@ def _made_of_another_lock(about: dict[str, Any]) -> bool:
 @functools.cache
 def machine() -> Machine:
     """The machine we run on."""
-    from ...worker.setup_packages import this_machine
-
     return this_machine()
 
 
 @functools.lru_cache(maxsize=16)
 def read_once(path: Path) -> Lock:
     """The lock in a file. Raises OSError, ValueError."""
-    from ...worker.setup_packages import read_lock
-
     return read_lock(path)
 
 
 @functools.cache
 def available() -> dict[str, Path]:
-    """The locks for this machine, by what they compute on."""
-    from ...worker.setup_packages import locks_for
-
+    """The locks for this machine, by device."""
     return locks_for(LOCKS, machine().platform, machine().python)
 
 
 def chosen() -> tuple[str, Lock, str]:
-    """What would be set up: what it computes on, its packages, and a sentence where there is something to say.
+    """What would be set up: the device, its packages, and a note or "".
 
     Raises ValueError in a sentence.
     """
-    from ...worker.setup_packages import chosen_compute
-
     addon = bpy.context.preferences.addons.get(EXTENSION)
     wish = addon.preferences.compute.lower() if addon is not None else "automatic"
     compute, note = chosen_compute(machine(), wish, available())
@@ -107,7 +99,7 @@ def chosen() -> tuple[str, Lock, str]:
 
 
 def cost(lock: Lock) -> str:
-    """What setting up takes, said before it is begun."""
+    """The cost of a set-up, as a sentence."""
     seconds = lock.download_bytes / _LINE_BYTES_PER_S + lock.installed_bytes / _UNPACKED_BYTES_PER_S + _SELF_TEST_S
     return (
         f"Downloads {gigabytes(lock.download_bytes)}, takes {gigabytes(lock.installed_bytes)} on disk, "

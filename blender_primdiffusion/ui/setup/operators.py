@@ -1,33 +1,124 @@
-"""Set up, cancel, repair, remove and test the backend. None touches the scene."""
+"""Set up, cancel, repair, remove and test the backend, one at a time. The scene stays as it is."""
 
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import bpy
 
+from ...backend import environment, setup
+from ...backend.requests import sentence
+from ...jobs.queue import queue
 from ...places import CACHE_VARIABLE, backend_module_path, cache_folder, preference, set_up_folder
-from ...worker.sentence import sentence
 from . import known
-from .session import redraw, see_through, session
 
 if TYPE_CHECKING:
-    from ...worker.setup import Steps
+    from ...backend.setup import Steps
+
+TICK_S = 0.2
+_PRINT_S = 2.0
+"""Between lines of progress on the console in background mode."""
+
+
+class SetUpSession:
+    """Runs the steps of a set-up, a repair, a test or a removal. All methods are for Blender's main thread."""
+
+    def __init__(self) -> None:
+        self.message = ""
+        self.fraction = 0.0
+        self.error = ""
+        """Why the last one failed, in a sentence."""
+        self.notice = ""
+        """How the last one ended otherwise."""
+        self._steps: Steps | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Something is being set up, repaired, tested or removed."""
+        return self._steps is not None
+
+    def start(self, steps: Steps) -> None:
+        """Begin at the next tick. Raises ValueError while another is under way."""
+        if self.busy:
+            raise ValueError("The backend is being set up already; wait for it, or press Cancel")
+        self._steps, self.error, self.notice, self.message, self.fraction = steps, "", "", "Starting", 0.0
+
+    def tick(self) -> bool:
+        """Continue; True when something visible changed. At the end `notice` or `error` is set."""
+        if self._steps is None:
+            return False
+        before = (self.message, self.fraction)
+        try:
+            step = next(self._steps)
+        except StopIteration as done:
+            self._steps, self.notice = None, done.value
+        except (RuntimeError, OSError) as error:  # SetUpFailed is one
+            self._steps, self.error = None, sentence(error)
+        else:
+            self.message, self.fraction = step.message, step.fraction
+        return not self.busy or before != (self.message, self.fraction)
+
+    def cancel(self) -> None:
+        """End the set-up and its processes at once."""
+        if self._steps is not None:
+            self._steps.close()
+            self._steps, self.notice = None, "Cancelled; what has been downloaded is used by the next Set Up Backend"
+
+
+session = SetUpSession()
+"""One for all windows."""
+
+
+def follow_session(operator: bpy.types.Operator) -> set[str]:
+    """Follow the session: by a timer with a window, by waiting in background mode, which reports an error."""
+    if not bpy.app.background:
+        if not bpy.app.timers.is_registered(follow):
+            bpy.app.timers.register(follow, first_interval=TICK_S, persistent=True)
+        return {"FINISHED"}
+    printed = 0.0
+    try:
+        while session.busy:
+            if session.tick() and session.busy and time.monotonic() - printed > _PRINT_S:
+                printed = time.monotonic()
+                print(f"PrimDiffusion: {session.message}", flush=True)
+            time.sleep(TICK_S / 4)
+    finally:
+        session.cancel()
+    if session.error:
+        operator.report({"ERROR"}, session.error)
+        return {"CANCELLED"}
+    print(f"PrimDiffusion: {session.notice}", flush=True)
+    return {"FINISHED"}
+
+
+def follow() -> float | None:
+    """The timer."""
+    if session.tick():
+        redraw()
+    return TICK_S if session.busy else None
+
+
+def redraw() -> None:
+    """Redraw sidebars and preferences."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type in {"VIEW_3D", "PREFERENCES"}:
+                area.tag_redraw()
+
 
 OWN_LOCK = "requirements.txt"
 """In a folder of wheels: a list of packages that goes before ours."""
 
 
 def installing(wheels: Path | None = None) -> Steps:
-    """From the package index, or from a folder of wheels, whose own list of packages goes before ours.
+    """Steps of a set-up from the package index, or from a folder of wheels, whose own lock takes precedence.
 
     Raises ValueError where there are no packages for this machine or Blender may not use the network, and OSError.
     """
-    from ...worker import setup
-
     compute, lock, _ = known.chosen()
     if wheels is None and not bpy.app.online_access:
         raise ValueError(setup.OFFLINE)
@@ -37,16 +128,12 @@ def installing(wheels: Path | None = None) -> Steps:
 
 
 def removing() -> Steps:
-    """Also where there are no packages for this machine any more. A cache that is shared with others stays."""
-    from ...worker import setup
-
+    """Steps of a removal; a shared cache stays."""
     return setup.remove(set_up_folder(), None if os.environ.get(CACHE_VARIABLE) else cache_folder())
 
 
 def testing() -> Steps:
-    """On the Python that would run the backend."""
-    from ...worker import environment, setup
-
+    """Steps of a test of the Python that would run the backend."""
     named = preference("backend_python")
     own = None if known.known().state == "own Python" else set_up_folder().environment
     _, python = next(environment.candidates(named, own))
@@ -61,7 +148,7 @@ def _module_path() -> Path:
 
 
 def _begin(operator: bpy.types.Operator, make: Callable[[], Steps], *, replaces: bool = True) -> set[str]:
-    """Start and follow; a sentence where that cannot be. `replaces`: the environment, which children run on."""
+    """Start steps and follow them; errors become reports. `replaces`: the environment, on which children run."""
     try:
         if session.busy:
             raise ValueError("The backend is being set up already; wait for it, or press Cancel")
@@ -72,13 +159,12 @@ def _begin(operator: bpy.types.Operator, make: Callable[[], Steps], *, replaces:
     except (ValueError, OSError) as error:
         operator.report({"ERROR"}, sentence(error))
         return {"CANCELLED"}
-    return see_through(operator)
+    return follow_session(operator)
 
 
 def _release_environment() -> None:
     """End the children that run on the environment: their files could not be replaced. Raises ValueError."""
-    from ...engine import studio
-    from ...jobs.queue import queue
+    from ...engine import studio  # needs numpy
 
     if queue.busy:
         raise ValueError("The backend is at work; wait until it is done, or press Cancel")
@@ -91,10 +177,9 @@ class PRIMDIFFUSION_OT_set_up_backend(bpy.types.Operator):
 
     bl_idname = "primdiffusion.set_up_backend"
     bl_label = "Set Up Backend"
-    bl_options: set[str] = set()  # noqa: RUF012  bpy wants a plain set
+    bl_options: set[str] = set()
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """With a window a timer follows; in background mode this waits."""
         now = known.known()
         try:
             there = now.state == "ready" and now.about.get("compute") == known.chosen()[0]
@@ -112,18 +197,16 @@ class PRIMDIFFUSION_OT_install_from_folder(bpy.types.Operator):
 
     bl_idname = "primdiffusion.install_from_folder"
     bl_label = "Install from Folder"
-    bl_options: set[str] = set()  # noqa: RUF012
+    bl_options: set[str] = set()
 
     directory: bpy.props.StringProperty(name="Folder", subtype="DIR_PATH", options={"SKIP_SAVE"})
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        """Ask for the folder."""
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """As Set Up Backend."""
         folder = Path(bpy.path.abspath(self.directory)) if self.directory else None
         if folder is None or not folder.is_dir():
             self.report({"ERROR"}, f"{self.directory!r} is no folder: choose the one that holds the wheels")
@@ -132,34 +215,31 @@ class PRIMDIFFUSION_OT_install_from_folder(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_cancel_set_up(bpy.types.Operator):
-    """Stop; what has been downloaded is used by the next Set Up Backend"""
+    """Stop; the next Set Up Backend uses what was downloaded"""
 
     bl_idname = "primdiffusion.cancel_set_up"
     bl_label = "Cancel"
-    bl_options: set[str] = set()  # noqa: RUF012
+    bl_options: set[str] = set()
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        """While something is under way."""
         cls.poll_message_set("Nothing is being set up")
         return session.busy
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """End the process at work."""
         session.cancel()
         redraw()
         return {"FINISHED"}
 
 
 class PRIMDIFFUSION_OT_repair_backend(bpy.types.Operator):
-    """Set up the backend anew in the place of the one that is there"""
+    """Reinstall the backend"""
 
     bl_idname = "primdiffusion.repair_backend"
     bl_label = "Repair"
-    bl_options: set[str] = set()  # noqa: RUF012
+    bl_options: set[str] = set()
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """As Set Up Backend."""
         return _begin(self, installing)
 
 
@@ -168,10 +248,9 @@ class PRIMDIFFUSION_OT_remove_backend(bpy.types.Operator):
 
     bl_idname = "primdiffusion.remove_backend"
     bl_label = "Remove"
-    bl_options: set[str] = set()  # noqa: RUF012
+    bl_options: set[str] = set()
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Ask first."""
         size = known.known().about.get("bytes", 0)
         freed = f" and {known.gigabytes(size)} on disk are free again" if size else ""
         return context.window_manager.invoke_confirm(
@@ -184,7 +263,6 @@ class PRIMDIFFUSION_OT_remove_backend(bpy.types.Operator):
         )
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Without asking when called from Python."""
         if not any(path.exists() for path in (set_up_folder().environment, set_up_folder().pip_cache)):
             self.report({"ERROR"}, "There is no backend to remove: none was set up here")
             return {"CANCELLED"}
@@ -192,16 +270,22 @@ class PRIMDIFFUSION_OT_remove_backend(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_test_backend(bpy.types.Operator):
-    """Start the backend that is named or set up, and generate a person in a few steps"""
+    """Start the backend and generate a test person in a few steps"""
 
     bl_idname = "primdiffusion.test_backend"
     bl_label = "Test"
-    bl_options: set[str] = set()  # noqa: RUF012
+    bl_options: set[str] = set()
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """With a window a timer follows; in background mode this waits."""
         now = known.known()
         if not now.usable:
             self.report({"ERROR"}, f"{now.line}: press Set Up Backend first, or name a Python")
             return {"CANCELLED"}
         return _begin(self, testing, replaces=False)
+
+
+def unregister() -> None:
+    """End a running set-up."""
+    session.cancel()
+    if bpy.app.timers.is_registered(follow):
+        bpy.app.timers.unregister(follow)

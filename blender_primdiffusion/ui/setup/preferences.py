@@ -1,16 +1,84 @@
-"""Preferences: the backend's state and set-up, which checkpoints it uses, when it gives its memory back."""
+"""Preferences; and the state of the backend, drawn here and in panels that need it."""
 
 from __future__ import annotations
 
+import textwrap
+
 import bpy
 
+from ...backend.requests import sentence
 from ...places import EXTENSION, set_up_folder
-from .drawing import draw_cost, draw_news, draw_progress, draw_text
-from .known import gigabytes, known, machine
-from .session import redraw, session
+from .known import chosen, cost, gigabytes, known, machine
+from .operators import redraw, session
+
+_SIDEBAR = 30
+"""Characters that fit a box in a sidebar of default width, beside an icon."""
+ONLINE = "Blender may not use the network: allow it in System > Network > Allow Online Access, or install from a folder"
+
+
+def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
+    """For panels that need the backend: the progress of a set-up, or its button; nothing where a backend is ready.
+
+    Returns whether it is.
+    """
+    if session.busy:
+        draw_progress(layout, width)
+        return False
+    now = known()
+    if now.usable:
+        return True
+    box = layout.box()
+    draw_text(box, now.line, "ERROR", width)
+    if not draw_cost(box, width):
+        props = box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES")
+        props.module = EXTENSION
+    elif now.state == "broken":
+        box.operator("primdiffusion.repair_backend", icon="TOOL_SETTINGS")
+    else:
+        box.operator("primdiffusion.set_up_backend", icon="IMPORT")
+    draw_result(box, width)
+    return False
+
+
+def draw_progress(layout: bpy.types.UILayout, width: int) -> None:
+    """The bar, the current step below it (a bar cuts long texts), and Cancel."""
+    layout.progress(factor=session.fraction, text=f"{session.fraction:.0%}")
+    draw_text(layout, session.message, "BLANK1", width)
+    layout.operator("primdiffusion.cancel_set_up", icon="CANCEL")
+
+
+def draw_cost(layout: bpy.types.UILayout, width: int) -> bool:
+    """The cost of a set-up, and what prevents it; returns whether it is possible on this machine."""
+    try:
+        _, lock, note = chosen()
+    except (ValueError, OSError) as error:
+        draw_text(layout, sentence(error), "ERROR", width)
+        return False
+    draw_text(layout, cost(lock), "BLANK1", width)
+    if note:
+        draw_text(layout, note, "INFO", width)
+    if not bpy.app.online_access:
+        draw_text(layout, ONLINE, "INTERNET_OFFLINE", width)
+    return True
+
+
+def draw_result(layout: bpy.types.UILayout, width: int) -> None:
+    """How the last set-up ended."""
+    if session.error:
+        draw_text(layout, session.error, "ERROR", width)
+    elif session.notice:
+        draw_text(layout, session.notice, "INFO", width)
+
+
+def draw_text(layout: bpy.types.UILayout, text: str, icon: str, width: int) -> None:
+    """A sentence over as many lines as it needs."""
+    column = layout.column(align=True)
+    for number, line in enumerate(textwrap.wrap(text, width)):
+        column.label(text=line, icon=icon if number == 0 else "BLANK1", translate=False)
+
 
 _WIDTH = 90
-"""Characters in a line of the preferences' window as it opens."""
+"""Characters in a line of the preferences window at its default size."""
 _COMPUTE = (
     ("AUTOMATIC", "Automatic", "NVIDIA where there is a driver that is new enough, else the processor"),
     ("CPU", "CPU", "Smallest download; a person takes seconds instead of fractions of one"),
@@ -20,7 +88,7 @@ _COMPUTE = (
 
 
 def _redraw(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
-    """Sidebars are grey, or not, by what is chosen here."""
+    """Panels depend on the preferences."""
     redraw()
 
 
@@ -30,7 +98,7 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
     bl_idname = EXTENSION
 
     compute: bpy.props.EnumProperty(
-        name="Compute On", description="For which device packages are installed", items=_COMPUTE
+        name="Compute On", description="Device that packages are installed for", items=_COMPUTE
     )
     backend_python: bpy.props.StringProperty(
         name="Existing Python",
@@ -41,26 +109,24 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
     )
     checkpoint: bpy.props.StringProperty(
         name="Checkpoint",
-        description="A .safetensors file of the diffusion model; empty: the one that comes with the add-on",
+        description="Diffusion model, a .safetensors file; empty: the bundled one",
         subtype="FILE_PATH",
     )
     encoder: bpy.props.StringProperty(
         name="Encoder",
-        description="A .safetensors file of the encoder, for people from captures; empty: the one that comes with "
-        "the add-on",
+        description="Encoder for humans from captures, a .safetensors file; empty: the bundled one",
         subtype="FILE_PATH",
     )
     idle_minutes: bpy.props.IntProperty(
         name="Release Memory After",
-        description="Minutes after its last job until the backend gives back its memory, also that of the graphics "
-        "card; 0: it keeps it",
+        description="Minutes after the last job until the backend releases its memory, including the graphics card's; "
+        "0: never",
         default=10,
         min=0,
         soft_max=120,
     )
 
     def draw(self, _context: bpy.types.Context) -> None:
-        """State and set-up first, then file fields. Starts nothing."""
         layout = self.layout
         self._draw_backend(layout.box())
         layout.use_property_split = True
@@ -80,7 +146,7 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         if now.state != "named":
             _draw_private(self, box)
         self._draw_buttons(box, now.state, folder.environment.is_dir())
-        draw_news(box, _WIDTH)
+        draw_result(box, _WIDTH)
         if session.error and folder.log.is_file():
             box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(folder.log)
 
@@ -93,7 +159,7 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
 
 
 def _draw_private(preferences: PRIMDIFFUSION_AP_preferences, box: bpy.types.UILayout) -> None:
-    """Of the private environment: for what, at which cost, the buttons."""
+    """The private environment: device, cost, buttons."""
     row = box.row()
     row.prop(preferences, "compute", expand=True)
     draw_text(box, f"Found: {machine().described}", "SYSTEM", _WIDTH)

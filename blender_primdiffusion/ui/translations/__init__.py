@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import bpy
@@ -15,8 +16,6 @@ _CONTEXTS = ("*", "Operator", CONTEXT)
 
 def words_of(language: str) -> dict[str, str]:
     """English -> translation."""
-    import json
-
     return json.loads(Path(__file__).with_name(f"{language}.json").read_text(encoding="utf-8"))
 
 

@@ -1,0 +1,168 @@
+"""The streams of a child process, read and written without a thread and without waiting.
+
+A child writes its output into a temporary file, which we read on a timer. Of what works without a thread on Linux,
+Windows and macOS alike this is the one that never holds up either side: a pipe cannot be read without waiting by the
+same calls on all three, and a full one stops the child while Blender is busy; a socket would need a child that knows of
+it, and asks some firewalls. The file grows by 0.4 MB an hour of heartbeats. Its input is a pipe, whose end tells the
+child that Blender is gone; what the pipe does not take at once is written at the next tick.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import sys
+import tempfile
+from typing import IO
+
+READ_BYTES = 1 << 18
+"""Of a child's output, taken in at once."""
+LONGEST_LINE = 1 << 22
+"""Longer ones, which take too long to parse, are dropped."""
+LOG_BYTES = 1 << 16
+LOG_LINES = 200
+
+
+class Output:
+    """A file that a child writes and that we read as it grows."""
+
+    def __init__(self) -> None:
+        """Raises OSError."""
+        descriptor, self._name = tempfile.mkstemp(prefix="primdiffusion_")
+        self.target: IO[bytes] = os.fdopen(descriptor, "wb", 0)
+        """For the child: its stdout or stderr."""
+        self._source = open(self._name, "rb", buffering=0)  # noqa: SIM115  closed by `close`
+        if os.name != "nt":  # Windows removes no open file
+            os.unlink(self._name)
+        self._line = bytearray()
+        self._dropping = False
+        self.at_end = True
+        """The last read has met the end of the file."""
+
+    def lines(self) -> list[bytes]:
+        """The lines that have been completed since the last call, of READ_BYTES at most."""
+        if self._source.closed:
+            return []
+        read = self._source.read(READ_BYTES) or b""
+        self.at_end = len(read) < READ_BYTES
+        *whole, rest = read.split(b"\n")
+        if whole:
+            whole[0] = bytes(self._line) + whole[0]
+            self._line.clear()
+            if self._dropping:
+                del whole[0]
+        self._dropping = (self._dropping and not whole) or len(self._line) + len(rest) > LONGEST_LINE
+        if self._dropping:
+            self._line.clear()
+        else:
+            self._line += rest
+        return whole
+
+    def rest(self) -> bytes:
+        """What was written after the last whole line, for a child that has ended."""
+        rest = bytes(self._line)
+        self._line.clear()
+        return rest
+
+    def has_more(self) -> bool:
+        """There is something that has not been read."""
+        return not self._source.closed and os.fstat(self._source.fileno()).st_size > self._source.tell()
+
+    def log(self) -> list[str]:
+        """The last lines of all that was written; reads them anew, apart from `lines`."""
+        if self._source.closed:
+            return []
+        place = self._source.tell()
+        size = os.fstat(self._source.fileno()).st_size
+        self._source.seek(max(size - LOG_BYTES, 0))
+        text = self._source.read(LOG_BYTES) or b""
+        self._source.seek(place)
+        return [line.rstrip() for line in text.decode("utf-8", "replace").splitlines()[-LOG_LINES:]]
+
+    def close(self) -> None:
+        """Let go of the file, which goes with its last user."""
+        self.target.close()
+        self._source.close()
+        if os.name == "nt":
+            with contextlib.suppress(OSError):  # a child that has not ended holds it: a small file stays
+                os.unlink(self._name)
+
+
+class Input:
+    """The writing end of a child's stdin. What does not fit the pipe waits for `flush`."""
+
+    def __init__(self, pipe: IO[bytes]) -> None:
+        """`pipe` is unbuffered (`bufsize=0` of Popen)."""
+        self._pipe = pipe
+        self._pending = bytearray()
+        _stop_waiting_on(pipe.fileno())
+
+    def send(self, data: bytes) -> None:
+        """Write `data` now or with later calls of `flush`; a child that is gone takes nothing."""
+        if not self._pipe.closed:
+            self._pending += data
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what the pipe takes."""
+        size = len(self._pending)
+        while self._pending and size:
+            try:
+                written = os.write(self._pipe.fileno(), self._pending[: min(size, LOG_BYTES)])
+            except BlockingIOError:
+                return
+            except OSError as error:
+                if error.errno != errno.ENOSPC:  # the child is gone
+                    self._pending.clear()
+                    return
+                size = min(size, LOG_BYTES) // 2  # Windows takes all of it or nothing
+                continue
+            del self._pending[:written]
+
+    def close(self) -> None:
+        """The end of the child's input; what is pending is dropped."""
+        self._pending.clear()
+        with contextlib.suppress(OSError):
+            self._pipe.close()
+
+
+def stdin_has_ended() -> bool:
+    """Whether the other end of this process's stdin, a pipe, was closed: its parent is gone, or asks for an end.
+
+    What arrives there is dropped. Never waits.
+    """
+    if os.name == "nt":
+        return _windows_pipe_is_broken(0)
+    import select  # of no use on Windows
+
+    while select.select([0], [], [], 0)[0]:
+        if not os.read(0, 4096):
+            return True
+    return False
+
+
+def _stop_waiting_on(descriptor: int) -> None:
+    if sys.platform != "win32":
+        os.set_blocking(descriptor, False)
+        return
+    # only on Windows, where os.set_blocking handles pipes from Python 3.12 on
+    import ctypes
+    import msvcrt
+
+    no_wait = ctypes.c_ulong(1)  # PIPE_NOWAIT
+    handle = ctypes.c_void_p(msvcrt.get_osfhandle(descriptor))
+    ctypes.windll.kernel32.SetNamedPipeHandleState(handle, ctypes.byref(no_wait), None, None)
+
+
+def _windows_pipe_is_broken(descriptor: int) -> bool:
+    if sys.platform != "win32":
+        raise AssertionError("for Windows alone")
+    # only on Windows
+    import ctypes
+    import msvcrt
+
+    kernel = ctypes.WinDLL("kernel32", use_last_error=True)
+    handle = ctypes.c_void_p(msvcrt.get_osfhandle(descriptor))
+    there = kernel.PeekNamedPipe(handle, None, 0, None, None, None)
+    return not there and ctypes.get_last_error() == 109  # ERROR_BROKEN_PIPE

@@ -1,0 +1,337 @@
+"""The child process and the conversation with it: JSON-RPC 2.0, a message a line. Nothing here waits for the child.
+
+`poll` reads what the child has written (see `child_streams`), sends what its input takes, and notices a death or a
+silence. All public methods are for one thread at a time.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import itertools
+import json
+import os
+import subprocess
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from .child_streams import LOG_LINES, Input, Output
+
+SILENCE_S = 20.0
+"""The child sends a heartbeat every 0.5 s; importing torch from a cold disk can hold it up for seconds."""
+LONGEST_POLL_GAP_S = 1.0
+"""Silence counts only while we poll: a suspended laptop or a blocked Blender is not the child's fault."""
+POLL_S = 0.05
+"""Of parsing in one call of `poll`: a flood of messages is taken in over several."""
+LISTEN_S = 0.01
+"""Between two looks at the child's output in `wait`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Response:
+    """A request went well."""
+
+    id: int | None
+    result: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class ErrorResponse:
+    """A request went wrong; `kind` and `remedy` as the backend states them ("" where it does not)."""
+
+    id: int | None
+    code: int
+    message: str
+    kind: str
+    remedy: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Notification:
+    """News that answers no request: progress, ready."""
+
+    method: str
+    params: dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Died:
+    """The child is gone, and it was not asked to end; the last event of a client."""
+
+    exit_code: int
+    message: str
+    stderr: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Silent:
+    """The child lives but has said nothing for `seconds`; sent once per silence."""
+
+    seconds: float
+
+
+Event = Response | ErrorResponse | Notification | Died | Silent
+
+
+def child_environment(module_path: Path | None, cache_dir: Path | None, extra: Mapping[str, str]) -> dict[str, str]:
+    """The environment of a backend process: this one's, without what would lead its Python astray.
+
+    `module_path` is the folder that holds the package `primdiffusion` (`bundled` in the zip); it goes before
+    anything installed. `cache_dir` takes byte code and compiled kernels, so that the extension's folder stays as it is.
+    """
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONHOME", "PYTHONSTARTUP")}
+    environment.update(PYTHONSAFEPATH="1")  # no modules from the current folder, which may be anybody's
+    environment.update(PYTHONUTF8="1", PYTHONUNBUFFERED="1", PYTHONFAULTHANDLER="1")
+    if module_path is not None:
+        environment["PYTHONPATH"] = str(module_path)
+    if cache_dir is not None:
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)  # torch would be compiled anew at every start
+        environment.update(PYTHONPYCACHEPREFIX=str(cache_dir / "bytecode"), NUMBA_CACHE_DIR=str(cache_dir / "numba"))
+    environment.update(extra)
+    return environment
+
+
+class BackendClient:
+    """One child process. Make it, `start` it, send requests, `poll` from a timer, `shutdown` at the end."""
+
+    def __init__(
+        self,
+        python: Path,
+        module_path: Path | None = None,
+        env: Mapping[str, str] | None = None,
+        *,
+        cache_dir: Path | None = None,
+        silence_s: float = SILENCE_S,
+    ):
+        self._command = [str(python), "-m", "primdiffusion.serve"]
+        self._environment = child_environment(module_path, cache_dir, env or {})
+        self._silence_s = silence_s
+        self._process: subprocess.Popen[bytes] | None = None
+        self._input: Input | None = None
+        self._output: Output | None = None
+        self._errors: Output | None = None
+        self._lines: collections.deque[bytes] = collections.deque()
+        self._stray: collections.deque[str] = collections.deque(maxlen=LOG_LINES)
+        self._last_errors: tuple[str, ...] = ()
+        self._ids = itertools.count(1)
+        self._expected_to_end = False
+        self._ended = False
+        self._silence = 0.0
+        self._reported_silence = False
+        self._polled_at = time.monotonic()
+        self._abandoned: set[int] = set()
+        self.info: dict[str, Any] = {}
+        """What the child said of itself: version, python, memory, and device once torch is loaded (`ready`)."""
+
+    def start(self) -> None:
+        """Starts the child and asks it who it is; `info` fills as it answers. Raises OSError without such a Python."""
+        if self._process is not None:
+            raise RuntimeError("this client has been started before: make a new one")
+        output, errors = Output(), Output()
+        try:
+            process = subprocess.Popen(
+                self._command,
+                stdin=subprocess.PIPE,
+                stdout=output.target,
+                stderr=errors.target,
+                bufsize=0,
+                env=self._environment,
+                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+            )
+        except OSError:
+            output.close()
+            errors.close()
+            raise
+        output.target.close()
+        errors.target.close()
+        assert process.stdin is not None
+        self._process = process
+        self._input, self._output, self._errors = Input(process.stdin), output, errors
+        self._polled_at = time.monotonic()
+        self._hello = self.request("hello", {})
+
+    @property
+    def pid(self) -> int | None:
+        """The child's process id, None before `start`."""
+        return self._process.pid if self._process is not None else None
+
+    @property
+    def alive(self) -> bool:
+        """The child runs and can be asked for something."""
+        if self._process is None or self._expected_to_end:  # one that was killed may take a moment to go
+            return False
+        return self._process.poll() is None
+
+    @property
+    def stderr(self) -> tuple[str, ...]:
+        """The last lines the child wrote to stderr, and lines on stdout that are no messages."""
+        errors = self._last_errors if self._errors is None else self._errors.log()
+        return (*self._stray, *errors)
+
+    def request(self, method: str, params: Mapping[str, Any]) -> int:
+        """Sends a request and returns its id; the answer comes through `poll`. A dead child answers with Died there."""
+        id = next(self._ids)
+        self._send({"jsonrpc": "2.0", "id": id, "method": method, "params": dict(params)})
+        return id
+
+    def cancel(self, id: int) -> None:
+        """Asks the child to stop request `id`; it then fails with code -32001."""
+        self.request("cancel", {"id": id})
+
+    def abandon(self, id: int) -> None:
+        """Drop the answer to request `id`, whose cancel the child has not come to yet."""
+        self._abandoned.add(id)
+
+    @property
+    def occupied(self) -> bool:
+        """The child has still to end a request that was abandoned; another one would be refused as busy."""
+        return bool(self._abandoned)
+
+    def poll(self) -> list[Event]:
+        """What has happened since the last call, in order. Takes no time; call it a few times a second."""
+        events: list[Event] = []
+        now = time.monotonic()
+        self._silence += min(now - self._polled_at, LONGEST_POLL_GAP_S)
+        self._polled_at = now
+        if self._process is None or self._ended:
+            return events
+        if self._input is not None:
+            self._input.flush()
+        exit_code = self._process.poll()  # before reading: then all that it wrote is there
+        for message in self._arrived():
+            self._silence, self._reported_silence = 0.0, False
+            if message.get("id") in self._abandoned and "method" not in message:
+                self._abandoned.discard(message["id"])
+            elif message.get("method") != "heartbeat":
+                events.append(self._event(message))
+        if exit_code is not None and not self._lines and self._output is not None and self._output.at_end:
+            events.extend(self._end(exit_code))
+        elif self.alive and self._silence > self._silence_s and not self._reported_silence:
+            self._reported_silence = True
+            events.append(Silent(self._silence))
+        return events
+
+    def wait(self, timeout_s: float) -> None:
+        """Sleeps until the child has written something or ended, at most `timeout_s`; then `poll`."""
+        end = time.monotonic() + timeout_s
+        while self.alive and not self._lines and not (self._output is not None and self._output.has_more()):
+            left = end - time.monotonic()
+            if left <= 0:
+                return
+            time.sleep(min(left, LISTEN_S))
+
+    def end(self) -> None:
+        """Asks the child to end, without waiting for it: by a request, and by the end of its input."""
+        self._expected_to_end = True
+        if self._input is not None:
+            self.request("shutdown", {})
+            self._input.close()
+
+    def shutdown(self, timeout_s: float = 2.0) -> None:
+        """Ends the child politely, or by force after `timeout_s`; waits no longer than that. Safe to call twice."""
+        self.end()
+        if not self.gone_within(timeout_s):
+            self.kill()
+
+    def kill(self, patience_s: float = 1.0) -> bool:
+        """Ends the child at once; no Died follows.
+
+        Waits no longer than `patience_s` for the system to take it away, gigabytes of memory with it; whether it is
+        gone.
+        """
+        self._expected_to_end = True
+        if self._process is not None:
+            self._process.kill()
+            if self._input is not None:
+                self._input.close()
+        return self.gone_within(patience_s)
+
+    def gone_within(self, seconds: float) -> bool:
+        """Wait for the end of a child that was asked to end; whether it has ended."""
+        if self._process is None:
+            return True
+        try:
+            self._process.wait(seconds)
+        except subprocess.TimeoutExpired:  # a busy system, or an uninterruptible wait
+            return False
+        self._close_streams()
+        return True
+
+    # what has arrived
+
+    def _arrived(self) -> Iterator[dict[str, Any]]:
+        """Messages, for POLL_S at most."""
+        end = time.monotonic() + POLL_S
+        while self._output is not None:
+            if not self._lines:
+                self._lines.extend(self._output.lines())
+                if not self._lines:
+                    return
+            line = self._lines.popleft()
+            message = _parse(line)
+            if message is not None:
+                yield message
+            elif line.strip():
+                self._stray.append(f"[not a message] {line[:300].decode('utf-8', 'replace').rstrip()}")
+            if time.monotonic() > end:
+                return
+
+    def _event(self, message: dict[str, Any]) -> Event:
+        method, params, id = message.get("method"), message.get("params") or {}, message.get("id")
+        if isinstance(method, str):
+            if method == "ready":
+                self.info = {**self.info, **params}
+            return Notification(method, params)
+        if "error" in message:
+            error = message["error"]
+            data = error.get("data") or {}
+            return ErrorResponse(
+                id, error.get("code", 0), error.get("message", ""), data.get("kind", ""), data.get("remedy", "")
+            )
+        result = message.get("result")
+        if id == self._hello and isinstance(result, dict):
+            self.info = {**result, **{name: value for name, value in self.info.items() if value is not None}}
+        return Response(id, result)
+
+    def _end(self, exit_code: int) -> Iterator[Event]:
+        """The end of the child, once, after everything it still said."""
+        self._ended = True
+        last = _parse(self._output.rest()) if self._output is not None else None
+        if last is not None:
+            yield self._event(last)
+        self._close_streams()
+        if not self._expected_to_end:
+            yield Died(exit_code, death_sentence(exit_code), self.stderr)
+
+    def _close_streams(self) -> None:
+        if self._errors is not None:
+            self._last_errors = tuple(self._errors.log())
+        for stream in (self._input, self._output, self._errors):
+            if stream is not None:
+                stream.close()
+        self._input = self._output = self._errors = None
+
+    def _send(self, message: dict[str, Any]) -> None:
+        if self._input is not None:
+            self._input.send(json.dumps(message).encode("utf-8") + b"\n")
+
+
+def _parse(line: bytes) -> dict[str, Any] | None:
+    try:
+        message = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return message if isinstance(message, dict) else None
+
+
+def death_sentence(exit_code: int) -> str:
+    """One sentence on how the child ended."""
+    if exit_code in (-9, 137):
+        return "the backend was killed by the system (often: out of memory)"
+    if exit_code < 0:
+        return f"the backend crashed (signal {-exit_code})"
+    if exit_code > 0x7FFFFFFF:
+        return f"the backend crashed (code {exit_code:#x})"
+    return f"the backend ended by itself (exit code {exit_code})"

@@ -1,0 +1,174 @@
+"""Which Python runs the backend: found and tried before a child is started with it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Generator, Iterator, Mapping
+from pathlib import Path
+
+from .child_streams import Output
+from .client import child_environment
+
+VARIABLE = "PRIMDIFFUSION_PYTHON"
+MARK = "ready.json"
+"""In the extension's own environment, when it is finished."""
+LONGEST_INSIDE = 180
+"""Characters of the longest path within site-packages (171 in torch 2.13), and some to spare."""
+WINDOWS_LONGEST = 259
+"""Characters of a whole path on Windows as it comes."""
+TRIAL_S = 90.0
+"""A first import of torch from a slow disk, with a virus scanner, takes most of a minute."""
+TRIAL = (
+    "import sys; sys.version_info >= (3, 11) or sys.exit('it is Python %d.%d, and 3.11 or newer is needed' "
+    "% sys.version_info[:2]); import json, primdiffusion, torch; "
+    "print(json.dumps({'version': primdiffusion.__version__, 'torch': torch.__version__, "
+    "'python': sys.version.split()[0]}))"
+)
+
+
+class BackendNotFound(RuntimeError):
+    """No Python that can run the backend; the message names each that was tried and why it will not do."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BackendPython:
+    """An interpreter that has imported torch and the backend."""
+
+    path: Path
+    source: str
+    """Who named it, in words for the user."""
+    version: str
+    """Of primdiffusion."""
+    torch: str
+    python: str
+
+
+def python_of_environment(folder: Path) -> Path:
+    """The interpreter of the virtual environment in `folder` on this system."""
+    return folder / "Scripts" / "python.exe" if os.name == "nt" else folder / "bin" / "python"
+
+
+@dataclasses.dataclass(frozen=True)
+class SetUpFolder:
+    """Names within the folder."""
+
+    root: Path
+
+    @property
+    def environment(self) -> Path:
+        """The virtual environment."""
+        return self.root / "env"
+
+    @property
+    def python(self) -> Path:
+        """The interpreter of the environment."""
+        return python_of_environment(self.environment)
+
+    @property
+    def pip_cache(self) -> Path:
+        """What has been downloaded."""
+        return self.root / "pip"
+
+    @property
+    def temporary(self) -> Path:
+        """Of pip and of the self-test."""
+        return self.root / "temporary"
+
+    @property
+    def log(self) -> Path:
+        """What venv and pip said."""
+        return self.root / "set_up.log"
+
+
+def short_root(own: Path, local: Path | None, name: str) -> Path:
+    """Where the environment goes: the extension's own folder, or, where Windows could not hold its longest paths, a
+    folder `name` in the user's local application data (`local`; None: it is not Windows)."""
+    longest = len(f"{own}/env/Lib/site-packages/") + LONGEST_INSIDE
+    return own if local is None or longest <= WINDOWS_LONGEST else local / "primdiffusion" / name
+
+
+def candidates(preference: str | Path | None, own_environment: Path | None) -> Iterator[tuple[str, Path]]:
+    """Who may name the Python, strongest first: the preferences, the variable, the extension's own, the running one.
+
+    An explicit wish (preferences or variable) that fails is an error and not a reason to look further. An environment
+    of the extension's own that is not finished is passed over.
+    """
+    if preference and str(preference).strip():
+        yield "the extension's preferences", Path(preference)
+        return
+    if os.environ.get(VARIABLE):
+        yield f"the environment variable {VARIABLE}", Path(os.environ[VARIABLE])
+        return
+    if own_environment is not None and (own_environment / MARK).exists():
+        yield "the extension's own environment", python_of_environment(own_environment)
+    yield "Blender's own Python", Path(sys.executable)
+
+
+def search(
+    preference: str | Path | None = None,
+    own_environment: Path | None = None,
+    module_path: Path | None = None,
+    *,
+    cache_dir: Path | None = None,
+    timeout_s: float = TRIAL_S,
+) -> Generator[None, None, BackendPython]:
+    """Try each candidate in a process of its own, which takes seconds; yields while it runs, and returns the first that
+    imports primdiffusion and torch.
+
+    `module_path` and `cache_dir` as in `child_environment`. Raises BackendNotFound with one reason for each candidate.
+    """
+    environment = child_environment(module_path, cache_dir, {})
+    reasons = []
+    for source, path in candidates(preference, own_environment):
+        try:
+            return (yield from _try(path, source, environment, timeout_s))
+        except BackendNotFound as e:
+            reasons.append(str(e))
+    advice = "press Set Up Backend, or name a Python with PrimDiffusion's packages in the extension's preferences"
+    raise BackendNotFound(f"No Python for the backend: {'; '.join(reasons)}. To go on, {advice}.")
+
+
+def _try(
+    path: Path, source: str, environment: Mapping[str, str], timeout_s: float
+) -> Generator[None, None, BackendPython]:
+    named = f"{path} ({source})"
+    answer, errors = Output(), Output()
+    try:
+        process = subprocess.Popen(
+            [str(path), "-c", TRIAL],
+            stdin=subprocess.DEVNULL,
+            stdout=answer.target,
+            stderr=errors.target,
+            env=dict(environment),
+            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+        )
+        end = time.monotonic() + timeout_s
+        try:
+            while (exit_code := process.poll()) is None:
+                if time.monotonic() > end:
+                    raise BackendNotFound(f"{named} did not import torch within {timeout_s:.0f} s")
+                yield
+        finally:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+        answered, complaints = answer.log(), errors.log()
+    except FileNotFoundError as e:
+        raise BackendNotFound(f"{named} does not exist") from e
+    except OSError as e:
+        raise BackendNotFound(f"{named} cannot be run: {e.strerror}") from e
+    finally:
+        answer.close()
+        errors.close()
+    if exit_code != 0:
+        raise BackendNotFound(f"{named} cannot run it: {complaints[-1] if complaints else f'exit code {exit_code}'}")
+    try:
+        about = json.loads(answered[-1])
+        return BackendPython(path, source, about["version"], about["torch"], about["python"])
+    except (ValueError, IndexError, KeyError) as e:
+        raise BackendNotFound(f"{named} is no Python interpreter: it answered {answered[:1]}") from e

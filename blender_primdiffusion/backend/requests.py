@@ -1,0 +1,362 @@
+"""The child that requests share, and one request as Blender follows it: a small state machine that a timer ticks."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shutil
+import time
+from collections.abc import Callable, Generator, Mapping
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from .client import BackendClient, Died, ErrorResponse, Event, Notification, Response, Silent
+
+
+def sentence(text: BaseException | str) -> str:
+    """`text` with a capital and a full stop; the kind of an error that says nothing."""
+    said = str(text).strip() or type(text).__name__
+    said = said[:1].upper() + said[1:]
+    return said if said.endswith((".", "!", "?")) else f"{said}."
+
+
+TICK_S = 0.02
+
+Result = TypeVar("Result")
+
+
+def run_to_end(work: Generator[object, None, Result]) -> Result:
+    """What `work` returns; sleeps at each of its yields. Raises what it raises."""
+    while True:
+        try:
+            next(work)
+        except StopIteration as done:
+            return done.value
+        time.sleep(TICK_S)
+
+
+END_S = 2.0
+"""What a child that was asked to end may take for it."""
+
+
+class Backend:
+    """The child that requests share: started at first use, kept warm, started anew after it died.
+
+    Blender may be closed between any two calls, so what takes long is a generator that yields while it waits.
+    """
+
+    def __init__(self, make_client: Callable[[], Generator[None, None, BackendClient]]):
+        """`make_client` finds a Python and returns a client not yet started; yields while it looks for one."""
+        self._make_client = make_client
+        self._client: BackendClient | None = None
+        self._leaving: list[tuple[BackendClient, float, Callable[[], None]]] = []
+        """Each with the time at which it is killed, and what is to be done after it has gone."""
+        self._closed = False
+        self._request: Request | None = None
+
+    def admit(self, request: Request) -> bool:
+        """Takes `request` as the one at work; False while another is."""
+        if self._request is not None and not self._request.finished:
+            return False
+        self._request = request
+        return True
+
+    @property
+    def client(self) -> BackendClient | None:
+        """The running child, if there is one; never starts one."""
+        client = self._client
+        return client if client is not None and client.alive else None
+
+    def connecting(self) -> Generator[None, None, BackendClient]:
+        """The running child, started now if there is none, which takes seconds. Raises BackendNotFound or OSError."""
+        running = self.client
+        if running is not None:
+            return running
+        client = yield from self._make_client()
+        if self._closed:
+            raise RuntimeError("the backend was shut down while it was starting")
+        client.start()
+        self._client = client
+        return client
+
+    def connect(self) -> BackendClient:
+        """As `connecting`, for callers that wait."""
+        return run_to_end(self.connecting())
+
+    @property
+    def log(self) -> tuple[str, ...]:
+        """The last lines that the child, or the one before it, wrote to stderr."""
+        return self._client.stderr if self._client is not None else ()
+
+    def listen(self) -> list[Event]:
+        """What has happened between requests: the child's end, or its silence."""
+        self.see_off()
+        return self._client.poll() if self._client is not None else []
+
+    def release(self) -> None:
+        """Ends the child that is kept warm, without waiting for it; the next request starts another."""
+        client, self._client = self._client, None
+        if client is not None:
+            client.end()
+            self.part_with(client)
+
+    def part_with(self, client: BackendClient, afterwards: Callable[[], None] = lambda: None) -> None:
+        """Do `afterwards` when a child that was asked to end has gone; see to it that it goes."""
+        self._leaving.append((client, time.monotonic() + END_S, afterwards))
+
+    def see_off(self) -> None:
+        """Look after children that are about to end. Takes no time."""
+        leaving, self._leaving = self._leaving, []
+        for client, killed_at, afterwards in leaving:
+            if client.gone_within(0.0):
+                afterwards()
+                continue
+            if time.monotonic() > killed_at:
+                client.kill(0.0)
+            self._leaving.append((client, killed_at, afterwards))
+
+    def shutdown(self) -> None:
+        """Ends the child for good, also one that is just being started. Waits for its end some seconds at most."""
+        self._closed = True
+        if self._client is not None:
+            self._client.shutdown()
+        for client, _, afterwards in self._leaving:
+            client.shutdown()
+            afterwards()
+        self._leaving.clear()
+
+
+_SETTINGS = {
+    "views": "lower Views",
+    "seeds": "lower Count",
+    "voxel": "raise Voxel Size",
+    "width": "lower the resolution",
+}
+"""By the parameter of the child's method that they become."""
+
+
+def memory_advice(params: Mapping[str, Any]) -> str:
+    """What to do, of the request that asked for too much; the number of steps takes time and no memory."""
+    lower = [advice for name, advice in _SETTINGS.items() if name in params]
+    lower.append("close other programs" if lower else "choose a smaller Checkpoint in the preferences")
+    steps = " (fewer Steps would not help)" if "steps" in params else ""
+    return f"{', or '.join(lower)}{steps}"
+
+
+State = Literal["starting", "running", "cancelling", "done", "failed", "cancelled"]
+FINAL: tuple[State, ...] = ("done", "failed", "cancelled")
+CANCELLED_CODE = -32001
+CANCEL_PATIENCE_S = 0.35
+"""A cancel takes effect at the end of a step; no step is waited for longer than this. Beside it the second in which a
+cancel is done holds ticks of the timer and drawings of the window, which on a busy machine take as long."""
+_KILL_PATIENCE_S = 0.05
+STAGES = {
+    "read": "Reading the pictures",
+    "load": "Loading the model",
+    "sample": "Generating",
+    "encode": "Reconstructing",
+    "preview": "Drawing the previews",
+    "render": "Drawing the previews",
+    "write": "Writing the person",
+    "merge": "Merging the volumes",
+    "fit": "Fitting",
+}
+"""What the child calls its stages, for people."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RequestError:
+    """Why a request failed, for the user and, in `log`, for a bug report."""
+
+    message: str
+    remedy: str
+    kind: str
+    log: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return " ".join(sentence(part) for part in (self.message, self.remedy) if part)
+
+
+class Request:
+    """Asks the child for one thing. Call `tick` from a timer until `finished`; then read `result` or `error`.
+
+    starting -> running -> done | failed;  cancel: -> cancelling -> cancelled.
+
+    Of a method with the parameter `steps` (a sampler's) those steps are the progress, else those of every stage.
+    """
+
+    def __init__(self, backend: Backend, method: str, params: Mapping[str, Any]):
+        """The child's half-written files are looked for in the parameter `out_dir`, where the method has one."""
+        self.method = method
+        self._params = dict(params)
+        self._backend = backend
+        self._out_dir = Path(params["out_dir"]) if "out_dir" in params else None
+        self._out_dir_is_new = self._out_dir is not None and not self._out_dir.exists()
+        self._client: BackendClient | None = None
+        self._id: int | None = None
+        self._cancel_asked_at: float | None = None
+        self.state: State = "starting"
+        self.step = 0
+        self.total = int(params.get("steps", 1))
+        self.eta_s: float | None = None
+        """Seconds that are left, None while unknown."""
+        self.message = "Starting the backend"
+        self.picture: Path | None = None
+        """A PNG of what is there so far."""
+        self.pictures: dict[int, Path] = {}
+        """PNGs by index, of a method that makes several people."""
+        self.result: dict[str, Any] | None = None
+        """The child's."""
+        self.error: RequestError | None = None
+        self._connecting = backend.connecting()
+        if not backend.admit(self):
+            self._fail(RequestError("the backend is at work already", "wait for it, or cancel it first", "busy"))
+
+    @property
+    def finished(self) -> bool:
+        """Nothing more will happen."""
+        return self.state in FINAL
+
+    @property
+    def fraction(self) -> float:
+        """Progress from 0 to 1."""
+        return 1.0 if self.state == "done" else min(self.step / max(self.total, 1), 1.0)
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """What the backend says of itself (version, device, memory); empty until it answers."""
+        return self._client.info if self._client is not None else {}
+
+    def tick(self) -> bool:
+        """Takes in what has happened; True if something visible changed. Never waits."""
+        if self.finished:
+            return False
+        self._backend.see_off()
+        before = (self.state, self.step, self.total, self.eta_s, self.message, self.picture, dict(self.pictures))
+        if self._client is None:
+            self._tick_start()
+        if self._client is not None and not self.finished:
+            for event in self._client.poll():
+                self._take(event)
+                if self.finished:
+                    break
+            if self._id is None and not self.finished:
+                self._ask(self._client)
+        self._lose_patience()
+        return before != (
+            self.state, self.step, self.total, self.eta_s, self.message, self.picture, self.pictures
+        )  # fmt: skip
+
+    def cancel(self) -> None:
+        """Asks for an end; `tick` goes on until the state is cancelled, which it is within a second."""
+        if self.finished or self._cancel_asked_at is not None:
+            return
+        self._cancel_asked_at = time.monotonic()
+        self.state, self.message, self.eta_s = "cancelling", "Cancelling", None
+        if self._client is not None and self._id is not None:
+            self._client.cancel(self._id)
+
+    # starting
+
+    def _tick_start(self) -> None:
+        if self._cancel_asked_at is not None:
+            self._connecting.close()
+            self._end("cancelled", "Cancelled")
+            return
+        try:
+            next(self._connecting)
+        except StopIteration as connected:
+            self._client = client = connected.value
+            if not client.info.get("ready"):
+                self.message = "Loading PyTorch"
+        except Exception as error:  # whatever it is, the user is to read it
+            self._fail(RequestError(str(error) or type(error).__name__, "", "environment"))
+
+    def _ask(self, client: BackendClient) -> None:
+        """Sends the request, unless the child has still to find out that an earlier one is not wanted any more."""
+        if self._cancel_asked_at is not None:
+            self._end("cancelled", "Cancelled")
+        elif not client.occupied:
+            self._id = client.request(self.method, self._params)
+
+    # following
+
+    def _take(self, event: Event) -> None:
+        if isinstance(event, Notification) and event.method == "progress" and event.params.get("id") == self._id:
+            self._take_progress(event.params)
+        elif isinstance(event, Response) and event.id == self._id:
+            self.result = event.result
+            self.step = self.total
+            self._end("done", "Done")
+        elif isinstance(event, ErrorResponse) and event.id == self._id:
+            if event.code == CANCELLED_CODE:
+                self._end("cancelled", "Cancelled")
+            else:
+                remedy = memory_advice(self._params) if event.kind == "out_of_memory" else event.remedy
+                self._fail(RequestError(event.message, remedy, event.kind, self._log()))
+        elif isinstance(event, Died):
+            self._clear_leftovers()
+            if self._cancel_asked_at is not None:
+                self._end("cancelled", "Cancelled")
+            else:
+                remedy = f"Try again; if it was the memory, {memory_advice(self._params)}"
+                self._fail(RequestError(event.message, remedy, "died", event.stderr))
+        elif isinstance(event, Silent):
+            self._kill()
+            said = f"the backend hung: it said nothing for {event.seconds:.0f} s and was ended"
+            self._fail(RequestError(said, "Try again", "hung", self._log()))
+
+    def _take_progress(self, params: dict[str, Any]) -> None:
+        if self._cancel_asked_at is not None:
+            return
+        stage = params.get("stage", "")
+        self.state = "running"
+        self.message = STAGES.get(stage, stage.capitalize())
+        self.eta_s = params.get("eta_s")
+        if params.get("picture") and "index" in params:
+            self.pictures[params["index"]] = Path(params["picture"])
+        elif params.get("picture"):
+            self.picture = Path(params["picture"])
+        samples = "steps" in self._params
+        if not samples or stage == "sample":
+            self.step, self.total = params["step"], params["total"]
+        if samples and stage == "sample":
+            self.message = f"{self.message}: step {self.step} of {self.total}"
+
+    def _lose_patience(self) -> None:
+        asked = self._cancel_asked_at
+        if self.finished or asked is None or time.monotonic() - asked < CANCEL_PATIENCE_S:
+            return
+        client = self._client
+        if client is not None and self._id is not None:
+            if client.info.get("ready"):
+                self._kill()
+            else:  # importing torch takes seconds that need not be spent again: the child drops the request after it
+                client.abandon(self._id)
+        self._end("cancelled", "Cancelled")
+
+    def _kill(self) -> None:
+        """Blender does not stand still while the system takes a large child away: what is left is cleared after it."""
+        client = self._client
+        if client is None or client.kill(_KILL_PATIENCE_S):
+            self._clear_leftovers()
+        else:
+            self._backend.part_with(client, self._clear_leftovers)
+
+    def _clear_leftovers(self) -> None:
+        """Half-written files of a killed child lie in a folder of its own (the backend's staging.py names it so)."""
+        if self._client is not None and self._out_dir is not None:
+            shutil.rmtree(self._out_dir / f".primdiffusion-partial-{self._client.pid}", ignore_errors=True)
+            if self._out_dir_is_new:
+                with contextlib.suppress(OSError):  # holds other things, or never came to be
+                    self._out_dir.rmdir()
+
+    def _log(self) -> tuple[str, ...]:
+        return self._client.stderr if self._client is not None else ()
+
+    def _fail(self, error: RequestError) -> None:
+        self.error = error
+        self._end("failed", str(error))
+
+    def _end(self, state: State, message: str) -> None:
+        self.state, self.message, self.eta_s = state, message, None

@@ -1,0 +1,208 @@
+"""The backend's private environment: made by venv and pip, tried, removed.
+
+What takes long is a process that a generator follows: it yields how far it is while it waits, so that a timer, or a
+command, can drive it, and closing it ends the process.
+
+env/           the virtual environment; env/ready.json, written last of all, says that it is finished
+pip/           pip's cache: a set-up that was cancelled does not download again; removed when it has succeeded
+temporary/     of pip and of the self-test
+set_up.log     what venv and pip said
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import shutil
+import sys
+import time
+from collections.abc import Generator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from .client import BackendClient
+from .environment import MARK, BackendPython, SetUpFolder, search
+from .packages import Lock, SetUpFailed, clean_environment, followed, what_went_wrong
+from .requests import Backend, Request
+
+State = Literal["absent", "broken", "ready"]
+OFFLINE = (
+    "Blender may not use the network; allow it in Preferences > System > Network > Allow Online Access, "
+    "or use Install from Folder"
+)
+TRIAL_S = 300.0
+"""A first import of torch compiles its byte code; a virus scanner reads along."""
+_TRIAL = {"seed": 0, "steps": 3, "size": 16}
+_DOWNLOADED, _INSTALLED = 0.6, 0.9
+"""Of the bar, when these are done."""
+_VENV = ("-I", "-m", "venv", "--clear")
+_INSTALL = (
+    "install", "--require-hashes", "--no-deps", "--only-binary", ":all:", "--no-compile", "--no-warn-script-location",
+    "--disable-pip-version-check", "--no-input", "--no-color", "--progress-bar", "off",
+)  # fmt: skip
+"""Named wheels of known hashes alone, nothing built. The child keeps byte code in the extension's cache."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """How far it is."""
+
+    message: str
+    fraction: float
+    """Of everything, 0 to 1."""
+
+
+Steps = Generator[Step, None, str]
+"""Returns a sentence on how it ended; raises SetUpFailed or OSError."""
+
+
+def state_of(folder: SetUpFolder) -> tuple[State, dict[str, Any]]:
+    """How far the environment is, and what its mark says of it. Takes a few file system calls.
+
+    broken: never finished, or the Python that it was made with is gone (another Blender was put in its place).
+    """
+    if not folder.environment.is_dir():
+        return "absent", {}
+    try:
+        about = json.loads((folder.environment / MARK).read_text(encoding="utf-8"))
+        made_with = Path(about["base"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "broken", {}
+    return ("ready" if folder.python.exists() and made_with.exists() else "broken"), about
+
+
+def set_up(
+    folder: SetUpFolder, lock: Lock, compute: str, module_path: Path, cache: Path, wheels: Path | None = None
+) -> Steps:
+    """Make the environment anew from the package index, or from a folder of `wheels`; it is ready when it has made a
+    person. `compute` (cpu, cuda or apple) is for its mark."""
+    python, host = folder.python, sys.executable
+    folder.root.mkdir(parents=True, exist_ok=True)
+    (folder.environment / MARK).unlink(missing_ok=True)
+    shutil.rmtree(folder.temporary, ignore_errors=True)
+    folder.temporary.mkdir(exist_ok=True)
+    folder.log.unlink(missing_ok=True)
+    yield Step("Making the environment", 0.0)
+    environment = clean_environment(folder.temporary, folder.pip_cache)
+    making = [host, *_VENV, str(folder.environment)]
+    for _ in followed(making, folder.log, environment, _no_venv):
+        yield Step("Making the environment", 0.0)
+    source = [] if wheels is None else ["--no-index", "--find-links", str(wheels)]
+    command = [*_pip(python), *_INSTALL, *source, "-r", str(lock.path)]
+    for said in followed(command, folder.log, environment, what_went_wrong):
+        yield _installing(folder, lock, said)
+    about = yield from _trial(python, module_path, cache, folder.temporary)
+    marked = {
+        **about,
+        "compute": compute,
+        "lock": lock.digest,
+        "lock_name": lock.path.name,
+        "packages": len(lock.packages),
+        "bytes": lock.installed_bytes,
+        "base": host,
+    }
+    unfinished = folder.environment / f"{MARK}.part"
+    unfinished.write_text(json.dumps(marked, indent=1), encoding="utf-8")
+    os.replace(unfinished, folder.environment / MARK)
+    for leftover in (folder.pip_cache, folder.temporary):
+        shutil.rmtree(leftover, ignore_errors=True)
+    return _ready(about)
+
+
+def self_test(folder: SetUpFolder, python: Path | None, module_path: Path, cache: Path) -> Steps:
+    """Make a person in a few steps with the environment, or with another `python`."""
+    folder.temporary.mkdir(parents=True, exist_ok=True)
+    about = yield from _trial(python or folder.python, module_path, cache, folder.temporary)
+    return _ready(about)
+
+
+def remove(folder: SetUpFolder, cache: Path | None) -> Steps:
+    """Environment, downloads and `cache`, where it is not shared, are gone; nothing else in the folder is touched."""
+    _, about = state_of(folder)
+    (folder.environment / MARK).unlink(missing_ok=True)
+    going = [folder.environment, folder.pip_cache, folder.temporary, *([cache] if cache is not None else ())]
+    program = "import shutil, sys; [shutil.rmtree(path) for path in sys.argv[1:]]"
+    command = [sys.executable, "-I", "-c", program, *(str(path) for path in going if path.exists())]
+    environment = clean_environment(folder.root, folder.pip_cache)
+    yield Step("Removing the environment", 0.0)
+    for _ in followed(command, folder.log, environment, _in_use):
+        yield Step("Removing the environment", 0.5)
+    freed = f"; {about['bytes'] / 1e6:.0f} MB are free again" if "bytes" in about else ""
+    return f"The backend was removed{freed}"
+
+
+def _pip(python: Path) -> list[str]:
+    return [str(python), "-I", "-m", "pip"]
+
+
+def _trial(python: Path, module_path: Path, cache: Path, temporary: Path) -> Generator[Step, None, dict[str, Any]]:
+    """The real child makes a person; returns what it is and what it computes on."""
+    found: list[BackendPython] = []
+
+    def make_client() -> Generator[None, None, BackendClient]:
+        found.append((yield from search(python, module_path=module_path, cache_dir=cache, timeout_s=TRIAL_S)))
+        return BackendClient(python, module_path, cache_dir=cache)
+
+    backend, began = Backend(make_client), time.monotonic()
+    person = temporary / "person"
+    try:
+        request = Request(backend, "generate", {**_TRIAL, "out_dir": str(person)})
+        while not request.finished:
+            yield Step(f"Testing the backend: {request.message}", _INSTALLED)
+            request.tick()
+        if request.error is not None:
+            last = f" ({request.error.log[-1]})" if request.error.kind == "died" and request.error.log else ""
+            raise SetUpFailed(f"the self-test failed: {request.error.message}{last}")
+        if not Path((request.result or {}).get("human", "")).is_file():
+            raise SetUpFailed("the self-test failed: the backend made no person and did not say why")
+        return {
+            "device": request.info.get("device_name") or "",
+            "seconds": round(time.monotonic() - began, 1),
+            "torch": found[0].torch,
+            "python": found[0].python,
+            "version": found[0].version,
+        }
+    finally:
+        backend.release()
+        shutil.rmtree(person, ignore_errors=True)
+
+
+def _installing(folder: SetUpFolder, lock: Lock, said: str) -> Step:
+    """How far pip is, by its files."""
+    if "Installing collected packages" in said:
+        pattern = "Lib/site-packages/*.dist-info" if os.name == "nt" else "lib/python*/site-packages/*.dist-info"
+        share = min(len(list(folder.environment.glob(pattern))) / len(lock.packages), 1.0)
+        return Step(f"Installing {len(lock.packages)} packages", _DOWNLOADED + (_INSTALLED - _DOWNLOADED) * share)
+    total = max(lock.download_bytes, 1)
+    now = min(_wheel_bytes(folder.temporary), total)
+    return Step(f"Downloading, {now / 1e6:.0f} of {total / 1e6:.0f} MB", _DOWNLOADED * now / total)
+
+
+def _wheel_bytes(folder: Path) -> int:
+    """Of the wheels below a folder, where pip adds and removes some meanwhile."""
+    total = 0
+    for parent, _, names in os.walk(folder):
+        with contextlib.suppress(OSError):
+            total += sum(os.path.getsize(os.path.join(parent, name)) for name in names if name.endswith(".whl"))
+    return total
+
+
+def _no_venv(_said: str, _exit_code: int) -> str:
+    return (
+        f"the Python of this Blender ({sys.executable}) cannot make an environment: it lacks venv or ensurepip; "
+        "install them (on Debian and Ubuntu: sudo apt install python3-venv), then try again"
+    )
+
+
+def _in_use(said: str, _exit_code: int) -> str:
+    reason = said.strip().splitlines()[-1:]
+    return f"the environment cannot be removed ({' '.join(reason)}): close other Blenders, then try again"
+
+
+def _ready(about: Mapping[str, Any]) -> str:
+    return (
+        f"The backend is ready: torch {about['torch']} on {about['device'] or 'the CPU'}, "
+        f"tested in {about['seconds']:.0f} s"
+    )

@@ -1,0 +1,329 @@
+"""Exports of humans: textured meshes, .human files, 3D Gaussians and VDB sequences; imports of .human files."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ..engine.picture import pose_of
+from ..motion.skeleton import unchain
+from ..scene.armature import keyframe_poses, pose_from_joint_rotations
+from ..scene.attachment import attachment_of, set_attachment
+from ..scene.convention import points_to_backend
+from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
+from ..scene.human import armature_of, person_file
+from ..scene.human_file import HumanMotion, motion_in, read_tensors, reshaped, with_motion, write_tensors
+from ..scene.merged import MergedGrid, merged_of, read_grid, write_grid
+from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy
+from ..scene.shape import BODY_FILE, betas_of, generated_betas, has_custom_shape, shape_model_of
+from ..scene.surface import carrier_of, primitives_of
+from .generate import build_person
+from .queue import Job
+from .target import HumanTarget
+
+
+def show(person: bpy.types.Collection, what: str) -> None:
+    """Switch to `what`: VOLUMES, VIEWPORT or MESH. Raises ValueError where there is no proxy; makes no undo step."""
+    proxy = proxy_of(person)
+    if proxy is None:
+        raise ValueError(f"{person.name!r} has no mesh proxy yet: press Add Mesh Proxy")
+    set_attachment(person, attachment_of(person))  # shows the parts of the current attachment
+    proxy.hide_viewport, proxy.hide_render = what == "VOLUMES", what != "MESH"
+    for part in (primitives_of(person), carrier_of(person), merged_of(person)):
+        if part is not None:
+            part.hide_viewport = part.hide_viewport or what != "VOLUMES"
+            part.hide_render = part.hide_render or what == "MESH"
+
+
+def shown(person: bpy.types.Collection) -> str:
+    """What is shown now: VOLUMES, VIEWPORT or MESH."""
+    proxy = proxy_of(person)
+    if proxy is None or proxy.hide_viewport:
+        return "VOLUMES"
+    return "VIEWPORT" if proxy.hide_render else "MESH"
+
+
+@dataclasses.dataclass(frozen=True)
+class ProxyJob(Job):
+    """Base of the jobs that need a mesh proxy."""
+
+    target: HumanTarget
+    texture_px: int
+    triangles: int
+
+    method = "proxy"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        return {
+            "person": self.target.file_now(),
+            "out_dir": str(folder / "proxy"),
+            "betas": betas_of(self.target.found()).tolist(),
+            "texture_px": self.texture_px,
+            "triangles": self.triangles,
+        }
+
+    def built(self, person: bpy.types.Collection, result: dict[str, Any]) -> bpy.types.Object:
+        """The proxy as an object, in no collection, with the current shape of the body."""
+        made = np.array(result["betas"], np.float64)
+        proxy = build_proxy(person, read_proxy(Path(result["proxy"])), Path(result["texture"]), made)
+        if BODY_FILE in person:
+            follow_shape(person, proxy, betas_of(person))
+        return proxy
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportMeshJob(ProxyJob):
+    """Write armature and proxy to a file; the scene stays as it is."""
+
+    kind = "export_mesh"
+
+    path: Path
+    format: str
+    frames: FrameRange
+
+    @property
+    def label(self) -> str:
+        return f"Export {self.target.name} to {self.path.name}"
+
+    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+        person = self.target.found()
+        armature = armature_of(person)
+        check_ready(armature)
+        proxy = self.built(person, result)
+        try:
+            write_model(context, armature, proxy, self.path, self.format, self.frames)
+        finally:
+            remove_proxy(proxy)
+        size = self.path.stat().st_size / 1e6
+        frames = f", {self.frames.last - self.frames.first + 1} frames" if self.frames.animated else ""
+        return f"Exported {person.name} to {self.path.name}: {result['triangles']} triangles{frames}, {size:.1f} MB"
+
+
+@dataclasses.dataclass(frozen=True)
+class AddProxyJob(ProxyJob):
+    """Add the proxy to the human, in place of an earlier one."""
+
+    kind = "add_proxy"
+    undo = "Add Mesh Proxy"
+
+    @property
+    def label(self) -> str:
+        return f"Mesh Proxy of {self.target.name}"
+
+    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+        person = self.target.found()
+        proxy = self.built(person, result)
+        earlier = proxy_of(person)
+        if earlier is not None:
+            remove_proxy(earlier)
+        person.objects.link(proxy)
+        show(person, "VIEWPORT")
+        return f"Mesh proxy of {result['triangles']} triangles for {person.name} in {result['seconds']:.1f} s"
+
+
+def scene_frames(scene: bpy.types.Scene, animated: bool) -> FrameRange:
+    """The scene's range, or the current frame."""
+    if animated:
+        return FrameRange(scene.frame_start, scene.frame_end)
+    return FrameRange(scene.frame_current, scene.frame_current)
+
+
+def posed_now(context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
+    """The human at the current frame: see `posed_frames`."""
+    return posed_frames(context, person, [context.scene.frame_current])[0]
+
+
+def posed_frames(
+    context: bpy.types.Context, person: bpy.types.Collection, frames: Iterable[int]
+) -> list[dict[str, Any]]:
+    """The human at these frames: file, object matrix, joints and shape, as parameters of the child's `draw`.
+
+    Raises ValueError for an armature in Edit Mode or without SMPL's bones, FileNotFoundError where the file is missing.
+    """
+    armature = armature_of(person)
+    check_ready(armature)
+    found = []
+    with scene_with_only(context, armature) as scene:
+        for frame in frames:
+            if frame != scene.frame_current:
+                scene.frame_set(frame)
+            evaluated = armature.evaluated_get(scene.view_layers[0].depsgraph)
+            found.append(pose_of(evaluated, np.array(evaluated.matrix_world, np.float64), person).params())
+    return found
+
+
+def write_human(
+    context: bpy.types.Context, person: bpy.types.Collection, path: Path, frames: FrameRange | None
+) -> None:
+    """Write the human with its current shape, and its motion on `frames`. Raises ValueError or OSError.
+
+    The motion is that of the joints in the armature's space, constraints and layers included; the object's own
+    transform is left out.
+    """
+    human = read_tensors(person_file(person))
+    if has_custom_shape(person):
+        betas, growth = betas_of(person), None
+        if BODY_FILE in person:  # humans of earlier versions have none, and boxes of fixed size
+            growth = shape_model_of(person).growth(generated_betas(person), betas)
+        human = reshaped(human, betas, growth)
+    motion = None if frames is None else _motion(context, person, frames)
+    write_tensors(path, with_motion(human, motion))
+
+
+def _motion(context: bpy.types.Context, person: bpy.types.Collection, frames: FrameRange) -> HumanMotion:
+    numbers = range(frames.first, frames.last + 1)
+    joints = np.array([entry["joints"] for entry in posed_frames(context, person, numbers)], np.float64)
+    pelvis = points_to_backend(np.array(armature_of(person).data.bones["pelvis"].head_local))
+    left, _, right = np.linalg.svd(joints[..., :3])
+    rotations = left @ right  # the nearest rotations: bones may be scaled
+    translations = joints[:, 0, :, :3] @ pelvis + joints[:, 0, :, 3] - pelvis
+    render = context.scene.render
+    return HumanMotion(
+        np.array(numbers, np.float32),
+        unchain(rotations).astype(np.float32),
+        translations.astype(np.float32),
+        render.fps / render.fps_base,
+    )
+
+
+_PICTURE_PX = 16
+"""Of the child's previews, which are not used here."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportGaussiansJob(Job):
+    """Write a human in a pose as 3D Gaussians."""
+
+    kind = "export_gaussians"
+    method = "gaussians"
+
+    target: HumanTarget
+    path: Path
+    person: dict[str, Any]
+    """The human and its pose, as parameters of `draw`."""
+    limit: int
+
+    @property
+    def label(self) -> str:
+        return f"Export {self.target.name} to {self.path.name}"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        pose = {name: self.person[name] for name in ("object", "joints", "betas")}
+        return {"person": self.target.file_now(), **pose, "limit": self.limit, "out": str(folder / "gaussians.ply")}
+
+    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+        put(Path(result["out"]), self.path)
+        size = self.path.stat().st_size / 1e6
+        return f"Exported {self.target.name} to {self.path.name}: {result['gaussians']} Gaussians, {size:.1f} MB"
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportVdbSequenceJob(Job):
+    """Write a human as one grid for each frame, in world space."""
+
+    kind = "export_vdb_sequence"
+    method = "merge_frames"
+
+    target: HumanTarget
+    folder: Path
+    stem: str
+    people: list[dict[str, Any]]
+    """Parameters of `draw`, an entry for each frame."""
+    first: int
+    """The first frame's number."""
+    voxel: float
+
+    @property
+    def label(self) -> str:
+        return f"Export {len(self.people)} VDB files of {self.target.name}"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        file = self.target.file_now()
+        people = [{**person, "human": file} for person in self.people]
+        return {"people": people, "voxel": self.voxel, "out_dir": str(folder)}
+
+    def finish(self, _context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
+        written = []
+        for index, grid in enumerate(result["files"]):
+            name = f"{self.stem}_{self.first + index:04d}.vdb"
+            write_grid(_for_other_programs(read_grid(Path(grid))), folder / name)
+            Path(grid).unlink()
+            written.append(folder / name)
+        size = sum(path.stat().st_size for path in written) / 1e6
+        for path in written:
+            put(path, self.folder / path.name)
+        return f"Exported {len(written)} frames of {self.target.name} to {self.folder.name}: {size:.0f} MB"
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportHumanJob(Job):
+    """Add the human of a .human file, with its motion if any."""
+
+    kind = "import_human"
+    method = "human_npz"
+    undo = "Import Human"
+
+    path: str
+    at: tuple[float, float, float] | None = None
+    """Location of the human, metres; None for the world's origin."""
+
+    @property
+    def label(self) -> str:
+        return f"Import {Path(self.path).name}"
+
+    @property
+    def new_person(self) -> str:
+        return name_of(self.path)
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        return {"person": self.path, "out_dir": str(folder), "size": _PICTURE_PX}
+
+    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+        motion = motion_in(read_tensors(Path(self.path)))
+        person, notice = build_person(context, result, "Imported", name_of(self.path))
+        armature = armature_of(person)
+        if motion is not None:
+            _move(armature, motion)
+        if self.at is not None:
+            armature.location.xy = self.at[:2]
+            armature.location.z += self.at[2]
+        return notice
+
+
+def name_of(path: str) -> str:
+    """The name for the human of this file."""
+    name = Path(path).name
+    for ending in (".safetensors", ".human"):
+        name = name.removesuffix(ending)
+    return name or "Human"
+
+
+def put(source: Path, target: Path) -> None:
+    """Copy a finished file to its destination, where it appears whole. Raises OSError."""
+    unfinished = target.with_name(f".{target.name}.part")
+    try:
+        shutil.copyfile(source, unfinished)
+        unfinished.replace(target)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _for_other_programs(grid: MergedGrid) -> MergedGrid:
+    """Undo the half voxel by which `write_grid` moves grids for old versions of Cycles."""
+    shift = 0.5 * grid.voxel if bpy.app.version < (5, 0) else 0.0
+    return dataclasses.replace(grid, origin=grid.origin + shift)
+
+
+def _move(armature: bpy.types.Object, motion: HumanMotion) -> None:
+    if len(motion.frames) == 1:
+        pose_from_joint_rotations(armature, motion.rotations[0], motion.translations[0])
+        return
+    keyframe_poses(
+        armature, np.asarray(motion.frames, np.float64), motion.rotations, motion.translations, armature.name
+    )

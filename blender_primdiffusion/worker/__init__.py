@@ -1,1 +1,0 @@
-"""The backend as seen from Blender: find its Python, run it as a child process, follow one job. No bpy in here."""

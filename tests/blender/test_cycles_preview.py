@@ -1,0 +1,102 @@
+"""What Cycles shows: colours and opacity of the volumes, where the marcher's conventions put them."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+import synthetic
+
+from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.cycles import posed_extent, setup_cycles_preview
+from blender_primdiffusion.scene.human import armature_of
+from blender_primdiffusion.scene.material import GAIN_NODE, MATERIAL_NAME
+
+RED = (0.6, 0.1, 0.05)
+DENSITY = 20.0
+HALF = np.array([0.05, 0.07, 0.06])
+
+
+@pytest.fixture
+def lone_box(saved_scene, tmp_path):
+    """A person of one box along the axes at chest height, red, denser in its left half (the person's left, +x)."""
+    density = np.full((1, 8, 8, 8), DENSITY, np.float32)
+    density[..., :4] *= 0.25  # the last axis, W, runs along T = +x: the person's right half
+    person = synthetic.write(
+        tmp_path / "human.npz",
+        1,
+        position=np.array([[0.0, 0.3, 0.0]]),
+        rotation=np.eye(3)[None],
+        half_extent=HALF[None],
+        primitive_weights=np.eye(24)[[9]],
+        rgb=np.broadcast_to(np.float16(RED), (1, 8, 8, 8, 3)),
+        density=density,
+    )
+    return build_human(saved_scene, person)
+
+
+def render(path) -> np.ndarray:
+    """The picture [H, W, 4], linear and premultiplied, top row first."""
+    scene = bpy.context.scene
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(str(path))
+    return np.array(image.pixels[:]).reshape(image.size[1], image.size[0], 4)[::-1]
+
+
+def test_a_box_has_its_colour_opacity_size_and_place_in_cycles(lone_box, tmp_path):
+    camera = setup_cycles_preview(bpy.context.scene, size=96, samples=4)
+    camera.data.type, camera.data.ortho_scale = "ORTHO", 0.24
+    centre = np.array([0, 0, 0.3]) + np.array(armature_of(lone_box).location)
+    camera.location = (0, -3, centre[2])
+    gain = bpy.data.materials[MATERIAL_NAME].node_tree.nodes[GAIN_NODE].outputs[0]
+    gain.default_value = 1.0
+    picture = render(tmp_path / "box.exr")
+    alpha, metres = picture[..., 3], 0.24 / 96
+    opaque = alpha > 0.2
+    np.testing.assert_allclose(
+        picture[..., :3][opaque] / alpha[opaque][:, None], np.broadcast_to(RED, (opaque.sum(), 3)), atol=5e-3
+    )
+
+    depth = -np.log(1 - alpha)
+    mass = depth.sum() * metres**2
+    axis = np.exp(-8 * np.abs(np.linspace(-1, 1, 8)) ** 8)
+    weights = np.where(np.arange(8) < 4, 0.25, 1.0) * axis
+    voxel = np.prod(2 * HALF / 7)
+    assert mass == pytest.approx(DENSITY * weights.sum() * axis.sum() ** 2 * voxel, rel=0.03)
+
+    columns = (np.arange(96) + 0.5 - 48) * metres
+    expected_x = (weights * np.linspace(-HALF[0], HALF[0], 8)).sum() / weights.sum()
+    # a wrong half voxel would be 7 to 10 mm
+    seen_x, seen_z = (depth * columns).sum() / depth.sum(), (depth * -columns[:, None]).sum() / depth.sum()
+    assert expected_x > 0.01  # the dense half is on the right of the picture: not mirrored
+    assert seen_x == pytest.approx(expected_x, abs=1.5e-3)
+    assert seen_z == pytest.approx(0.0, abs=1.5e-3)
+
+
+def test_the_camera_frames_a_posed_person_from_every_side(saved_scene, tmp_path):
+    person = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 8))
+    pose_from_joint_rotations(armature_of(person), synthetic.random_rotations(np.random.default_rng(0), 24), np.ones(3))
+    armature_of(person).location.x += 5
+    from bpy_extras.object_utils import world_to_camera_view
+
+    for yaw in (0.0, 0.7, np.pi / 2, 3.0):
+        camera = setup_cycles_preview(bpy.context.scene, yaw=yaw)
+        bpy.context.view_layer.update()
+        low, high = posed_extent(person)
+        matrix = armature_of(person).matrix_world
+        seen = [
+            world_to_camera_view(bpy.context.scene, camera, matrix @ bone.head)
+            for bone in armature_of(person).pose.bones
+        ]
+        assert all(0 < point.x < 1 and 0 < point.y < 1 and point.z > 0 for point in seen)
+        span = max(np.ptp([point.x for point in seen]), np.ptp([point.y for point in seen]))
+        assert span > 0.4
+        assert (high > low).all()
+
+
+def test_an_empty_scene_has_no_human_to_frame(empty_scene):
+    with pytest.raises(ValueError, match="no person in the scene"):
+        setup_cycles_preview(bpy.context.scene)

@@ -1,0 +1,64 @@
+"""Jobs about a person find the person's file when their turn comes, wherever it is by then."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import bpy
+import pytest
+import synthetic_shape
+
+from blender_primdiffusion.jobs.assets import HumanAssetJob, PoseAssetJob
+from blender_primdiffusion.jobs.edit import BlendJob, RedressJob, TransferJob, VaryJob
+from blender_primdiffusion.jobs.export import (
+    AddProxyJob,
+    ExportGaussiansJob,
+    ExportMeshJob,
+    ExportVdbSequenceJob,
+    posed_frames,
+    posed_now,
+)
+from blender_primdiffusion.jobs.merge import FitGainJob, MergeJob, Moment
+from blender_primdiffusion.jobs.queue import Job
+from blender_primdiffusion.jobs.target import HumanTarget
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.export_model import FrameRange
+from blender_primdiffusion.scene.human import person_file
+
+
+@pytest.fixture
+def person(addon, tmp_path):
+    file = tmp_path / "person.human.safetensors"
+    file.write_bytes(b"a person")
+    return build_human(addon, synthetic_shape.write(tmp_path / "human.npz", 6), "Änne", [file])
+
+
+def jobs_about(person: bpy.types.Collection, folder: Path) -> list[Job]:
+    target, moment, context = HumanTarget.of(person), Moment.now(person), bpy.context
+    return [
+        VaryJob.of(person, 3, {"amount": 0.5, "seed": 3}),
+        RedressJob.of(person, 3, {"region": {"painted": [0.0, 1.0]}, "seed": 3}),
+        TransferJob.of(person, 3, {"other": "/a/b"}),
+        BlendJob.of(person, 3, {"other": "/a/b", "fraction": 0.5}),
+        MergeJob(target, moment, 0.006),
+        FitGainJob(target, moment),
+        ExportMeshJob(target, 512, 9000, folder / "ä.glb", "GLB", FrameRange(1, 3)),
+        AddProxyJob(target, 512, 9000),
+        ExportGaussiansJob(target, folder / "ä.ply", posed_now(context, person), 500),
+        ExportVdbSequenceJob(target, folder, "ä", posed_frames(context, person, range(1, 4)), 1, 0.01),
+        HumanAssetJob(target),
+        PoseAssetJob.of(person, "Lehnt"),
+    ]
+
+
+def test_jobs_ask_where_the_file_is_when_their_turn_comes(person, tmp_path):
+    jobs, before = jobs_about(person, tmp_path), person_file(person)
+    now = before.parent.rename(tmp_path / "elsewhere") / before.name
+    for volume in bpy.data.volumes:
+        volume.filepath = str(now.parent / Path(volume.filepath).name)
+    assert person_file(person) == now
+    for job in jobs:
+        asked = json.dumps(job.params(tmp_path))
+        assert json.dumps(str(before)) not in asked, job.label
+        assert json.dumps(str(now)) in asked, job.label

@@ -1,0 +1,362 @@
+"""A person in the scene on their way to become another, or to have lost volumes back, and all that can happen
+meanwhile."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import bpy
+import pytest
+import synthetic_shape
+from jobs_driven import drive, error_of, notice_of
+
+import blender_primdiffusion
+from blender_primdiffusion.jobs.edit import RedressJob, RegenerateJob, RestoreJob, VaryJob, made_from_seed
+from blender_primdiffusion.jobs.follow import building, follow
+from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.jobs.target import HumanTarget
+from blender_primdiffusion.scene import volumes
+from blender_primdiffusion.scene.human import MARK, folder_of, humans, person_file, remove_human, volume_path
+from blender_primdiffusion.scene.missing import missing_files
+
+GIVES_GARBAGE, FINE = 3, 8
+"""Seeds that the fake child takes as orders, and one that it does not."""
+COUNT = 12
+"""Primitives of the synthetic person."""
+OF_THE_REGION = 2
+"""Primitives that the fake child changes where a region is given."""
+MEANWHILE = "blender_primdiffusion.jobs.follow.SLICE_S"
+
+
+@pytest.fixture
+def person(addon, tmp_path, monkeypatch):
+    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared.npz", COUNT)))
+    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    bpy.ops.ed.undo_push(message="a person")
+    return humans(addon.scene)[0]
+
+
+@pytest.fixture
+def varied(person, monkeypatch):
+    """The person, whose other volumes are written, and whose other grids are about to be read."""
+    monkeypatch.setattr(MEANWHILE, 0.0)
+    vary(person)
+    until_read()
+    return person
+
+
+def vary(person, seed: int = FINE) -> None:
+    queue.add(bpy.context, VaryJob.of(person, 2, {"amount": 0.5, "seed": seed}))
+
+
+def until_read(seconds: float = 30.0) -> None:
+    """Until some grids are read, and not all."""
+    end = time.monotonic() + seconds
+    while not 0.6 < building.fraction < 1.0:
+        assert time.monotonic() < end
+        assert follow() is not None
+        time.sleep(0.005)
+
+
+def shown(person) -> dict[str, Path]:
+    return {thing.name: volume_path(thing.data) for thing in person.all_objects if thing.type == "VOLUME"}
+
+
+def on_disk(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if "_humans" in str(path))
+
+
+def check_whole(person, count: int = COUNT) -> None:
+    files = shown(person).values()
+    assert len(files) == count
+    assert all(path.is_file() for path in files)
+    assert all(thing.data.grids.load() for thing in person.all_objects if thing.type == "VOLUME")
+    assert person_file(person).parent == next(iter(files)).parent
+    assert not list(person_file(person).parent.glob(".writing_*"))
+
+
+def check_drawn(person) -> None:
+    """Blender has the grids of all volumes in what it draws, also of those that it has missed."""
+    bpy.context.view_layer.update()
+    graph = bpy.context.evaluated_depsgraph_get()
+    drawn = [thing.evaluated_get(graph).data for thing in person.all_objects if thing.type == "VOLUME"]
+    assert [(len(volume.grids), volume.grids.error_message) for volume in drawn] == [(2, "")] * COUNT
+
+
+def test_an_edit_writes_its_volumes_in_slices(person, monkeypatch):
+    monkeypatch.setattr(MEANWHILE, 0.0)
+    written, write_file, ticks = [], volumes._write_file, [0]
+    monkeypatch.setattr(volumes, "_write_file", lambda *args: written.append(ticks[0]) or write_file(*args))
+    vary(person)
+    while follow() is not None:
+        ticks[0] += 1
+    assert len(written) == len(set(written)) == COUNT
+
+
+def test_only_what_the_edit_changes_is_written_and_read(person, monkeypatch):
+    monkeypatch.setattr(MEANWHILE, 0.0)
+    before = set(shown(person).values())
+    queue.add(bpy.context, RedressJob.of(person, 2, {"region": ["top"], "seed": FINE}))
+    until_read()
+    assert len(building._writing.result.files) == OF_THE_REGION
+    drive()
+    assert len(set(shown(person).values()) - before) == OF_THE_REGION
+    check_whole(person)
+
+
+def test_nothing_is_shown_until_all_is_in_one_undo_step(varied):
+    before = shown(varied)
+    assert len(list(folder_of(varied).glob("*.vdb"))) == 2 * COUNT
+    drive()
+    person = humans(bpy.context.scene)[0]
+    after = shown(person)
+    assert not set(before.values()) & set(after.values())
+    bpy.ops.ed.undo()
+    assert shown(humans(bpy.context.scene)[0]) == before
+    bpy.ops.ed.redo()
+    assert shown(humans(bpy.context.scene)[0]) == after
+    check_whole(humans(bpy.context.scene)[0])
+
+
+def test_an_edit_that_changes_nothing_has_nothing_to_read(person):
+    vary(person)
+    drive()
+    before = shown(person)
+    vary(person)
+    drive()
+    assert shown(person) == before
+    assert "0 of 12 volumes of Human changed" in notice_of("vary")
+
+
+def test_a_human_removed_meanwhile_is_reported_and_no_file_stays(varied, tmp_path):
+    before = {path.name for path in shown(varied).values()}
+    remove_human(varied)
+    drive()
+    assert "was removed during the edit" in error_of("vary")
+    assert {path.name for path in (tmp_path / "shot_humans").rglob("*.vdb")} == before
+
+
+def test_a_person_renamed_meanwhile_is_edited(varied):
+    varied.name = "Anna"
+    drive()
+    assert error_of("vary") == ""
+    check_whole(varied)
+
+
+def test_undo_that_makes_the_person_another_meanwhile_rejects_the_result(person, monkeypatch):
+    vary(person)
+    drive()
+    files = on_disk(folder_of(person).parents[1])
+    monkeypatch.setattr(MEANWHILE, 0.0)
+    vary(person, FINE + 1)
+    until_read()
+    bpy.ops.ed.undo()
+    drive()
+    assert "changed during the edit" in error_of("vary")
+    person = humans(bpy.context.scene)[0]
+    assert on_disk(folder_of(person).parents[1]) == files
+    check_whole(person)
+    bpy.ops.ed.redo()
+    check_whole(humans(bpy.context.scene)[0])
+
+
+def test_volumes_deleted_and_brought_back_meanwhile_show_what_they_should(person, monkeypatch):
+    removed = next(thing for thing in person.all_objects if thing.type == "VOLUME").name
+    before = shown(person)
+    bpy.data.objects.remove(bpy.data.objects[removed])
+    bpy.ops.ed.undo_push(message="a volume deleted")
+    monkeypatch.setattr(MEANWHILE, 0.0)
+    vary(person)
+    until_read()
+    assert len(building._writing.result.files) == COUNT - 1
+    bpy.ops.ed.undo()
+    drive()
+    person = humans(bpy.context.scene)[0]
+    assert not set(shown(person).values()) & set(before.values())
+    check_whole(person)
+
+
+def test_a_volume_deleted_meanwhile_stays_so(varied):
+    bpy.data.objects.remove(next(thing for thing in varied.all_objects if thing.type == "VOLUME"))
+    drive()
+    assert "11 of 11 volumes of Human changed" in notice_of("vary")
+    check_whole(varied, COUNT - 1)
+
+
+def test_a_person_reshaped_meanwhile_keeps_that_shape(varied):
+    armature = next(thing for thing in varied.objects if thing.type == "ARMATURE")
+    armature.primdiffusion_human.betas[0] = 1.25
+    drive()
+    assert armature.primdiffusion_human.betas[0] == pytest.approx(1.25)
+    check_whole(varied)
+
+
+def test_saved_elsewhere_meanwhile_all_of_the_person_goes_along(varied, tmp_path):
+    before = {path.name for path in shown(varied).values()}
+    (tmp_path / "film").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film" / "other.blend"))
+    drive()
+    person = humans(bpy.context.scene)[0]
+    check_whole(person)
+    assert person_file(person).parent == tmp_path / "film" / "other_humans" / "Human"
+    assert {path.name for path in (tmp_path / "shot_humans").rglob("*.vdb")} == before
+
+
+def test_a_first_save_meanwhile_takes_the_edited_person_along(addon, tmp_path, monkeypatch):
+    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared.npz", COUNT)))
+    bpy.ops.wm.read_homefile(use_empty=True)
+    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    monkeypatch.setattr(MEANWHILE, 0.0)
+    vary(humans(bpy.context.scene)[0])
+    until_read()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "late.blend"))
+    drive()
+    person = humans(bpy.context.scene)[0]
+    check_whole(person)
+    assert person_file(person).parent == tmp_path / "late_humans" / "Human"
+
+
+def test_files_removed_meanwhile_are_written_again(varied):
+    bpy.ops.primdiffusion.remove_unused_files()
+    drive()
+    check_whole(humans(bpy.context.scene)[0])
+
+
+def test_cancel_leaves_the_person_and_no_files(varied, tmp_path):
+    before = shown(varied)
+    bpy.ops.primdiffusion.cancel()
+    drive()
+    assert notice_of("vary") == "Cancelled"
+    assert shown(varied) == before
+    assert set((tmp_path / "shot_humans").rglob("*.vdb")) == set(before.values())
+    check_whole(varied)
+
+
+def test_cancel_leaves_files_that_undo_and_redo_need(person, monkeypatch):
+    vary(person)
+    drive()
+    bpy.ops.ed.undo()
+    person = humans(bpy.context.scene)[0]
+    monkeypatch.setattr(MEANWHILE, 0.0)
+    vary(person)  # to the very person that redo brings
+    until_read()
+    bpy.ops.primdiffusion.cancel()
+    drive()
+    bpy.ops.ed.redo()
+    check_whole(humans(bpy.context.scene)[0])
+
+
+def test_another_file_loaded_meanwhile_leaves_no_files(varied, tmp_path):
+    before = {path.name for path in shown(varied).values()}
+    bpy.ops.wm.read_homefile(use_empty=True)
+    drive()
+    assert {path.name for path in (tmp_path / "shot_humans").rglob("*.vdb")} == before
+
+
+def test_disabling_the_extension_leaves_no_files(varied, tmp_path):
+    before = {path.name for path in shown(varied).values()}
+    blender_primdiffusion.unregister()
+    assert {path.name for path in (tmp_path / "shot_humans").rglob("*.vdb")} == before
+    blender_primdiffusion.register()
+
+
+def test_a_full_disk_is_reported_and_leaves_scene_and_disk_as_they_were(person, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError("no space left on device")
+
+    before, files = shown(person), on_disk(tmp_path)
+    monkeypatch.setattr(volumes, "_write_file", full)
+    vary(person)
+    drive()
+    assert "no space left" in error_of("vary")
+    assert shown(person) == before
+    assert on_disk(tmp_path) == files
+
+
+def test_a_damaged_answer_is_reported_and_leaves_scene_and_disk_as_they_were(person, tmp_path):
+    before, files = shown(person), on_disk(tmp_path)
+    vary(person, GIVES_GARBAGE)
+    drive()
+    assert "is damaged" in error_of("vary")
+    assert shown(person) == before
+    assert on_disk(tmp_path) == files
+
+
+def test_a_failure_in_the_scene_leaves_no_files(varied, tmp_path, monkeypatch):
+    before = {path.name for path in shown(varied).values()}
+    monkeypatch.setattr("blender_primdiffusion.scene.edit.content_name", lambda _: 1 / 0)
+    drive()
+    assert error_of("vary")
+    assert {path.name for path in (tmp_path / "shot_humans").rglob("*.vdb")} == before
+
+
+def test_a_script_that_does_not_wait_for_the_volumes_gets_the_whole_edit(person):
+    before = shown(person)
+    vary(person)
+    while not queue.ready:
+        assert follow() is not None
+        time.sleep(0.01)
+    bpy.ops.primdiffusion.take_result()
+    assert follow() is None
+    assert not set(shown(person).values()) & set(before.values())
+    check_whole(person)
+
+
+@pytest.fixture
+def lost(person, monkeypatch):
+    """The person after five volumes were lost while Blender was closed, and were asked for; about to be read."""
+    monkeypatch.setattr(MEANWHILE, 0.0)
+    bpy.ops.wm.save_mainfile()
+    for path in sorted(folder_of(person).glob("*.vdb"))[:5]:
+        path.unlink()
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    (person,) = humans(bpy.context.scene)
+    bpy.context.view_layer.update()
+    assert not all(thing.data.grids.load() for thing in person.all_objects if thing.type == "VOLUME")  # seen by Blender
+    queue.add(bpy.context, RestoreJob(HumanTarget.of(person), str(person_file(person))))
+    until_read()
+    return person
+
+
+def test_lost_volumes_are_written_in_the_thread_and_counted_and_read(lost):
+    assert len(building._writing.result.files) == 5
+    drive()
+    assert "5 volumes of Human restored" in notice_of("restore_volumes")
+    check_drawn(lost)
+    check_whole(lost)
+    assert not missing_files()
+
+
+def test_lost_volumes_that_are_cancelled_stay_lost(lost):
+    bpy.ops.primdiffusion.cancel()
+    drive()
+    assert len(missing_files()[0].volumes) == 5
+
+
+def test_lost_volumes_of_a_file_saved_elsewhere_meanwhile_are_restored(lost, tmp_path):
+    (tmp_path / "film").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film" / "other.blend"))
+    drive()
+    assert not missing_files()
+    check_drawn(lost)
+
+
+def test_a_person_generated_again_is_written_in_the_thread(person, monkeypatch):
+    monkeypatch.setattr(MEANWHILE, 0.0)
+    bpy.ops.wm.save_mainfile()
+    made = made_from_seed(person)
+    for path in folder_of(person).iterdir():
+        path.unlink()
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    (person,) = humans(bpy.context.scene)
+    bpy.context.view_layer.update()
+    assert not any(thing.data.grids.load() for thing in person.all_objects if thing.type == "VOLUME")
+    queue.add(bpy.context, RegenerateJob(HumanTarget.of(person), made))
+    until_read()
+    drive()
+    assert error_of("regenerate") == ""
+    assert json.loads(person[MARK])["seed"] == made["seed"]
+    check_drawn(person)
+    check_whole(person)

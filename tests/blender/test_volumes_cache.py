@@ -1,0 +1,80 @@
+"""Memory of volumes that are gone."""
+
+from __future__ import annotations
+
+import bpy
+import psutil
+import synthetic
+
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.human import armature_of, volume_path
+from blender_primdiffusion.scene.volumes import free_unused_grids, read_headers
+
+
+def _resident_mb() -> float:
+    return psutil.Process().memory_info().rss / 1e6
+
+
+def test_grids_of_deleted_volumes_are_given_back_and_shown_ones_stay(saved_scene, tmp_path):
+    human = synthetic.write(tmp_path / "human.npz", 64)
+    kept = build_human(saved_scene, human, "Kept")
+    saved_scene.view_layer.update()
+    free_unused_grids()  # of earlier tests: what the process keeps of them would do for new ones
+    before = _resident_mb()
+    gone = build_human(saved_scene, synthetic.write(tmp_path / "other.npz", 64, seed=3), "Gone")
+    saved_scene.view_layer.update()
+    grown = _resident_mb()
+    for thing in list(gone.all_objects):
+        bpy.data.objects.remove(thing)
+    bpy.ops.outliner.orphans_purge(do_recursive=True)
+    free_unused_grids()
+    assert grown - before > 30, "a grid takes about 0.9 MB"
+    assert _resident_mb() - before < 0.35 * (grown - before)
+    assert all(thing.data.grids.load() for thing in kept.all_objects if thing.type == "VOLUME")
+
+
+def test_grids_of_people_who_are_shown_are_given_back_and_read_again(saved_scene, tmp_path):
+    person = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 64), "Shown")
+    free_unused_grids()
+    before = _resident_mb()
+    saved_scene.view_layer.update()
+    read = _resident_mb() - before
+    boxes = _boxes(person)
+    free_unused_grids()
+    assert read > 30
+    assert _resident_mb() - before < 0.35 * read
+    armature_of(person).pose.bones[0].location.x = 1.0
+    saved_scene.view_layer.update()
+    assert _resident_mb() - before < 0.35 * read, "posing reads no voxels"
+    assert _boxes(person) == boxes
+    for thing in person.all_objects:
+        thing.update_tag()
+        if thing.type == "VOLUME":
+            thing.data.update_tag()
+    saved_scene.view_layer.update()
+    assert _boxes(person) == boxes
+
+
+def _boxes(person: bpy.types.Collection) -> dict[str, list[tuple[float, ...]]]:
+    graph = bpy.context.evaluated_depsgraph_get()
+    volumes = [thing for thing in person.all_objects if thing.type == "VOLUME"]
+    return {thing.name: [tuple(corner) for corner in thing.evaluated_get(graph).bound_box] for thing in volumes}
+
+
+def test_reading_headers_leaves_the_blend_as_it_was(saved_scene, tmp_path):
+    person = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 8), "Shown")
+    was_dirty = bpy.data.is_dirty
+    read_headers([volume_path(thing.data) for thing in person.all_objects if thing.type == "VOLUME"])
+    assert bpy.data.is_dirty == was_dirty
+    assert len(bpy.data.volumes) == 8
+    saved_scene.view_layer.update()
+    assert not any(thing.data.grids.error_message for thing in person.all_objects if thing.type == "VOLUME")
+
+
+def test_the_users_preferences_are_as_before(empty_scene):
+    system = bpy.context.preferences.system
+    system.memory_cache_limit = 1234
+    bpy.context.preferences.is_dirty = False
+    free_unused_grids()
+    assert (system.memory_cache_limit, bpy.context.preferences.is_dirty) == (1234, False)
+    system.memory_cache_limit = 4096
