@@ -87,14 +87,14 @@ def load_human(path: str | Path) -> Human:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"there is no person in {path}: check the path, or generate one")
+        raise FileNotFoundError(f"there is no human file {path}: check the path, or generate a human")
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             _check_format(path, metadata)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  safe_open is no mapping
     except safetensors.SafetensorError as e:
-        raise HumanFileError(f"{path} is truncated or no safetensors file ({e}): generate the person again") from e
+        raise HumanFileError(f"{path} is truncated or not a safetensors file ({e}): generate the human again") from e
     _check_shapes(path, tensors)
     payload = Payload(tensors["rgb"], tensors["density"], tensors["delta_scale"])
     try:
@@ -104,20 +104,20 @@ def load_human(path: str | Path) -> Human:
     except BodySetupError as e:
         raise HumanFileError(f"{path}: {e}") from e
     except ValueError as e:
-        raise HumanFileError(f"{path} holds no whole person: {e}") from e
+        raise HumanFileError(f"{path} does not contain a valid human: {e}") from e
     return human
 
 
 def _check_format(path: Path, metadata: Mapping[str, str]) -> None:
     if metadata.get("format") != FORMAT:
-        raise NoPersonError(f"{path} is a safetensors file but holds no person: choose a .human.safetensors file")
+        raise NoPersonError(f"{path} is a safetensors file without a human: choose a .human.safetensors file")
     version = metadata.get("format_version", "")
     if not version.isdecimal() or int(version) < 1:
-        raise HumanFileError(f"{path} holds no whole person (its format version is {version!r}): generate it again")
+        raise HumanFileError(f"{path} does not contain a valid human (format version {version!r}): generate it again")
     if int(version) > FORMAT_VERSION_ON_FILES:
         raise HumanFileError(
-            f"{path} comes from a newer PrimDiffusion (format {version}, this one reads {FORMAT_VERSION_ON_FILES}): "
-            "update it"
+            f"{path} was written by a newer PrimDiffusion (format {version}, this one reads up to "
+            f"{FORMAT_VERSION_ON_FILES}): update it"
         )
 
 
@@ -129,18 +129,20 @@ def _body_setup(path: Path, metadata: Mapping[str, str], tensors: Mapping[str, t
 def _check_shapes(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
     for name, shape in SHAPES.items():
         if name not in tensors:
-            raise HumanFileError(f"{path} holds no whole person ({name} is missing): generate it again")
+            raise HumanFileError(f"{path} does not contain a valid human ({name} is missing): generate it again")
         if tuple(tensors[name].shape) != shape or not tensors[name].is_floating_point():
             given = f"{tensors[name].dtype} {tuple(tensors[name].shape)}"
-            raise HumanFileError(f"{path} holds no whole person ({name} is {given}, not {shape}): generate it again")
+            raise HumanFileError(
+                f"{path} does not contain a valid human ({name} is {given}, not {shape}): generate it again"
+            )
 
 
 def _check_betas(human: Human) -> None:
     largest = float(human.betas.abs().max())
     if largest > LARGEST_BETA:
         raise ValueError(
-            f"one of the betas is {largest:.3g} in size, beyond {LARGEST_BETA:g} no body is a person's: "
-            "choose smaller betas, or generate the person again"
+            f"the largest beta is {largest:.3g}, but bodies are only valid up to {LARGEST_BETA:g}: "
+            "choose smaller betas, or generate the human again"
         )
 
 
@@ -148,27 +150,27 @@ def _provenance(metadata: Mapping[str, str]) -> dict[str, Any]:
     try:
         provenance = json.loads(metadata.get("provenance", ""))
     except (ValueError, RecursionError) as e:
-        raise ValueError(f"its provenance is no JSON ({e}): generate the person again") from e
+        raise ValueError(f"its provenance is not JSON ({e}): generate the human again") from e
     _check_provenance(provenance)
     return provenance
 
 
 _KINDS: dict[str, tuple[str, Any]] = {
-    "seed": ("a whole number", int),
-    "steps": ("a whole number", int),
-    "sampler": ("a text", str),
+    "seed": ("an integer", int),
+    "steps": ("an integer", int),
+    "sampler": ("a string", str),
     "guidance": ("a number", (int, float)),
-    "checkpoint": ("a text", str),
-    "checkpoint_sha256": ("a text", str),
+    "checkpoint": ("a string", str),
+    "checkpoint_sha256": ("a string", str),
     "full_density": ("a number", (int, float)),
-    "version": ("a text", str),
+    "version": ("a string", str),
 }
 
 
 def _check_provenance(provenance: Any) -> None:
     """Raise ValueError, naming the entry, for one of a wrong type."""
     if not isinstance(provenance, Mapping):
-        raise ValueError(f"its provenance is no JSON object but {provenance!r:.60}: generate the person again")
+        raise ValueError(f"its provenance is {provenance!r:.60}, not a JSON object: generate the human again")
     for name, (wanted, kind) in _KINDS.items():
         if name in provenance and not _is(provenance[name], kind):
             _reject(name, provenance[name], wanted)
@@ -182,7 +184,7 @@ def _check_provenance(provenance: Any) -> None:
 
 
 def _check_attributes(name: str, attributes: Any) -> None:
-    wanted = "an object of texts and numbers"
+    wanted = "an object of strings and numbers"
     if not isinstance(attributes, Mapping):
         _reject(name, attributes, wanted)
     for value in attributes.values():
@@ -197,7 +199,7 @@ def _is(value: Any, kind: Any) -> bool:
 
 
 def _reject(name: str, value: Any, wanted: str) -> NoReturn:
-    raise ValueError(f"{name!r} of its provenance is {value!r:.60}, not {wanted}: generate the person again")
+    raise ValueError(f"{name!r} of its provenance is {value!r:.60}, not {wanted}: generate the human again")
 
 
 def export_for_blender(path: str | Path, human: Human) -> None:

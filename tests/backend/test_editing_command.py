@@ -110,15 +110,15 @@ def test_a_transfer_needs_no_checkpoint(line, tmp_path):
         (["vary", "--steps", "0"], 1, "0 steps"),
         (["vary", "--steps", "1001"], 1, "1001 steps"),
         (["vary", "--amount", "2"], 1, "amount is 2.0: choose a number from 0 to 1"),
-        (["vary", "--attributes", "tall"], 1, "'tall' is no attribute: write NAME=VALUE"),
+        (["vary", "--attributes", "tall"], 1, "'tall' is not an attribute: write NAME=VALUE"),
         (["vary", "--attributes", "species=cat"], 1, "knows no attribute 'species'"),
         (["vary", "--size", "0"], 1, "pictures of 0 pixels"),
-        (["interpolate", "nobody.human.safetensors"], 1, "there is no person in"),
-        (["interpolate", "tiny.safetensors"], 1, "holds no person"),
+        (["interpolate", "nobody.human.safetensors"], 1, "there is no human file"),
+        (["interpolate", "tiny.safetensors"], 1, "without a human"),
         (["inpaint"], 1, "either --region NAME or --weights FILE"),
         (["inpaint", "--region", "top", "--weights", "painted.npz"], 1, "either --region NAME or --weights FILE"),
         (["inpaint", "--region", "hat"], 1, "'hat': choose from face"),
-        (["inpaint", "--region", "clothes", "skin", "hair"], 1, "the region is the whole person"),
+        (["inpaint", "--region", "clothes", "skin", "hair"], 1, "the region is the whole human"),
         (["inpaint", "--weights", "nothing.npz"], 1, "nothing.npz"),
         (["inpaint", "--weights", "ann.human.safetensors"], 1, "ann.human.safetensors"),
         (["inpaint", "--region", "top", "--checkpoint", "bob.human.safetensors"], 1, "choose another file"),
@@ -197,4 +197,4 @@ def test_info_of_a_damaged_person_says_so_and_not_that_it_is_no_checkpoint(folde
     path.write_bytes((folder / "ann.human.safetensors").read_bytes()[:-10])
     with pytest.raises(SystemExit):
         cli.main(["info", str(path)])
-    assert "generate the person again" in capsys.readouterr().err
+    assert "generate the human again" in capsys.readouterr().err

@@ -152,7 +152,7 @@ def test_an_amount_outside_0_to_1_is_rejected(human, amount):
     ("region", "fact"),
     [
         (torch.zeros(K, dtype=torch.bool), "the region is empty"),
-        (torch.ones(K, dtype=torch.bool), "the whole person"),
+        (torch.ones(K, dtype=torch.bool), "the whole human"),
         (torch.ones(12, dtype=torch.bool), "a mask bool"),
         (torch.ones(K), "a mask bool"),
     ],

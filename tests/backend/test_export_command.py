@@ -46,7 +46,7 @@ def test_a_posed_person_becomes_gaussians(saved):
     ("more", "sentence"),
     [
         (["--out", "anna.stl"], "choose one"),
-        (["--out", "anna.glb", "--pose", "pose.json"], "cannot hold a pose"),
+        (["--out", "anna.glb", "--pose", "pose.json"], "cannot store a pose"),
         (["--out", "anna.ply", "--frame", "2"], "without a pose file"),
         (["--out", "nowhere/anna.glb"], "there is no folder"),
     ],

@@ -77,13 +77,13 @@ def damage(path, human, how):
         ("truncated", "truncated"),
         ("cut in its header", "truncated"),
         ("empty", "truncated"),
-        ("text", "no safetensors file"),
-        ("no metadata", "holds no person"),
+        ("text", "not a safetensors file"),
+        ("no metadata", "without a human"),
         ("no density", "density is missing"),
         ("wrong shape", "rgb is torch.float32"),
         ("whole numbers", "betas is torch.int64"),
         ("NaN", "'density' holds NaN"),
-        ("giant", "betas is 6 in size"),
+        ("giant", "largest beta is 6"),
     ],
 )
 def test_a_damaged_file_is_refused_by_name_with_its_damage(human, tmp_path, how, told):
@@ -97,7 +97,7 @@ def test_a_damaged_file_is_refused_by_name_with_its_damage(human, tmp_path, how,
 
 @pytest.mark.parametrize(
     ("version", "told"),
-    [("3", "newer PrimDiffusion"), ("10", "newer PrimDiffusion"), ("one", "format version is 'one'"), ("0", "'0'")],
+    [("3", "newer PrimDiffusion"), ("10", "newer PrimDiffusion"), ("one", "format version 'one'"), ("0", "'0'")],
 )
 def test_a_file_of_another_version_is_refused_with_what_to_do(human, tmp_path, version, told):
     path = tmp_path / "other.human.safetensors"
@@ -126,10 +126,10 @@ def test_a_file_of_the_first_release_is_read(human, tmp_path):
 @pytest.mark.parametrize(
     ("provenance", "told"),
     [
-        ("{", "provenance is no JSON"),
-        ("[" * 100_000, "provenance is no JSON"),
-        ("[1]", "no JSON object"),
-        ('{"seed": "seven"}', "'seed' of its provenance is 'seven', not a whole number"),
+        ("{", "provenance is not JSON"),
+        ("[" * 100_000, "provenance is not JSON"),
+        ("[1]", "not a JSON object"),
+        ('{"seed": "seven"}', "'seed' of its provenance is 'seven', not an integer"),
         ('{"steps": true}', "'steps'"),
         ('{"checkpoint": null}', "'checkpoint'"),
         ('{"guidance": NaN}', "'guidance'"),

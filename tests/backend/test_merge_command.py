@@ -84,7 +84,7 @@ def test_without_openvdb_a_vdb_is_refused_before_any_work(saved, tmp_path, monke
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (["--out", "anna.obj"], "has none of the endings"),
+        (["--out", "anna.obj"], "has none of the extensions"),
         (["--out", "nowhere/anna.npz"], "there is no folder"),
         (["--out", "anna.npz", "--voxel", "0"], "above zero"),
         (["--out", "anna.npz", "--voxel", "0.0001"], "choose .* mm or more"),

@@ -158,8 +158,8 @@ def test_a_camera_that_has_the_person_at_its_back_changes_nothing(dataset, tmp_p
         ([], "holds several subjects: name one of them (person_000000, person_000001)"),
         (["--subject", "anna"], "there is no subject 'anna'"),
         (["--subject", FIRST, "--frame", "7"], "person_000000 has frames 0 to 1, not 7"),
-        (["--subject", FIRST, "--views", "0"], "0 views were asked for"),
-        (["--subject", FIRST, "--size", "0"], "pictures of 0 pixels a side"),
+        (["--subject", FIRST, "--views", "0"], "0 views were requested"),
+        (["--subject", FIRST, "--size", "0"], "size is 0 pixels"),
     ],
 )
 def test_impossible_wishes_are_one_sentence_and_leave_nothing(dataset, line, capsys, words, sentence):
@@ -228,5 +228,5 @@ def test_the_request_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypa
 
 @pytest.mark.parametrize("wrong", [{"frame": -1}, {"views": 0}, {"size": 0}, {"capture": ""}, {"out_dir": ""}])
 def test_impossible_parameters_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong)) if wrong != {"size": 0} else "pixels a side"):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
         read_request(ReconstructRequest, {"capture": "captures", "out_dir": "out", **wrong}, "reconstruct")

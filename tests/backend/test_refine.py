@@ -161,7 +161,7 @@ def spoiled(human: Human, name: str) -> Human:
         (lambda human, views: (human, [dataclasses.replace(views, rgba=views.rgba * 0)]), "views 0 shows a person"),
         (lambda human, views: (spoiled(human, "rgb"), [views]), "'rgb' holds NaN"),
         (lambda human, views: (spoiled(human, "density"), [views]), "'density' holds NaN"),
-        (lambda human, views: (dataclasses.replace(human, betas=torch.zeros(300)), [views]), "another body's"),
+        (lambda human, views: (dataclasses.replace(human, betas=torch.zeros(300)), [views]), "another body"),
         (lambda human, views: (dataclasses.replace(human, betas=torch.full((10,), torch.nan)), [views]), "betas"),
     ],
 )
@@ -244,7 +244,7 @@ def test_a_cancelled_command_leaves_nothing(line, tmp_path, monkeypatch):
     ("change", "sentence"),
     [
         (("--subject", "nobody"), "no subject 'nobody'"),
-        (("--start", "missing.human.safetensors"), "no person in missing"),
+        (("--start", "missing.human.safetensors"), "no human file missing"),
         (("--start", "missing.glb"), "missing.glb"),
         (("--hold-out-cameras", "4"), "cannot be held out"),
         (("--size", "0"), "0 pixels"),

@@ -115,7 +115,7 @@ def test_it_can_be_ended_at_every_report_and_then_leaves_nothing(checkpoint, tmp
 def test_a_person_that_is_not_there_is_named(checkpoint, tmp_path):
     how = {"steps": 2, "checkpoint": checkpoint, "person": tmp_path / "nobody"}
     request = VariationsRequest(seeds=[1], out_dir=tmp_path / "out", **how)
-    with pytest.raises(FileNotFoundError, match=r"there is no person in .*nobody"):
+    with pytest.raises(FileNotFoundError, match=r"there is no human file .*nobody"):
         request.run(Session(), lambda *_, **more: None)
     assert not (tmp_path / "out").exists()
 
@@ -128,9 +128,9 @@ def test_a_person_that_is_not_there_is_named(checkpoint, tmp_path):
         ({"seeds": [1, "2"]}, "seeds"),
         ({"seeds": [True]}, "seeds"),
         ({"seeds": [-1]}, "seed -1 is outside"),
-        ({"seeds": [4, 5, 4]}, "two of the seeds are alike"),
+        ({"seeds": [4, 5, 4]}, "two of the seeds are equal"),
         ({"steps": 0}, "0 steps"),
-        ({"size": 1}, "pictures of 1 pixels a side: choose 2 or more"),
+        ({"size": 1}, "size is 1 pixels: choose 2 or more"),
         ({"size": 5000}, "picture_px is 5000"),
         ({"out_dir": ""}, "out_dir"),
         ({"person": ""}, "person"),

@@ -126,7 +126,7 @@ def test_vary_transfer_and_blend_follow_one_another_and_undo_goes_back_through_t
 
 def test_what_the_child_rejects_is_one_sentence(people):
     refused = {
-        "1 steps were asked for": lambda: ops.blend(human="Human", other="Human.001", steps=1),
+        "1 steps were requested": lambda: ops.blend(human="Human", other="Human.001", steps=1),
         "knows no attribute 'wings'": lambda: ops.redress(human="Human", attributes="wings=two", steps=2),
     }
     before = files(people[0])

@@ -145,7 +145,7 @@ def test_a_cancel_ends_an_edit_within_a_step_and_leaves_nothing(child, people, a
 @pytest.mark.parametrize(
     ("method", "wrong", "code", "kind", "told"),
     [
-        ("vary", {"person": "/nobody.human.safetensors"}, DOMAIN_ERROR, "missing_file", "there is no person in"),
+        ("vary", {"person": "/nobody.human.safetensors"}, DOMAIN_ERROR, "missing_file", "there is no human file"),
         ("vary", {"attributes": {"species": "cat"}}, DOMAIN_ERROR, "bad_input", "knows no attribute 'species'"),
         ("vary", {"attributes": {"outfit": None}}, INVALID_PARAMS, None, "vary.attributes['outfit']"),
         ("vary", {"attributes": ["outfit"]}, INVALID_PARAMS, None, "vary.attributes"),
@@ -163,10 +163,10 @@ def test_a_cancel_ends_an_edit_within_a_step_and_leaves_nothing(child, people, a
         ("inpaint", {"region": {"vertices": "x"}}, INVALID_PARAMS, None, "give a list of names of parts"),
         ("inpaint", {"region": "top"}, INVALID_PARAMS, None, "inpaint.region"),
         ("inpaint", {"region": ["hat"]}, DOMAIN_ERROR, "bad_input", "part of the body 'hat'"),
-        ("inpaint", {"region": ["clothes", "skin", "hair"]}, DOMAIN_ERROR, "bad_input", "the whole person"),
+        ("inpaint", {"region": ["clothes", "skin", "hair"]}, DOMAIN_ERROR, "bad_input", "the whole human"),
         ("inpaint", {"region": {"weights": "/no.npz"}}, DOMAIN_ERROR, "missing_file", "/no.npz"),
         ("transfer", {"what": "soul"}, INVALID_PARAMS, None, "transfer.what"),
-        ("transfer", {"source": "/nobody.human.safetensors"}, DOMAIN_ERROR, "missing_file", "there is no person in"),
+        ("transfer", {"source": "/nobody.human.safetensors"}, DOMAIN_ERROR, "missing_file", "there is no human file"),
     ],
 )
 def test_a_refusal_names_what_was_wrong_and_leaves_nothing(child, people, asked, method, wrong, code, kind, told):

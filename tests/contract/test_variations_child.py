@@ -34,7 +34,7 @@ def test_variations_name_each_picture_as_it_appears_and_whom_it_shows(child, che
 def test_wrong_seeds_are_refused_in_a_sentence(child, tmp_path):
     error = child.ask(2, "variations", seeds=[1, 1], out_dir=str(tmp_path))["error"]
     assert error["code"] == -32602
-    assert "two of the seeds are alike" in error["message"]
+    assert "two of the seeds are equal" in error["message"]
     error = child.ask(3, "generate", seed=1, out_dir=str(tmp_path), picture_px=-5)["error"]
     assert "picture_px is -5" in error["message"]
 

@@ -134,7 +134,7 @@ class Region:
     def check(self) -> None:
         """Raise ValueError unless either names or weights are given; names are validated when the request runs."""
         if bool(self.names) == (self.weights is not None):
-            raise ValueError("say where to edit with either --region NAME or --weights FILE")
+            raise ValueError("give either --region NAME or --weights FILE")
 
     def primitives(self, human: Human) -> Bool[Tensor, "k"]:
         """Return the region as a mask. Raises ValueError for unknown names, and as `read_weights`."""
@@ -205,7 +205,7 @@ class InterpolateRequest(EditRequest):
         super().check()
         check_unit_interval("fraction", self.fraction)
         if self.steps < 2:
-            raise ValueError(f"{self.steps} steps were asked for: an interpolation takes 2 or more")
+            raise ValueError(f"{self.steps} steps were requested: interpolation takes 2 or more")
 
     def edit(self, human: Human, session: Session, sampling: Sampling) -> Human:
         """See `editing.interpolate`."""

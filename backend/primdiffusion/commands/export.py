@@ -93,7 +93,7 @@ class GaussiansRequest:
             check_numbers("object", self.object, (3, 4))
             check_numbers("joints", self.joints, (len(JOINT_NAMES), 3, 4))
         if self.limit < 1:
-            raise ValueError(f"{self.limit} Gaussians were asked for: choose 1 or more")
+            raise ValueError(f"{self.limit} Gaussians were requested: choose 1 or more")
 
     def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
         """Raises OSError, and as load_human."""
@@ -185,11 +185,11 @@ class ExportCommand:
         """See `Request`."""
         write = _writer(self.out)
         if self.pose is not None and write is not _write_gaussians:
-            raise ValueError(f"{self.out.name} cannot hold a pose: leave --pose out, or write Gaussians to a .ply")
+            raise ValueError(f"{self.out.name} cannot store a pose: omit --pose, or export Gaussians to a .ply")
         if self.frame and self.pose is None:
-            raise ValueError(f"frame {self.frame} was asked for without a pose file: name one with --pose")
+            raise ValueError(f"frame {self.frame} was requested without a pose file: give one with --pose")
         if not self.out.parent.is_dir():
-            raise FileNotFoundError(f"there is no folder {self.out.parent}: make it first, or choose another")
+            raise FileNotFoundError(f"there is no folder {self.out.parent}: create it, or choose another")
 
     def export(self) -> None:
         """Export, and print the path."""
@@ -202,7 +202,7 @@ class ExportCommand:
 def _writer(out: Path) -> Callable[[ExportCommand, Human], None]:
     writers = {".glb": _write_mesh, ".obj": _write_mesh, ".ply": _write_gaussians}
     if out.suffix.lower() not in writers:
-        raise ValueError(f"{out.name!r} has none of the endings {', '.join(writers)}: choose one")
+        raise ValueError(f"{out.name!r} has none of the extensions {', '.join(writers)}: choose one")
     return writers[out.suffix.lower()]
 
 

@@ -142,7 +142,7 @@ class GenerateCommand(GenerateRequest):
         super().check()
         for name in ("count", "batch"):
             if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: ask for one person or more")
+                raise ValueError(f"{name} is {getattr(self, name)}: choose 1 or more")
 
     def generate(self, session: Session) -> None:
         """Generate batch by batch; print the folder of each human."""
@@ -193,11 +193,11 @@ class VariationsRequest:
         for seed in self.seeds:
             check_seed(seed)
         if len(set(self.seeds)) < len(self.seeds):
-            raise ValueError("two of the seeds are alike, which would be one person twice: give each once")
+            raise ValueError("two of the seeds are equal: give each once")
         check_steps(self.steps)
         check_picture_px(self.size)
         if self.size < 2:
-            raise ValueError(f"pictures of {self.size} pixels a side: choose 2 or more")
+            raise ValueError(f"size is {self.size} pixels: choose 2 or more")
         check_attributes(self.attributes, self.guidance)
         check_unit_interval("amount", self.amount)
 

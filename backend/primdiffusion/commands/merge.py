@@ -131,7 +131,7 @@ class FitGainRequest:
 
 def _check_people(people: list[PosedPerson]) -> None:
     if not people:
-        raise ValueError("people is empty: name at least one person")
+        raise ValueError("people is empty: give at least one")
     for person in people:
         person.check()
 
@@ -208,16 +208,16 @@ class MergeCommand:
     def check(self) -> None:
         """See `Request`."""
         if not self.humans:
-            raise ValueError("no person was named: give at least one .human file")
+            raise ValueError("no file was given: give at least one .human file")
         if self.out.suffix.lower() not in (".vdb", ".npz"):
-            raise ValueError(f"{self.out.name!r} has none of the endings .vdb, .npz: choose one")
+            raise ValueError(f"{self.out.name!r} has none of the extensions .vdb, .npz: choose one")
         if not self.out.parent.is_dir():
-            raise FileNotFoundError(f"there is no folder {self.out.parent}: make it first, or choose another")
+            raise FileNotFoundError(f"there is no folder {self.out.parent}: create it, or choose another")
         check_voxel(self.voxel)
         if not math.isfinite(self.apart):
             raise ValueError(f"apart is {self.apart}: give metres between neighbours")
         if self.frame and self.pose is None:
-            raise ValueError(f"frame {self.frame} was asked for without a pose file: name one with --pose")
+            raise ValueError(f"frame {self.frame} was requested without a pose file: give one with --pose")
 
 
 def run(arguments: Sequence[str]) -> None:

@@ -60,9 +60,9 @@ class ReconstructRequest:
     def check(self) -> None:
         """See `Request`."""
         if self.frame < 0:
-            raise ValueError(f"frame {self.frame}: they are counted from 0")
+            raise ValueError(f"frame is {self.frame}: frames are numbered from 0")
         if self.views < 1:
-            raise ValueError(f"{self.views} views were asked for: the encoder needs one or more")
+            raise ValueError(f"{self.views} views were requested: the encoder needs one or more")
         check_size(self.size)
 
     def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
@@ -157,7 +157,7 @@ class RefineCommand:
         from primdiffusion.training.refine_views import view_psnr
 
         if self.size < 1:
-            raise ValueError(f"pictures of {self.size} pixels a side: choose 1 or more")
+            raise ValueError(f"size is {self.size} pixels: choose 1 or more")
         settings = RefineSettings(self.steps, seconds=60 * self.minutes, seed=self.seed)
         with staged(self.out) as folder:
             captures, name = choose_subject(self.capture, self.subject)
@@ -182,11 +182,12 @@ class RefineCommand:
             before, after = (float(view_psnr(one, held_out).mean()) for one in (human, refined.human))
             print(f"held-out views  {before:.2f} -> {after:.2f} dB (cameras {', '.join(map(str, held))})")
             if after < before:
-                print(
-                    "primdiffusion: warning: on held-out cameras the start was better: give more views", file=sys.stderr
-                )
+                print("primdiffusion: warning: the held-out PSNR decreased: use more views", file=sys.stderr)
         if refined.steps < self.steps:
-            print(f"primdiffusion: warning: {self.minutes:g} minutes were over after {seconds}", file=sys.stderr)
+            print(
+                f"primdiffusion: warning: the time limit of {self.minutes:g} minutes was reached after {seconds}",
+                file=sys.stderr,
+            )
 
     def _start(self, captures: Captures, name: str, betas: Tensor, given: Sequence[int]) -> Human:
         """Return the initial human with the subject's betas."""

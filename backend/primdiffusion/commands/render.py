@@ -149,9 +149,9 @@ class RenderCommand:
         check_angle("yaw", self.yaw, "degrees")
         check_step(self.step)
         if self.depth is not None and self.depth.resolve() == self.out.resolve():
-            raise ValueError(f"out and depth are both {self.out}: name two files")
+            raise ValueError(f"out and depth are both {self.out}: give two different files")
         if self.frame and self.pose is None:
-            raise ValueError(f"frame {self.frame} was asked for without a pose file: name one with --pose")
+            raise ValueError(f"frame {self.frame} was requested without a pose file: give one with --pose")
 
 
 def run(arguments: Sequence[str]) -> None:

@@ -123,9 +123,9 @@ _WORDS = {
     Path: "the path of a file or folder",
     types.NoneType: "null",
     bool: "true or false",
-    int: "a whole number",
+    int: "an integer",
     float: "a number",
-    str: "a text",
+    str: "a string",
     list: "a list",
     tuple: "a list",
     dict: "a JSON object",
@@ -220,37 +220,39 @@ def check_seed(seed: int) -> None:
 def check_steps(steps: int) -> None:
     """Raise ValueError outside 1 ... STEP_LIMIT."""
     if not 1 <= steps <= STEP_LIMIT:
-        raise ValueError(f"{steps} steps were asked for: choose 1 to {STEP_LIMIT}")
+        raise ValueError(f"{steps} steps were requested: choose 1 to {STEP_LIMIT}")
 
 
 def check_size(size: int) -> None:
     """Raise ValueError for an empty picture."""
     if size < 1:
-        raise ValueError(f"pictures of {size} pixels a side: choose 1 or more")
+        raise ValueError(f"size is {size} pixels: choose 1 or more")
 
 
 def check_sides(width: int, height: int) -> None:
     """Raise ValueError for an empty picture."""
     if min(width, height) < 1:
-        raise ValueError(f"a picture of {width} x {height} pixels: choose sides of 1 or more")
+        raise ValueError(f"the image size is {width} x {height} pixels: choose sides of 1 or more")
 
 
 def check_picture_px(picture_px: int) -> None:
     """Raise ValueError outside 0 ... LARGEST_PREVIEW."""
     if not 0 <= picture_px <= LARGEST_PREVIEW:
-        raise ValueError(f"picture_px is {picture_px}: choose 0, for no pictures, to {LARGEST_PREVIEW}")
+        raise ValueError(f"picture_px is {picture_px}: choose 0, for no previews, to {LARGEST_PREVIEW}")
 
 
 def check_attributes(attributes: dict[str, Any], guidance: float) -> None:
     """Raise ValueError unless all values are strings or finite numbers; the model checks which of them it knows."""
     for name, value in attributes.items():
         if not name or value == "":
-            raise ValueError(f"{name or value!r} is no attribute: write NAME=VALUE, as in outfit=suit or height=1.8")
+            raise ValueError(
+                f"{name or value!r} is not an attribute: write NAME=VALUE, as in outfit=suit or height=1.8"
+            )
         if isinstance(value, list):
             raise ValueError(f"the attribute {name!r} is given twice: give it once")
         number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
         if not (isinstance(value, str) or number):
-            raise ValueError(f"the attribute {name!r} is {value!r:.40}: give a text or a number")
+            raise ValueError(f"the attribute {name!r} is {value!r:.40}: give a string or a number")
     if not math.isfinite(guidance):
         raise ValueError(f"guidance is {guidance}: give a number, 1 for none")
 
@@ -277,12 +279,12 @@ def check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> None:
     """Raise ValueError unless `value` holds numbers that fit into float32, in nested lists of this shape."""
     if not shape:
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ValueError(f"{name} holds {value!r:.40} where a number should be")
+            raise ValueError(f"{name} holds {value!r:.40} instead of a number")
         if not -LARGEST_NUMBER <= value <= LARGEST_NUMBER:
             raise ValueError(f"{name} holds {value!r:.40}: give finite numbers, of at most {LARGEST_NUMBER:g}")
         return
     if not isinstance(value, list) or len(value) != shape[0]:
         given = f"{len(value)} entries" if isinstance(value, list) else f"{value!r:.40}"
-        raise ValueError(f"{name} holds {given} where {' x '.join(map(str, shape))} numbers should be")
+        raise ValueError(f"{name} holds {given} instead of {' x '.join(map(str, shape))} numbers")
     for entry in value:
         check_numbers(name, entry, shape[1:])

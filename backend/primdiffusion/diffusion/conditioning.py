@@ -114,7 +114,7 @@ def read_attributes(words: Sequence[str]) -> dict[str, str | float]:
     for word in words:
         name, sign, value = word.partition("=")
         if not sign or not name or not value:
-            raise ValueError(f"{word!r} is no attribute: write NAME=VALUE, as in outfit=suit or height=1.8")
+            raise ValueError(f"{word!r} is not an attribute: write NAME=VALUE, as in outfit=suit or height=1.8")
         if name in attributes:
             raise ValueError(f"the attribute {name!r} is given twice: give it once")
         attributes[name] = value

@@ -279,7 +279,7 @@ def sample(
     if sampler not in SAMPLERS:
         raise ValueError(f"there is no sampler {sampler!r}; choose one of {', '.join(sorted(SAMPLERS))}")
     if not len(seeds):
-        raise ValueError("no seeds were given: give one for each person")
+        raise ValueError("no seeds were given: give one for each human")
     chain = model.chain(model.schedule.length, steps)
     generators = [seeded(seed) for seed in seeds]
     start = model.start(generators, chain[0], condition)
@@ -296,5 +296,5 @@ def seeded(seed: int) -> torch.Generator:
     Always on the CPU: each kind of device has its own random number generator, and a seed should give one person.
     """
     if not 0 <= seed < 2**63:
-        raise ValueError(f"seed {seed} is out of range; choose a whole number from 0 to {2**63 - 1}")
+        raise ValueError(f"seed {seed} is out of range; choose an integer from 0 to {2**63 - 1}")
     return torch.Generator().manual_seed(seed)

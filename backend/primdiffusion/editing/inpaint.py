@@ -124,7 +124,7 @@ def inpaint(
     """
     region = check_region(region)
     if region.all():
-        raise ValueError("the region is the whole person: generate or vary instead of inpainting")
+        raise ValueError("the region is the whole human: use generate or vary instead")
     generator = edit_generator(seed)
     chain = model.chain(model.schedule.length, steps)
     model = match_density(model, human)

@@ -119,6 +119,8 @@ def load_encoder(path: Path | str | None = None, device: torch.device | str = "c
     format or version, does not match its own configuration or holds values that are not finite.
     """
     path = default_encoder() if path is None else Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no encoder at {path}: give the path of a .safetensors file")
     tensors, metadata = read_tensors(path, (ENCODER_FORMAT,))
     with mismatches_named(path, ValueError):
         encoder = Encoder(config_from_json(json.loads(metadata["config"])))

@@ -215,6 +215,6 @@ def _memory_named(config: FitConfig) -> Iterator[None]:
             raise
         remedy = f"--batch {config.batch // 2}" if config.batch > 1 else "fewer --targets, or a smaller --size"
         raise ValueError(
-            f"memory does not hold {config.batch} people with {config.targets} targets of {config.size} x "
-            f"{config.size} pixels each: try {remedy} in a new run folder"
+            f"{config.batch} subjects with {config.targets} targets of {config.size} x {config.size} pixels do not fit "
+            f"into memory: try {remedy} in a new run folder"
         ) from error

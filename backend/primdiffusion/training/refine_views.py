@@ -52,10 +52,10 @@ def scenes_of(human: Human, views: Sequence[Views]) -> list[PosedView]:
     components = default_body().shape_basis.shape[-1]
     if len(human.betas) > components:
         raise ValueError(
-            f"the person has {len(human.betas)} betas, the default body {components}: it is another body's"
+            f"the person has {len(human.betas)} betas, the default body {components}: it was captured on another body"
         )
     if not views or not any(record.rgba.shape[0] for record in views):
-        raise ValueError("there are no views to refine from: give pictures of the person from at least one side")
+        raise ValueError("there are no views to refine from: give images of at least one view")
     device, scenes = human.payload.density.device, []
     for number, record in enumerate(views):
         _check(number, record)
@@ -81,7 +81,7 @@ def _check(number: int, record: Views) -> None:
             f"views {number} have poses {tuple(record.pose.translation.shape[:-1])}: give one pose a record"
         )
     if not record.mask.any():
-        raise ValueError(f"no mask of views {number} shows a person: leave out this frame, or give it masks")
+        raise ValueError(f"no mask of views {number} covers the subject: omit this frame, or give it masks")
 
 
 @torch.no_grad()

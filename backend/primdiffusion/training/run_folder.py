@@ -94,8 +94,8 @@ def _earlier(config: RunConfig, people: Sequence[str], saved: str, processes: in
         raise ValueError(f"{config.run / RUN} is damaged ({error}): give a new folder") from error
     if known != list(people):
         raise ValueError(
-            f"the run in {config.run} began with other people than those of {config.data} ({len(known)} and "
-            f"{len(people)} of them): give the same data, or a new folder"
+            f"the run in {config.run} has another training set than {config.data} ({len(known)} and {len(people)} "
+            "people): give the same data, or a new folder"
         )
     if were != processes:
         log.warning("resuming on %d processes instead of %d: batches will differ", processes, were)

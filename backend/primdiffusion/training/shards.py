@@ -55,9 +55,9 @@ def pack_people(folder: Path, out: Path, people_each: int = PEOPLE_EACH) -> Iter
         OSError: there is no room; no index is written then.
     """
     if people_each < 1:
-        raise ValueError(f"{people_each} people a shard: pack 1 or more")
+        raise ValueError(f"{people_each} people per shard: choose 1 or more")
     if (out / INDEX).exists():
-        raise ShardError(f"{out} holds packed people already: choose another folder, or remove it")
+        raise ShardError(f"{out} already contains shards: choose another folder, or remove it")
     people = PersonFolder(folder)
     out.mkdir(parents=True, exist_ok=True)
     shards, done = [], 0
@@ -149,7 +149,7 @@ class PackedPeople:
         if not path.is_file():
             raise FileNotFoundError(f"there is no {path}, which {INDEX} names: pack the people again")
         if digest_of(path) != self._digests[shard]:
-            raise ShardError(f"{path} is damaged, its SHA-256 is not that of {INDEX}: pack the people again")
+            raise ShardError(f"{path} is damaged: its SHA-256 differs from {INDEX}: pack the people again")
 
     def _rows(self, index: int) -> tuple[int, int, slice]:
         """Return the shard of a person, the index in it, and the rows."""
