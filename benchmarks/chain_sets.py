@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, ShapedBody, default_body
 from primdiffusion.capture.poses import BUILT_IN, built_in_poses
-from primdiffusion.diffusion.codec import cells_from_voxels
+from primdiffusion.diffusion.codec import CellCodec, cells_from_voxels
 from primdiffusion.diffusion.denoiser import PersonDenoiser
-from primdiffusion.diffusion.model import CellCodec, DiffusionModel, sample, seeded
+from primdiffusion.diffusion.model import DiffusionModel, sample, seeded
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.textured_mesh import TexturedMesh

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import torch
-from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel, WholeSlab
+from primdiffusion.diffusion.codec import WholeSlab
+from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel
 from primdiffusion.diffusion.schedule import linear
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.human import Human

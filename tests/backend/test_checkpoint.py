@@ -13,8 +13,8 @@ from primdiffusion.diffusion.checkpoint import (
     read_card,
     save_checkpoint,
 )
-from primdiffusion.diffusion.codec import DEAD_ZONE, VALUES
-from primdiffusion.diffusion.model import DiffusionModel, WholeSlab, sample
+from primdiffusion.diffusion.codec import DEAD_ZONE, VALUES, WholeSlab
+from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.schedule import dense_steps, linear, trailing_steps
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from safetensors import safe_open

@@ -3,7 +3,8 @@ import dataclasses
 import pytest
 import torch
 from diffusion_people import small_model
-from primdiffusion.diffusion.model import STANDARD_SHAPES, WholeSlab, sample, seeded
+from primdiffusion.diffusion.codec import WholeSlab
+from primdiffusion.diffusion.model import STANDARD_SHAPES, sample, seeded
 from primdiffusion.diffusion.schedule import trailing_steps
 from primdiffusion.primitives.primitives import GRID, K, S
 

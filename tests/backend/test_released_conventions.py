@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose
-from primdiffusion.diffusion.model import SMALLEST_DELTA_S, ReleasedSlab
+from primdiffusion.diffusion.codec import SMALLEST_DELTA_S, ReleasedSlab
 from primdiffusion.diffusion.schedule import released_steps, sqrt_linear
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.primitives.anchors import attach, build_anchors

@@ -15,7 +15,7 @@ from primdiffusion.body.smpl_files import load_body
 from primdiffusion.commands.frame import FrameSpec, PosedPerson
 from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
 from primdiffusion.diffusion.checkpoint import CheckpointError, load_checkpoint, read_card
-from primdiffusion.diffusion.model import ReleasedSlab
+from primdiffusion.diffusion.codec import ReleasedSlab
 from primdiffusion.diffusion.schedule import released_steps
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Look, Scene

@@ -17,20 +17,12 @@ from safetensors.torch import save
 from torch import Tensor
 
 from primdiffusion.body.measures import LARGEST_BETA
-from primdiffusion.diffusion.codec import LinearCodec
+from primdiffusion.diffusion.codec import CellCodec, LinearCodec, ReleasedSlab, WholeSlab
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkConfig
-from primdiffusion.diffusion.model import (
-    BETAS,
-    STANDARD_SHAPES,
-    CellCodec,
-    DiffusionModel,
-    ReleasedSlab,
-    ShapePrior,
-    WholeSlab,
-)
+from primdiffusion.diffusion.model import BETAS, STANDARD_SHAPES, DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetupError, find_body_setup

@@ -1,15 +1,17 @@
-"""A frozen orthonormal linear codec per primitive: the first and last layer of slab diffusion, in closed form.
+"""Codecs between payloads and samples of the diffusion: whole slabs, or latents of a linear codec per primitive.
 
-A primitive's 4 x 8^3 values (sRGB-encoded colour, density / full density; the slab's values, SPEC 3) and its delta
-scale become C numbers in one basis that all primitives share. Noise of the slab projected on orthonormal rows is
-standard normal again, and nothing outside the basis feeds back, so diffusing latents is diffusing the slab with these
-two layers fixed. The slab repeats a delta scale over 8^3 voxels; here it is one number of the same energy.
+The linear codec is the first and last layer of slab diffusion, in closed form, orthonormal and frozen. A primitive's
+4 x 8^3 values (sRGB-encoded colour, density / full density; the slab's values, SPEC 3) and its delta scale become C
+numbers in one basis that all primitives share. Noise of the slab projected on orthonormal rows is standard normal
+again, and nothing outside the basis feeds back, so diffusing latents is diffusing the slab with these two layers fixed.
+The slab repeats a delta scale over 8^3 voxels; here it is one number of the same energy.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Protocol
 
 import torch
 from jaxtyping import Float, UInt8
@@ -18,7 +20,7 @@ from torch import Tensor
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.primitives.primitives import GRID, WINDOW_POWER, WINDOW_SHARPNESS, K, Payload, S
-from primdiffusion.primitives.slab import DELTA_SCALE_UNIT, NETWORK_SCALE
+from primdiffusion.primitives.slab import CHANNELS_PER_LAYER, DELTA_SCALE_UNIT, NETWORK_SCALE, pack, unpack
 
 VOXEL_VALUES = 4 * S**3
 VALUES = VOXEL_VALUES + 3
@@ -32,6 +34,11 @@ DEAD_ZONE = (0.08, 0.84)
 person. The default for codecs that store none: fitted to payloads from meshes, at 96 numbers a primitive."""
 FITTED_DEAD_ZONE = (0.03, 0.94)
 """For codecs of fitted payloads, whose densities are exact enough for silhouettes."""
+SMALLEST_DELTA_S = 0.2
+"""Released values are never clamped (SPEC 1.13). Usual values are around 1; a box of five times its rest size is an
+outlier, and 0 has no reciprocal."""
+_B_AXIS = -2
+"""The voxels' axes D, H, W run along N, B, T."""
 LEAST_WEIGHT = 0.1
 """Weight of a voxel in a corner of its box, which the window all but hides."""
 
@@ -167,3 +174,104 @@ def _whole(part: Float[Tensor, "n h"], sign: float) -> Float[Tensor, "n v"]:
     left = voxels.unflatten(-1, (4 * S * S, S // 2)) / 2**0.5
     scale = scale if sign > 0 else scale.new_zeros(len(scale), 3)
     return torch.cat([torch.cat([left, sign * left.flip(-1)], dim=-1).flatten(-2), scale], dim=-1)
+
+
+class Codec(Protocol):
+    """Converts between clean samples of the diffusion and payloads."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Channels, height and width of a sample."""
+        ...
+
+    def to_payload(self, x0: Tensor, full_density: float) -> Payload:
+        """The payload of a clean sample [*b, *shape]."""
+        ...
+
+    def from_payload(self, payload: Payload, full_density: float) -> Tensor:
+        """The clean sample [*b, *shape] nearest to a payload; may be lossy."""
+        ...
+
+    @property
+    def cell_side(self) -> int:
+        """Pixels a side that a primitive covers in a sample."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class CellCodec:
+    """Latents of the default denoiser."""
+
+    codec: LinearCodec
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """[C, 32, 32]."""
+        return self.codec.basis.shape[0], GRID, GRID
+
+    def to_payload(self, x0: Float[Tensor, "*b c h w"], full_density: float) -> Payload:
+        """Decode; clamped, with the dead zone applied."""
+        return payload_from_cells(self.codec.decode(x0), full_density, self._dead_zone)
+
+    def from_payload(self, payload: Payload, full_density: float) -> Float[Tensor, "*b c h w"]:
+        """Encode as latents; the part outside the basis is lost."""
+        return self.codec.encode(cells_from_payload(payload, full_density, self._dead_zone))
+
+    @property
+    def _dead_zone(self) -> tuple[float, float]:
+        start, width = self.codec.dead_zone.tolist()
+        return start, width
+
+    @property
+    def cell_side(self) -> int:
+        """1."""
+        return 1
+
+
+@dataclasses.dataclass(frozen=True)
+class WholeSlab:
+    """No codec: the slab itself is diffused, as in the paper."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """[56, 256, 256]."""
+        return S * CHANNELS_PER_LAYER, GRID * S, GRID * S
+
+    def to_payload(self, x0: Float[Tensor, "*b c h w"], full_density: float) -> Payload:
+        """Unpack and clamp."""
+        return unpack(x0, full_density)
+
+    def from_payload(self, payload: Payload, full_density: float) -> Float[Tensor, "*b c h w"]:
+        """Pack."""
+        return pack(payload, full_density)
+
+    @property
+    def cell_side(self) -> int:
+        """8."""
+        return S
+
+
+@dataclasses.dataclass(frozen=True)
+class ReleasedSlab(WholeSlab):
+    """A slab whose boxes have B = T x N, and delta_s that divides their size (SPEC 1.1, 1.8).
+
+    Conversion flips voxels along B, so that frames stay in SO(3), and delta_scale = 1 / delta_s.
+    """
+
+    def to_payload(self, x0: Float[Tensor, "*b c h w"], full_density: float) -> Payload:
+        """Unpack and clamp."""
+        payload = super().to_payload(x0, full_density)
+        return Payload(
+            payload.rgb.flip(_B_AXIS),
+            payload.density.flip(_B_AXIS),
+            1 / payload.delta_scale.clamp_min(SMALLEST_DELTA_S),
+        )
+
+    def from_payload(self, payload: Payload, full_density: float) -> Float[Tensor, "*b c h w"]:
+        """Pack; the inverse for boxes up to five times their rest size. Raises ValueError for boxes without size."""
+        if not (payload.delta_scale > 0).all():
+            raise ValueError(
+                "a delta scale is 0 or less, but released slabs store its reciprocal: refine this human again"
+            )
+        flipped = Payload(payload.rgb.flip(_B_AXIS), payload.density.flip(_B_AXIS), 1 / payload.delta_scale)
+        return super().from_payload(flipped, full_density)

@@ -7,13 +7,42 @@ multilayer perceptron denoises the person components, which are few, and a small
 from __future__ import annotations
 
 import dataclasses
+import math
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from primdiffusion.diffusion.unet import TimeEmbedding, zeroed
+Layer = TypeVar("Layer", nn.Linear, nn.Conv2d)
+
+
+def zeroed(layer: Layer) -> Layer:
+    """Set weights and bias to 0, so that a residual block that ends in the layer starts as the identity."""
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
+    return layer
+
+
+class TimeEmbedding(nn.Sequential):
+    """Linear - SiLU - Linear on [cos, sin] features of the step."""
+
+    def __init__(self, features: int, width: int):
+        super().__init__(nn.Linear(features, width), nn.SiLU(), nn.Linear(width, width))
+        self.features = features
+
+    def forward(self, t: Int[Tensor, "b"]) -> Float[Tensor, "b width"]:
+        """Embedding of a batch of steps."""
+        return super().forward(step_features(t, self.features).to(next(self.parameters()).dtype))
+
+
+def step_features(t: Int[Tensor, "b"], features: int, longest: float = 10_000.0) -> Float[Tensor, "b features"]:
+    """cos and sin of t at `features` / 2 frequencies falling geometrically from 1 to 1 / `longest`."""
+    half = features // 2
+    frequency = torch.exp(-math.log(longest) * torch.arange(half, device=t.device) / half)
+    phase = t[:, None].float() * frequency
+    return torch.cat([phase.cos(), phase.sin()], dim=-1)
 
 
 @dataclasses.dataclass(frozen=True)

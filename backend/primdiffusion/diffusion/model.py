@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from primdiffusion.diffusion.codec import LinearCodec, cells_from_payload, payload_from_cells
+from primdiffusion.diffusion.codec import CellCodec, Codec
 from primdiffusion.diffusion.conditioning import NOTHING, Attributes, AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.samplers import SAMPLERS, SamplerStep, gaussian_noise
@@ -18,117 +18,10 @@ from primdiffusion.diffusion.schedule import Schedule, trailing_steps
 from primdiffusion.formats import requests
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.body_setup import BodySetup
-from primdiffusion.primitives.primitives import GRID, K, Payload, S
-from primdiffusion.primitives.slab import CHANNELS_PER_LAYER, pack, unpack
+from primdiffusion.primitives.primitives import GRID, K, Payload
 
 BETAS = 10
 """Shape coefficients of a sampled body."""
-SMALLEST_DELTA_S = 0.2
-"""Released values are never clamped (SPEC 1.13). Usual values are around 1; a box of five times its rest size is an
-outlier, and 0 has no reciprocal."""
-_B_AXIS = -2
-"""The voxels' axes D, H, W run along N, B, T."""
-
-
-class Codec(Protocol):
-    """Converts between clean samples of the diffusion and payloads."""
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Channels, height and width of a sample."""
-        ...
-
-    def to_payload(self, x0: Tensor, full_density: float) -> Payload:
-        """The payload of a clean sample [*b, *shape]."""
-        ...
-
-    def from_payload(self, payload: Payload, full_density: float) -> Tensor:
-        """The clean sample [*b, *shape] nearest to a payload; may be lossy."""
-        ...
-
-    @property
-    def cell_side(self) -> int:
-        """Pixels a side that a primitive covers in a sample."""
-        ...
-
-
-@dataclasses.dataclass(frozen=True)
-class CellCodec:
-    """Latents of the default denoiser."""
-
-    codec: LinearCodec
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """[C, 32, 32]."""
-        return self.codec.basis.shape[0], GRID, GRID
-
-    def to_payload(self, x0: Float[Tensor, "*b c h w"], full_density: float) -> Payload:
-        """Decode; clamped, with the dead zone applied."""
-        return payload_from_cells(self.codec.decode(x0), full_density, self._dead_zone)
-
-    def from_payload(self, payload: Payload, full_density: float) -> Float[Tensor, "*b c h w"]:
-        """Encode as latents; the part outside the basis is lost."""
-        return self.codec.encode(cells_from_payload(payload, full_density, self._dead_zone))
-
-    @property
-    def _dead_zone(self) -> tuple[float, float]:
-        start, width = self.codec.dead_zone.tolist()
-        return start, width
-
-    @property
-    def cell_side(self) -> int:
-        """1."""
-        return 1
-
-
-@dataclasses.dataclass(frozen=True)
-class WholeSlab:
-    """No codec: the slab itself is diffused, as in the paper."""
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """[56, 256, 256]."""
-        return S * CHANNELS_PER_LAYER, GRID * S, GRID * S
-
-    def to_payload(self, x0: Float[Tensor, "*b c h w"], full_density: float) -> Payload:
-        """Unpack and clamp."""
-        return unpack(x0, full_density)
-
-    def from_payload(self, payload: Payload, full_density: float) -> Float[Tensor, "*b c h w"]:
-        """Pack."""
-        return pack(payload, full_density)
-
-    @property
-    def cell_side(self) -> int:
-        """8."""
-        return S
-
-
-@dataclasses.dataclass(frozen=True)
-class ReleasedSlab(WholeSlab):
-    """A slab whose boxes have B = T x N, and delta_s that divides their size (SPEC 1.1, 1.8).
-
-    Conversion flips voxels along B, so that frames stay in SO(3), and delta_scale = 1 / delta_s.
-    """
-
-    def to_payload(self, x0: Float[Tensor, "*b c h w"], full_density: float) -> Payload:
-        """Unpack and clamp."""
-        payload = super().to_payload(x0, full_density)
-        return Payload(
-            payload.rgb.flip(_B_AXIS),
-            payload.density.flip(_B_AXIS),
-            1 / payload.delta_scale.clamp_min(SMALLEST_DELTA_S),
-        )
-
-    def from_payload(self, payload: Payload, full_density: float) -> Float[Tensor, "*b c h w"]:
-        """Pack; the inverse for boxes up to five times their rest size. Raises ValueError for boxes without size."""
-        if not (payload.delta_scale > 0).all():
-            raise ValueError(
-                "a delta scale is 0 or less, but released slabs store its reciprocal: refine this human again"
-            )
-        flipped = Payload(payload.rgb.flip(_B_AXIS), payload.density.flip(_B_AXIS), 1 / payload.delta_scale)
-        return super().from_payload(flipped, full_density)
 
 
 @dataclasses.dataclass(frozen=True)

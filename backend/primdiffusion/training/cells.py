@@ -13,11 +13,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from primdiffusion.diffusion.codec import LinearCodec
+from primdiffusion.diffusion.codec import CellCodec, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
-from primdiffusion.diffusion.model import CellCodec, DiffusionModel, ShapePrior
+from primdiffusion.diffusion.model import DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.staging import write_atomically
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
