@@ -16,11 +16,11 @@ from capture_scenes import captured
 from fit_scenes import WHOLE, child_environment, files, logged, make_small, rows, same_tensors, sentence, settings
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import load_encoder
-from primdiffusion.training import interrupt as interrupt_module
+from primdiffusion.training import recorder as recorder_module
 from primdiffusion.training.fit import fit
 from primdiffusion.training.fit_config import LossConfig
 from primdiffusion.training.fit_run import MODEL, STATE, FitState
-from primdiffusion.training.interrupt import Interrupt
+from primdiffusion.training.recorder import Interrupt
 from primdiffusion.training.run_folder import CONFIG, METRICS, RUN
 from primdiffusion.training.state import TrainingState
 from safetensors import safe_open
@@ -254,7 +254,7 @@ def test_a_polite_kill_asks_to_stop_and_a_second_ctrl_c_stops_at_once(monkeypatc
         os.kill(os.getpid(), signal.SIGTERM)
         assert interrupt.due()
         os.kill(os.getpid(), signal.SIGINT)  # within the two seconds in which launchers pass the same one on
-        monkeypatch.setattr(interrupt_module, "IMPATIENT", 0.0)
+        monkeypatch.setattr(recorder_module, "IMPATIENT", 0.0)
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
     assert signal.getsignal(signal.SIGTERM) is before

@@ -15,7 +15,6 @@ from primdiffusion.diffusion.schedule import fine_linear, linear, sqrt_linear
 from primdiffusion.primitives.primitives import GRID
 from primdiffusion.training.cells import CellTrainee, prepare
 from primdiffusion.training.config import PhaseConfig, PriorConfig, check_resumable, to_json
-from primdiffusion.training.interrupt import Interrupt
 from primdiffusion.training.latents import LatentSet, split_people
 from primdiffusion.training.losses import (
     blend_conditions,
@@ -29,6 +28,7 @@ from primdiffusion.training.losses import (
     x0_errors,
 )
 from primdiffusion.training.prior import fit_prior
+from primdiffusion.training.recorder import Interrupt
 from primdiffusion.training.shards import open_people
 from primdiffusion.training.state import TrainingState, learning_rate_factor
 from primdiffusion.training.stored_people import find_people, read_person

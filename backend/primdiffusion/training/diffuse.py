@@ -15,15 +15,15 @@ from primdiffusion import __version__
 from primdiffusion.diffusion.checkpoint import save_checkpoint
 from primdiffusion.diffusion.codec import VALUES
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.training.accelerated import AcceleratedState, accelerator_of
 from primdiffusion.training.cells import CellTrainee, prepare
 from primdiffusion.training.config import TrainingConfig
-from primdiffusion.training.interrupt import Interrupt
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.phase import state_path, train_phase
+from primdiffusion.training.recorder import Interrupt
 from primdiffusion.training.run_folder import begin, versions
 from primdiffusion.training.shards import open_people
 from primdiffusion.training.slabs import SlabTrainee
+from primdiffusion.training.state import AcceleratedState, accelerator_of
 from primdiffusion.training.stored_people import PersonDataset
 
 MODEL = "model.safetensors"

@@ -26,16 +26,14 @@ from primdiffusion.failures import out_of_memory
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
-from primdiffusion.training.accelerated import accelerator_of, agreed
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.fit_data import FitDataset, FitSample, betas_of, fit_batches, fit_dataset
 from primdiffusion.training.fit_losses import Features, loss_terms
 from primdiffusion.training.fit_perceptual import load_perceptual
 from primdiffusion.training.fit_run import MODEL, STATE, FitRecorder, FitState, begin, save
-from primdiffusion.training.interrupt import Interrupt
-from primdiffusion.training.recorder import StepMetrics, StepTimer
+from primdiffusion.training.recorder import Interrupt, StepMetrics, StepTimer
 from primdiffusion.training.run_folder import versions
-from primdiffusion.training.state import NotFiniteError
+from primdiffusion.training.state import NotFiniteError, accelerator_of, agreed
 
 
 def run(arguments: Sequence[str]) -> None:

@@ -22,10 +22,10 @@ from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.render.march import march
 from primdiffusion.staging import written_whole
 from primdiffusion.training import run_folder
-from primdiffusion.training.accelerated import AcceleratedState
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.recorder import Recorder
 from primdiffusion.training.run_folder import PICTURES, append_metrics
+from primdiffusion.training.state import AcceleratedState
 
 STATE, MODEL = "state.safetensors", "encoder.safetensors"
 SIZE = 256

@@ -1,4 +1,4 @@
-"""Train or resume one network of a diffusion model, for either preset."""
+"""Train or resume one network of a diffusion model, for either preset, with images of samples as it goes."""
 
 from __future__ import annotations
 
@@ -7,24 +7,36 @@ import dataclasses
 import hashlib
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
 import torch
 from accelerate import Accelerator
+from PIL import Image
 from torch import Tensor, nn
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.failures import out_of_memory
-from primdiffusion.training.accelerated import AcceleratedState, agreed
+from primdiffusion.formats import requests
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.human import framing, generate_batch, place
+from primdiffusion.render.march import MarchSettings, march
+from primdiffusion.staging import written_whole
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
-from primdiffusion.training.diffuse_pictures import write_samples
-from primdiffusion.training.interrupt import Interrupt
-from primdiffusion.training.recorder import Recorder, StepMetrics, StepTimer
+from primdiffusion.training.recorder import Interrupt, Recorder, StepMetrics, StepTimer
 from primdiffusion.training.run_folder import PICTURES, append_metrics
-from primdiffusion.training.state import NotFiniteError
+from primdiffusion.training.state import AcceleratedState, NotFiniteError, agreed
+
+SEEDS = (0, 1, 2, 3)
+"""Of the samples in images."""
+WIDTH, HEIGHT = 256, 256
+YAW = 0.4
+"""Radians."""
+STEP = 0.006
+"""Metres between samples of a ray."""
 
 
 class Trainee(Protocol):
@@ -174,3 +186,18 @@ def _memory_named(name: str, phase: PhaseConfig) -> Iterator[None]:
             raise
         remedy = f"--{name}.batch {phase.batch // 2}" if phase.batch > 1 else "a smaller network, or another device"
         raise ValueError(f"out of memory for a batch of {phase.batch}: try {remedy} in a new run folder") from error
+
+
+@torch.no_grad()
+def write_samples(path: Path, model: DiffusionModel, seeds: Sequence[int] = SEEDS, steps: int = requests.STEPS) -> None:
+    """Write an image of humans of `seeds`, side by side over black. Raises OSError."""
+    pictures = []
+    for human in generate_batch(model, seeds, steps):
+        primitives = place(human)
+        camera = framing(primitives, YAW, WIDTH, HEIGHT).to(model.device)
+        rendering = march(primitives.to(model.device), camera, MarchSettings(step=STEP))
+        pictures.append(encode_srgb(rendering.rgb.clamp(0, 1)).cpu())
+    picture = (torch.cat(pictures, dim=1) * 255).round().to(torch.uint8).numpy()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as unfinished:
+        Image.fromarray(np.ascontiguousarray(picture)).save(unfinished, format="PNG")
