@@ -112,7 +112,7 @@ def test_a_transfer_needs_no_checkpoint(line, tmp_path):
         (["vary", "--amount", "2"], 1, "amount is 2.0: choose a number from 0 to 1"),
         (["vary", "--attributes", "tall"], 1, "'tall' is not an attribute: write NAME=VALUE"),
         (["vary", "--attributes", "species=cat"], 1, "knows no attribute 'species'"),
-        (["vary", "--size", "0"], 1, "pictures of 0 pixels"),
+        (["vary", "--size", "0"], 1, "size is 0 pixels"),
         (["interpolate", "nobody.human.safetensors"], 1, "there is no human file"),
         (["interpolate", "tiny.safetensors"], 1, "without a human"),
         (["inpaint"], 1, "either --region NAME or --weights FILE"),
