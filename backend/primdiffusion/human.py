@@ -111,11 +111,11 @@ def generate_batch(
         final = step.x0
     assert final is not None, "a sampler yields at least one step"
     numbers = {name: float(attributes[name]) for name in model.vocabulary.scalars if name in attributes}
-    asked = {"attributes": {**attributes, **numbers}, "guidance": guidance} if attributes else {}
-    made = {"steps": steps, "sampler": sampler, **asked, **made_by(model)}
+    conditioning = {"attributes": {**attributes, **numbers}, "guidance": guidance} if attributes else {}
+    shared = {"steps": steps, "sampler": sampler, **conditioning, **made_by(model)}
     people = people_of(model, final, seeds, attributes)
     return [
-        dataclasses.replace(human, provenance={"seed": seed, **made}).validate()
+        dataclasses.replace(human, provenance={"seed": seed, **shared}).validate()
         for human, seed in zip(people, seeds, strict=True)
     ]
 

@@ -206,25 +206,25 @@ def _writer(out: Path) -> Callable[[ExportCommand, Human], None]:
     return writers[out.suffix.lower()]
 
 
-def _write_mesh(asked: ExportCommand, human: Human) -> None:
+def _write_mesh(command: ExportCommand, human: Human) -> None:
     # torch is loaded late
     from primdiffusion.export.proxy import ProxySettings, mesh_proxy, write_proxy_glb, write_proxy_obj
 
-    proxy = mesh_proxy(human, ProxySettings(triangles=asked.triangles, texture_px=asked.texture))
-    if asked.out.suffix.lower() == ".glb":
-        write_proxy_glb(asked.out, proxy, human.provenance)
+    proxy = mesh_proxy(human, ProxySettings(triangles=command.triangles, texture_px=command.texture))
+    if command.out.suffix.lower() == ".glb":
+        write_proxy_glb(command.out, proxy, human.provenance)
     else:
-        write_proxy_obj(asked.out, proxy)
+        write_proxy_obj(command.out, proxy)
 
 
-def _write_gaussians(asked: ExportCommand, human: Human) -> None:
+def _write_gaussians(command: ExportCommand, human: Human) -> None:
     # torch is loaded late
     from primdiffusion.export.gaussians import gaussians_of, write_gaussians
     from primdiffusion.human import place
     from primdiffusion.pose_file import read_pose
 
-    pose = None if asked.pose is None else read_pose(asked.pose, asked.frame)
-    write_gaussians(asked.out, gaussians_of(place(human, pose), asked.gaussians))
+    pose = None if command.pose is None else read_pose(command.pose, command.frame)
+    write_gaussians(command.out, gaussians_of(place(human, pose), command.gaussians))
 
 
 def run(arguments: Sequence[str]) -> None:

@@ -99,10 +99,10 @@ class DiffusionModel:
             if condition is None:
                 return self.denoiser(x, steps)
             condition = condition.expand(len(x), -1)
-            asked = self.denoiser(x, steps, condition)
+            conditional = self.denoiser(x, steps, condition)
             if guidance == 1.0:
-                return asked
-            return torch.lerp(self.denoiser(x, steps), asked, guidance)
+                return conditional
+            return torch.lerp(self.denoiser(x, steps), conditional, guidance)
 
     def start(
         self, generators: Sequence[torch.Generator], t: int, condition: Float[Tensor, "#b a"] | None = None

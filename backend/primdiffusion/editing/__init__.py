@@ -1,1 +1,1 @@
-"""Control without training: variants of a person, people between two, parts made anew, textures taken from others."""
+"""Training-free edits: variants, interpolation, inpainting and transfer of regions."""

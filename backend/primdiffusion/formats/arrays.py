@@ -1,4 +1,4 @@
-"""Reading .npz and .npy files that others made: no pickles, no arrays larger than their file, no paths out of it."""
+"""Read untrusted .npz and .npy files: no pickles, no arrays larger than their file, no extraction to disk."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 LARGEST_BYTES = 512 * 2**20
-"""Of one array, unpacked: small files can claim to hold petabytes. An hour of motion at 60 frames/s takes 285 MB."""
+"""Largest size of an array: small files can claim petabytes. An hour of motion at 60 frames/s takes 285 MB."""
 
 
 class ArrayFileError(ValueError):
-    """A file of arrays that cannot be read; the message names it."""
+    """A file of arrays that cannot be read; the message names the file."""
 
 
 def array_names(path: str | Path) -> list[str]:
-    """Names of the arrays in an .npz. Raises ArrayFileError where it is no whole zip archive; OSError."""
+    """Return the names of the arrays in an .npz. Raises ArrayFileError for a damaged file, and OSError."""
     with _archive(path) as archive:
         return [name.removesuffix(".npy") for name in archive.namelist()]
 
 
 def read_arrays(path: str | Path, required: Sequence[str] = (), optional: Sequence[str] = ()) -> dict[str, NDArray]:
-    """The arrays `required` of an .npz, and those of `optional` that it holds; others are never unpacked.
+    """Read the arrays `required` of an .npz, and those of `optional` that it contains; others are not unpacked.
 
-    Nothing is written to disk, so names with paths in them do no harm.
+    Nothing is extracted to disk, so paths in names do no harm.
 
     Raises:
         ArrayFileError: the file is damaged, lacks an array, or one is pickled or larger than `LARGEST_BYTES`.
-        OSError: it cannot be opened; FileNotFoundError where there is none.
+        OSError: it cannot be opened; FileNotFoundError if it does not exist.
     """
     arrays = {}
     with _archive(path) as archive:
@@ -49,7 +49,7 @@ def read_arrays(path: str | Path, required: Sequence[str] = (), optional: Sequen
 
 
 def read_numbers(path: str | Path, required: Sequence[str] = (), optional: Sequence[str] = ()) -> dict[str, NDArray]:
-    """As `read_arrays`; also raises ArrayFileError for arrays of anything else than finite numbers."""
+    """As `read_arrays`; also raises ArrayFileError for arrays that are not finite numbers."""
     arrays = read_arrays(path, required, optional)
     for name, values in arrays.items():
         if values.dtype.kind not in "biuf":
@@ -62,10 +62,9 @@ def read_numbers(path: str | Path, required: Sequence[str] = (), optional: Seque
 def check_shapes(
     path: str | Path, arrays: Mapping[str, NDArray], shapes: Mapping[str, Sequence[int | str]], sizes: dict[str, int]
 ) -> None:
-    """Check that `arrays` of a file hold numbers of these shapes. A letter stands for one size, the same in all arrays,
-    which is added to `sizes`.
+    """Check that `arrays` are numbers of these shapes. A letter is a size, the same in all arrays, added to `sizes`.
 
-    Raises ArrayFileError, or KeyError where one is missing.
+    Raises ArrayFileError, and KeyError for a missing array.
     """
     for name, shape in shapes.items():
         values = arrays[name]
@@ -80,13 +79,13 @@ def check_shapes(
 
 
 def read_npy(path: str | Path) -> NDArray:
-    """The array of an .npy file. Raises as `read_arrays`."""
+    """Read an .npy file. Raises as `read_arrays`."""
     with Path(path).open("rb") as stream:
         return _read(stream, Path(path).stat().st_size, str(path))
 
 
 def read_member(path: str | Path, name: str) -> bytes:
-    """The bytes of a file in a zip archive. Raises as `read_arrays`."""
+    """Read a file in a zip archive. Raises as `read_arrays`."""
     with _archive(path) as archive:
         member = _member(archive, name)
         if member is None:
@@ -115,7 +114,7 @@ def _check_size(size: int, what: str) -> None:
 
 
 def _read(stream: IO[bytes], size: int, what: str) -> NDArray:
-    """One array of `size` bytes with its header, which is believed only where it agrees with that size."""
+    """Read an array of `size` bytes including its header, which must agree with that size."""
     _check_size(size, what)
     try:
         version = np.lib.format.read_magic(stream)

@@ -1,4 +1,4 @@
-"""The cameras of a capture as the projects that read them want them: released code, OpenCV, NeRF, COLMAP."""
+"""Camera files of a capture for other projects: the released code, OpenCV, NeRF, COLMAP."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 def write_cameras(subject: Path, views: Sequence[View]) -> None:
-    """cameras.json, from which the released code reads."""
+    """Write cameras.json for the released code."""
     named = {
         f"camera{i:04d}": {"K": v.intrinsics.tolist(), "R": v.rotation.tolist(), "T": v.translation.tolist()}
         for i, v in enumerate(views)
@@ -27,7 +27,7 @@ def write_cameras(subject: Path, views: Sequence[View]) -> None:
 
 
 def write_opencv(subject: Path, views: Sequence[View]) -> None:
-    """K, R, T of all cameras as arrays."""
+    """Write K, R, T of all cameras as arrays."""
     write_npz(
         subject / "opencv" / "cameras.npz",
         K=np.stack([view.intrinsics for view in views]),
@@ -39,7 +39,7 @@ def write_opencv(subject: Path, views: Sequence[View]) -> None:
 
 
 def write_nerf(subject: Path, views: Sequence[View], frame: int) -> None:
-    """transforms.json of one frame, as instant-ngp and nerfstudio read it."""
+    """Write transforms.json of one frame, for instant-ngp and nerfstudio."""
     frames = []
     for i, view in enumerate(views):
         matrix = np.eye(4)
@@ -61,7 +61,7 @@ def write_nerf(subject: Path, views: Sequence[View], frame: int) -> None:
 
 
 def write_colmap(subject: Path, views: Sequence[View], frame: int) -> None:
-    """COLMAP's text model of one frame, without points; picture names are relative to the folder img."""
+    """Write COLMAP's text model of one frame, without points; image names are relative to the folder img."""
     cameras, images = (
         ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"],
         ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, ID, NAME"],
@@ -80,7 +80,7 @@ def write_colmap(subject: Path, views: Sequence[View], frame: int) -> None:
 
 
 def _quaternion(rotation: NDArray) -> NDArray[np.float64]:
-    """w, x, y, z with w >= 0: the eigenvector of Bar-Itzhack's matrix that belongs to its largest eigenvalue."""
+    """Convert to w, x, y, z with w >= 0: the eigenvector of Bar-Itzhack's matrix with the largest eigenvalue."""
     m = rotation
     matrix = np.array(
         [

@@ -1,7 +1,6 @@
-"""Where the cameras of a capture stand: rings, spheres, hemispheres around a person.
+"""Camera rigs of captures: rings, spheres and hemispheres around a human.
 
-World: metres, y up, the person faces +z. Cameras as OpenCV has them: x right, y down, z forward, pixel centres at
-+0.5.
+World: metres, y up, the human faces +z. OpenCV cameras: x right, y down, z forward, pixel centres at +0.5.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 Arrangement = Literal["rings", "sphere", "hemisphere"]
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 _LOWEST = -0.2
-"""Sine of the lowest elevation of a hemisphere: a little below the horizon."""
+"""Sine of the lowest elevation of a hemisphere, slightly below the horizon."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -46,21 +45,21 @@ class View:
 
 @dataclasses.dataclass(frozen=True)
 class Rig:
-    """Cameras of one kind on a sphere about a target; all see it in the middle of their pictures."""
+    """Equal cameras on a sphere around a target, which is at the centre of their images."""
 
     arrangement: Arrangement = "rings"
     count: int = 36
     elevations: tuple[float, ...] = (-10.0, 15.0, 40.0)
-    """Of rings: degrees above the horizon, one a ring; the cameras are dealt evenly to the rings."""
+    """Elevation of each ring, degrees above the horizon; cameras are distributed evenly to the rings."""
     vertical_fov: float = 30.0
     """Degrees."""
     width: int = 512
     height: int = 512
     margin: float = 1.05
-    """How much larger than the person's bounding sphere the picture is."""
+    """Size of the view relative to the bounding sphere."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for numbers no camera can have."""
+        """Raise ValueError for invalid values."""
         wrong = {
             "count": self.count < 1,
             "elevations": not self.elevations or not all(-89 <= angle <= 89 for angle in self.elevations),
@@ -77,13 +76,13 @@ class Rig:
                 )
 
     def views(self, target: NDArray, radius: float) -> list[View]:
-        """The cameras about `target` [3], as far away as shows a sphere of `radius` metres whole.
+        """Return the cameras around `target` [3], at a distance that shows all of a sphere of `radius` metres.
 
-        Raises ValueError where target or radius are not finite, or the radius is not positive.
+        Raises ValueError if target or radius are not finite, or the radius is not positive.
         """
         target = np.asarray(target, np.float64)
         if not (np.isfinite(target).all() and np.isfinite(radius) and radius > 0):
-            raise ValueError(f"a rig about {target.tolist()} with radius {radius}: the person has no finite size")
+            raise ValueError(f"a rig about {target.tolist()} with radius {radius}: the bounding sphere must be finite")
         narrow = min(1.0, self.width / self.height) * math.tan(math.radians(self.vertical_fov) / 2)
         distance = self.margin * radius / math.sin(math.atan(narrow))
         return [
@@ -92,7 +91,7 @@ class Rig:
         ]
 
     def directions(self) -> NDArray[np.float64]:
-        """Unit vectors [count, 3] from the target to the cameras; the first of a ring stands in front of the face."""
+        """Unit vectors [count, 3] from the target to the cameras; the first of a ring is in front of the face."""
         if self.arrangement == "rings":
             return _rings(self.count, self.elevations)
         lowest = -1.0 if self.arrangement == "sphere" else _LOWEST
@@ -101,7 +100,7 @@ class Rig:
 
 
 def look_at(position: NDArray, target: NDArray, vertical_fov: float, width: int, height: int) -> View:
-    """A camera at `position` with `target` in the middle of its picture; `vertical_fov` in radians, square pixels."""
+    """A camera at `position` with `target` at the centre of its image; `vertical_fov` in radians, square pixels."""
     forward = np.asarray(target, np.float64) - position
     forward = forward / np.linalg.norm(forward)
     up = (0.0, 1.0, 0.0) if abs(forward[1]) < 1 - 1e-9 else (0.0, 0.0, math.copysign(1.0, -forward[1]))
@@ -114,7 +113,7 @@ def look_at(position: NDArray, target: NDArray, vertical_fov: float, width: int,
 
 
 def bounding_sphere(points: NDArray) -> tuple[NDArray[np.float64], float]:
-    """Centre [3] of the box around points [..., 3] and the radius about it that holds them all, metres."""
+    """Centre [3] of the bounding box of points [..., 3], and the radius around it that contains them, metres."""
     points = np.asarray(points, np.float64).reshape(-1, 3)
     centre = (points.min(0) + points.max(0)) / 2
     return centre, float(np.linalg.norm(points - centre, axis=1).max())
@@ -129,6 +128,6 @@ def _rings(count: int, elevations: tuple[float, ...]) -> NDArray[np.float64]:
 
 
 def _on_sphere(azimuth: NDArray, height: NDArray) -> NDArray[np.float64]:
-    """Azimuth 0 is in front of the face (+z), a quarter turn at the person's left (+x)."""
+    """Azimuth 0 is in front of the face (+z), a quarter turn at the human's left (+x)."""
     across = np.sqrt(np.maximum(1 - height**2, 0))
     return np.stack([across * np.sin(azimuth), height, across * np.cos(azimuth)], -1).astype(np.float64)

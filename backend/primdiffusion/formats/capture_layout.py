@@ -1,4 +1,4 @@
-"""Captures on disk: the released code's folders (SPEC 5), with passes, joints and other projects' camera files beside.
+"""Captures on disk: the folders of the released code (SPEC 5), plus passes, joints and camera files of other projects.
 
     root/dataset.json                              what the captures are: settings, axes, passes, names of parts
     root/release_human_list.txt                    one subject a line
@@ -40,33 +40,33 @@ from .camera_rig import View
 
 FORMAT, VERSION = "primdiffusion-captures", 1
 ENDINGS = {"img": ".jpg", "mask": ".png", "depth": ".png", "normal": ".png", "part": ".png", "rgba": ".png"}
-"""Passes and the endings of their files."""
+"""File extensions of passes."""
 SMPL_FOLDER, SMPL_FILE, SMPL_PLAIN_FILE = "outputs_re_fitting", "refit_smpl_2nd.npz", "refit_smpl_2nd_plain.npz"
 RELEASED_REFERENCE = "seq_000016-rp_alison_rigged_002"
-"""The subject from which the released code takes the rest sizes of primitives, by this name."""
+"""Name of the subject that determines the rest sizes of primitives in the released code."""
 LIST_FILE, DATASET_FILE, COMPLETE_FILE = "release_human_list.txt", "dataset.json", "complete.json"
 
 
 class CaptureFolderError(ValueError):
-    """A folder that holds something else than the captures that were to be written or read."""
+    """A folder without the expected captures."""
 
 
 def picture_path(subject: Path, kind: str, camera: int, frame: int) -> Path:
-    """Where a picture of pass `kind` lies."""
+    """Return the path of an image of pass `kind`."""
     return subject / kind / f"camera{camera:04d}" / f"{frame:04d}{ENDINGS[kind]}"
 
 
 def view_seed(seed: int, subject: str, frame: int, camera: int) -> int:
-    """The seed of one picture's noise, 0 ... 2^31 - 1: the same whoever renders it, in whatever order."""
+    """Return the noise seed of an image, 0 ... 2^31 - 1, independent of the order of rendering."""
     digest = hashlib.sha256(f"{seed}/{subject}/{frame}/{camera}".encode()).digest()
     return int.from_bytes(digest[:4], "big") >> 1
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends, and vanishes when it fails.
+    """Yield a temporary path that replaces `path` at the end, or is removed after an error.
 
-    Errors of the file system name `path`: Python names no file where a disk is full.
+    OSErrors name `path`, also those of a full disk, for which Python names no file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
@@ -82,7 +82,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_npz(path: Path, **arrays: NDArray) -> None:
-    """Arrays as an .npz, made in memory: numpy's own writer leaves an archive half open where a disk is full."""
+    """Write an .npz atomically, built in memory: numpy's writer leaves an open archive behind if the disk is full."""
     made = io.BytesIO()
     np.savez(made, **arrays)  # type: ignore[arg-type]
     with replacing(path) as partial:
@@ -90,14 +90,13 @@ def write_npz(path: Path, **arrays: NDArray) -> None:
 
 
 def claim(root: Path, about: Mapping[str, Any]) -> None:
-    """Make `root` the dataset of these settings, or find that it is.
+    """Create the dataset `root` with the settings `about`, or check that an existing one has the same.
 
-    `about` is what must agree between all who write to it. Raises CaptureFolderError where the folder holds another
-    dataset, or anything that is no dataset.
+    Raises CaptureFolderError if the folder contains another dataset or other files.
     """
     wanted = {"format": FORMAT, "version": VERSION, **json.loads(json.dumps(about))}
     if not (root / DATASET_FILE).exists():
-        if root.is_dir() and any(not thing.name.startswith(".") for thing in root.iterdir()):
+        if root.is_dir() and any(not path.name.startswith(".") for path in root.iterdir()):
             raise CaptureFolderError(
                 f"{root} is not empty and holds no {DATASET_FILE}: choose a new folder for the captures"
             )
@@ -120,7 +119,7 @@ def claim(root: Path, about: Mapping[str, Any]) -> None:
 
 
 def read_about(root: Path) -> dict[str, Any]:
-    """The settings of a dataset. Raises CaptureFolderError where there are none that can be read."""
+    """Read the settings of a dataset. Raises CaptureFolderError if they are missing or damaged."""
     try:
         about = json.loads((root / DATASET_FILE).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -135,13 +134,13 @@ def read_about(root: Path) -> dict[str, Any]:
 
 
 def write_list(root: Path, subjects: Sequence[str]) -> None:
-    """The list of subjects, sorted."""
+    """Write the sorted list of subjects."""
     with replacing(root / LIST_FILE) as path:
         path.write_text("".join(f"{name}\n" for name in sorted(subjects)), encoding="utf-8")
 
 
 def write_smpl(subject: Path, global_orient: NDArray, body_pose: NDArray, betas: NDArray, translation: NDArray) -> None:
-    """The person's parameters: axis-angle [F,3] and [F,69], betas [B], metres [F,3]; frame 0 is the near-T pose."""
+    """Write SMPL parameters: axis-angle [F,3] and [F,69], betas [B], metres [F,3]; frame 0 is the near-T pose."""
     arrays = {
         "global_orient": np.asarray(global_orient, np.float32),
         "body_pose": np.asarray(body_pose, np.float32),
@@ -153,7 +152,7 @@ def write_smpl(subject: Path, global_orient: NDArray, body_pose: NDArray, betas:
 
 
 def write_joints(subject: Path, views: Sequence[View], world: NDArray) -> None:
-    """The joints [F,24,3] in the world and in every picture."""
+    """Write the joints [F,24,3] in the world and in every image."""
     projected = [view.project(world) for view in views]
     write_npz(
         subject / "joints.npz",
@@ -164,9 +163,9 @@ def write_joints(subject: Path, views: Sequence[View], world: NDArray) -> None:
 
 
 def complete(subject: Path) -> None:
-    """Note every file of a finished subject with its size and checksum; what killed processes left half written goes.
+    """Record size and checksum of every file of a finished subject, and remove partial files of killed processes.
 
-    Only one process finishes a subject: call it when nobody writes to it any more.
+    Call it once, after all writing to the subject has ended.
     """
     for partial in subject.rglob(".*.partial.*"):
         partial.unlink(missing_ok=True)
@@ -180,15 +179,15 @@ def complete(subject: Path) -> None:
 
 
 def damaged(subject: Path, *, checksums: bool = True) -> list[str]:
-    """What is wrong with a finished subject, a sentence a file; empty where nothing is.
+    """Return an error message for each damaged file of a finished subject, or one if it is unfinished.
 
-    An unfinished subject, without a readable complete.json, is one sentence. Without `checksums` only sizes count.
+    An unfinished subject has no readable complete.json. Without `checksums` only sizes are compared.
     """
     return [f"{path}: {what}" for path, what in damage(subject, checksums=checksums).items()]
 
 
 def damage(subject: Path, *, checksums: bool = True) -> dict[Path, str]:
-    """As `damaged`, by the files; of an unfinished subject the folder itself. Never names a file outside of it."""
+    """As `damaged`, by file, or by the folder of an unfinished subject. Never names a file outside of it."""
     try:
         files = json.loads((subject / COMPLETE_FILE).read_text(encoding="utf-8"))
         noted = {_inside(subject, name): (int(size), int(crc)) for name, (size, crc) in files.items()}

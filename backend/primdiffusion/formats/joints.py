@@ -1,4 +1,4 @@
-"""SMPL's joints, which are the bones of people."""
+"""The joints of SMPL, and so the bones of armatures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pictures of a capture as values of files, and PNGs without an imaging library."""
+"""Encoding of capture images, and PNG files without an imaging library."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from .capture_layout import replacing
 
 DEPTH_UNIT = 0.00025
-"""Metres a step of a depth file: up to 16.38 m."""
+"""Metres per unit of a depth file, which reaches 16.38 m."""
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\x00\x00\x00\x00IEND\xaeB\x60\x82"
 _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
 
 def write_png(path: Path, pixels: NDArray) -> None:
-    """A PNG of [H, W], [H, W, 3] or [H, W, 4], uint8 or uint16, unfiltered: lossless and the same bytes everywhere."""
+    """Encode [H, W], [H, W, 3] or [H, W, 4], uint8 or uint16, as an unfiltered PNG: the same bytes on every machine."""
     pixels = np.asarray(pixels)
     if pixels.dtype not in (np.uint8, np.uint16) or pixels.shape[2:] not in ((), (3,), (4,)):
         raise ValueError(
@@ -38,20 +38,20 @@ def write_png(path: Path, pixels: NDArray) -> None:
 
 
 def depth_steps(depth: NDArray) -> NDArray[np.uint16]:
-    """Metres along the optical axis as a depth file's values; nothing where not finite or out of range."""
+    """Convert metres along the optical axis to units of a depth file; 0 if not finite or out of range."""
     steps = np.where(np.isfinite(depth), np.round(np.nan_to_num(depth, posinf=0) / DEPTH_UNIT), 0)
     return np.where((steps > 0) & (steps < 65536), steps, 0).astype(np.uint16)
 
 
 def normal_bytes(normal: NDArray, covered: NDArray) -> NDArray[np.uint8]:
-    """World normals [H, W, 3] as a normal file's values, zero where not `covered` [H, W]."""
+    """Convert world normals [H, W, 3] to values of a normal file, 0 outside `covered` [H, W]."""
     values = np.zeros(normal.shape, np.uint8)
     values[covered] = np.round((np.clip(normal[covered], -1, 1) + 1) * 127.5)
     return values
 
 
 def is_whole_picture(path: Path) -> bool:
-    """Whether a .png or .jpg is there from its first to its last byte; does not decode it."""
+    """Return whether a .png or .jpg has its first and last bytes; does not decode it."""
     head, tail = (_PNG, _PNG_END) if path.suffix == ".png" else (_JPEG, _JPEG_END)
     try:
         with path.open("rb") as file:

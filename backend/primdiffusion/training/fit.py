@@ -145,12 +145,12 @@ def objective(
         payload = state.prepared(sample.found, sample.axis_angle)
     payload = payload.to(dtype=torch.float32)
     if state.step < config.hold_scale:
-        # Times zero and not left out: distributed training wants a gradient of every parameter.
+        # Multiplied by zero, because distributed training needs a gradient of every parameter.
         start = payload.delta_scale.new_tensor(PRESETS[config.encoder].extent)
         payload = dataclasses.replace(payload, delta_scale=start + 0 * payload.delta_scale)
     clock.lap("forward")
     primitives = Primitives.place(sample.frames, payload)
-    picture = drawn(primitives, sample, settings)
+    picture = render_targets(primitives, sample, settings)
     target = sample.target.image.float() / 255
     mask = sample.target.mask.float() / 255
     image = encode_srgb(picture.rgb)
@@ -169,8 +169,8 @@ def _total(terms: dict[str, Tensor], step: int) -> Tensor:
     return total
 
 
-def drawn(primitives: Primitives, sample: FitSample, settings: MarchSettings) -> Rendering:
-    """Pictures [b, v] of people [b]."""
+def render_targets(primitives: Primitives, sample: FitSample, settings: MarchSettings) -> Rendering:
+    """Render the target views [b, v] of humans [b]."""
     return march(primitives.map(lambda tensor: tensor[:, None]), sample.target.camera, settings)
 
 

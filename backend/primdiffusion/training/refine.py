@@ -27,7 +27,7 @@ from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
 from primdiffusion.primitives.primitives import Payload
-from primdiffusion.training.refine_views import PosedView, drawn, psnr_of, scenes_of
+from primdiffusion.training.refine_views import PosedView, psnr_of, render_view, scenes_of
 
 BETAS = (0.9, 0.99)
 """Adam's decay rates; short averages, because a run is a few hundred steps."""
@@ -204,7 +204,7 @@ def _share_of_rate(done: int, settings: RefineSettings) -> float:
 
 def _loss(scene: PosedView, payload: Payload, settings: RefineSettings) -> Tensor:
     """L_rgb + silhouette * L_sil, summed over pixels; L_rgb is the mean over channels."""
-    rendering = drawn(scene, payload, settings.step)
+    rendering = render_view(scene, payload, settings.step)
     target = scene.target.float() / 255
     colour = (encode_srgb(rendering.rgb) - target[..., :3]).square().mean(-1)
     return (colour + settings.silhouette * (rendering.alpha - target[..., 3]).square()).sum()

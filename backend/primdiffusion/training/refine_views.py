@@ -89,12 +89,12 @@ def psnr_of(scenes: Sequence[PosedView], payload: Payload) -> Float[Tensor, "n"]
     """See `view_psnr`."""
     found = []
     for scene in scenes:
-        image = encode_srgb(drawn(scene, payload, MarchSettings().step).rgb.clamp(0, 1))
+        image = encode_srgb(render_view(scene, payload, MarchSettings().step).rgb.clamp(0, 1))
         found.append(psnr(image, scene.target[..., :3].float() / 255))
     return torch.stack(found).cpu()
 
 
-def drawn(scene: PosedView, payload: Payload, step: float) -> Rendering:
+def render_view(scene: PosedView, payload: Payload, step: float) -> Rendering:
     """Render the payload for the scene's camera. Raises PictureOutOfMemory."""
     try:
         return march(Primitives.place(scene.frames, payload), scene.camera, MarchSettings(step=step))

@@ -37,7 +37,7 @@ class ShardError(ValueError):
 
 
 def open_people(folder: Path) -> PersonDataset:
-    """The people of a folder: packed ones where there is an index, files of single people otherwise.
+    """Open the people of a folder: shards if there is an index, files of single people otherwise.
 
     Raises:
         FileNotFoundError: there are fewer than two.

@@ -143,7 +143,7 @@ def _under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 def accelerator_of(mixed_precision: str = "no") -> Accelerator:
-    """Return the accelerator of this process; on the CPU where there is no GPU."""
+    """Return the accelerator of this process; on the CPU if there is no GPU."""
     patience = InitProcessGroupKwargs(timeout=PATIENCE)
     return Accelerator(mixed_precision=mixed_precision, cpu=not torch.cuda.is_available(), kwargs_handlers=[patience])
 
