@@ -50,8 +50,9 @@ def compare(captures: Captures, people: dict, samples: int) -> list[Difference]:
 
 def joint_error_px(subject: Subject) -> float:
     """The largest distance between joints saved with the captures and those of the backend's body, in pixels."""
-    apart = [view.project(default_joints(subject))[0] - view.project(joints_of(subject))[0] for view in subject.views]
-    return float(np.linalg.norm(apart, axis=-1).max())
+    saved, ours = joints_of(subject), default_joints(subject)
+    differences = [view.project(ours)[0] - view.project(saved)[0] for view in subject.views]
+    return float(np.linalg.norm(differences, axis=-1).max())
 
 
 def _difference(subject: Subject, frame: int, camera: int, shot) -> Difference:
@@ -59,12 +60,12 @@ def _difference(subject: Subject, frame: int, camera: int, shot) -> Difference:
     colours, coverage = srgb_bytes(shot.rgb), np.round(shot.coverage * 255)
     ours, theirs = coverage > 127, stored["mask"] > 127
     covered = (coverage > 0) | (stored["mask"] > 0)
-    apart = _as_blender_stores(colours)[covered].astype(float) - stored["img"][covered]
+    difference = _as_blender_stores(colours)[covered].astype(float) - stored["img"][covered]
     depth = stored["depth"] * DEPTH_UNIT
     either = (depth > 0) | (shot.depth > 0)
     return Difference(
         mask_iou=float((ours & theirs).sum() / (ours | theirs).sum()),
-        squared=float((apart**2).mean()),
+        squared=float((difference**2).mean()),
         depth_share=float((np.abs(depth - shot.depth) < SAME_DEPTH_M)[either].mean()),
         part_share=float((stored["part"] == shot.part)[either].mean()),
         shift_px=_shift(stored["img"].astype(float), colours.astype(float)),

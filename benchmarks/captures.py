@@ -15,20 +15,22 @@ is measured).
 
 from __future__ import annotations
 
-import argparse
 import contextlib
+import dataclasses
 import importlib.util
 import itertools
 import math
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 from capture_compare import compare, joint_error_px
-from capture_cycles import Moment, cycles
 from primdiffusion.capture.dataset import CaptureDataset, SampleSettings, batches
 from primdiffusion.capture.pack import pack
 from primdiffusion.capture.people_files import find_people, read_person
@@ -37,26 +39,40 @@ from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import Captures, open_captures
 from primdiffusion.capture.subject import begin, draw_frames, sit
 from primdiffusion.formats.camera_rig import Rig
-from primdiffusion.people.assets import open_assets
+from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
-from record import tell
+from record import command_line, report
 
+ROOT = Path(__file__).resolve().parents[1]
+MARK = b"PRIMDIFFUSION "
+"""Begins each line of progress of the capture command."""
 SIZE, SAMPLES = 512, 3
 FIRST_SEED = 20_000_000
 """The seed of the first person; training sets count from 0."""
+TIMED_PEOPLE, WARM_UP = 16, 4
+"""People that are timed, and people that each worker makes before."""
 GROWTH_VIEWS, GROWTH_FROM = 200, 20
 """The number of views in the memory test, and how many of them are warm-up."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Moment:
+    """Time and memory of the capture command when it has finished a view."""
+
+    wall_s: float
+    processor_s: float
+    """Processor seconds of the process so far."""
+    resident_mb: float
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
     parser.add_argument("--people", type=int, default=3, help="number of people to compare")
     parser.add_argument("--cameras", type=int, default=6, help="number of cameras for each of the four poses")
     parser.add_argument("--out", type=Path, help="save people and captures here")
     parser.add_argument("--quick", action="store_true", help="one person, few views")
-    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         folder = arguments.out or Path(scratch)
@@ -64,7 +80,7 @@ def main() -> None:
         count, poses, cameras = (1, 2, 3) if arguments.quick else (arguments.people, 4, arguments.cameras)
         for _ in make_people(assets, PeopleSet(folder / "people", FIRST_SEED, count), 1):
             pass
-        figures = {"people_per_second": None if arguments.quick else _people(assets)}
+        figures = {"people_per_second": None if arguments.quick else _people_per_second(assets)}
         figures |= _fast(folder, poses, cameras)
         figures |= _cycles(folder, poses, cameras) if importlib.util.find_spec("bpy") else _no_cycles()
         both = (figures["processor_seconds_a_view_cycles_512"], figures["processor_seconds_a_view_fast_512"])
@@ -74,13 +90,18 @@ def main() -> None:
         measurable = not arguments.quick and importlib.util.find_spec("bpy")
         figures["memory_growth_mb_over_200_views"] = _growth(folder) if measurable else None
         figures |= _loader(folder, 1.5 if arguments.quick else 5.0)
-    tell(figures, arguments.json)
+    report(figures, arguments.json)
 
 
-def _people(assets) -> float:
-    from people_speed import people_per_second
-
-    return people_per_second(16, os.cpu_count() or 1, assets)
+def _people_per_second(assets: Assets) -> float:
+    """Rate of `make_people` with one worker per core, after the first WARM_UP people of each worker."""
+    workers = os.cpu_count() or 1
+    first = WARM_UP * workers
+    with tempfile.TemporaryDirectory() as folder:
+        making = make_people(assets, PeopleSet(Path(folder), 0, TIMED_PEOPLE + first), workers)
+        moments = [(done, time.perf_counter()) for done in making]
+    started = next(moment for done, moment in moments if done >= first)
+    return TIMED_PEOPLE / (moments[-1][1] - started)
 
 
 def _fast(folder: Path, poses: int, cameras: int) -> dict[str, float]:
@@ -105,7 +126,7 @@ def _fast(folder: Path, poses: int, cameras: int) -> dict[str, float]:
 
 
 def _cycles(folder: Path, poses: int, cameras: int) -> dict[str, float | None]:
-    moments = cycles(folder / "people", folder / "cycles", poses, cameras, SIZE)
+    moments = _run_cycles(folder / "people", folder / "cycles", poses, cameras, SIZE)
     captures = open_captures(folder / "cycles")
     wall, processor = _pace(moments, len(captures.subjects))
     differences = compare(captures, find_people(folder / "people"), SAMPLES)
@@ -124,6 +145,27 @@ def _cycles(folder: Path, poses: int, cameras: int) -> dict[str, float | None]:
     }
 
 
+def _run_cycles(people: Path, out: Path, poses: int, cameras: int, size: int, *more: str) -> list[Moment]:
+    """Render captures in Cycles under uniform light; one Moment per view. Raises RuntimeError if the command fails."""
+    command = [
+        sys.executable, "-m", "blender_primdiffusion.capture", "--people", people, "--out", out, "--poses", poses,
+        "--cameras", cameras, "--size", size, size, "--progress", "json", *more,
+    ]  # fmt: skip
+    with subprocess.Popen(list(map(str, command)), cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        assert child.stderr is not None
+        process, moments = psutil.Process(child.pid), []
+        for line in child.stdout:
+            if line.startswith(MARK) and child.poll() is None:
+                used = process.cpu_times()
+                resident = process.memory_info().rss / 1e6
+                moments.append(Moment(time.perf_counter(), used.user + used.system, resident))
+        errors = child.stderr.read().decode(errors="replace")
+    if child.returncode:
+        raise RuntimeError(f"the capture command ended with {child.returncode}: {errors[-2000:]}")
+    return moments
+
+
 def _no_cycles() -> dict[str, float | None]:
     names = ("seconds_a_view_cycles_512", "processor_seconds_a_view_cycles_512", "mask_iou_fast_vs_cycles",
              "psnr_fast_vs_cycles", "joint_reprojection_px_max")  # fmt: skip
@@ -133,16 +175,16 @@ def _no_cycles() -> dict[str, float | None]:
 def _pace(moments: list[Moment], people: int) -> tuple[float, float]:
     """Wall and processor seconds per view, without each person's first view, which includes loading."""
     each = len(moments) // people
-    kept = [pair for i, pair in enumerate(itertools.pairwise(moments), start=1) if i % each]
-    wall = sum(after.wall_s - before.wall_s for before, after in kept) / len(kept)
-    return wall, sum(after.processor_s - before.processor_s for before, after in kept) / len(kept)
+    later = [pair for i, pair in enumerate(itertools.pairwise(moments), start=1) if i % each]
+    wall = sum(after.wall_s - before.wall_s for before, after in later) / len(later)
+    return wall, sum(after.processor_s - before.processor_s for before, after in later) / len(later)
 
 
 def _growth(folder: Path) -> float:
     """Growth of the memory of Cycles' process between view 20 and view 200, in MB."""
     poses, cameras = 5, GROWTH_VIEWS // 5
     first = next(iter(find_people(folder / "people")))
-    moments = cycles(folder / "people", folder / "growth", poses, cameras, 64, "--samples", "1", "--only", first)
+    moments = _run_cycles(folder / "people", folder / "growth", poses, cameras, 64, "--samples", "1", "--only", first)
     return moments[-1].resident_mb - moments[min(GROWTH_FROM, len(moments) - 1)].resident_mb
 
 
@@ -165,11 +207,11 @@ def _views_per_second(captures: Captures, size: int, seconds: float) -> float:
     with contextlib.closing(stream):
         for _ in range(2):
             next(stream)
-        begun, views = time.perf_counter(), 0
-        while time.perf_counter() - begun < seconds:
+        start, views = time.perf_counter(), 0
+        while time.perf_counter() - start < seconds:
             batch, _ = next(stream)
             views += batch.conditioning.mask.shape[:2].numel() + batch.target.mask.shape[:2].numel()
-        return views / (time.perf_counter() - begun)
+        return views / (time.perf_counter() - start)
 
 
 if __name__ == "__main__":

@@ -74,7 +74,7 @@ from primdiffusion.people.fitted import head_centre
 from primdiffusion.people.payloads import make_payloads, rest_frames
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
-from record import tell
+from record import report
 from torch import Tensor
 
 Figures = dict[str, float | int | bool | str | None]
@@ -106,12 +106,12 @@ def main() -> None:
         if arguments.sheet is not None:
             save_sheet(chain.pictures, arguments.sheet)
         figures |= chain.figures()
-        tell(figures, arguments.json)  # what is known so far: the rest takes long
+        report(figures, arguments.json)  # what is known so far: the rest takes long
         figures |= sample_figures(model, assets, chain, samples, skins)
-        tell(figures, arguments.json)
+        report(figures, arguments.json)
         if held is not None:
             figures |= payload_figures(assets, held, 1 if arguments.quick else PAYLOAD_PEOPLE)
-    tell(figures, arguments.json)
+    report(figures, arguments.json)
 
 
 def parsed() -> argparse.Namespace:

@@ -9,7 +9,6 @@ longest one under a flood of messages.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
@@ -63,8 +62,7 @@ class Timer:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
+    parser = record.command_line(__doc__)
     arguments = parser.parse_args()
     timer = Timer()
     with tempfile.TemporaryDirectory(prefix="primdiffusion_child_") as name:
@@ -80,7 +78,7 @@ def main() -> None:
             "flood_tick_seconds_max": flood_tick_s(folder),
         }
     figures["tick_seconds_max"] = timer.longest_s
-    record.tell(figures, arguments.json)
+    record.report(figures, arguments.json)
 
 
 def cancel_seconds(timer: Timer, folder: Path, when: Callable[[Request], bool], send: int = 0) -> float:

@@ -5,15 +5,16 @@ Each stage runs in its own process and is measured from outside. `--json FILE` a
 
 from __future__ import annotations
 
-import argparse
+import dataclasses
 import json
 import os
+import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import record
-import stages
 from PIL import Image
 from primdiffusion.machine import share_processors
 
@@ -24,9 +25,8 @@ FRAMES, SHOWN = 48, 31
 
 def main() -> None:
     """Runs the stages one after another; if a stage fails, the demo ends with the last lines of its output."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record.command_line(__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "demo_out")
-    parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
     parser.add_argument("--quick", action="store_true", help="no Cycles frame, a small contact sheet")
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument(
@@ -40,19 +40,19 @@ def main() -> None:
     out, logs = arguments.out.resolve(), arguments.out.resolve() / "logs"
     logs.mkdir(parents=True, exist_ok=True)
     blend, human = out / "human.blend", out / "person.human.safetensors"
-    begun = time.perf_counter()
-    rows: list[stages.Stage] = []
+    start = time.perf_counter()
+    rows: list[Stage] = []
     figures: dict[str, float | None] = {"people_iou_mean": None, "people_psnr_mean": None}
 
     def stage(name: str, script: str, *options: str | Path, figures_file: bool = True) -> None:
-        report = logs / f"{len(rows)}.json"
-        asked = ["--json", report] if figures_file else []
+        written = logs / f"{len(rows)}.json"
+        figures_option = ["--json", written] if figures_file else []
         print(f"{name} ...", flush=True)
         rows.append(
-            stages.run_stage(name, [sys.executable, ROOT / script, *options, *asked], logs / f"{len(rows)}.log")
+            run_stage(name, [sys.executable, ROOT / script, *options, *figures_option], logs / f"{len(rows)}.log")
         )
         if figures_file:
-            figures.update(json.loads(report.read_text()))
+            figures.update(json.loads(written.read_text()))
 
     stage("build the extension", "build_addon.py", "--out", out, figures_file=False)
     archive = next(out.glob("primdiffusion-*.zip"))
@@ -70,15 +70,47 @@ def main() -> None:
         stage("people against meshes", "benchmarks/people.py", "--assets", arguments.assets, *options)
 
     overview(out, ["march_rest", "march_posed", "march_side", "march_depth", "march_boxes", "cycles"])
-    figures["seconds_setup_excluded_total"] = time.perf_counter() - begun
+    figures["seconds_setup_excluded_total"] = time.perf_counter() - start
     figures["peak_gb"] = max(row.took.peak_gb for row in rows)
-    print(f"\n{stages.table(rows)}\n")
+    print(f"\n{table(rows)}\n")
     print(f"from pressing the button to a person in the scene: {figures['seconds_pressed_to_standing']:.1f} s")
     print(f"volumes follow linear blend skinning within {figures['lbs_error_mm_max']:.5f} mm")
     print(f"look at {out}: overview.png, contact_sheet.png, human.blend")
     if arguments.json is not None:
         about = record.surroundings()  # that stage has printed its own figures
         record.write_record(arguments.json, {name: value for name, value in figures.items() if name not in about})
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """A finished stage, its time and memory."""
+
+    name: str
+    took: record.Measurement
+
+
+class StageFailed(RuntimeError):
+    """A stage ended with a non-zero exit code."""
+
+
+def run_stage(name: str, command: Sequence[str | Path], log: Path) -> Stage:
+    """Runs `command` with its output in `log`; raises StageFailed with the end of that output if it fails."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("wb") as output, record.measured() as took:
+        code = subprocess.run([str(part) for part in command], stdout=output, stderr=subprocess.STDOUT).returncode
+    if code != 0:
+        tail = "\n".join(log.read_text(errors="replace").splitlines()[-25:])
+        raise StageFailed(f"{name} ended with exit code {code}; the whole output is in {log}:\n{tail}")
+    return Stage(name, took)
+
+
+def table(rows: Sequence[Stage]) -> str:
+    """Seconds and peak memory of each stage, with the sum and the maximum in the last row."""
+    width = max(len(row.name) for row in rows)
+    lines = [f"{'stage':<{width}}  {'seconds':>8}  {'peak GB':>8}"]
+    lines += [f"{row.name:<{width}}  {row.took.seconds:8.1f}  {row.took.peak_gb:8.2f}" for row in rows]
+    total, peak = sum(row.took.seconds for row in rows), max(row.took.peak_gb for row in rows)
+    return "\n".join([*lines, f"{'total':<{width}}  {total:8.1f}  {peak:8.2f}"])
 
 
 def nearby_assets() -> Path | None:

@@ -28,11 +28,11 @@ SIDE = math.radians(70)
 
 def share_on_body(position: torch.Tensor) -> float:
     """Share of the grid's cells with a distinct point on the body: on a face, 1 mm or more from all others."""
-    apart = torch.cdist(position.double(), position.double())
-    apart.fill_diagonal_(torch.inf)
+    distance = torch.cdist(position.double(), position.double())
+    distance.fill_diagonal_(torch.inf)
     body, anchors = default_body(), default_anchors()
     on_a_face = (anchors.face >= 0) & (anchors.face < body.faces.shape[0]) & (anchors.barycentric >= -1e-6).all(-1)
-    return float((on_a_face & (apart.amin(-1) >= 1e-3)).float().mean())
+    return float((on_a_face & (distance.amin(-1) >= 1e-3)).float().mean())
 
 
 def main() -> None:

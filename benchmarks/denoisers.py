@@ -7,16 +7,14 @@ checkpoint's card: they were measured in training, on people that are not in the
 
 from __future__ import annotations
 
-import argparse
 import time
-from pathlib import Path
 
 import torch
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.unet import PAPER, PAPER_WITH_ATTENTION, SlabUNet
-from record import tell
+from record import command_line, report
 from torch.utils.flop_counter import FlopCounterMode
 
 STEPS = 30
@@ -89,12 +87,11 @@ def measure(quick: bool) -> dict[str, float | int | None]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser = command_line(__doc__)
     parser.add_argument("--quick", action="store_true", help="under a minute")
     arguments = parser.parse_args()
     figures = measure(arguments.quick)
-    tell(figures, arguments.json)
+    report(figures, arguments.json)
 
 
 if __name__ == "__main__":

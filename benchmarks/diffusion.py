@@ -50,7 +50,7 @@ from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person
-from record import tell
+from record import report
 from torch import Tensor
 
 Figures = dict[str, float | int | str | None]
@@ -114,7 +114,7 @@ def main() -> None:
         figures |= photograph_figures(model, held, arguments)
         figures["nearest_neighbour_ratio_latent"] = None if arguments.quick else latent_ratio(model, train, held)
     figures |= quality_figures(rows, reference)
-    tell(figures, arguments.json)
+    report(figures, arguments.json)
     text = table_of(rows, reference)
     print(text)
     if arguments.table is not None:

@@ -25,7 +25,7 @@ import torch  # noqa: E402
 from primdiffusion.diffusion.checkpoint import load_checkpoint  # noqa: E402
 from primdiffusion.diffusion.model import DiffusionModel  # noqa: E402
 from primdiffusion.human import generate, generate_batch  # noqa: E402
-from record import tell  # noqa: E402
+from record import report  # noqa: E402
 
 TOGETHER = 8
 
@@ -70,7 +70,7 @@ def main() -> None:
         "generate_seconds_a_person_of_8": together,
         "peak_gb": peak,
     }
-    tell({name: round(value, 4) for name, value in figures.items()}, arguments.json)
+    report({name: round(value, 4) for name, value in figures.items()}, arguments.json)
 
 
 if __name__ == "__main__":

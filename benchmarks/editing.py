@@ -7,7 +7,6 @@ edit. `--quick` takes few steps.
 
 from __future__ import annotations
 
-import argparse
 import colorsys
 import dataclasses
 import math
@@ -35,7 +34,7 @@ from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.machine import best_device
 from primdiffusion.render.image import over
 from primdiffusion.render.march import march
-from record import tell
+from record import command_line, report
 
 COLUMNS = 6
 ARMS_LOWERED = 1.05
@@ -181,12 +180,11 @@ def sheet(rows: list[tuple[str, list[tuple[str, np.ndarray]]]], height: int) -> 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("--checkpoint", type=Path, help="without it, the package's checkpoint")
     parser.add_argument("--height", type=int, default=270, help="pixels of each picture")
     parser.add_argument("--quick", action="store_true", help="3 steps per edit")
     parser.add_argument("--out", type=Path, required=True, help="PNG to write")
-    parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     studio = Studio(load_checkpoint(arguments.checkpoint, best_device()), 3 if arguments.quick else STEPS)
     rows = []
@@ -203,7 +201,7 @@ def main() -> None:
         if cells:
             rows.append((heading, cells))
     sheet(rows, arguments.height).save(arguments.out, optimize=True)
-    tell({name: statistics.median(seconds) for name, seconds in studio.seconds.items()}, arguments.json)
+    report({name: statistics.median(seconds) for name, seconds in studio.seconds.items()}, arguments.json)
 
 
 if __name__ == "__main__":

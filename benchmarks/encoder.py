@@ -31,7 +31,7 @@ from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
-from record import tell
+from record import command_line, report
 
 FIRST_SEED = 30_000_000
 """Seed of the first person made here; training sets count from 0."""
@@ -96,7 +96,7 @@ def main() -> None:
     else:
         assets = () if arguments.assets is None else ("--assets", str(arguments.assets))
         figures |= from_script("refine.py", REFINE_FIGURES, *assets)
-    tell(figures, arguments.json)
+    report(figures, arguments.json)
     text = table_of(qualities)
     print(text)
     if arguments.table is not None:
@@ -104,17 +104,16 @@ def main() -> None:
 
 
 def parsed() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("--train", type=Path, help="captures of people that the encoder was trained on")
     parser.add_argument("--heldout", type=Path, help="captures of other people")
     parser.add_argument("--models", type=Path, help="folder of checkpoints; without it, the package's encoder")
     parser.add_argument("--people", type=int, default=16, help="number of people from each set, evenly spaced")
     parser.add_argument("--cameras", type=int, help="number of cameras to compare in, evenly spaced; without it, all")
-    parser.add_argument("--lpips", type=Path, nargs="*", default=(), help="folder of the weights of LPIPS")
+    parser.add_argument("--lpips", type=Path, nargs="*", default=(), help="files with the weights of LPIPS")
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
     parser.add_argument("--without-refine", action="store_true", help="skip benchmarks/refine.py")
     parser.add_argument("--quick", action="store_true", help="one person, two poses")
-    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--table", type=Path, help="markdown file for the tables")
     return parser.parse_args()
 
@@ -147,11 +146,11 @@ def measured(
     count = 1 if arguments.quick else min(arguments.people, len(captures.subjects))
     names = tuple(captures.subjects[i * len(captures.subjects) // count] for i in range(count))
     every = len(captures.subject(names[0]).views)
-    wanted = min(arguments.cameras or every, every)
+    count = min(arguments.cameras or every, every)
     settings = EvaluationSettings(
         names,
         frames=(0, 1) if arguments.quick else (),
-        cameras=tuple(i * every // wanted for i in range(wanted)),
+        cameras=tuple(i * every // count for i in range(count)),
         given_views=VIEWS,
     )
     return summary(evaluate(model, captures, settings, lpips))

@@ -9,7 +9,6 @@ the backend's own picture, with pixel values in 0 ... 1.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 import time
@@ -17,8 +16,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import blender_apart  # noqa: F401  before bpy
 import bpy
+import isolated_blender  # noqa: F401  before bpy
 import numpy as np
 import torch
 from march_people import checkered_human
@@ -29,7 +28,7 @@ from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, place
 from primdiffusion.human_file import export_for_blender, save_human
 from primdiffusion.render.march import march
-from record import tell
+from record import command_line, report
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import blender_primdiffusion
@@ -97,12 +96,12 @@ def overhead(change: Callable[[int], None]) -> dict[str, float]:
     drawings: list = []
     plain = final.render_layer
 
-    def kept(engine: object, depsgraph: object) -> object:
+    def recorded(engine: object, depsgraph: object) -> object:
         drawings.append(plain(engine, depsgraph))
         return drawings[-1]
 
     whole, gather, fill = [], [], []
-    final.render_layer = kept
+    final.render_layer = recorded
     try:
         with (
             timed(final, "render_layer", whole),
@@ -152,13 +151,12 @@ def pixel_error(human: Human, armature: bpy.types.Object, rotations: np.ndarray)
     rendering = march(place(human, body_pose), camera)
     alpha = rendering.alpha[..., None]
     straight = (rendering.rgb / torch.where(alpha > 0, alpha, 1)).clamp(0, 1)
-    wanted = np.concatenate([np.asarray(encode_srgb(straight.numpy())), alpha.numpy()], -1)
-    return float(np.abs(given - np.round(255 * wanted)).max() / 255)
+    expected = np.concatenate([np.asarray(encode_srgb(straight.numpy())), alpha.numpy()], -1)
+    return float(np.abs(given - np.round(255 * expected)).max() / 255)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser = command_line(__doc__)
     arguments = parser.parse_args()
     human = checkered_human()
     blender_primdiffusion.register()
@@ -172,7 +170,7 @@ def main() -> None:
         figures |= {f"engine_{name}": value for name, value in moved.items()}
         figures |= {f"engine_new_pose_{name}": value for name, value in posed.items()}
         blender_primdiffusion.unregister()
-    tell(figures, arguments.json)
+    report(figures, arguments.json)
 
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-import blender_apart  # noqa: F401  before bpy
 import bpy
+import isolated_blender  # noqa: F401  before bpy
 import numpy as np
 from march_people import generated
 from PIL import Image
@@ -102,7 +102,7 @@ def over_cycles(person: bpy.types.Collection, folder: Path) -> np.ndarray:
     scene.cycles.samples, scene.cycles.device = SAMPLES, "CPU"
     layer = bpy.context.view_layer.layer_collection.children[person.name]
     next(child for child in layer.children if child.name.endswith("_primitives")).exclude = True
-    body = next(thing for thing in person.objects if thing.type == "MESH")
+    body = next(obj for obj in person.objects if obj.type == "MESH")
     body.hide_render = body.visible_camera = False
     below = picture(folder)
     return above + (1 - above[..., 3:]) * below

@@ -11,18 +11,17 @@ volumes changed (at_once_edit_ms is without slices, including evaluation). Drawi
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-import blender_apart  # noqa: F401  before bpy
 import bpy
+import isolated_blender  # noqa: F401  before bpy
 from march_people import checkered_human
 from primdiffusion.human_file import export_for_blender
-from record import tell
+from record import command_line, report
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -34,9 +33,9 @@ from blender_primdiffusion.scene.human_npz import Destination, WrittenHuman, wri
 from blender_primdiffusion.scene.volumes import free_unused_grids, read_grids
 
 
-def milliseconds(does: Callable[[], object]) -> float:
+def milliseconds(call: Callable[[], object]) -> float:
     began = time.perf_counter()
-    does()
+    call()
     return 1000 * (time.perf_counter() - began)
 
 
@@ -46,10 +45,10 @@ def new_file(folder: Path, name: str) -> None:
     bpy.ops.ed.undo_push(message="before")
 
 
-def prepare(human: Path, place: Destination) -> tuple[WrittenHuman, dict[str, float]]:
+def prepare(human: Path, destination: Destination) -> tuple[WrittenHuman, dict[str, float]]:
     """The sliced part of adding a person, as a window does it."""
     began = time.perf_counter()
-    written = write_now(human, place)
+    written = write_now(human, destination)
     figures = {"write_ms": 1000 * (time.perf_counter() - began)}
     parts, read = [], 0
     while read < len(written.files):
@@ -79,12 +78,11 @@ def edit(person: bpy.types.Collection, human: Path, file: Path) -> dict[str, flo
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", type=Path)
+    parser = command_line(__doc__)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="primdiffusion_entering_") as folder:
         figures = measured(Path(folder))
-    tell(figures, given.json)
+    report(figures, given.json)
 
 
 def measured(folder: Path) -> dict[str, float]:

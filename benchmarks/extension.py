@@ -27,8 +27,7 @@ PARTS = ["register", "person", "memory", "merged", "soak", "bare"]
 
 def main() -> None:
     """Measure with this interpreter, then with those of --also."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
+    parser = record.command_line(__doc__)
     parser.add_argument("--quick", action="store_true", help="smaller pictures, five rounds")
     parser.add_argument("--parts", nargs="*", default=PARTS, help="parts to measure; the file's other figures stay")
     parser.add_argument(
@@ -46,7 +45,7 @@ def main() -> None:
         about = record.surroundings()
         before = json.loads(arguments.json.read_text())
         figures = {name: value for name, value in before.items() if name not in about} | figures
-    record.tell(figures, arguments.json)
+    record.report(figures, arguments.json)
 
 
 def measure(python: Path, arguments: argparse.Namespace) -> dict[str, float | str | None]:

@@ -39,13 +39,13 @@ def errors(
                 expected = (blended[:, :3, :3] @ rest[:, :, None])[:, :, 0] + blended[:, :3, 3]
                 found = _volumes(collection)
                 worst["lbs_error_mm_max"] = max(
-                    worst["lbs_error_mm_max"], _apart(found[:, :3, 3], expected.numpy(), world)
+                    worst["lbs_error_mm_max"], _distance_mm(found[:, :3, 3], expected.numpy(), world)
                 )
                 continue
             frames = attach(anchors, posed.vertices, body.faces)
             found = _instances(armature)
             worst["surface_error_mm_max"] = max(
-                worst["surface_error_mm_max"], _apart(found[:, :3, 3], frames.position.numpy(), world)
+                worst["surface_error_mm_max"], _distance_mm(found[:, :3, 3], frames.position.numpy(), world)
             )
             axes = world[:3, :3] @ BLENDER_FROM_BACKEND @ frames.rotation.numpy()
             own = found[:, :3, :3] / np.linalg.norm(found[:, :3, :3], axis=1, keepdims=True)
@@ -70,8 +70,8 @@ def _pose(armature: bpy.types.Object, bases: np.ndarray) -> BodyPose:
 
 def _volumes(collection: bpy.types.Collection) -> np.ndarray:
     graph = bpy.context.evaluated_depsgraph_get()
-    things = sorted((t for t in collection.all_objects if t.type == "VOLUME"), key=lambda thing: thing.name)
-    return np.array([np.array(thing.evaluated_get(graph).matrix_world) for thing in things])
+    objs = sorted((obj for obj in collection.all_objects if obj.type == "VOLUME"), key=lambda obj: obj.name)
+    return np.array([np.array(obj.evaluated_get(graph).matrix_world) for obj in objs])
 
 
 def _instances(armature: bpy.types.Object) -> np.ndarray:
@@ -84,7 +84,7 @@ def _instances(armature: bpy.types.Object) -> np.ndarray:
     return np.array([found[name] for name in sorted(found)])
 
 
-def _apart(found: np.ndarray, expected: np.ndarray, world: np.ndarray) -> float:
+def _distance_mm(found: np.ndarray, expected: np.ndarray, world: np.ndarray) -> float:
     """Largest distance in mm between world points and backend points given in the armature's space."""
     upright = expected @ BLENDER_FROM_BACKEND.T @ world[:3, :3].T + world[:3, 3]
     return 1e3 * float(np.linalg.norm(found - upright, axis=-1).max())

@@ -12,8 +12,8 @@ import sys
 import time
 from pathlib import Path
 
-import blender_apart  # before bpy
 import bpy
+import isolated_blender  # before bpy
 import numpy as np
 import psutil
 import resident
@@ -123,8 +123,8 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
         blender.append(resident.resident_mb())
         megabytes.append(blender[-1] + resident.children_mb())
         print(f"round {number + 1}: {blender[-1]:.0f} MB, {megabytes[-1]:.0f} MB with the child", flush=True)
-    kept = {"shot.blend", "shot.blend1"}
-    stray = [path for path in (arguments.folder / "scene").rglob("*") if path.is_file() and path.name not in kept]
+    expected = {"shot.blend", "shot.blend1"}
+    stray = [path for path in (arguments.folder / "scene").rglob("*") if path.is_file() and path.name not in expected]
     compiled = Path(bpy.app.tempdir) / "primdiffusion" / "cache"  # code cache of an add-on that is not installed
     temporary = [path for path in Path(bpy.app.tempdir).rglob("*") if path.is_file()]
     stray += [path for path in temporary if not path.is_relative_to(compiled)]
@@ -211,7 +211,7 @@ def main() -> None:
     arguments = parser.parse_args()
     figures = PARTS[arguments.part](arguments)
     print("\nfigures " + json.dumps(figures), flush=True)
-    blender_apart.remove()
+    isolated_blender.remove()
     os._exit(0)  # bpy as a module may hang at exit
 
 

@@ -8,7 +8,6 @@ The source is parsed, never imported. The items counted are printed above the fi
 
 from __future__ import annotations
 
-import argparse
 import ast
 import io
 import json
@@ -68,8 +67,7 @@ class Module:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
+    parser = record.command_line(__doc__)
     parser.add_argument("--walk", action="store_true", help="generate in Blender and count the files passed (walk.py)")
     arguments = parser.parse_args()
     modules = parsed()
@@ -85,7 +83,7 @@ def main() -> None:
     figures: dict[str, float | None] = {**sizes(modules), **{name: len(found) for name, found in findings.items()}}
     figures["test_minutes"] = json.loads(SUITE.read_text())["test_minutes"] if SUITE.is_file() else None
     figures |= walk() if arguments.walk else {"walk_extension_files": None, "walk_backend_files": None}
-    record.tell(figures, arguments.json)
+    record.report(figures, arguments.json)
 
 
 def parsed() -> list[Module]:

@@ -9,20 +9,18 @@ together, the best of several warm calls, because wall time is unreliable on a s
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numba
 import torch
 from march_people import Scene, checkered_human, contorted, in_fewer_boxes, portrait, scenes, standing_person
-from march_table import Row, write_plot, write_table
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.human import framing, place
 from primdiffusion.primitives.primitives import Primitives
@@ -30,7 +28,7 @@ from primdiffusion.render.cpu import count_samples
 from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings, strides_of
 from primdiffusion.render.march import march
 from primdiffusion.render.reference import march_reference
-from record import tell
+from record import command_line, report
 from roofline import float32_operations_per_second, roofline_ms
 from torch import Tensor
 
@@ -38,6 +36,26 @@ HERE = Path(__file__).resolve().parent
 Figures = dict[str, float | int | str | None]
 ENGINE_FIGURES = ("engine_overhead_ms", "engine_pixel_error_max")
 CUDA_FIGURES = ("cuda_forward_4mm_ms", "cuda_forward_1mm_ms", "cuda_backward_ratio")
+
+COLOURS = {"size": "#1b6ca8", "person": "#c8553d", "pose": "#6a994e", "boxes": "#7b2d8b", "people": "#222222"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """The cost of one picture; milliseconds are processor time of all threads together."""
+
+    group: str
+    name: str
+    pixels: int
+    boxes: int
+    hit_share: float
+    samples: int
+    """Lattice points inside boxes on rays that are not yet opaque: the work of SPEC 4."""
+    evaluated: int
+    """The samples that were looked up; the others are where a box is empty."""
+    milliseconds: float
+    roofline_ms: float
+    """The time of `samples` at the processor's measured ceiling."""
 
 
 def best(call: Callable[[], object], repeats: int, clock: Callable[[], float] = time.process_time) -> float:
@@ -191,6 +209,48 @@ def shrunk(camera: Camera, size: int = 48) -> Camera:
     return dataclasses.replace(camera, intrinsics=camera.intrinsics * scale[:, None], width=size, height=size)
 
 
+def write_table(path: Path, rows: Sequence[Row]) -> None:
+    """Write a markdown table with one row per picture."""
+    lines = [
+        "| varied | picture | boxes | hit rays | samples (M) | evaluated (M) | ms | ns per sample | x roofline |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        lines.append(
+            f"| {row.group} | {row.name} | {row.boxes} | {row.hit_share:.1%} | {row.samples / 1e6:.2f} | "
+            f"{row.evaluated / 1e6:.2f} | {row.milliseconds:.1f} | {1e6 * row.milliseconds / row.samples:.1f} | "
+            f"{row.milliseconds / row.roofline_ms:.1f} |"
+        )
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_plot(path: Path, rows: Sequence[Row]) -> None:
+    """Plot time against samples, where all pictures lie on one line, and against boxes x pixels, where they do not."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(11, 4.4), sharey=True)
+    for group, colour in COLOURS.items():
+        members = [row for row in rows if row.group == group]
+        times = [row.milliseconds for row in members]
+        left.loglog([row.samples for row in members], times, "o", color=colour, label=group)
+        right.loglog([row.boxes * row.pixels for row in members], times, "o", color=colour)
+    ordered = sorted(rows, key=lambda row: row.samples)
+    samples = [row.samples for row in ordered]
+    left.loglog(samples, [row.roofline_ms for row in ordered], "k-", linewidth=1, label="roofline")
+    left.loglog(samples, [8 * row.roofline_ms for row in ordered], "k--", linewidth=1, label="8 x roofline")
+    left.set(xlabel="samples inside boxes", ylabel="processor time per picture, ms")
+    right.set(xlabel="boxes x pixels")
+    left.legend(fontsize=8)
+    for axes in (left, right):
+        axes.grid(True, which="both", linewidth=0.3)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
 def from_script(script: str, names: tuple[str, ...], *arguments: str) -> Figures:
     """The figures `names` of another benchmark's record; None if the script cannot measure them here."""
     with tempfile.TemporaryDirectory() as folder:
@@ -203,8 +263,7 @@ def from_script(script: str, names: tuple[str, ...], *arguments: str) -> Figures
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser = command_line(__doc__)
     parser.add_argument("--table", type=Path, help="markdown file for the table of scenes")
     parser.add_argument("--plot", type=Path, help="PNG of time against samples")
     parser.add_argument("--quick", action="store_true", help="about a minute")
@@ -223,7 +282,7 @@ def main() -> None:
     if torch.cuda.is_available():
         figures |= from_script("march_cuda.py", CUDA_FIGURES)
     figures |= dict.fromkeys(ENGINE_FIGURES) if arguments.quick else from_script("engine.py", ENGINE_FIGURES)
-    tell(figures, arguments.json)
+    report(figures, arguments.json)
     if arguments.table is not None:
         write_table(arguments.table, rows)
     if arguments.plot is not None:

@@ -11,11 +11,9 @@ is downloaded. From a checkout: `PYTHONPATH=backend python benchmarks/march_cuda
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -27,7 +25,7 @@ from primdiffusion.render.cpu import count_samples
 from primdiffusion.render.cuda import Shapes, available, march_cuda
 from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings
 from primdiffusion.render.reference import march_reference
-from record import tell
+from record import command_line, report
 from roofline import OPERATIONS_PER_SAMPLE
 from torch import Tensor
 
@@ -184,8 +182,7 @@ def print_sweep() -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser = command_line(__doc__)
     parser.add_argument("--kernels", action="store_true", help="also print the time of each kernel")
     parser.add_argument("--sweep", action="store_true", help="also print the times of other program shapes")
     arguments = parser.parse_args()
@@ -193,7 +190,7 @@ def main() -> None:
         sys.exit("no CUDA device: torch sees none on this machine, so there is nothing to measure")
     if not available("cuda"):
         sys.exit("no triton: install the version that `pip show torch` names")
-    tell(exactness() | speed(), arguments.json)
+    report(exactness() | speed(), arguments.json)
     if arguments.kernels:
         print_kernels()
     if arguments.sweep:

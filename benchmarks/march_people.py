@@ -92,8 +92,8 @@ def contorted(seed: int = 0) -> BodyPose:
 def in_fewer_boxes(person: Primitives) -> Primitives:
     """A quarter of the boxes, every other row and column of the grid, twice as wide: about the same coverage."""
     index = torch.arange(GRID * GRID).reshape(GRID, GRID)[::2, ::2].flatten()
-    kept = person.map(lambda tensor: tensor[index])
-    return dataclasses.replace(kept, half_extent=kept.half_extent * torch.tensor([2.0, 2.0, 1.0]))
+    remaining = person.map(lambda tensor: tensor[index])
+    return dataclasses.replace(remaining, half_extent=remaining.half_extent * torch.tensor([2.0, 2.0, 1.0]))
 
 
 def in_more_boxes(person: Primitives) -> Primitives:
@@ -116,9 +116,9 @@ def in_more_boxes(person: Primitives) -> Primitives:
 def _half(voxels: Tensor, axis: int, side: float) -> Tensor:
     """The lower (side < 0) or upper half of an axis, resampled to 8 voxels by linear interpolation."""
     size = voxels.shape[axis]
-    place = torch.linspace(0, (size - 1) / 2, size) + (0 if side < 0 else (size - 1) / 2)
-    low = place.floor().long().clamp_max(size - 2)
-    fraction = (place - low).reshape([-1 if i == axis % voxels.ndim else 1 for i in range(voxels.ndim)])
+    position = torch.linspace(0, (size - 1) / 2, size) + (0 if side < 0 else (size - 1) / 2)
+    low = position.floor().long().clamp_max(size - 2)
+    fraction = (position - low).reshape([-1 if i == axis % voxels.ndim else 1 for i in range(voxels.ndim)])
     near, far = voxels.index_select(axis, low), voxels.index_select(axis, low + 1)
     return near + (far - near) * fraction
 

@@ -8,13 +8,12 @@ surface_error is against the backend's own frames on the posed surface. `--no-vo
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from pathlib import Path
 
-import blender_apart  # noqa: F401  before bpy
 import bpy
+import isolated_blender  # noqa: F401  before bpy
 import numpy as np
 import psutil
 import torch
@@ -27,7 +26,7 @@ from primdiffusion.formats.requests import DENSITY_GAIN
 from primdiffusion.human import body_of, generate, pose_body
 from primdiffusion.human_file import export_for_blender, load_human, save_human
 from primdiffusion.primitives.anchors import attach
-from record import tell
+from record import command_line, report
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import blender_primdiffusion
@@ -83,10 +82,10 @@ def surface_error(human, armature, rotations: np.ndarray) -> tuple[float, float]
         world = np.array(armature.matrix_world)
         expected = frames.position.double().numpy() @ Z_UP.T @ world[:3, :3].T + world[:3, 3]
         distance = max(distance, 1e3 * float(np.linalg.norm(matrices[:, :3, 3] - expected, axis=-1).max()))
-        apart = np.linalg.norm(
+        difference = np.linalg.norm(
             matrices[:, :3, :3] - world[:3, :3] @ Z_UP @ frames.rotation.double().numpy(), axis=(1, 2)
         )
-        angle = max(angle, float(np.degrees(2 * np.arcsin(np.minimum(apart / np.sqrt(8), 1))).max()))
+        angle = max(angle, float(np.degrees(2 * np.arcsin(np.minimum(difference / np.sqrt(8), 1))).max()))
     return distance, angle
 
 
@@ -107,8 +106,7 @@ def psnr(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser = command_line(__doc__)
     parser.add_argument("--pictures", type=Path, required=True, help="folder for the PNGs")
     parser.add_argument("--person", type=Path, help="a .human.safetensors; otherwise one is generated")
     parser.add_argument(
@@ -171,7 +169,7 @@ def main() -> None:
     bpy.context.scene.render.engine = "CYCLES"
     for name, picture in pictures.items():
         figures[f"psnr_merged_{name}_exact"] = psnr(picture, exact)
-    tell(figures, arguments.json)
+    report(figures, arguments.json)
     if not arguments.no_volumes:
         set_attachment(person, "SURFACE")
         volumes, figures["seconds_cycles_volumes"] = rendered(folder / "volumes.png")
@@ -179,7 +177,7 @@ def main() -> None:
         figures["psnr_volumes_exact"] = psnr(volumes, exact)
         figures["psnr_merged_volumes"] = psnr(pictures["fitted"], volumes)
     blender_primdiffusion.unregister()
-    tell(figures, arguments.json)
+    report(figures, arguments.json)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ silhouettes. `--quick` takes 4 people from 2 sides. `--pictures DIR` saves mesh 
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Callable
@@ -33,7 +32,7 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.rasterise import RasterImage, rasterise
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.march import march
-from record import tell
+from record import command_line, report
 
 Result = TypeVar("Result")
 FIRST_SEED = 10_000_000
@@ -64,8 +63,8 @@ def camera_at(bounds: np.ndarray, yaw: float, pitch: float) -> Camera:
     middle = bounds.mean(0)
     distance = 1.1 * (bounds[1] - bounds[0]).max() / 2 / math.tan(FIELD_OF_VIEW / 2)
     yaw, pitch = math.radians(yaw), math.radians(pitch)
-    way = np.array([math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch)])
-    position, target = (torch.from_numpy(point).float() for point in (middle + distance * way, middle))
+    direction = np.array([math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch)])
+    position, target = (torch.from_numpy(point).float() for point in (middle + distance * direction, middle))
     return look_at(position, target, vertical_fov=FIELD_OF_VIEW, width=SIZE, height=SIZE)
 
 
@@ -154,9 +153,8 @@ def timed(call: Callable[[], Result]) -> tuple[Result, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
-    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--pictures", type=Path, help="folder for pictures of mesh and payload side by side")
     parser.add_argument("--quick", action="store_true", help="4 people from 2 directions, under a minute")
     arguments = parser.parse_args()
@@ -164,7 +162,7 @@ def main() -> None:
         arguments.pictures.mkdir(parents=True, exist_ok=True)
     people, directions = (4, 2) if arguments.quick else (16, len(DIRECTIONS))
     figures = measure(open_assets(arguments.assets), people, directions, arguments.pictures)
-    tell(figures, arguments.json)
+    report(figures, arguments.json)
 
 
 if __name__ == "__main__":

@@ -54,21 +54,21 @@ def view_of(mesh: TexturedMesh, width: int, height: int, heads: bool) -> tuple[C
     middle = (low + high) / 2
     aim = np.array([middle[0], low[1] + 0.48 * HEIGHT, middle[2]])
     extent, target = (0.4, eyes + np.array([0, 0.02, -0.06])) if heads else (HEIGHT, aim)
-    way = np.array([math.sin(YAW) * math.cos(PITCH), math.sin(PITCH), math.cos(YAW) * math.cos(PITCH)])
-    place = target + way * extent / 2 / math.tan(FIELD_OF_VIEW / 2)
+    direction = np.array([math.sin(YAW) * math.cos(PITCH), math.sin(PITCH), math.cos(YAW) * math.cos(PITCH)])
+    place = target + direction * extent / 2 / math.tan(FIELD_OF_VIEW / 2)
     place, target = (torch.from_numpy(point).float() for point in (place, target))
-    return look_at(place, target, vertical_fov=FIELD_OF_VIEW, width=width, height=height), way
+    return look_at(place, target, vertical_fov=FIELD_OF_VIEW, width=width, height=height), direction
 
 
 def picture(mesh: TexturedMesh, width: int, height: int, heads: bool, lit: bool) -> np.ndarray:
     """The person's picture, [height, width, 3] bytes."""
-    camera, way = view_of(mesh, width * SUPERSAMPLE, height * SUPERSAMPLE, heads)
+    camera, direction = view_of(mesh, width * SUPERSAMPLE, height * SUPERSAMPLE, heads)
     soup = flatten(mesh)
     fragments = draw(soup, camera)
     rgb = shade(soup, fragments)
     if lit:
         normal = np.einsum("hwk,hwkc->hwc", fragments.barycentric, normals(soup)[soup.faces[fragments.face]])
-        rgb = rgb * light(normal, way)[..., None]
+        rgb = rgb * light(normal, direction)[..., None]
     rgb = np.where((fragments.face >= 0)[..., None], rgb, BACKGROUND)
     blocks = rgb.reshape(height, SUPERSAMPLE, width, SUPERSAMPLE, 3).mean((1, 3))
     return np.rint(encode_srgb(np.clip(blocks, 0, 1)) * 255).astype(np.uint8)
@@ -84,11 +84,11 @@ def normals(soup: TriangleSoup) -> np.ndarray:
     return total
 
 
-def light(normal: np.ndarray, way: np.ndarray) -> np.ndarray:
+def light(normal: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """[H, W] brightness: a lamp above the camera's left shoulder and a bright sky."""
     unit = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    unit = np.where((unit @ way)[..., None] < 0, -unit, unit)
-    lamp = way + np.array([0, 0.8, 0]) - 0.7 * np.cross([0, 1, 0], way)
+    unit = np.where((unit @ direction)[..., None] < 0, -unit, unit)
+    lamp = direction + np.array([0, 0.8, 0]) - 0.7 * np.cross([0, 1, 0], direction)
     return 0.5 + 0.15 * unit[..., 1] + 0.55 * np.clip(unit @ (lamp / np.linalg.norm(lamp)), 0, 1)
 
 

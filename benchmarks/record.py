@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import dataclasses
 import datetime
@@ -20,6 +21,13 @@ import psutil
 
 SAMPLING_S = 0.05
 PACKAGES = ("primdiffusion", "torch", "numpy", "numba", "bpy")
+
+
+def command_line(documentation: str | None) -> argparse.ArgumentParser:
+    """A parser with a benchmark's docstring as its help, and the option --json for `report`."""
+    parser = argparse.ArgumentParser(description=documentation, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
+    return parser
 
 
 def write_record(path: str | Path, figures: Mapping[str, float | int | bool | str | None]) -> None:
@@ -41,7 +49,7 @@ def write_record(path: str | Path, figures: Mapping[str, float | int | bool | st
     os.replace(unfinished, path)
 
 
-def tell(figures: Mapping[str, float | int | bool | str | None], path: Path | None) -> None:
+def report(figures: Mapping[str, float | int | bool | str | None], path: Path | None) -> None:
     """Prints one figure per line; also writes the record if a path is given."""
     if path is not None:
         write_record(path, figures)

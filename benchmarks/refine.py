@@ -10,7 +10,6 @@ held-out views side by side: before, after, target; from the mesh in the first r
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections.abc import Sequence
@@ -35,7 +34,7 @@ from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.render.march import march
 from primdiffusion.training.refine import RefineSettings, refine
 from primdiffusion.training.refine_views import bare_body, meshed_person, view_psnr
-from record import tell
+from record import command_line, report
 
 SEED = 30_000_000
 """Seed of the person; training sets count from 0."""
@@ -44,13 +43,12 @@ QUICK_STEPS = 60
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
     parser.add_argument("--steps", type=int, default=RefineSettings().steps, help="steps of each refinement")
     parser.add_argument("--seed", type=int, default=SEED, help="seed of the person")
     parser.add_argument("--quick", action="store_true", help="few steps, from the mesh only")
     parser.add_argument("--pictures", type=Path, help="folder for a PNG")
-    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     steps = QUICK_STEPS if arguments.quick else arguments.steps
     with tempfile.TemporaryDirectory() as scratch:
@@ -79,7 +77,7 @@ def main() -> None:
         arguments.pictures.mkdir(parents=True, exist_ok=True)
         pixels = (torch.cat(rows).cpu() * 255).round().to(torch.uint8).numpy()
         Image.fromarray(pixels).save(arguments.pictures / "refine.png")
-    tell(figures, arguments.json)
+    report(figures, arguments.json)
 
 
 def measure(

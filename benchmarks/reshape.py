@@ -9,7 +9,6 @@ human_npz_mb is the file that the backend hands over.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import sys
 import tempfile
@@ -17,12 +16,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import blender_apart  # noqa: F401  before bpy
 import bpy
+import isolated_blender  # noqa: F401  before bpy
 import numpy as np
 from march_people import checkered_human
 from primdiffusion.human_file import export_for_blender
-from record import tell
+from record import command_line, report
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from blender_primdiffusion.scene.build import build_human
@@ -32,15 +31,14 @@ from blender_primdiffusion.scene.shape import shape_model_of
 MOVES, QUICK_MOVES = 30, 5
 
 
-def milliseconds(does: Callable[[], object]) -> float:
+def milliseconds(call: Callable[[], object]) -> float:
     began = time.perf_counter()
-    does()
+    call()
     return 1000 * (time.perf_counter() - began)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", type=Path)
+    parser = command_line(__doc__)
     parser.add_argument("--quick", action="store_true")
     given = parser.parse_args()
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -64,11 +62,11 @@ def main() -> None:
         "reshape_ms": statistics.median(setting),
         "reshape_evaluate_ms": statistics.median(evaluating),
         "graph_ms": statistics.median(linking),
-        "reshape_volumes": sum(thing.type == "VOLUME" for thing in person.all_objects),
+        "reshape_volumes": sum(obj.type == "VOLUME" for obj in person.all_objects),
         "body_file_mb": body.stat().st_size / 1e6,
         "human_npz_mb": (folder / "human.npz").stat().st_size / 1e6,
     }
-    tell(figures, given.json)
+    report(figures, given.json)
 
 
 if __name__ == "__main__":

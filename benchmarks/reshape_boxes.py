@@ -10,7 +10,6 @@ Names with a body, such as psnr_heavy_50, are of that body.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, framing, place
 from primdiffusion.render.image import over, to_png
 from primdiffusion.render.march import march
-from record import tell
+from record import command_line, report
 
 MEAN = torch.zeros(10)
 MEASURES = {"heavy": (1.76, 110.0), "thin": (1.76, 45.0), "tall": (2.1, None), "short": (1.45, None)}
@@ -35,8 +34,7 @@ GREY = (0.35, 0.35, 0.35)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", type=Path)
+    parser = command_line(__doc__)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--pictures", type=Path, help="folder for one picture per body")
     given = parser.parse_args()
@@ -48,14 +46,14 @@ def main() -> None:
         for offset in OFF_THE_SKIN:
             before, truth = (march_people.checkered_human(0, b, offset) for b in (MEAN, betas))
             camera = framing(place(truth), 0.3, size, size)
-            wanted = march(place(truth), camera)
+            expected = march(place(truth), camera)
             for share in SHARES:
-                got = march(place(grown(before, betas, share)), camera)
-                holes = float((got.alpha[wanted.alpha > 0.95] < 0.7).float().mean())
-                colours = (encode_srgb(over(one, GREY).clamp(0, 1)) for one in (got, wanted))
+                drawn = march(place(grown(before, betas, share)), camera)
+                holes = float((drawn.alpha[expected.alpha > 0.95] < 0.7).float().mean())
+                colours = (encode_srgb(over(one, GREY).clamp(0, 1)) for one in (drawn, expected))
                 seen[share].append((float(psnr(*colours)), holes))
                 if given.pictures:
-                    to_png(given.pictures / f"{name}_{offset:g}_{share:g}.png", got, GREY)
+                    to_png(given.pictures / f"{name}_{offset:g}_{share:g}.png", drawn, GREY)
         for share, pairs in seen.items():
             for kind, values in zip(("psnr", "holes"), zip(*pairs, strict=True), strict=True):
                 figures[f"{kind}_{name}_{100 * share:.0f}"] = statistics.mean(values)
@@ -63,7 +61,7 @@ def main() -> None:
         for kind in ("psnr", "holes"):
             of_bodies = [figures[f"{kind}_{name}_{100 * share:.0f}"] for name in MEASURES]
             figures[f"{kind}_{100 * share:.0f}"] = statistics.mean(of_bodies)
-    tell(figures, given.json)
+    report(figures, given.json)
 
 
 def grown(human: Human, betas: torch.Tensor, share: float) -> Human:

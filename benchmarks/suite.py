@@ -7,7 +7,6 @@ Run it on an idle machine after `make test` has set up the environments. Ends wi
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 from pathlib import Path
 
@@ -18,8 +17,7 @@ BLENDERS = ("5.0", "4.5", "5.2")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
+    parser = record.command_line(__doc__)
     arguments = parser.parse_args()
     figures: dict[str, float | None] = {}
     for version in BLENDERS:
@@ -27,7 +25,7 @@ def main() -> None:
             subprocess.run(["make", f"test-{version}"], cwd=ROOT, check=True)
         figures[f"test_minutes_{version.replace('.', '_')}"] = took.seconds / 60
     total = sum(minutes for minutes in figures.values() if minutes is not None)
-    record.tell({"test_minutes": total, **figures}, arguments.json)
+    record.report({"test_minutes": total, **figures}, arguments.json)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ functions that only other compiled functions call, because no trace sees them.
 
 from __future__ import annotations
 
-import argparse
 import os
 import runpy
 import shlex
@@ -56,10 +55,9 @@ class Trace:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
+    parser = record.command_line(__doc__)
     arguments = parser.parse_args()
-    import blender_apart  # before bpy; not in the child
+    import isolated_blender  # before bpy; not in the child
     import record
 
     with tempfile.TemporaryDirectory(prefix="primdiffusion_walk_") as name:
@@ -72,15 +70,15 @@ def main() -> None:
             passed = log.read_text(encoding="utf-8").splitlines()
             print(f"{program}:", *(Path(path).relative_to(ROOT) for path in passed), sep="\n  ", end="\n\n")
             figures[f"walk_{program}_files"] = len(passed)
-        record.tell(figures, arguments.json)
+        record.report(figures, arguments.json)
     sys.stdout.flush()
-    blender_apart.remove()
+    isolated_blender.remove()
     os._exit(0)  # bpy as a module may hang at exit
 
 
 def _generate(folder: Path, log: Path) -> int:
     """Generate a person; returns the number of volumes in the scene."""
-    import bpy  # after blender_apart
+    import bpy  # after isolated_blender
 
     sys.path.insert(0, str(ROOT))
     import blender_primdiffusion

@@ -1,6 +1,6 @@
-"""Everything by script: open a file, generate two people, pose one, move the other, render, save.
+"""Everything in a script: open a file, generate two people, pose one, animate the other, render, save.
 
-blender -b shot.blend --python examples/blender_batch.py -- --out rendered        # the extension enabled
+blender -b shot.blend --python examples/blender_batch.py -- --out rendered        # with the extension enabled
 python examples/blender_batch.py --blend shot.blend --out rendered                # Blender as a Python module
 """
 
@@ -11,8 +11,8 @@ from pathlib import Path
 import bpy
 
 
-def main(words: list[str]) -> None:
-    """Writes people.blend and a picture of each asked-for frame; any operator that fails raises RuntimeError."""
+def main(options: list[str]) -> None:
+    """Writes people.blend and a picture of each frame; raises RuntimeError if an operator fails."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--blend", type=Path, help="the file to begin with; not given: the open one")
     parser.add_argument("--out", type=Path, required=True)
@@ -21,29 +21,29 @@ def main(words: list[str]) -> None:
     parser.add_argument("--motion", type=Path, help="of the second person: AMASS .npz, .bvh ...; not given: a walk")
     parser.add_argument("--frames", type=int, nargs="+", default=[1, 12])
     parser.add_argument("--size", type=int, nargs=2, default=(640, 480))
-    arguments = parser.parse_args(words)
+    arguments = parser.parse_args(options)
     if arguments.blend is not None:
         bpy.ops.wm.open_mainfile(filepath=str(arguments.blend))
-    people = bpy.ops.primdiffusion
+    operators = bpy.ops.primdiffusion
     scene, out = bpy.context.scene, arguments.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
-    bpy.ops.wm.save_as_mainfile(filepath=str(out / "people.blend"))  # people's files go beside it
+    bpy.ops.wm.save_as_mainfile(filepath=str(out / "people.blend"))  # the people's files are saved next to it
 
-    for place, seed in zip((-0.6, 0.6), arguments.seeds, strict=True):
-        before = set(everybody())
-        people.generate(seed=seed, steps=arguments.steps, count=1)
-        (person,) = set(everybody()) - before
+    for x, seed in zip((-0.6, 0.6), arguments.seeds, strict=True):
+        before = set(humans())
+        operators.generate(seed=seed, steps=arguments.steps, count=1)
+        (person,) = set(humans()) - before
         person.name = f"Person {seed}"
-        armature_of(person).location.x = place
+        armature_of(person).location.x = x
     first, second = (bpy.data.collections[f"Person {seed}"] for seed in arguments.seeds)
 
     select(armature_of(first))
-    people.apply_pose(pose_name="Waving")
+    operators.apply_pose(pose_name="Waving")
     select(armature_of(second))
     if arguments.motion is not None:
-        people.import_motion(filepath=str(arguments.motion))
+        operators.import_motion(filepath=str(arguments.motion))
     else:
-        people.add_motion(motion="WALK")
+        operators.add_motion(motion="WALK")
 
     camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     scene.collection.objects.link(camera)
@@ -58,19 +58,19 @@ def main(words: list[str]) -> None:
     bpy.ops.wm.save_mainfile()
 
 
-def everybody() -> list[bpy.types.Collection]:
-    """The people of the file."""
+def humans() -> list[bpy.types.Collection]:
+    """The people in the file."""
     return [collection for collection in bpy.data.collections if "primdiffusion_human" in collection]
 
 
 def armature_of(person: bpy.types.Collection) -> bpy.types.Object:
-    """What is posed, moved and placed."""
-    return next(thing for thing in person.objects if thing.type == "ARMATURE")
+    """The armature, which is posed, moved and animated."""
+    return next(obj for obj in person.objects if obj.type == "ARMATURE")
 
 
-def select(thing: bpy.types.Object) -> None:
-    """Whom the next operators are about."""
-    bpy.context.view_layer.objects.active = thing
+def select(obj: bpy.types.Object) -> None:
+    """Select the person for the next operators."""
+    bpy.context.view_layer.objects.active = obj
 
 
 if __name__ == "__main__":

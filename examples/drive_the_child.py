@@ -1,4 +1,4 @@
-"""The backend from any program: start the child, send a line, read lines (docs/design/protocol.md); stdlib only.
+"""Use the backend from any program: start the child, send a line, read lines (docs/design/protocol.md); stdlib only.
 
 python examples/drive_the_child.py --out people/7 --seed 7
 """
@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 def main() -> None:
-    """Generates one person and prints where it is."""
+    """Generates one person and prints the path of their file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seed", type=int, default=7)

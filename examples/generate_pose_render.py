@@ -1,4 +1,4 @@
-"""The Python API in one go: a person from noise, waving, seen from four sides.
+"""The Python API in short: generate a person, pose them, draw them from four sides.
 
 python examples/generate_pose_render.py --out waving
 """

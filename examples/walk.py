@@ -1,6 +1,6 @@
-"""A walk in place and a wave of the right hand, as SMPL joint rotations: small motions to show that a person moves.
+"""A walk in place and a wave of the right hand as SMPL joint rotations: a small motion for examples.
 
-Only numpy, so that it runs in Blender's Python as well as in the backend's.
+Uses only numpy, so that it runs in Blender's Python as well as in the backend's.
 """
 
 from __future__ import annotations

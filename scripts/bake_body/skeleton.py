@@ -1,4 +1,4 @@
-"""SMPL's 24 joints and how the source rig's 104 bones collapse onto them."""
+"""SMPL's 24 joints, and the mapping of the source rig's 104 bones to them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _OTHER_SIDE = {"left": "right", "right": "left"}
 MIRRORED_JOINT = np.array(
     [JOINT_NAMES.index("_".join(_OTHER_SIDE.get(word, word) for word in name.split("_"))) for name in JOINT_NAMES]
 )
-"""Joint j of a mirrored person is joint MIRRORED_JOINT[j] of the person."""
+"""Joint j of a mirrored person is joint MIRRORED_JOINT[j] of the original."""
 
 _TRUNK_BONES = {
     "root": "pelvis",
@@ -22,7 +22,7 @@ _TRUNK_BONES = {
     "head": "head",
     "eye": "head",
 }
-_LIMB_BONES = (  # first matching prefix wins: the thumb's root moves with the wrist, the other fingers with the hand
+_LIMB_BONES = (  # the first match applies: the thumb's root moves with the wrist, the other fingers with the hand
     ("upperleg", "hip"),
     ("lowerleg", "knee"),
     ("foot", "ankle"),
@@ -58,7 +58,7 @@ _LIMB_HEADS = {
 
 
 def joint_of_bone(bone: str) -> int:
-    """The SMPL joint that moves what the source's bone (such as "upperarm02.L") moves."""
+    """The SMPL joint that corresponds to a bone of the source rig, such as "upperarm02.L"."""
     stem, _, side = bone.partition(".")
     if stem.startswith("neck"):
         return JOINT_NAMES.index("neck")
@@ -67,7 +67,7 @@ def joint_of_bone(bone: str) -> int:
     for prefix, joint in _LIMB_BONES:
         if stem.startswith(prefix):
             return JOINT_NAMES.index({"L": "left_", "R": "right_"}[side] + joint)
-    raise KeyError(f"The rig has a bone {bone!r} that no SMPL joint takes; add it to the tables of {__name__}.")
+    raise KeyError(f"The rig has a bone {bone!r} without an SMPL joint; add it to the tables of {__name__}.")
 
 
 def joints_from_bone_heads(bones: list[str]) -> np.ndarray:

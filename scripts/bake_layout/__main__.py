@@ -61,7 +61,7 @@ def read_body() -> Body:
 
 
 def write_layout(cells: UvRaster, texels: UvRaster) -> None:
-    """layout.npz: cells in full precision; of a texel's coordinates the first two, in steps of 1/65535."""
+    """Write layout.npz: cells in full precision; of texels the first two coordinates, in steps of 1/65535."""
     file = io.BytesIO()
     np.savez_compressed(
         file,

@@ -1,4 +1,4 @@
-"""The ten charts: where each lies on the grid, and how each region of the half body is opened to its rectangle."""
+"""The ten charts: their places on the grid, and how each region of the half body is flattened to its rectangle."""
 
 from __future__ import annotations
 
@@ -60,16 +60,16 @@ PLACES = {
     "foot": Place(6, 7, 10, 8, 2),
 }
 SMOOTHING = {"torso": 0.012, "head": 0.020, "arm": 0.012, "leg": 0.012, "foot": 0.005}
-"""Metres, of the smoothed copy each region is flattened on: the face's features vanish, the toes stay apart."""
+"""Smoothing radius in metres before a region is flattened: the face's features vanish, the toes remain separate."""
 EMPHASIS = {"torso": 1.0, "head": 0.0, "arm": 1.0, "leg": 1.0, "foot": 0.0}
 """See rectangle.flatten. The head is a near-hemisphere with equal cells either way."""
 
 NECK_ON_SIDES = 1.0
-"""Share of the half neck's arc, front and back, that lies on the sides of the torso's rectangle rather than on top."""
+"""Share of the half neck's arc, front and back, that is on the sides of the torso's rectangle instead of the top."""
 
 
 def lay_out(sheet: Sheet, region: Array) -> dict[str, Flat]:
-    """Every region but the hand on its rectangle (the hand is projected, see hand.py)."""
+    """Every region except the hand on its rectangle (the hand is projected, see hand.py)."""
     regions = _Regions(sheet, region)
     return {
         "torso": _torso(regions),
@@ -98,7 +98,7 @@ class _Regions:
         return int(candidates[score.argmin()])
 
     def open(self, name: str, path: Sequence[int]) -> tuple[Disc, list[int], Array]:
-        """The region cut along the path: a disc, its outline, and the sheet's vertex behind each of the disc's."""
+        """The region cut along the path: a disc, its outline, and the sheet's vertex for each vertex of the disc."""
         faces, origin = cut_along(self.faces(name), path)
         parent = self.sheet.parent[self.region == REGIONS.index(name)]
         disc = Disc(self.points[origin], self.copies[SMOOTHING[name]][origin], faces, parent)
@@ -121,7 +121,7 @@ def _torso(regions: _Regions) -> Flat:
     path = cheapest_path(p, regions.faces("torso"), start, top, avoid=[*neck, *armhole])
     disc, loop, origin = regions.open("torso", path)
     front, back = sorted(runs(loop, midline[origin]), key=lambda run: -disc.points[run, 2].mean())
-    # The rectangle's upper corners lie on the neck, so that its sides take the neck's arc: the upper side, with the
+    # The rectangle's upper corners are on the neck, so that its sides include the neck's arc: the upper side, with the
     # armhole, is far longer than any other row, and its cells would be 8 cm wide.
     forward = loop[loop.index(back[-1]) :] + loop[: loop.index(back[-1])]
     upper = forward[: forward.index(front[0]) + 1]
@@ -145,7 +145,7 @@ def _head(regions: _Regions) -> Flat:
 
 
 def _arm(regions: _Regions) -> Flat:
-    """A tube opened along its underside: the wrist below, the armhole above."""
+    """A tube cut along its underside: the wrist below, the armhole above."""
     p = regions.points
     armhole, wrist = regions.ring("arm", "torso"), regions.ring("arm", "hand")
     pit = regions.lowest(armhole, p[armhole, 1] + 0.6 * np.abs(p[armhole, 2] - 0.03))
@@ -159,7 +159,7 @@ def _arm(regions: _Regions) -> Flat:
 
 
 def _leg(regions: _Regions) -> Flat:
-    """A tube opened along its inside: the ankle below, the hip above."""
+    """A tube cut along its inside: the ankle below, the hip above."""
     p = regions.points
     leg = regions.vertices("leg")
     crotch, ankle = leg[regions.sheet.midline[leg]], regions.ring("leg", "foot")
@@ -174,13 +174,13 @@ def _leg(regions: _Regions) -> Flat:
 
 
 def inner_ankle(regions: _Regions) -> int:
-    """Where the seams of leg and foot meet."""
+    """The vertex where the seams of leg and foot meet."""
     p, ring = regions.points, regions.ring("leg", "foot")
     return regions.lowest(ring, p[ring, 0] + 0.6 * np.abs(p[ring, 2] - p[ring, 2].mean()))
 
 
 def _foot(regions: _Regions) -> Flat:
-    """Opened along its inner edge and across the tips of the toes: the ankle above, the toes below."""
+    """Cut along its inner edge and across the tips of the toes: the ankle above, the toes below."""
     p, ankle = regions.points, regions.ring("foot", "leg")
     foot = regions.vertices("foot")
     sole = p[foot, 1].min()
@@ -204,7 +204,7 @@ def _foot(regions: _Regions) -> Flat:
 
 
 def _tube(regions: _Regions, name: str, path: list[int], upper: int, lower: int, tied: bool = True) -> Flat:
-    """A region cut along the path, whose rectangle has the two sides of the cut from upper to lower left and right."""
+    """A region cut along the path; the two sides of the cut become the rectangle's left and right, lower to upper."""
     disc, loop, origin = regions.open(name, path)
     copies = {v: [w for w in loop if origin[w] == v] for v in path}
     turned = loop[loop.index(copies[upper][0]) :] + loop[: loop.index(copies[upper][0])]

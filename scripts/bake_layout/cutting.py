@@ -1,4 +1,4 @@
-"""Opens patches to discs: paths along edges, cuts along paths, the loop around a disc."""
+"""Cuts patches open to discs: paths along edges, cuts along paths, the loop around a disc."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def cheapest_path(
     cost: Callable[[Array], Array] = lambda middle: np.ones(len(middle)),
     avoid: Sequence[int] = (),
 ) -> list[int]:
-    """Vertices along the edges from start to end with the least sum of length x cost(edge middle).
+    """Vertices of the path from start to end along edges with the least sum of length x cost(edge middle).
 
-    The vertices in `avoid` are passed only at the path's ends.
+    Vertices in `avoid` can only be the ends of the path.
     """
     edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     closed = np.setdiff1d(np.asarray(avoid, dtype=int), [start, end])
@@ -39,7 +39,7 @@ def cheapest_path(
 
 
 def cut_along(faces: Array, path: Sequence[int]) -> tuple[Array, Array]:
-    """The faces renumbered so that the two sides of the path come apart, and the old number of each new vertex."""
+    """The faces renumbered so that the two sides of the path are separate, and the old index of each new vertex."""
     count = len(faces)
     blocked = {tuple(sorted(edge)) for edge in pairwise(path)}
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
@@ -69,12 +69,12 @@ def outline(faces: Array) -> list[int]:
     while following[loop[-1]] != loop[0]:
         loop.append(following[loop[-1]])
     if len(loop) != len(edges):
-        raise ValueError(f"a patch has a boundary of {len(edges)} edges in more than one loop; it is not a disc")
+        raise ValueError(f"a patch has a boundary of {len(edges)} edges in more than one loop, so it is not a disc")
     return loop
 
 
 def runs(loop: Sequence[int], marked: Array) -> list[list[int]]:
-    """Maximal stretches of the loop, in its sense, along edges whose two ends are marked."""
+    """Maximal runs of the loop, in its direction, along edges with both ends marked."""
     count = len(loop)
     both = [marked[loop[i]] and marked[loop[(i + 1) % count]] for i in range(count)]
     found: list[list[int]] = []

@@ -20,7 +20,7 @@ from scipy.ndimage import distance_transform_edt
 
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """What the layout needs of the body."""
+    """The body's mesh."""
 
     vertices: Array
     """[V, 3] float64."""
@@ -30,7 +30,7 @@ class Body:
 
 
 def draw(body: Body, sheet: Sheet, region: Array, flats: dict[str, Flat], samples: int) -> UvRaster:
-    """The whole UV square at `samples` texels a cell, every texel on the body."""
+    """The whole UV square with `samples` texels per side of a cell, every texel on the body."""
     height, width = GRID * samples, GRID * samples // 2
     face = np.full((height, width), -1)
     barycentric = np.zeros((height, width, 3))
@@ -41,7 +41,7 @@ def draw(body: Body, sheet: Sheet, region: Array, flats: dict[str, Flat], sample
             place.column * samples : (place.column + columns) * samples,
         ]
         if (face[window] >= 0).any():
-            raise ValueError(f"the chart {name!r} overlaps another; mend PLACES")
+            raise ValueError(f"the chart {name!r} overlaps another: correct PLACES")
         y, x = np.mgrid[window]
         of_region = np.unique(sheet.parent[(region == REGIONS.index(name)) & (sheet.parent != FILLED)])
         if name == "hand":
@@ -52,7 +52,7 @@ def draw(body: Body, sheet: Sheet, region: Array, flats: dict[str, Flat], sample
         face[window] = found[0].reshape(y.shape)
         barycentric[window] = found[1].reshape(*y.shape, 3)
     if (face < 0).any():
-        raise ValueError(f"{(face < 0).mean():.1%} of the half grid belongs to no chart; mend PLACES")
+        raise ValueError(f"{(face < 0).mean():.1%} of the half grid is in no chart: correct PLACES")
     return _mirrored(body, UvRaster(face, barycentric))
 
 

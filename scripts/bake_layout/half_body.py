@@ -1,4 +1,4 @@
-"""The person's left half as a closed sheet: what the charts are cut from."""
+"""The person's left half as a closed sheet, from which the charts are cut."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 FILLED = -1
-"""Parent of a face that closes a hole (eye, mouth) and is on no face of the body."""
+"""The parent of a face that closes a hole (eye, mouth) and is not part of the body."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Sheet:
-    """A triangle mesh whose faces remember which face of the body they are part of."""
+    """A triangle mesh whose faces know which face of the body they come from."""
 
     points: Array
     """[n, 3] float64, metres."""
@@ -33,7 +33,7 @@ def mirror_vertices(vertices: Array) -> Array:
     """[V] int: the vertex opposite to each; ValueError unless the body is symmetric in x to 1 micrometre."""
     distance, opposite = cKDTree(vertices).query(vertices * (-1, 1, 1))
     if distance.max() > 1e-6:
-        raise ValueError(f"the body is {distance.max():.1e} m away from mirror symmetry; bake it with its mirror step")
+        raise ValueError(f"the body differs by {distance.max():.1e} m from its mirror image: bake with the mirror step")
     return opposite
 
 
@@ -41,12 +41,12 @@ def left_half(vertices: Array, faces: Array) -> Sheet:
     """The faces at x > 0, with fans over the eye socket and the open half of the mouth."""
     midline = mirror_vertices(vertices) == np.arange(len(vertices))
     parent = np.flatnonzero(vertices[faces][:, :, 0].mean(1) > 0)
-    kept = faces[parent]
-    edges = boundary_edges(kept)
+    left_faces = faces[parent]
+    edges = boundary_edges(left_faces)
     edges = edges[~midline[edges].all(1)]
     graph = sp.coo_matrix((np.ones(len(edges)), edges.T), shape=(len(vertices),) * 2)
     component = connected_components(graph, directed=False)[1][edges[:, 0]]
-    points, on_midline, fans = [vertices], [midline], [kept]
+    points, on_midline, fans = [vertices], [midline], [left_faces]
     for hole in np.unique(component):
         rim = edges[component == hole]
         used = np.unique(rim)
@@ -63,7 +63,7 @@ def left_half(vertices: Array, faces: Array) -> Sheet:
 
 
 def boundary_edges(faces: Array) -> Array:
-    """[e, 2] directed edges (in the sense of their face) that belong to one face only."""
+    """[e, 2] directed edges (in the direction of their face) that belong to one face only."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     _, index, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     return edges[count[index.reshape(-1)] == 1]
@@ -72,7 +72,7 @@ def boundary_edges(faces: Array) -> Array:
 def smoothed(sheet: Sheet, radius: float, steps: int = 3) -> Array:
     """The points after implicit mean-curvature flow over about `radius` metres; midline points stay at x = 0.
 
-    Charts are laid out on this copy, or every nostril and toe would claim cells of its own.
+    Charts are laid out on this copy; otherwise every nostril and toe would get cells of its own.
     """
     points = sheet.points.copy()
     used = np.unique(sheet.faces)

@@ -1,4 +1,4 @@
-"""The hand by projection: a mitten seen from above and from below, since fingers are no disc worth flattening."""
+"""Projects the hand: a mitten seen from above and below, because fingers cannot be flattened well."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from numpy import ndarray as Array
 from on_surface import closest_on_faces
 
 OUTLINE_WINDOW, OUTLINE_SMOOTHING = 0.012, 0.008
-"""Metres along the hand: over what the outline takes its extremes, and how it is blurred; the first bridges the gaps
-between fingers, more of the second makes rows even and loses the tip of the thumb."""
+"""Metres along the hand: the window of the outline's extremes, and its blur. A larger window bridges the gaps between
+fingers; more blur makes rows even and loses the tip of the thumb."""
 REACH_WINDOW, REACH_SMOOTHING = 0.12, 0.3
-"""The same for the tips, in shares of the hand's breadth."""
+"""The same for the fingertips, as shares of the hand's width."""
 SLOPE = 0.05
-"""Faces whose normal's y is beyond this are back (+) or palm (-); the rest is seen from neither side."""
+"""Faces whose normal's y is beyond this are back (+) or palm (-); the others are seen from neither side."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,8 +55,9 @@ class Mitten:
 def project_hand(vertices: Array, faces: Array, hand: Array, uv: Array) -> tuple[Array, Array]:
     """Face and barycentric coordinates for chart coordinates uv [n, 2] in the unit square.
 
-    u runs thumb side -> little finger over the back of the hand, then back over the palm; v from the fingertips to the
-    wrist. `hand` lists the body's faces there. Points that look down between fingers take the closest face instead.
+    u runs from the thumb's side to the little finger over the back of the hand, then back over the palm; v from the
+    fingertips to the wrist. `hand` lists the body's faces of the hand. Points that look down between fingers get the
+    closest face.
     """
     normal = np.cross(*(vertices[faces[hand, k]] - vertices[faces[hand, 0]] for k in (1, 2)))
     slope = normal[:, 1] / np.linalg.norm(normal, axis=1)
@@ -72,7 +73,7 @@ def project_hand(vertices: Array, faces: Array, hand: Array, uv: Array) -> tuple
 
 
 def _drop(vertices: Array, faces: Array, side: Array, x: Array, z: Array, upward: bool) -> tuple[Array, Array]:
-    """The outermost of the faces `side` over each (x, z), or the closest to the level of the nearest face."""
+    """The outermost of the faces `side` over each (x, z); otherwise the closest to the height of the nearest face."""
     corners = vertices[faces[side]]
     a, b, c = (corners[:, k][:, [0, 2]] for k in range(3))
     point = np.stack([x, z], -1)[:, None]

@@ -1,4 +1,4 @@
-"""How good a layout is, in numbers: on the body, even, symmetric, and do its boxes hold the surface and clothes."""
+"""Measures a layout: whether it is on the body, even and symmetric, and its boxes contain the skin and clothes."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from scipy.spatial import cKDTree
 
 SAMPLES = 20_000
 PUSHED_OUT = (0.0, 0.02, 0.04, 0.06)
-"""Metres off the skin at which clothes and hair must still lie in some box."""
+"""Distances from the skin in metres at which clothes and hair must still be in a box."""
 
 CORE = 0.8
-"""Share of a half extent that counts as inside: farther out the marcher's window has faded to a quarter."""
+"""Share of a half extent that counts as inside; farther out, the marcher's window has dropped to a quarter."""
 
 
 def measure(anchors: Anchors, vertices: torch.Tensor, faces: torch.Tensor, texels: UvRaster) -> dict[str, float]:
-    """The table as {name: number}; lengths in millimetres. `vertices` are the rest shape, float64."""
+    """The figures by name; lengths in millimetres. `vertices` are the rest shape, float64."""
     frames = attach(anchors, vertices, faces)
     position, rotation = frames.position.numpy(), frames.rotation.numpy()
     du, dv = (edge.norm(dim=-1).numpy() * 1e3 for edge in tangent_plane(anchors, vertices))
@@ -63,7 +63,7 @@ def measure(anchors: Anchors, vertices: torch.Tensor, faces: torch.Tensor, texel
 
 
 def boxes_over(points: Array, frames: Frames) -> Array:
-    """[n] the number of boxes each point lies in the core of."""
+    """[n] the number of boxes whose core contains each point."""
     position, rotation, half_extent = (a.numpy() for a in (frames.position, frames.rotation, frames.half_extent))
     count = np.zeros(len(points), dtype=int)
     tree = cKDTree(points)
@@ -75,7 +75,7 @@ def boxes_over(points: Array, frames: Frames) -> Array:
 
 
 def _footprint_normals(vertices: torch.Tensor, faces: torch.Tensor, texels: UvRaster) -> Array:
-    """[K, 3] mean unit normal of the surface a cell covers."""
+    """[K, 3] mean unit normal of the surface that a cell covers."""
     barycentric = torch.from_numpy(texels.barycentric.reshape(-1, 3))
     normals = surface_points(
         vertex_normals(vertices, faces), faces, torch.from_numpy(texels.face.ravel()), barycentric
@@ -86,14 +86,14 @@ def _footprint_normals(vertices: torch.Tensor, faces: torch.Tensor, texels: UvRa
 
 
 def _shear(anchors: Anchors, vertices: torch.Tensor) -> Array:
-    """[K] by how many degrees the two sides of a cell fail to stand at right angles."""
+    """[K] degrees by which the angle between the two sides of a cell differs from a right angle."""
     du, dv = tangent_plane(anchors, vertices)
     cosine = torch.nn.functional.cosine_similarity(du, dv, dim=-1)
     return np.degrees(np.arcsin(cosine.abs().clamp(max=1).numpy()))
 
 
 def _sampled_surface(vertices: torch.Tensor, faces: torch.Tensor, number: int) -> tuple[Array, Array]:
-    """Points spread evenly by area, and the normals there; always the same ones."""
+    """Deterministic points spread evenly by area, and the normals there."""
     generator = np.random.default_rng(0)
     p, f = vertices.numpy(), faces.numpy()
     area = np.linalg.norm(np.cross(p[f[:, 1]] - p[f[:, 0]], p[f[:, 2]] - p[f[:, 0]]), axis=1)

@@ -8,7 +8,7 @@ from numpy import ndarray as Array
 
 
 def barycentric_on(vertices: Array, faces: Array, face: Array, points: Array) -> Array:
-    """[n, 3] coordinates of points on the faces `face`; clipped to the face, since cut pieces carry rounding errors."""
+    """[n, 3] coordinates of points on the faces `face`, clipped to the face because cut pieces have rounding errors."""
     a, b, c = (vertices[faces[face, k]] for k in range(3))
     e1, e2, d = b - a, c - a, points - a
     g11, g12, g22 = (e1 * e1).sum(1), (e1 * e2).sum(1), (e2 * e2).sum(1)

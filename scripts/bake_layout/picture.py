@@ -1,4 +1,4 @@
-"""The figure of the layout: its grid on the body, the body in its grid, and the boxes in a pose."""
+"""Draws the figure of the layout: its grid on the body, the body in its grid, and the boxes in a pose."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ POSE = {
     "left_knee": (1.0, 0.0, 0.0),
     "spine2": (0.0, 0.3, 0.0),
 }
-"""Axis-angle, radians; the other joints rest."""
+"""Axis-angle in radians; the other joints are at rest."""
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 BOX_TRIANGLES = np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
 
 
 def colour_of_cells(chart: torch.Tensor) -> Array:
-    """[K, 3] in 0 .. 1, neighbours told apart like a chess board."""
+    """[K, 3] in 0 .. 1; neighbouring cells alternate like a chessboard."""
     base = np.array([COLOURS[CHARTS[c].split("_")[-1]] for c in chart.tolist()]) / 255
     row, column = np.divmod(np.arange(len(base)), GRID)
     return base * (1 - 0.18 * ((row + column) % 2))[:, None]
@@ -54,7 +54,7 @@ def look_at(
     metres: float,
     size: tuple[int, int],
 ) -> Array:
-    """[h, w, 3] orthographic view from `yaw` degrees right of the front, triangles painted from far to near."""
+    """[h, w, 3] orthographic view from `yaw` degrees to the right of the front; triangles painted from far to near."""
     angle = np.radians(yaw)
     turn = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
     seen = (triangles - centre) @ turn.T
@@ -72,7 +72,7 @@ def look_at(
 
 
 def boxes_of(frames: Frames, colours: Array, share: float = 1.0) -> tuple[Array, Array]:
-    """Triangles [12 K, 3, 3] and colours of the boxes, scaled about their centres by `share`."""
+    """Triangles [12 K, 3, 3] and colours of the boxes, scaled by `share` about their centres."""
     position, rotation, half_extent = (
         a.double().numpy() for a in (frames.position, frames.rotation, frames.half_extent)
     )
@@ -81,7 +81,7 @@ def boxes_of(frames: Frames, colours: Array, share: float = 1.0) -> tuple[Array,
 
 
 def cells_on_skin(vertices: Array, faces: Array, texels: UvRaster, colours: Array) -> tuple[Array, Array]:
-    """The texel map as little squares, coloured by cell, on a dark body that shows between: triangles, colours."""
+    """The texel map as small squares, coloured by cell, on a dark body visible between them: triangles, colours."""
     points = (vertices[faces[texels.face]] * texels.barycentric[..., None]).sum(2)
     side = len(points) // GRID
     row, column = np.mgrid[: len(points) - 1, : len(points) - 1]
@@ -92,7 +92,7 @@ def cells_on_skin(vertices: Array, faces: Array, texels: UvRaster, colours: Arra
     )
     colour = colours[row // side * GRID + column // side]
     normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
-    # Drawn thinner: painting whole triangles from far to near would let neighbouring faces show through the squares.
+    # Drawn thinner: triangles are painted whole from far to near, so neighbouring faces would show through the squares.
     inside = (vertices - 0.008 * normals)[faces]
     return (
         np.concatenate([inside, square[:, [0, 1, 2]], square[:, [0, 2, 3]]]),
@@ -101,7 +101,7 @@ def cells_on_skin(vertices: Array, faces: Array, texels: UvRaster, colours: Arra
 
 
 def grid_picture(anchors: Anchors, size: int) -> Array:
-    """[size, size, 3] the UV square, v upward, in the same colours."""
+    """[size, size, 3] the UV square, v up, in the same colours."""
     index = (np.arange(size) * GRID) // size
     row = GRID - 1 - index[:, None]
     colours = colour_of_cells(anchors.chart).reshape(GRID, GRID, 3)

@@ -26,9 +26,9 @@ class Disc:
     """A patch opened to a disc."""
 
     points: Array
-    """[n, 3] where the vertices are on the body."""
+    """[n, 3] positions on the body."""
     smooth: Array
-    """[n, 3] where they are on the smoothed copy that is flattened."""
+    """[n, 3] positions on the smoothed copy that is flattened."""
     faces: Array
     """[m, 3]."""
     parent: Array
@@ -53,7 +53,7 @@ def sides_of(loop: Sequence[int], corners: Sequence[int]) -> list[list[int]]:
 
 
 def split_chords(disc: Disc, sides: Sequence[Sequence[int]]) -> Disc:
-    """The disc with every inner edge halved that joins two vertices of one side: on a straight side it has no area."""
+    """The disc with inner edges between two vertices of one side halved: a straight side would leave them no area."""
     outline = {tuple(sorted(edge)) for side in sides for edge in pairwise(side)}
     on_side = [set(side) for side in sides]
     edges = {tuple(sorted((face[k], face[(k + 1) % 3]))) for face in disc.faces.tolist() for k in range(3)}
@@ -81,9 +81,9 @@ def flatten(
 ) -> Flat:
     """The disc on a width x height rectangle.
 
-    `corners` are the vertices for (0, 0), (width, 0), (width, height), (0, height); pairs in `seams` share their height
+    `corners` are the vertices for (0, 0), (width, 0), (width, height), (0, height); pairs in `seams` have equal height
     (the two copies of a cut, so that rows of cells go round a limb). `emphasis` raises the energy of a triangle to the
-    power 1 + emphasis, which trades the mean distortion for the worst.
+    power 1 + emphasis, which accepts a higher mean distortion for a lower maximum.
     """
     sides = sides_of(loop, corners)
     disc = split_chords(disc, sides)
@@ -110,7 +110,7 @@ def flatten(
 
     energy = total(uv)
     if not np.isfinite(energy):
-        raise ValueError("the patch starts with flipped triangles; move its corners or seam")
+        raise ValueError("the patch has flipped triangles at the start: move its corners or seam")
     for _ in range(ITERATIONS):
         weight = area * energies(uv) ** emphasis
         step = _proxy_step(jacobian(uv), uv, weight, to_x, to_y, unknowns)
@@ -180,7 +180,7 @@ def _gradients(points: Array, faces: Array, target_area: float) -> tuple[Array, 
     shape = (len(faces), len(points))
     to_x, to_y = (sp.coo_matrix((d.ravel(), (row, faces.ravel())), shape=shape).tocsr() for d in (by_x, by_y))
     area = twice_area / 2 * scale**2
-    # A floor, or the tiniest triangles would hardly weigh anything and end up as needles.
+    # A lower bound: otherwise the tiniest triangles would have almost no weight and become needles.
     return np.maximum(area, 1e-3 * area.mean()), to_x, to_y
 
 

@@ -8,14 +8,15 @@ from numpy import ndarray as Array
 
 REGIONS = ("torso", "head", "arm", "hand", "leg", "foot")
 SNAP = 0.2
-"""A cut closer than this share of an edge to one of its ends goes through that end: no needle triangles."""
+"""A cut closer to an edge's end than this share of the edge goes through that end, which avoids needle triangles."""
 
 
 def cut_into_regions(sheet: Sheet, joints: dict[str, Array]) -> tuple[Sheet, Array]:
     """The sheet with faces split along the cuts, and the region of each face as an index into REGIONS.
 
-    The cuts are placed by the joints, so they move with the body's proportions: a plane across the neck that falls
-    towards the chin, a plane through the armpit, a wrist and an ankle plane, and a groin line that rises outwards.
+    The cuts are placed relative to the joints, so they follow the body's proportions: a plane across the neck that
+    slopes towards the chin, a plane through the armpit, a wrist and an ankle plane, and a groin line that rises
+    outwards.
     """
     neck, shoulder, wrist = joints["neck"], joints["left_shoulder"], joints["left_wrist"]
     ankle, pelvis = joints["left_ankle"], joints["pelvis"]
@@ -52,9 +53,9 @@ def cut_into_regions(sheet: Sheet, joints: dict[str, Array]) -> tuple[Sheet, Arr
 
 
 def _split(sheet: Sheet, region: Array, value: Array, only: int) -> tuple[Sheet, Array, Array]:
-    """Splits the faces of region `only` where `value` (one a point, linear on edges) changes sign.
+    """Splits the faces of region `only` where `value` (one per point, linear on edges) changes sign.
 
-    Returns the sheet, the regions of its faces and which faces lie where the value is positive.
+    Returns the sheet, the regions of its faces and which faces are on the positive side.
     """
     value = value.copy()
     subject = sheet.faces[region == only]
@@ -87,7 +88,7 @@ def _split(sheet: Sheet, region: Array, value: Array, only: int) -> tuple[Sheet,
 
 
 def _pieces(face: list[int], middle: dict[tuple[int, int], int]) -> list[list[int]]:
-    """A triangle cut at the new points on its edges, in the same sense."""
+    """A triangle cut at the new points on its edges, with the same orientation."""
     new = [middle.get((face[k], face[(k + 1) % 3])) for k in range(3)]
     cuts = [k for k in range(3) if new[k] is not None]
     if not cuts:

@@ -1,6 +1,6 @@
-"""Pictures of the pose library's poses for the extension: `python -m scripts.bake_pose_thumbnails`.
+"""Renders the previews of the extension's pose library: `python -m scripts.bake_pose_thumbnails`.
 
-A person of the default checkpoint is drawn by our own marcher in each pose; the pictures are 160 pixels wide.
+A person from the default checkpoint is drawn in each pose by our own marcher; the pictures are 160 pixels wide.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from blender_primdiffusion.motion.poses import LIBRARY
 OUT = Path(__file__).resolve().parents[2] / "blender_primdiffusion" / "motion" / "data" / "thumbnails"
 SEED, YAW, SIZE = 7, 0.45, 160
 _COLOURS = 96
-"""Of a picture's palette: a third of the size, and nothing to be seen of it."""
+"""Size of a picture's palette: the file is a third as large without a visible difference."""
 
 
 def main() -> None:
-    """Writes a PNG for each pose, in place of those there were."""
+    """Writes a PNG for each pose and replaces the existing ones."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=OUT)
     out = parser.parse_args().out

@@ -1,6 +1,7 @@
-"""The extension's built-in poses as a file of the backend: `python -m scripts.bake_poses`.
+"""Writes the extension's built-in poses to a file of the backend: `python -m scripts.bake_poses`.
 
-They are authored as angles of limbs in `blender_primdiffusion/motion/poses.py`; both programs then capture the same.
+They are defined as joint angles in `blender_primdiffusion/motion/poses.py`; with the file, both programs capture the
+same poses.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The machines that locks are made for: Blender's platforms and Pythons, and what torch computes on."""
+"""The platforms that requirements are locked for: systems and Pythons of Blender, and torch's compute back ends."""
 
 from __future__ import annotations
 
@@ -8,33 +8,33 @@ import re
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """One lock: a platform, a Python, a build of torch."""
+    """One lock file: a platform, a Python, a build of torch."""
 
     platform: str
-    """As the extension names it: linux_x86_64, linux_arm64, windows_x86_64, macos_arm64."""
+    """The extension's name for it: linux_x86_64, linux_arm64, windows_x86_64, macos_arm64."""
     python: str
-    """3.11 (Blender 4.5, 5.0), 3.13 (5.1 and newer), 3.14 (as some Linux distributions build Blender)."""
+    """3.11 (Blender 4.5, 5.0), 3.13 (5.1 and newer) or 3.14 (used by some Linux distributions)."""
     compute: str
     """cpu, cuda, apple."""
     uv_platform: str
-    """As uv names it, with the oldest system that torch has wheels for."""
+    """uv's name for it, with the oldest system that torch has wheels for."""
     wheel_platforms: tuple[str, ...]
     """Patterns of platform tags that run there, best first."""
     torch_build: str = ""
-    """Local version of a build that is on download.pytorch.org alone: cpu, cu130; empty: PyPI's."""
+    """Local version of a build that only download.pytorch.org has: cpu, cu130; empty: PyPI's build."""
 
     @property
     def name(self) -> str:
-        """Of the lock's file, without its suffix."""
+        """The lock's file name without its suffix."""
         return f"{self.platform}-py{self.python.replace('.', '')}-{self.compute}"
 
     @property
     def without_cuda(self) -> bool:
-        """torch is another build than the one whose requirements PyPI tells, and needs no CUDA packages."""
+        """Whether torch's build needs no CUDA packages, although PyPI lists them as its requirements."""
         return bool(self.torch_build)
 
     def runs(self, tags: str) -> int | None:
-        """How well a wheel of these tags (cp311-cp311-win_amd64) suits, lower is better; None: not at all."""
+        """The rank of a wheel with these tags (cp311-cp311-win_amd64), lower is better; None: it does not run."""
         pythons, abis, platforms = tags.split("-")
         version = self.python.replace(".", "")
         exact = f"cp{version}" in pythons.split(".") and f"cp{version}" in abis.split(".")

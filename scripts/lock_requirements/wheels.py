@@ -1,4 +1,4 @@
-"""Wheels as the indexes tell of them: address, SHA-256, size; what they unpack to, read from their last bytes alone."""
+"""Wheels from the package indexes: address, SHA-256, size, and unpacked size, read from the last bytes of the file."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ class Wheel:
     sha256: str
     bytes: int
     installed: int | None
-    """Bytes that it unpacks to; None: not known, because its bytes are out of reach."""
+    """Unpacked bytes; None: unknown, because the wheel could not be read."""
     index: str | None
-    """The index that has it, where that is not PyPI."""
+    """The index of the wheel if it is not PyPI."""
 
 
 def wheel_of(name: str, version: str, target: Target) -> Wheel:
-    """The wheel that pip would take on this target. Raises NoWheel."""
+    """The wheel that pip would choose on this target. Raises NoWheel."""
     if name == "torch" and target.torch_build:
         return _of_pytorch(version, target)
     ranked = []
@@ -57,18 +57,18 @@ def _of_pytorch(version: str, target: Target) -> Wheel:
     filename = f"torch-{version}+{target.torch_build}-{tag}-{tag}-{platform}.whl"
     index = f"{PYTORCH}/{target.torch_build}"
     recorded = json.loads(RECORDED.read_text(encoding="utf-8"))["wheels"].get(filename)
-    told = _told_by_pytorch(index, filename)
-    if told is not None:
-        sha256, size, installed = told
+    found = _from_pytorch_index(index, filename)
+    if found is not None:
+        sha256, size, installed = found
         if recorded is not None and recorded["sha256"] != sha256:
             raise NoWheel(f"{filename}: {index} says {sha256}, {RECORDED.name} says {recorded['sha256']}")
         return Wheel(filename, sha256, size, installed, index)
     if recorded is None:
-        raise NoWheel(f"{index} is out of reach, and {RECORDED.name} knows nothing of {filename}")
+        raise NoWheel(f"{index} cannot be reached, and {RECORDED.name} does not list {filename}")
     return Wheel(filename, recorded["sha256"], recorded["bytes"], recorded["installed"], index)
 
 
-def _told_by_pytorch(index: str, filename: str) -> tuple[str, int, int | None] | None:
+def _from_pytorch_index(index: str, filename: str) -> tuple[str, int, int | None] | None:
     try:
         with urllib.request.urlopen(f"{index}/torch/", timeout=30) as page:
             html = page.read().decode("utf-8")
@@ -92,7 +92,7 @@ def _files(name: str) -> list[dict]:
 
 @functools.cache
 def _unpacked(url: str, size: int) -> int:
-    """Bytes of a wheel's contents, from the zip's directory at its end."""
+    """Unpacked bytes of a wheel, from the zip's directory at its end."""
     tail = min(_TAIL, size)
     while True:
         request = urllib.request.Request(url, headers={"Range": f"bytes={size - tail}-{size - 1}"})
@@ -107,7 +107,7 @@ def _unpacked(url: str, size: int) -> int:
 
 
 class _EndOfFile(io.BytesIO):
-    """The last bytes of a file as if all of it were there; reading elsewhere raises OSError."""
+    """The last bytes of a file at their original positions; reading elsewhere raises OSError."""
 
     def __init__(self, data: bytes, size: int):
         super().__init__(data)

@@ -1,9 +1,9 @@
-"""Pictures of the manual that Blender renders: people walking, and stills.
+"""Renders the manual's pictures in Blender: walking people, and stills; crops screenshots.
 
     .venv/bin/python -m scripts.manual_pictures walk            # docs/manual/pictures/walking.gif
     .venv/bin/python -m scripts.manual_pictures stills          # engine, Cycles, a group, edits
     .venv/bin/python -m scripts.manual_pictures boxes           # a reshaped person, as in the paper and as here
-    .venv/bin/python -m scripts.manual_pictures window SHOTS    # crops of what scripts/window/look.py has seen
+    .venv/bin/python -m scripts.manual_pictures window SHOTS    # crops of the screenshots of scripts/window/look.py
 
 Runs in Blender as a Python module, with the extension from this checkout.
 """
@@ -19,35 +19,35 @@ ROOT = Path(__file__).resolve().parents[2]
 PICTURES = ROOT / "docs" / "manual" / "pictures"
 
 
-def main(words: list[str]) -> None:
+def main(options: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("walk", "stills", "boxes", "window"))
-    parser.add_argument("shots", type=Path, nargs="?", help="folder of the window's pictures")
+    parser.add_argument("shots", type=Path, nargs="?", help="folder of the screenshots")
     parser.add_argument("--out", type=Path, default=PICTURES)
     parser.add_argument("--only", nargs="*", default=[], help="names of stills; none: all")
-    asked = parser.parse_args(words)
-    asked.out.mkdir(parents=True, exist_ok=True)
-    if asked.what == "window":
-        if asked.shots is None:
-            parser.error("window wants the folder of the window's pictures")
+    arguments = parser.parse_args(options)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    if arguments.what == "window":
+        if arguments.shots is None:
+            parser.error("window needs the folder of the screenshots")
         from .crops import crop_all
 
-        crop_all(asked.shots, asked.out)
+        crop_all(arguments.shots, arguments.out)
         return
-    if asked.what == "boxes":
+    if arguments.what == "boxes":
         from .boxes import boxes
 
-        boxes(asked.out / "reshaped_boxes.jpg")
+        boxes(arguments.out / "reshaped_boxes.jpg")
         return
     with tempfile.TemporaryDirectory() as scratch:
-        if asked.what == "walk":
+        if arguments.what == "walk":
             from .walk import walk
 
-            walk(Path(scratch), asked.out / "walking.gif")
+            walk(Path(scratch), arguments.out / "walking.gif")
         else:
             from .stills import stills
 
-            stills(Path(scratch), asked.out, asked.only)
+            stills(Path(scratch), arguments.out, arguments.only)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A person on a far heavier body: with boxes that keep their size, as in the paper, and with boxes that grow."""
+"""Draws a person on a much heavier body: with boxes that keep their size, as in the paper, and with boxes that grow."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _GREY = (0.35, 0.35, 0.35)
 
 
 def boxes(out: Path) -> None:
-    """Generate, reshape, draw both side by side."""
+    """Generate, reshape, and draw both side by side."""
     human = generate(load_checkpoint(), SEED)
     betas = betas_of_measures(human.betas, torch.eye(10), default_body(), HEIGHT_M, WEIGHT_KG).float()
     of_the_paper = dataclasses.replace(human, betas=betas)

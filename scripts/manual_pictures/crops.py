@@ -1,4 +1,4 @@
-"""The manual's pictures of the window: panels cut out of what scripts/window/look.py has seen."""
+"""Crops the manual's pictures from the screenshots of scripts/window/look.py."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PANELS = {
     "missing": ("missing_files",),
     "german_french": ("language_de_generate", "language_fr_generate"),
 }
-"""Each a row of sidebars, with nothing but their panels."""
+"""Rows of sidebars, cropped to their panels."""
 WINDOWS = {
     "preferences_without": ("set_up_preferences", "window 1"),
     "preferences_with": ("set_up_tested", "window 1"),
@@ -37,32 +37,32 @@ WINDOWS = {
     "window_proxy": ("export_proxy", "window 0"),
     "window_motion": ("motion_imported", "window 0"),
 }
-"""A whole window, or the part of it that WINDOW_PART says."""
+"""Whole windows, or the part of the main window in WINDOW_PART."""
 STACKS = {"set_up_progress": ("set_up_real_0", "set_up_real_1", "set_up_real_2")}
-"""The extension's part of the preferences, one under the other."""
+"""The extension's part of the preferences, one below the other."""
 DIALOGS = {"motion_dialog": "motion_dialog"}
 WINDOW_PART = (0, 24, 1320, 1190)
-"""Of the main window, pixels: without the properties and the timeline."""
+"""Pixels of the main window: without the properties and the timeline."""
 PREFERENCES_PART = (172, 222, 872, 548)
-"""Of the preferences' window, pixels: what is the extension's, down to a whole row."""
+"""Pixels of the preferences' window: the extension's part, down to a whole row."""
 _STACKED_ROWS = 130
-"""Of the preferences' part: down to the end of the backend's box, while it is at work."""
+"""Pixels of the preferences' part: down to the end of the backend's box while a set-up runs."""
 _WINDOW_WIDTH = 880
 _PANEL_WIDTH = 262
 _OUTLINE_RGB, _OUTLINE_COLUMN, _RUN = 74, 8, 10
-"""Panels have an outline of this grey, this far from the sidebar's left edge; a run of so many rows is no chance."""
+"""Panels have an outline of this grey at this distance from the sidebar's left edge, over at least so many rows."""
 _GAP, _GAP_RGB = 12, (255, 255, 255)
 
 
 def crop_all(shots: Path, out: Path) -> None:
-    """Whatever was seen; what was not is told."""
+    """Crop all screenshots that exist; print the names of missing ones."""
     for name, seen in PANELS.items():
         if _are_there(shots, *seen):
             save_png(_row([panels_of(shots, shot) for shot in seen]), out / f"{name}.png")
     for name, (shot, window) in WINDOWS.items():
         if _are_there(shots, shot):
-            picture, places = _read(shots, shot)
-            box = WINDOW_PART if window == "window 0" else places[window]
+            picture, boxes = _read(shots, shot)
+            box = WINDOW_PART if window == "window 0" else boxes[window]
             part = picture.crop(box)
             if window == "window 0":
                 size = (_WINDOW_WIDTH, round(part.height * _WINDOW_WIDTH / part.width))
@@ -78,9 +78,9 @@ def crop_all(shots: Path, out: Path) -> None:
 
 
 def panels_of(shots: Path, shot: str) -> Image.Image:
-    """The sidebar down to where its last panel ends."""
-    picture, places = _read(shots, shot)
-    left, top, _, bottom = places["sidebar"]
+    """The sidebar down to the end of its last panel."""
+    picture, boxes = _read(shots, shot)
+    left, top, _, bottom = boxes["sidebar"]
     column = np.asarray(picture)[top:bottom, left + _OUTLINE_COLUMN].astype(int)
     outline = (np.abs(column - _OUTLINE_RGB) <= 1).all(1)
     runs = np.convolve(outline, np.ones(_RUN), "valid") == _RUN
@@ -91,10 +91,10 @@ def panels_of(shots: Path, shot: str) -> Image.Image:
 
 
 def _changed_part(shots: Path, shot: str) -> Image.Image:
-    """A dialog: what differs from the same window before it, in the 3D view."""
-    after, places = _read(shots, shot)
+    """A dialog: the part of the 3D view that differs from the same window before it."""
+    after, boxes = _read(shots, shot)
     before, _ = _read(shots, "motion_empty")
-    after, before = (np.asarray(p)[: places["sidebar"][3], : places["sidebar"][0]] for p in (after, before))
+    after, before = (np.asarray(p)[: boxes["sidebar"][3], : boxes["sidebar"][0]] for p in (after, before))
     differ = np.abs(after.astype(int) - before).max(2) > 24
     rows, columns = np.flatnonzero(differ.sum(1) > 40), np.flatnonzero(differ.sum(0) > 40)
     return Image.fromarray(after[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
@@ -103,7 +103,7 @@ def _changed_part(shots: Path, shot: str) -> Image.Image:
 def _are_there(shots: Path, *names: str) -> bool:
     missing = [name for name in names if not (shots / f"{name}.png").is_file()]
     if missing:
-        print(f"not seen: {', '.join(missing)}")
+        print(f"missing screenshots: {', '.join(missing)}")
     return not missing
 
 
@@ -122,9 +122,9 @@ def _row(pictures: list[Image.Image]) -> Image.Image:
 
 
 def _preferences_top(shots: Path, shot: str) -> Image.Image:
-    picture, places = _read(shots, shot)
+    picture, boxes = _read(shots, shot)
     left, top, right, _ = PREFERENCES_PART
-    return picture.crop(places["window 1"]).crop((left, top, right, top + _STACKED_ROWS))
+    return picture.crop(boxes["window 1"]).crop((left, top, right, top + _STACKED_ROWS))
 
 
 def _column(pictures: list[Image.Image]) -> Image.Image:

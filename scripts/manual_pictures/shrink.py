@@ -1,4 +1,4 @@
-"""Small files of pictures: panels and GIFs of few colours, JPEGs of people."""
+"""Saves small files: PNGs of panels and GIFs with few colours, JPEGs of people."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import numpy as np
 from PIL import Image
 
 MOST_BYTES = 120_000
-"""Of a still picture of the manual."""
+"""The limit for a still picture of the manual."""
 
 
 def save_png(image: Image.Image, path: Path) -> None:
-    """Of 256 colours: for panels. Raises ValueError where that takes more than MOST_BYTES."""
+    """With 256 colours, for panels. Raises ValueError above MOST_BYTES."""
     image.convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(path, optimize=True)
     _check(path, image)
 
 
 def save_jpeg(image: Image.Image, path: Path) -> None:
-    """For pictures with people in them. Raises ValueError where that takes more than MOST_BYTES."""
+    """For pictures with people. Raises ValueError above MOST_BYTES."""
     image.convert("RGB").save(path, quality=88, optimize=True, progressive=True)
     _check(path, image)
 
@@ -27,12 +27,12 @@ def _check(path: Path, image: Image.Image) -> None:
     size = path.stat().st_size
     if size > MOST_BYTES:
         path.unlink()
-        raise ValueError(f"{path.name} takes {size} bytes and {MOST_BYTES} are wanted: crop it, or scale it")
+        raise ValueError(f"{path.name} has {size} bytes and may have {MOST_BYTES}: crop or scale it")
     print(f"{path.name}: {image.width} x {image.height}, {size / 1e3:.0f} kB")
 
 
 def save_gif(pictures: list[Path], path: Path, milliseconds: int, colours: int = 256) -> None:
-    """A loop for ever, one palette for all frames, what stays the same left out."""
+    """An endless loop, with one palette for all frames and unchanged pixels left out."""
     frames = [Image.open(picture).convert("RGB") for picture in pictures]
     sample = Image.fromarray(np.concatenate([np.asarray(frame) for frame in frames[:: max(1, len(frames) // 4)]]))
     palette = sample.quantize(colours, Image.Quantize.MEDIANCUT)

@@ -1,4 +1,4 @@
-"""A scene to take pictures in: Blender as a module with the extension, people, a tiled floor, a camera."""
+"""A scene for pictures: Blender as a module with the extension, people, a tiled floor, a camera."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _FLOOR_TILES = 64
 
 
 def empty_file(blend: Path) -> bpy.types.Scene:
-    """A saved file with nothing in it, the extension registered and its backend this interpreter."""
+    """A saved empty file, with the extension registered and this interpreter as its backend."""
     if not hasattr(bpy.types, "PRIMDIFFUSION_OT_generate"):
         import blender_primdiffusion
 
@@ -32,20 +32,20 @@ def empty_file(blend: Path) -> bpy.types.Scene:
     return scene
 
 
-def generate(seed: int, place: tuple[float, float] = (0.0, 0.0), attributes: str = "") -> bpy.types.Collection:
-    """A person standing at x, y, selected."""
+def generate(seed: int, position: tuple[float, float] = (0.0, 0.0), attributes: str = "") -> bpy.types.Collection:
+    """Generate a person at x, y, and select them."""
     before = set(bpy.data.collections)
     bpy.ops.primdiffusion.generate(seed=seed, steps=30, attributes=attributes)
     person = next(c for c in set(bpy.data.collections) - before if "primdiffusion_human" in c)
     armature = armature_of(person)
-    armature.location.xy = place
+    armature.location.xy = position
     bpy.context.view_layer.objects.active = armature
     leave_out_volumes()
     return person
 
 
 def leave_out_volumes() -> None:
-    """Out of the view layer: the engine does not need them, and each person's take a gigabyte."""
+    """Exclude the volumes from the view layer: the engine does not need them, and each person's take a gigabyte."""
     waiting = [bpy.context.view_layer.layer_collection]
     while waiting:
         layer = waiting.pop()
@@ -55,7 +55,7 @@ def leave_out_volumes() -> None:
 
 
 def armature_of(person: bpy.types.Collection) -> bpy.types.Object:
-    return next(thing for thing in person.objects if thing.type == "ARMATURE")
+    return next(obj for obj in person.objects if obj.type == "ARMATURE")
 
 
 def pose(person: bpy.types.Collection, name: str) -> None:
@@ -64,7 +64,7 @@ def pose(person: bpy.types.Collection, name: str) -> None:
 
 
 def tiled_floor(scene: bpy.types.Scene, tile: float, columns: int = _FLOOR_TILES) -> bpy.types.Object:
-    """Tiles of two greys, `tile` metres a side, `columns` of them along x; the pattern repeats after two."""
+    """Tiles of two greys, `tile` metres a side, `columns` of them along x; the pattern repeats every two."""
     corners = [
         ((x - columns / 2) * tile, (y - _FLOOR_TILES / 2) * tile, 0.0)
         for y in range(_FLOOR_TILES + 1)
@@ -88,14 +88,14 @@ def tiled_floor(scene: bpy.types.Scene, tile: float, columns: int = _FLOOR_TILES
     return floor
 
 
-def look(scene: bpy.types.Scene, stand: tuple, at: tuple, lens: float = 50.0) -> bpy.types.Object:
-    """A camera at `stand` that looks at `at`."""
+def look(scene: bpy.types.Scene, position: tuple, at: tuple, lens: float = 50.0) -> bpy.types.Object:
+    """A camera at `position`, aimed at `at`."""
     data = bpy.data.cameras.new("Camera")
     data.lens = lens
     camera = bpy.data.objects.new("Camera", data)
     scene.collection.objects.link(camera)
-    camera.location = stand
-    camera.rotation_euler = (Vector(at) - Vector(stand)).to_track_quat("-Z", "Y").to_euler()
+    camera.location = position
+    camera.rotation_euler = (Vector(at) - Vector(position)).to_track_quat("-Z", "Y").to_euler()
     scene.camera = camera
     return camera
 

@@ -1,4 +1,4 @@
-"""Stills of the manual: the engine and Cycles, a group, somebody re-dressed and reshaped, the poses of the library."""
+"""Stills of the manual: the engine and Cycles, a group, a re-dressed and a reshaped person, library poses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def stills(scratch: Path, out: Path, only: list[str]) -> None:
 
 
 def engine_and_cycles(folder: Path) -> list[Path]:
-    """One person by the engine, and merged in Cycles with an object that mirrors them."""
+    """One person drawn by the engine, and merged in Cycles with an object that reflects them."""
     scene = _stage(folder, 3, "Hands on Hips")
     exact = render(scene, folder / "engine.png", SIZE)
     bpy.ops.primdiffusion.merge(voxel=0.005)
@@ -58,7 +58,7 @@ def group(folder: Path) -> list[Path]:
 
 
 def redressed(folder: Path) -> list[Path]:
-    """One person, in a tee instead of the jacket, then in shorts too."""
+    """One person, then with a tee instead of the jacket, then with shorts too."""
     scene = _stage(folder, 0, "Contrapposto")
     pictures = [render(scene, folder / "before.png", SIZE)]
     for number, (parts, outfit) in enumerate((({"clothes"}, "suit"), ({"clothes"}, "tee and shorts"))):
@@ -68,7 +68,7 @@ def redressed(folder: Path) -> list[Path]:
 
 
 def reshaped(folder: Path) -> list[Path]:
-    """One person, shorter and heavier, taller and lighter."""
+    """One person, then shorter and heavier, then taller and lighter."""
     scene = _stage(folder, 12, "Relaxed")
     pictures = []
     for number, (height, weight) in enumerate(((1.55, 80.0), (1.72, 68.0), (1.9, 75.0))):

@@ -1,4 +1,4 @@
-"""Three people walk side by side, for ever: a floor runs below each of them, a stride of their own legs a round."""
+"""Three people walk side by side in an endless loop; the floor below each moves by their stride once per loop."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from .stage import armature_of, empty_file, generate, look, render, tiled_floor
 
 SEEDS = (3, 53, 23)
 FRAMES = 32
-"""Of a round."""
+"""Frames per loop."""
 FPS = 30
 SIZE = (480, 400)
 _APART = 0.82
 _WIDEST = 40
 """Columns of tiles of the floors at the sides; the one in the middle has two."""
 _OUT_OF_STEP = 11
-"""Frames by which each is behind the one before."""
+"""Frames by which each person lags behind the previous one."""
 
 
 def walk(scratch: Path, out: Path) -> None:
-    """Generate, add the built-in motion, render a round with the engine, save the loop."""
+    """Generate, add the built-in motion, render one loop with the engine, save it."""
     scene = empty_file(scratch / "walk.blend")
     scene.render.fps = FPS
     middle, floors = (len(SEEDS) - 1) / 2, []
@@ -50,7 +50,7 @@ def walk(scratch: Path, out: Path) -> None:
 
 
 def _floor(scene: bpy.types.Scene, lane: float, stride: float) -> tuple[bpy.types.Object, float]:
-    """A floor for one person, two tiles wide below them and on to the side they are at; and their stride, metres."""
+    """A floor for one person, two tiles wide and extended to their side; and their stride in metres."""
     columns = _WIDEST if lane else 2
     floor = tiled_floor(scene, stride / 2, columns)
     floor.scale.x = _APART / stride

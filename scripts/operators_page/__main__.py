@@ -1,6 +1,6 @@
-"""docs/manual/api.md from the registered operators and settings: `python scripts/operators_page`.
+"""Writes docs/manual/api.md from the registered operators and settings: `python scripts/operators_page`.
 
-Needs `bpy`. Whatever is registered is on the page, in words that are its own: descriptions, defaults, docstrings.
+Needs `bpy`. The page contains everything that is registered, with its own descriptions, defaults and docstrings.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ PAGE = ROOT / "docs" / "manual" / "api.md"
 
 
 def main() -> int:
-    """Write the page; with --check only tell whether it is current."""
+    """Write the page; with --check only report whether it is up to date."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--check", action="store_true", help="write nothing; exit code 1 where the page is out of date")
+    parser.add_argument("--check", action="store_true", help="write nothing; exit code 1 if the page is out of date")
     arguments = parser.parse_args()
     sys.path.insert(0, str(ROOT))
     import page

@@ -21,7 +21,7 @@ _OWNERS = (
 
 
 def page() -> str:
-    """The page: a beginning written by hand, then operators and settings, each sorted by name."""
+    """The page: a handwritten introduction, then operators and settings, each sorted by name."""
     parts = [BEGINNING.read_text(encoding="utf-8").rstrip(), "", "## Operators", ""]
     for operator in sorted(operators(), key=lambda cls: cls.bl_idname):
         parts += _operator(operator)
@@ -32,13 +32,13 @@ def page() -> str:
 
 
 def operators() -> list[type[bpy.types.Operator]]:
-    """Our registered operators that are for users; internal ones are not."""
+    """Our registered operators for users, without internal ones."""
     ours = (cls for cls in bpy.types.Operator.__subclasses__() if cls.__name__.startswith(f"{_OURS}OT_"))
     return [cls for cls in _registered(ours) if "INTERNAL" not in cls.bl_options]
 
 
 def settings() -> list[tuple[str, type[bpy.types.PropertyGroup]]]:
-    """Where settings are, and their groups; nested ones after those that hold them."""
+    """Our setting groups with their paths; nested groups come after the ones that contain them."""
     found: list[tuple[str, type]] = []
     for cls in _registered(c for c in bpy.types.AddonPreferences.__subclasses__() if c.__name__.startswith(_OURS)):
         found.append(("bpy.context.preferences.addons[NAME OF THE EXTENSION].preferences", cls.bl_rna))
@@ -51,7 +51,7 @@ def settings() -> list[tuple[str, type[bpy.types.PropertyGroup]]]:
 
 
 def properties(struct) -> list[bpy.types.Property]:
-    """Of an operator or a group, its own ones that are not hidden."""
+    """The visible properties that an operator or a group defines itself."""
     return [
         p for p in struct.properties if p.identifier not in _INHERITED and p.identifier != "name" and not p.is_hidden
     ]
@@ -65,7 +65,7 @@ def _nested(path: str, struct) -> Iterator[tuple[str, type]]:
 
 
 def _registered(classes: Iterable[type]) -> Iterator[type]:
-    """Without those left over from an earlier registration: only what Blender knows by this very class."""
+    """Without classes of an earlier registration: only those that Blender has registered now."""
     return (cls for cls in classes if getattr(cls, "is_registered", False))
 
 
@@ -77,7 +77,7 @@ def _operator(cls: type[bpy.types.Operator]) -> list[str]:
         f"### {name}",
         "",
         f"**{cls.bl_label}.** {_sentence(rna.description)}",
-        *([f"Where disabled, its tooltip says: {_sentence(message)}"] if message else []),
+        *([f"If it is disabled, the tooltip says: {_sentence(message)}"] if message else []),
         "",
         *_table(properties(rna)),
     ]
@@ -109,7 +109,7 @@ def _kind(prop: bpy.types.Property) -> str:
     if prop.type == "ENUM":
         items = [f"`{item.identifier}`" for item in prop.enum_items_static]
         kind = "set of " if prop.is_enum_flag else ""
-        return kind + (", ".join(items) if items else "a name; which ones there are depends")
+        return kind + (", ".join(items) if items else "a name; the choices depend on the scene")
     if prop.type in ("POINTER", "COLLECTION"):
         return prop.fixed_type.identifier
     return {"BOOLEAN": "bool", "STRING": "path" if prop.subtype in ("FILE_PATH", "DIR_PATH") else "string"}[prop.type]
@@ -135,12 +135,12 @@ def _default(prop: bpy.types.Property) -> str:
 
 
 def _poll_message(cls: type[bpy.types.Operator]) -> str:
-    """What `poll` says where it disables the operator; empty without one of ours."""
-    said: list[str] = []
+    """The message that `poll` sets when it disables the operator; empty if the operator has no `poll` of its own."""
+    messages: list[str] = []
     poll = getattr(cls, "poll", None)
     if getattr(poll, "__module__", "").startswith("blender_primdiffusion"):
-        poll.__func__(SimpleNamespace(poll_message_set=said.append), bpy.context)
-    return said[0] if said else ""
+        poll.__func__(SimpleNamespace(poll_message_set=messages.append), bpy.context)
+    return messages[0] if messages else ""
 
 
 def _sentence(text: str) -> str:

@@ -1,4 +1,4 @@
-"""What scenes begin with: a new file, people in it, one of them selected, nothing at work."""
+"""Initial states of scenes: an empty file, people in it, one of them selected, no job running."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ def begin(module: str, python: str) -> Steps:
     bpy.ops.wm.read_homefile(use_factory_startup=True)
     yield 1.5
     bpy.context.preferences.addons[module].preferences.backend_python = python
-    for thing in list(bpy.data.objects):
-        if thing.type == "MESH":
-            bpy.data.objects.remove(thing)
+    for obj in list(bpy.data.objects):
+        if obj.type == "MESH":
+            bpy.data.objects.remove(obj)
 
 
 def with_people(module: str, python: str, *seeds: int) -> Steps:
-    """A file with these people, made once."""
+    """A file with these people; they are generated once."""
     yield from begin(module, python)
     path = people_file(module, len(seeds))
     if path.is_file():
@@ -35,7 +35,7 @@ def with_people(module: str, python: str, *seeds: int) -> Steps:
 
 
 def leave_out_volumes() -> None:
-    """Out of the view layer: the engine does not need them, and each person's take a gigabyte."""
+    """Exclude the volumes from the view layer: the engine does not need them, and each person's take a gigabyte."""
     waiting = [bpy.context.view_layer.layer_collection]
     while waiting:
         layer = waiting.pop()
@@ -45,7 +45,7 @@ def leave_out_volumes() -> None:
 
 
 def people_file(module: str, count: int = 1) -> Path:
-    """Beside the installed extension: gone with it."""
+    """A file in the installed extension's folder, which is deleted with it."""
     folder = Path(import_module(module).__file__).parents[3]
     return folder / f"people_{count}.blend"
 
@@ -62,13 +62,13 @@ def cancel_all(module: str) -> Steps:
 
 
 def armatures() -> list[bpy.types.Object]:
-    """Of the people, in the order of their making."""
-    return sorted((thing for thing in bpy.context.scene.objects if thing.type == "ARMATURE"), key=lambda t: t.name)
+    """The people's armatures, in the order they were generated."""
+    return sorted((obj for obj in bpy.context.scene.objects if obj.type == "ARMATURE"), key=lambda t: t.name)
 
 
 def select(armature: bpy.types.Object) -> None:
-    """The person of whom the panels tell."""
-    for thing in bpy.context.view_layer.objects:
-        thing.select_set(False)
+    """Select the person that the panels show."""
+    for obj in bpy.context.view_layer.objects:
+        obj.select_set(False)
     armature.select_set(True)
     bpy.context.view_layer.objects.active = armature

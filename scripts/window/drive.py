@@ -1,7 +1,7 @@
-"""Runs inside Blender's window: installs the zip, then plays the scenes of `story.py` from a timer, a step at a time.
+"""Runs inside Blender's window: installs the zip, then plays the scenes of `story.py` from a timer, step by step.
 
-A scene is a generator. It yields seconds to wait, the name of a picture to take of the whole window, or what the hand
-is to do: {"point": [x, y], "click": True} or {"key": "Escape"}.
+A scene is a generator. It yields seconds to wait, the name of a screenshot to take, or an input:
+{"point": [x, y], "click": True} or {"key": "Escape"}.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from pathlib import Path
 import bpy
 
 sys.path.append(str(Path(__file__).resolve().parent))
-ARCHIVE, WANTED, PYTHON, *SCENES = sys.argv[sys.argv.index("--") + 1 :]
+ARCHIVE, REQUEST, PYTHON, *SCENES = sys.argv[sys.argv.index("--") + 1 :]
 MODULE = "bl_ext.user_default.primdiffusion"
 
 
 def play() -> Iterator[float]:
-    """Everything, seconds to wait between steps."""
+    """Play all scenes; yields seconds to wait between steps."""
     import story
     from setting_up import set_up_real
 
@@ -36,7 +36,7 @@ def play() -> Iterator[float]:
         print(f"scene {name}", flush=True)
         try:
             yield from perform(scene(MODULE, PYTHON))
-        except Exception:  # the others may still be seen; the exit code tells
+        except Exception:  # continue with the other scenes; the exit code reports the failure
             traceback.print_exc()
             FAILED.append(name)
 
@@ -52,14 +52,14 @@ def perform(steps: Iterator) -> Iterator[float]:
 
 
 def install() -> None:
-    """As dragging the zip into the window does."""
+    """Install the zip, as dragging it into the window does."""
     with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
         bpy.ops.extensions.package_install_files(filepath=ARCHIVE, repo="user_default", enable_on_install=True)
     import_module(MODULE)
 
 
 def photograph(name: str) -> Iterator[float]:
-    """Draw the windows anew, then save what the screen shows. Panels that have grown slide for a while."""
+    """Redraw the windows, then save the screen. Panels that have grown slide for a while."""
     for _ in range(3):
         for window in bpy.context.window_manager.windows:
             for area in window.screen.areas:
@@ -70,26 +70,26 @@ def photograph(name: str) -> Iterator[float]:
 
 def where() -> dict[str, list[int]]:
     """Left, top, right, bottom in pixels of the screen: the sidebar, and each window."""
-    places = {}
+    boxes = {}
     windows = bpy.context.window_manager.windows
     full = windows[0].height
     for number, window in enumerate(windows):
         top = full - window.y - window.height
-        places[f"window {number}"] = [window.x, top, window.x + window.width, top + window.height]
+        boxes[f"window {number}"] = [window.x, top, window.x + window.width, top + window.height]
     for area in windows[0].screen.areas:
         for region in area.regions:
             if area.type == "VIEW_3D" and region.type == "UI":
                 top = full - region.y - region.height
-                places["sidebar"] = [region.x, top, region.x + region.width, top + region.height]
-    return places
+                boxes["sidebar"] = [region.x, top, region.x + region.width, top + region.height]
+    return boxes
 
 
 def ask(what: dict) -> Iterator[float]:
-    """Wait until it is done."""
-    wanted = Path(WANTED)
-    wanted.with_suffix(".part").write_text(json.dumps(what))
-    wanted.with_suffix(".part").rename(wanted)
-    while wanted.exists():
+    """Send a request and wait until it is done."""
+    request = Path(REQUEST)
+    request.with_suffix(".part").write_text(json.dumps(what))
+    request.with_suffix(".part").rename(request)
+    while request.exists():
         yield 0.1
 
 
@@ -102,14 +102,14 @@ def tick() -> float | None:
     try:
         return next(STEPS)
     except StopIteration:
-        print(f"the story is over; failed: {', '.join(FAILED) or 'nothing'}", flush=True)
+        print(f"all scenes played; failed: {', '.join(FAILED) or 'none'}", flush=True)
         code = 1 if FAILED else 0
     except Exception:
         traceback.print_exc()
         code = 1
     sys.stdout.flush()
     if code:
-        os._exit(code)  # an operator cannot give Blender an exit code
+        os._exit(code)  # an operator cannot set Blender's exit code
     bpy.ops.wm.quit_blender()
     return None
 

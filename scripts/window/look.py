@@ -1,12 +1,12 @@
-"""See the extension as a user does: a real Blender window on a virtual screen, the zip installed, buttons pressed.
+"""Test the extension in a real Blender window on a virtual screen: install the zip, press buttons, take screenshots.
 
     python scripts/window/look.py --blender blender --out window_out
     python scripts/window/look.py --chroot DEBIAN_FOLDER --out window_out      # Blender of a distribution in a folder
 
 Builds the zip, starts Xvfb (Debian's package xvfb) and Blender with software OpenGL, and runs `drive.py` in it, which
-plays the scenes of `story.py` and asks for pictures of the whole screen, which ImageMagick's import takes, and for
-clicks, which xdotool makes. Beside each NAME.png stands NAME.json: where the sidebar was. The exit code is Blender's:
-not 0 when a scene went wrong. A chroot needs /proc, /dev, /tmp/.X11-unix and this checkout mounted at their own paths.
+plays the scenes of `story.py` and requests screenshots of the whole screen (taken by ImageMagick's import) and clicks
+(made by xdotool). Next to each NAME.png, NAME.json gives the position of the sidebar. The exit code is Blender's, which
+is not 0 if a scene failed. A chroot needs /proc, /dev, /tmp/.X11-unix and this checkout mounted at their own paths.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).resolve().parent
-WANTED = "wanted"
-"""File in which drive.py says what it waits for: a picture, a click, a key."""
+REQUEST = "request"
+"""File in which drive.py requests a screenshot, a click or a key."""
 _QUIET = "import bpy; bpy.context.preferences.view.show_splash = False; bpy.ops.wm.save_userpref()"
-"""A first start would show the splash with its quick set-up over everything."""
+"""At its first start, Blender would show the splash screen with its quick set-up over everything."""
 
 
 def free_display() -> str:
-    """A number no X server uses."""
+    """A display number that no X server uses."""
     taken = {path.name.removeprefix("X") for path in Path("/tmp/.X11-unix").glob("X*")}
     return next(str(number) for number in range(90, 200) if str(number) not in taken)
 
@@ -40,7 +40,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--blender", default="blender", help="the program, inside --chroot if that is given")
     parser.add_argument("--chroot", type=Path, help="folder of a system that has Blender (debootstrap)")
     parser.add_argument("--out", type=Path, default=ROOT / "window_out", help="folder for the pictures")
-    parser.add_argument("--size", default="1600x1400", help="of the screen, pixels")
+    parser.add_argument("--size", default="1600x1400", help="size of the screen in pixels")
     parser.add_argument("--scenes", nargs="*", default=[], help="names of scenes to play; none: all")
     parser.add_argument("--python", type=Path, default=ROOT / ".venv/bin/python", help="interpreter of the backend")
     parser.add_argument("--time", type=float, default=3000.0, help="seconds after which Blender is ended")
@@ -48,46 +48,46 @@ def arguments() -> argparse.Namespace:
 
 
 def serve(blender: subprocess.Popen, scratch: Path, out: Path, display: str, time_s: float) -> int:
-    """Do what `drive.py` asks for until Blender ends; its exit code."""
+    """Serve the requests of `drive.py` until Blender ends; returns its exit code."""
     began = time.monotonic()
-    wanted = scratch / WANTED
+    request = scratch / REQUEST
     while blender.poll() is None:
         if time.monotonic() - began > time_s:
             blender.kill()
             print(f"Blender was ended after {time_s:.0f} s", file=sys.stderr)
-        if wanted.is_file():
-            do(json.loads(wanted.read_text()), out, display)
-            wanted.unlink()
+        if request.is_file():
+            do(json.loads(request.read_text()), out, display)
+            request.unlink()
         time.sleep(0.05)
     return blender.returncode
 
 
-def do(asked: dict, out: Path, display: str) -> None:
-    """A picture, a click, or a key. Blender's own screenshots are black with software OpenGL."""
+def do(request: dict, out: Path, display: str) -> None:
+    """Take a screenshot, click, or press a key. Blender's own screenshots are black with software OpenGL."""
     hand = ["xdotool"]
     environment = {**os.environ, "DISPLAY": f":{display}"}
-    if "picture" in asked:
-        path = out / f"{asked['picture']}.png"
+    if "picture" in request:
+        path = out / f"{request['picture']}.png"
         subprocess.run(["import", "-display", f":{display}", "-window", "root", str(path)], check=True)
-        path.with_suffix(".json").write_text(json.dumps(asked["where"]))
+        path.with_suffix(".json").write_text(json.dumps(request["where"]))
         print(f"saved {path.name}", flush=True)
-    if "point" in asked:
-        x, y = map(str, asked["point"])
+    if "point" in request:
+        x, y = map(str, request["point"])
         subprocess.run([*hand, "mousemove", x, y], check=True, env=environment)
-    if asked.get("click"):
+    if request.get("click"):
         time.sleep(0.3)
         subprocess.run([*hand, "click", "1"], check=True, env=environment)
-    if "key" in asked:
-        subprocess.run([*hand, "key", asked["key"]], check=True, env=environment)
+    if "key" in request:
+        subprocess.run([*hand, "key", request["key"]], check=True, env=environment)
 
 
 def main() -> int:
-    asked = arguments()
-    asked.out.mkdir(parents=True, exist_ok=True)
+    options = arguments()
+    options.out.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix=".window_", dir=ROOT / "build" if (ROOT / "build").is_dir() else ROOT))
     display = free_display()
     screen = subprocess.Popen(
-        ["Xvfb", f":{display}", "-screen", "0", f"{asked.size}x24", "-ac"], stderr=subprocess.DEVNULL
+        ["Xvfb", f":{display}", "-screen", "0", f"{options.size}x24", "-ac"], stderr=subprocess.DEVNULL
     )
     try:
         subprocess.run([sys.executable, ROOT / "build_addon.py", "--out", scratch], check=True)
@@ -99,13 +99,13 @@ def main() -> int:
             "BLENDER_USER_RESOURCES": str(scratch / "user"),
         }
         environment.pop("PRIMDIFFUSION_PYTHON", None)
-        program = [] if asked.chroot is None else ["chroot", str(asked.chroot)]
-        program.append(asked.blender)
+        program = [] if options.chroot is None else ["chroot", str(options.chroot)]
+        program.append(options.blender)
         subprocess.run([*program, "-b", "--python-expr", _QUIET], env=environment, check=True, capture_output=True)
-        command = [*program, "--gpu-backend", "opengl", "--window-geometry", "0", "0", *asked.size.split("x")]
+        command = [*program, "--gpu-backend", "opengl", "--window-geometry", "0", "0", *options.size.split("x")]
         command += ["--python-exit-code", "1", "--python", str(HERE / "drive.py"), "--"]
-        command += [str(archive), str(scratch / WANTED), str(asked.python), *asked.scenes]
-        return serve(subprocess.Popen(command, env=environment), scratch, asked.out, display, asked.time)
+        command += [str(archive), str(scratch / REQUEST), str(options.python), *options.scenes]
+        return serve(subprocess.Popen(command, env=environment), scratch, options.out, display, options.time)
     finally:
         screen.terminate()
         shutil.rmtree(scratch, ignore_errors=True)

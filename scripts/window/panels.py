@@ -1,4 +1,4 @@
-"""The sidebar: all of it as it opens, or some panels alone, opened."""
+"""The sidebar: all panels as they open, or some panels alone, opened."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mathutils import Euler, Vector
 
 _OURS = "PrimDiffusion"
 _shown: set[str] | None = None
-"""Panels to show; None: all there are."""
+"""Panels to show; None: all."""
 
 
 def view() -> tuple[bpy.types.Window, bpy.types.Area]:
@@ -30,10 +30,10 @@ def sidebar() -> Iterator[float]:
 
 
 def show(*names: str | None) -> Iterator[float]:
-    """These panels alone, opened; all for None.
+    """Show only these panels, opened; with None, all of them.
 
-    Blender opens and closes panels for hands alone. So they are registered anew, open unless told otherwise, and
-    what is not wanted polls False.
+    Blender has no function to open and close panels. So the panels are registered again, open by default, and `poll` of
+    the others returns False.
     """
     global _shown
     _shown = None if names == (None,) else {name for name in names if name}
@@ -72,7 +72,7 @@ def _is_ours(cls: type) -> bool:
 
 
 def wide_view() -> None:
-    """The 3D view rendered, from the front, at people's height, without a grid over them."""
+    """The 3D view rendered, from the front, at people's height, without a grid."""
     _, area = view()
     space = area.spaces.active
     space.shading.type = "RENDERED"

@@ -1,4 +1,4 @@
-"""Buttons, and waiting for what they do."""
+"""Presses buttons, and waits for their results."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Steps = Iterator[float | str | dict]
 
 
 def press(operator: str, how: str = "INVOKE_DEFAULT", **given: object) -> set[str]:
-    """A button: the operator is invoked in the 3D view, as a click does; it may refuse, as buttons do."""
+    """Invoke an operator in the 3D view, as a click on its button does; like a button, it may be rejected by `poll`."""
     window, area = view()
     region = next(region for region in area.regions if region.type == "WINDOW")
     room, name = operator.split(".")

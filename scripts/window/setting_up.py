@@ -1,6 +1,6 @@
-"""The backend truly set up in the window, from the package index: asked for by name (`--scenes set_up_real`).
+"""Sets up the real backend in the window, from the package index; runs only on request (`--scenes set_up_real`).
 
-Some hundreds of megabytes to 3 GB are downloaded. `PRIMDIFFUSION_COMPUTE` is cpu, cuda or apple; not set: automatic.
+This downloads some hundreds of megabytes to 3 GB. `PRIMDIFFUSION_COMPUTE` is cpu, cuda or apple; not set: automatic.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from panels import sidebar
 from press import Steps, press, wait
 
 _STAGES = ("Downloading", "Installing", "Trying")
-"""Words that progress begins with; a picture is taken in the middle of each."""
+"""Beginnings of progress messages; a screenshot is taken in the middle of each stage."""
 _MOST_S = 2400.0
 
 
 def set_up_real(module: str, _python: str) -> Steps:
-    """Cost, download, cancel, going on, installing, trying, ready; removed again."""
+    """Cost, download, cancel, second start, installation, self-test, ready; removed again."""
     bpy.context.preferences.system.use_online_access = True
     preferences = bpy.context.preferences.addons[module].preferences
     preferences.compute = os.environ.get("PRIMDIFFUSION_COMPUTE", "automatic").upper()

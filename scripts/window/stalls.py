@@ -1,5 +1,4 @@
-"""How long the window stands still: the longest times between two calls of a timer that is due every few
-milliseconds."""
+"""Measures how long the window is blocked, by the longest intervals between calls of a timer due every few ms."""
 
 from __future__ import annotations
 
@@ -13,23 +12,25 @@ _NOTICED_S = 0.1
 
 
 class Stalls:
-    """Measures from its making until `end`. Whatever keeps Blender's main loop, ours or not, counts."""
+    """Measures from its creation until `end`. Everything that blocks Blender's main loop counts, ours or not."""
 
     def __init__(self) -> None:
         self._gaps: list[tuple[float, float]] = []
         self._last = self._now()
-        self._timer = self._tick  # one object: Blender tells timers apart by identity
+        self._timer = self._tick  # one object, because Blender identifies timers by identity
         bpy.app.timers.register(self._timer, first_interval=0.0, persistent=True)
 
     def end(self) -> str:
-        """For people: the longest gaps in milliseconds, and how long the main thread truly worked in each: on a busy
-        machine it waits for its turn."""
+        """A summary: the longest gaps in ms, and the processor time of the main thread in each.
+
+        The two differ on a busy machine, where the thread waits for a core.
+        """
         self._tick()
         bpy.app.timers.unregister(self._timer)
         longest = sorted(self._gaps, reverse=True)[:_SHOWN]
-        told = ", ".join(f"{1000 * wall:.0f} ({1000 * worked:.0f})" for wall, worked in longest)
+        gaps = ", ".join(f"{1000 * wall:.0f} ({1000 * worked:.0f})" for wall, worked in longest)
         noticed = sum(wall for wall, _ in self._gaps if wall > _NOTICED_S)
-        return f"longest {told} ms; {noticed:.1f} s of {sum(wall for wall, _ in self._gaps):.1f} s in gaps above 0.1 s"
+        return f"longest {gaps} ms; {noticed:.1f} s of {sum(wall for wall, _ in self._gaps):.1f} s in gaps above 0.1 s"
 
     @staticmethod
     def _now() -> tuple[float, float]:

@@ -1,6 +1,6 @@
-"""What is looked at: each scene a generator of pictures' names, of seconds to wait, of clicks (see `drive.py`).
+"""The scenes: generators of screenshot names, seconds to wait and clicks (see `drive.py`).
 
-Every scene is told the name of the extension's module and the backend's Python, and brings about what it needs.
+Every scene gets the name of the extension's module and the backend's Python, and prepares what it needs.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FIRST_SEED, SECOND_SEED = 3, 53
 
 
 def set_up(module: str, python: str) -> Steps:
-    """Preferences and sidebar without a backend; with one; tried."""
+    """Preferences and sidebar without a backend; with one; tested."""
     preferences = bpy.context.preferences.addons[module].preferences
     yield from sidebar()
     yield "set_up_sidebar"
@@ -45,7 +45,7 @@ def set_up(module: str, python: str) -> Steps:
 
 
 def first_human(module: str, python: str) -> Steps:
-    """The sidebar as it opens, a true click on Generate Human, denoising, the person."""
+    """The sidebar as it opens, a real click on Generate Human, denoising, the person."""
     yield from begin(module, python)
     yield from sidebar()
     yield "first_sidebar"
@@ -53,7 +53,7 @@ def first_human(module: str, python: str) -> Steps:
     queue = queue_of(module)
     yield from wait(lambda: queue.busy, 5)
     if not queue.busy:
-        raise RuntimeError("the click on Generate Human did not reach it")
+        raise RuntimeError("the click did not hit Generate Human")
     so_far = import_module(f"{module}.jobs.pictures").so_far
     yield 1.0
     yield "first_starting"
@@ -67,7 +67,7 @@ def first_human(module: str, python: str) -> Steps:
 
 
 def generate(module: str, python: str) -> Steps:
-    """A line of three, an error with its remedy, a notice, attributes."""
+    """A queue of three, an error with its remedy, a notice, attributes."""
     yield from with_people(module, python, FIRST_SEED)
     yield from show("PRIMDIFFUSION_PT_generate", "PRIMDIFFUSION_PT_jobs")
     yield "generate_notice"
@@ -96,7 +96,7 @@ def generate(module: str, python: str) -> Steps:
 
 
 def variations(module: str, python: str) -> Steps:
-    """Eight in the making, the sheet, two selected."""
+    """Eight in progress, the sheet, two selected."""
     yield from begin(module, python)
     yield from show("PRIMDIFFUSION_PT_variations")
     bpy.context.scene.primdiffusion_variations.seeds = "CONSECUTIVE"
@@ -145,13 +145,13 @@ def edits(module: str, python: str) -> Steps:
     yield from with_people(module, python, FIRST_SEED, SECOND_SEED)
     first, second = armatures()
     select(first)
-    asked = bpy.context.scene.primdiffusion_edit
-    asked.other = next(c for c in second.users_collection if "primdiffusion_human" in c)
+    settings = bpy.context.scene.primdiffusion_edit
+    settings.other = next(c for c in second.users_collection if "primdiffusion_human" in c)
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_edit_transfer", "PRIMDIFFUSION_PT_edit_blend")
     yield "edit_two_people"
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_edit_vary", "PRIMDIFFUSION_PT_edit_redress")
-    asked.parts = {"top"}
-    asked.attributes.outfit = "suit"
+    settings.parts = {"top"}
+    settings.attributes.outfit = "suit"
     yield "edit_parts"
     press("primdiffusion.redress")
     queue = queue_of(module)
@@ -161,7 +161,7 @@ def edits(module: str, python: str) -> Steps:
     yield from wait(lambda: not queue.busy, 180)
     yield from rendered_view()
     yield "edit_redressed"
-    asked.region = "PAINTED"
+    settings.region = "PAINTED"
     press("primdiffusion.paint_region")
     yield 1.0
     paint(first)
@@ -170,11 +170,11 @@ def edits(module: str, python: str) -> Steps:
     yield 2.0
     yield "edit_painting"
     press("primdiffusion.finish_painting")
-    asked.region = "PARTS"
+    settings.region = "PARTS"
 
 
 def motion(module: str, python: str) -> Steps:
-    """Nothing yet, the dialog with what was found in a file, after the import."""
+    """The empty panel, the dialog with what was detected in a file, after the import."""
     yield from with_people(module, python, FIRST_SEED)
     yield from show("PRIMDIFFUSION_PT_motion")
     yield "motion_empty"
@@ -259,22 +259,22 @@ def export(module: str, python: str) -> Steps:
 
 
 def cancelled(module: str, python: str) -> Steps:
-    """Works are cancelled in the middle of their steps: how long that takes."""
+    """Measures how long cancelling a job in the middle of its steps takes."""
     yield from begin(module, python)
     yield from show("PRIMDIFFUSION_PT_generate", "PRIMDIFFUSION_PT_jobs")
     queue = queue_of(module)
     for seed in (FIRST_SEED, SECOND_SEED, FIRST_SEED):
         press("primdiffusion.generate", seed=seed)
         yield from wait(lambda: queue.request is not None and queue.request.step > 1, 120)
-        asked = time.monotonic()
+        start = time.monotonic()
         press("primdiffusion.cancel")
         yield from wait(lambda: not queue.busy, 10)
-        print(f"a work is cancelled: {time.monotonic() - asked:.2f} s", flush=True)
+        print(f"a job is cancelled: {time.monotonic() - start:.2f} s", flush=True)
     yield "cancelled"
 
 
 def missing(module: str, python: str) -> Steps:
-    """The person's files are away."""
+    """The person's files are missing."""
     yield from with_people(module, python, FIRST_SEED)
     folder = people_file(module).with_name(people_file(module).stem + "_humans")
     away = folder.with_name("elsewhere")
@@ -308,7 +308,7 @@ def languages(module: str, python: str) -> Steps:
 
 
 def stalls(module: str, python: str) -> Steps:
-    """A person enters the scene, twice, one is varied, then a slider is dragged: how long the window stands still."""
+    """Measures how long the window is blocked by adding two people, varying one, and dragging a slider."""
     yield from begin(module, python)
     yield from show("PRIMDIFFUSION_PT_generate")
     queue = queue_of(module)
@@ -317,7 +317,7 @@ def stalls(module: str, python: str) -> Steps:
         press("primdiffusion.generate", seed=seed)
         yield from wait(lambda: not queue.busy, 240)
         yield 3.0
-        print(f"a person is made: {measured.end()}", flush=True)
+        print(f"a person is added: {measured.end()}", flush=True)
     yield "stalls_person"
     select(armatures()[0])
     measured = Stalls()
@@ -335,7 +335,7 @@ def stalls(module: str, python: str) -> Steps:
 
 
 def paint(armature: bpy.types.Object) -> None:
-    """A chest of the body mesh, by weights: a brush's strokes need a hand."""
+    """Set the weights of the chest, because brush strokes need a mouse."""
     body = bpy.context.view_layer.objects.active
     group = body.vertex_groups.active
     mode = body.mode
@@ -348,7 +348,7 @@ def paint(armature: bpy.types.Object) -> None:
 
 
 def rendered_view() -> Steps:
-    """The engine in the viewport, the person large in it."""
+    """The engine in the viewport, with a large view of the person."""
     scene = bpy.context.scene
     scene.render.engine = "PRIMDIFFUSION"
     scene.view_settings.view_transform = "Standard"
@@ -357,7 +357,7 @@ def rendered_view() -> Steps:
 
 
 def click_generate() -> Steps:
-    """With the mouse, where the button is."""
+    """Click Generate Human with the mouse."""
     window, area = view()
     region = next(region for region in area.regions if region.type == "UI")
     x = region.x + region.width // 2 - 20
@@ -375,9 +375,9 @@ TRANSLATED = {
     "render": ("render", "attachment", "merge", "cycles_look", "memory", "export", "export_mesh", "export_volumes"),
     "captures": ("captures", *(f"captures_{name}" for name in ("input", "poses", "cameras", "cycles", "output"))),
 }
-"""Panels that are seen together in other languages."""
+"""Panels shown together in other languages."""
 GENERATE_BUTTON_PX = 118
-"""Below the top of the sidebar, in the panel as it opens."""
+"""Distance from the top of the sidebar, with the panel as it opens."""
 
 SCENES: dict[str, Callable[[str, str], Steps]] = {
     "set_up": set_up,

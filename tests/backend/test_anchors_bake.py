@@ -166,7 +166,7 @@ def test_the_charts_tile_the_grid():
 
 
 def test_a_lopsided_body_is_refused():
-    with pytest.raises(ValueError, match="mirror symmetry"):
+    with pytest.raises(ValueError, match="mirror image"):
         mirror_vertices(np.array([[0.1, 0, 0], [-0.2, 0, 0]]))
 
 
