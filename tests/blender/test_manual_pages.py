@@ -16,7 +16,10 @@ ROOT = Path(__file__).resolve().parents[2]
 MANUAL = ROOT / "docs" / "manual"
 PAGES = sorted(MANUAL.glob("*.md"))
 LINK = re.compile(r"(!?)\[[^\]]*\]\(([^)\s]+)\)")
-BUTTON = re.compile(r"draw_manual_button\(\s*[\w.]+,\s*\"(\w+)\"(?:,\s*\"([\w-]+)\")?\)")
+BUTTON = re.compile(
+    r"draw_manual_button\(\s*[\w.]+,\s*\"(\w+)\"(?:,\s*\"([\w-]+)\")?\)"
+    r"|manual_page(?:, manual_section)? = \"(\w+)\"(?:, \"([\w-]+)\")?"
+)
 
 
 def links(page: Path) -> list[str]:
@@ -41,7 +44,7 @@ def test_links_pictures_and_sections_are_there(page):
 
 def test_every_question_mark_of_a_panel_has_its_page_and_section():
     asked = {
-        found
+        (found[0] or found[2], found[1] or found[3])
         for file in (ROOT / "blender_primdiffusion").rglob("*.py")
         for found in BUTTON.findall(file.read_text(encoding="utf-8"))
     }
