@@ -81,15 +81,15 @@ def main() -> None:
         for _ in make_people(assets, PeopleSet(folder / "people", FIRST_SEED, count), 1):
             pass
         figures = {"people_per_second": None if arguments.quick else _people_per_second(assets)}
-        figures |= _fast(folder, poses, cameras)
-        figures |= _cycles(folder, poses, cameras) if importlib.util.find_spec("bpy") else _no_cycles()
+        figures |= _rasteriser_figures(folder, poses, cameras)
+        figures |= _cycles_figures(folder, poses, cameras) if importlib.util.find_spec("bpy") else _no_cycles_figures()
         both = (figures["processor_seconds_a_view_cycles_512"], figures["processor_seconds_a_view_fast_512"])
         figures["fast_speedup"] = both[0] / both[1] if both[0] else None
         walls = (figures["seconds_a_view_cycles_512"], figures["seconds_a_view_fast_512"])
         figures["fast_speedup_wall_one_process"] = walls[0] / walls[1] if walls[0] else None
         measurable = not arguments.quick and importlib.util.find_spec("bpy")
-        figures["memory_growth_mb_over_200_views"] = _growth(folder) if measurable else None
-        figures |= _loader(folder, 1.5 if arguments.quick else 5.0)
+        figures["memory_growth_mb_over_200_views"] = _memory_growth_mb(folder) if measurable else None
+        figures |= _loader_figures(folder, 1.5 if arguments.quick else 5.0)
     report(figures, arguments.json)
 
 
@@ -104,7 +104,7 @@ def _people_per_second(assets: Assets) -> float:
     return TIMED_PEOPLE / (moments[-1][1] - started)
 
 
-def _fast(folder: Path, poses: int, cameras: int) -> dict[str, float]:
+def _rasteriser_figures(folder: Path, poses: int, cameras: int) -> dict[str, float]:
     """Draws every person in one process; the first view of each person is not timed."""
     taken = built_in_poses().map(lambda values: values[:poses])
     job = Job(find_people(folder / "people"), taken, folder / "fast", Rig(count=cameras), samples=SAMPLES)
@@ -125,10 +125,10 @@ def _fast(folder: Path, poses: int, cameras: int) -> dict[str, float]:
     return {"seconds_a_view_fast_512": float(wall), "processor_seconds_a_view_fast_512": float(processor)}
 
 
-def _cycles(folder: Path, poses: int, cameras: int) -> dict[str, float | None]:
+def _cycles_figures(folder: Path, poses: int, cameras: int) -> dict[str, float | None]:
     moments = _run_cycles(folder / "people", folder / "cycles", poses, cameras, SIZE)
     captures = open_captures(folder / "cycles")
-    wall, processor = _pace(moments, len(captures.subjects))
+    wall, processor = _seconds_per_view(moments, len(captures.subjects))
     differences = compare(captures, find_people(folder / "people"), SAMPLES)
     return {
         "seconds_a_view_cycles_512": wall,
@@ -166,13 +166,13 @@ def _run_cycles(people: Path, out: Path, poses: int, cameras: int, size: int, *m
     return moments
 
 
-def _no_cycles() -> dict[str, float | None]:
+def _no_cycles_figures() -> dict[str, float | None]:
     names = ("seconds_a_view_cycles_512", "processor_seconds_a_view_cycles_512", "mask_iou_fast_vs_cycles",
              "psnr_fast_vs_cycles", "joint_reprojection_px_max")  # fmt: skip
     return dict.fromkeys(names)
 
 
-def _pace(moments: list[Moment], people: int) -> tuple[float, float]:
+def _seconds_per_view(moments: list[Moment], people: int) -> tuple[float, float]:
     """Wall and processor seconds per view, without each person's first view, which includes loading."""
     each = len(moments) // people
     later = [pair for i, pair in enumerate(itertools.pairwise(moments), start=1) if i % each]
@@ -180,7 +180,7 @@ def _pace(moments: list[Moment], people: int) -> tuple[float, float]:
     return wall, sum(after.processor_s - before.processor_s for before, after in later) / len(later)
 
 
-def _growth(folder: Path) -> float:
+def _memory_growth_mb(folder: Path) -> float:
     """Growth of the memory of Cycles' process between view 20 and view 200, in MB."""
     poses, cameras = 5, GROWTH_VIEWS // 5
     first = next(iter(find_people(folder / "people")))
@@ -188,7 +188,7 @@ def _growth(folder: Path) -> float:
     return moments[-1].resident_mb - moments[min(GROWTH_FROM, len(moments) - 1)].resident_mb
 
 
-def _loader(folder: Path, seconds: float) -> dict[str, float]:
+def _loader_figures(folder: Path, seconds: float) -> dict[str, float]:
     """Views per second that one worker delivers to training, in batches of 2 samples of 4 + 4 views."""
     captures = open_captures(folder / "fast")
     figures = {}

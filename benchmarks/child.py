@@ -38,7 +38,7 @@ for i in range(300_000):
     progress = {"id": 2, "stage": "sample", "step": i, "total": 300_000, "eta_s": 1.0}
     print(json.dumps({"jsonrpc": "2.0", "method": "progress", "params": progress}))
 """
-PATIENCE_S = 120.0
+TIMEOUT_S = 120.0
 
 
 class Timer:
@@ -51,8 +51,8 @@ class Timer:
         """Seconds until `reached` is true; raises TimeoutError."""
         began = time.monotonic()
         while not reached():
-            if time.monotonic() - began > PATIENCE_S:
-                raise TimeoutError(f"waited {PATIENCE_S:.0f} s for a job that is {job.state}: {job.message}")
+            if time.monotonic() - began > TIMEOUT_S:
+                raise TimeoutError(f"waited {TIMEOUT_S:.0f} s for a job that is {job.state}: {job.message}")
             before = time.monotonic()
             job.tick()
             self.longest_s = max(self.longest_s, time.monotonic() - before)

@@ -45,7 +45,7 @@ HEADING, LABEL = 24, 18
 """Heights in pixels of a row's heading and of a picture's caption."""
 GARMENTS = ("top", "bottom", "shoes", "hair", "skin")
 
-Shown = tuple[str, Human] | tuple[str, Human, float]
+Captioned = tuple[str, Human] | tuple[str, Human, float]
 """A picture's caption, the person on it, and the yaw of the camera in radians."""
 
 
@@ -57,13 +57,13 @@ class Studio:
         self.seconds: dict[str, list[float]] = defaultdict(list)
         self.people = [generate(model, seed, steps) for seed in range(4)]
 
-    def took(self, name: str, edit: Callable[[], Human]) -> Human:
+    def timed(self, name: str, edit: Callable[[], Human]) -> Human:
         began = time.perf_counter()
         edited = edit()
         self.seconds[f"{name}_seconds"].append(time.perf_counter() - began)
         return edited
 
-    def parts(self) -> Iterator[Shown]:
+    def parts(self) -> Iterator[Captioned]:
         """Which primitives belong to which part of the body."""
         person = self.people[0]
         yield "person", person
@@ -74,15 +74,15 @@ class Studio:
         for name, yaw in ((", ".join(GARMENTS[:3]), 0.0), (", ".join(GARMENTS[3:]), math.pi)):
             yield name, unions, yaw
 
-    def varied(self) -> Iterator[Shown]:
+    def varied(self) -> Iterator[Captioned]:
         """Variants at growing distances."""
         person = self.people[1]
         yield "before", person
         for amount in (0.2, 0.4, 0.6, 0.8, 1.0):
-            varied = self.took("vary", lambda amount=amount: vary(self.model, person, amount, 0, self.steps))
+            varied = self.timed("vary", lambda amount=amount: vary(self.model, person, amount, 0, self.steps))
             yield f"amount {amount}", varied
 
-    def inpainted(self) -> Iterator[Shown]:
+    def inpainted(self) -> Iterator[Captioned]:
         person = self.people[0]
         yield "before", person
         for parts, seed in (
@@ -94,7 +94,7 @@ class Studio:
         ):
             yield f"{' and '.join(parts)}, seed {seed}", self._inpainted(person, parts, seed)
 
-    def dressed(self) -> Iterator[Shown]:
+    def dressed(self) -> Iterator[Captioned]:
         """Clothes regenerated with the attributes given, if the model knows outfits."""
         person = self.people[3]
         outfits = self.model.vocabulary.categories.get("outfit", ())
@@ -107,21 +107,21 @@ class Studio:
         self, person: Human, parts: tuple[str, ...], seed: int, attributes: dict[str, str | float] | None = None
     ) -> Human:
         region = region_of(parts)
-        return self.took("inpaint", lambda: inpaint(self.model, person, region, seed, self.steps, attributes or {}))
+        return self.timed("inpaint", lambda: inpaint(self.model, person, region, seed, self.steps, attributes or {}))
 
-    def transferred(self) -> Iterator[Shown]:
+    def transferred(self) -> Iterator[Captioned]:
         """One person's clothes transferred to another."""
         target, source = self.people[1], self.people[2]
         top = region_of(["top"])
         yield "target", target
         yield "source", source
-        yield "texture of the top", self.took("transfer", lambda: transfer_texture(source, target, top))
-        garment = self.took("transfer", lambda: transfer_garment(source, target, top))
+        yield "texture of the top", self.timed("transfer", lambda: transfer_texture(source, target, top))
+        garment = self.timed("transfer", lambda: transfer_garment(source, target, top))
         yield "garment: top", garment
         yield "harmonised 0.3", self._harmonised(garment, top, 0.3)
         yield "texture of all clothes", transfer_texture(source, target, region_of(["clothes"]))
 
-    def harmonised(self) -> Iterator[Shown]:
+    def harmonised(self) -> Iterator[Captioned]:
         """Another person's head, which does not match the neck and hands at first."""
         target, source = self.people[3], self.people[0]
         region = region_of(["head", "hands"])
@@ -132,14 +132,14 @@ class Studio:
             yield f"head, hands: {amount}", self._harmonised(pasted, region, amount)
 
     def _harmonised(self, person: Human, region: torch.Tensor, amount: float) -> Human:
-        return self.took("harmonise", lambda: harmonise(self.model, person, region, amount, 0, self.steps))
+        return self.timed("harmonise", lambda: harmonise(self.model, person, region, amount, 0, self.steps))
 
-    def interpolated(self) -> Iterator[Shown]:
+    def interpolated(self) -> Iterator[Captioned]:
         """Steps of the interpolation from one person to another."""
         a, b = self.people[2], self.people[0]
         for number in range(COLUMNS):
             fraction = number / (COLUMNS - 1)
-            between = self.took("interpolate", lambda: interpolate(self.model, a, b, fraction, self.steps))  # noqa: B023
+            between = self.timed("interpolate", lambda: interpolate(self.model, a, b, fraction, self.steps))  # noqa: B023
             yield f"fraction {fraction:.1f}", between
 
 

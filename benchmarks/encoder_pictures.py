@@ -53,21 +53,21 @@ def row(model: EncoderModel, captures: Captures, name: str, novel_frame: int) ->
         view = seen.camera.map(lambda tensor: tensor[0])
         drawn, target = picture(march(primitives, view)), seen.image[0].float() / 255
         for image in (target, drawn) if number == 0 else (drawn, target):
-            yield cut(image, seen.mask[0])
+            yield cropped(image, seen.mask[0])
     for look in ("depth", "boxes"):
-        yield cut(looked_at(primitives, view, look), seen.mask[0])
+        yield cropped(drawn_view(primitives, view, look), seen.mask[0])
 
 
-def looked_at(primitives: Primitives, camera: Camera, look: str) -> Tensor:
+def drawn_view(primitives: Primitives, camera: Camera, look: str) -> Tensor:
     """The depth or the primitives, drawn over black, sRGB-encoded."""
     drawn = draw(Scene(primitives, chart=default_anchors().chart), camera, Look(look))
     return encode_srgb(torch.from_numpy(drawn.combined[..., :3]).clamp(0, 1))
 
 
-def cut(image: Tensor, mask: Tensor) -> np.ndarray:
+def cropped(image: Tensor, mask: Tensor) -> np.ndarray:
     """The square around the person, as bytes; black outside the picture."""
     rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
-    middle = [(int(places[0]) + int(places[-1])) / 2 for places in (rows, columns)]
+    middle = [(int(hits[0]) + int(hits[-1])) / 2 for hits in (rows, columns)]
     longest = max(int(rows[-1] - rows[0]), int(columns[-1] - columns[0])) + 1
     side = round(longest / (1 - 2 * MARGIN))
     top, left = (round(centre - side / 2) for centre in middle)

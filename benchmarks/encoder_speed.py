@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import torch
-from march import best
+from march import best_ms
 from primdiffusion.capture.conditioning import captured_person
 from primdiffusion.capture.dataset import batches
 from primdiffusion.capture.reader import Captures
@@ -41,8 +41,8 @@ def reconstruct_seconds(model: EncoderModel, captures: Captures, repeats: int) -
     whole()
     figures = {}
     for name, clock in (("", time.perf_counter), ("processor_", time.process_time)):
-        total = best(whole, repeats, clock) / 1e3
-        looked_up = best(unproject, repeats, clock) / 1e3
+        total = best_ms(whole, repeats, clock) / 1e3
+        looked_up = best_ms(unproject, repeats, clock) / 1e3
         figures |= {
             f"reconstruct_{name}seconds_cpu": total,
             f"reconstruct_unproject_{name}seconds_cpu": looked_up,

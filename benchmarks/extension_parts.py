@@ -48,7 +48,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float | None]:
     armature = armature_of(collection)
     context.view_layer.objects.active = armature
 
-    motion = _amass(arguments.folder / "amass.npz")
+    motion = _amass_file(arguments.folder / "amass.npz")
     start = time.perf_counter()
     bpy.ops.primdiffusion.import_motion(filepath=str(motion), timing="SOURCE")
     keyed = time.perf_counter() - start
@@ -87,11 +87,11 @@ def merged(arguments: argparse.Namespace) -> dict[str, float]:
     folder = arguments.folder / "person"
     build_human(bpy.context, folder / "human.npz", "Human", [folder / "person.human.safetensors"])
     setup_cycles_preview(bpy.context.scene, size=arguments.size, samples=1, world=0.48)
-    many = _rendered(arguments.folder / "cycles_volumes.png")
+    many = _render_seconds(arguments.folder / "cycles_volumes.png")
     start = time.perf_counter()
     bpy.ops.primdiffusion.merge()
     merging = time.perf_counter() - start
-    one = _rendered(arguments.folder / "cycles_merged.png")
+    one = _render_seconds(arguments.folder / "cycles_merged.png")
     return {
         "cycles_volumes_seconds": many,
         "cycles_merged_seconds": one,
@@ -153,7 +153,7 @@ def _enable(arguments: argparse.Namespace) -> None:
     blender_primdiffusion.register()
 
 
-def _amass(path: Path) -> Path:
+def _amass_file(path: Path) -> Path:
     """A file like those of AMASS: SMPL-H, z up, every body joint moving."""
     rng = np.random.default_rng(SEED)
     times = np.arange(MOTION_FRAMES) / 120.0
@@ -183,7 +183,7 @@ def _errors(collection: bpy.types.Collection, armature: bpy.types.Object, file: 
     return extension_oracle.errors(collection, armature, file, range(1, MOTION_FRAMES, 211))
 
 
-def _rendered(path: Path) -> float:
+def _render_seconds(path: Path) -> float:
     bpy.context.scene.render.filepath = str(path)
     start = time.perf_counter()
     bpy.ops.render.render(write_still=True)

@@ -58,7 +58,7 @@ class Row:
     """The time of `samples` at the processor's measured ceiling."""
 
 
-def best(call: Callable[[], object], repeats: int, clock: Callable[[], float] = time.process_time) -> float:
+def best_ms(call: Callable[[], object], repeats: int, clock: Callable[[], float] = time.process_time) -> float:
     """Milliseconds of the fastest of `repeats` calls."""
     fastest = float("inf")
     for _ in range(repeats):
@@ -93,7 +93,7 @@ def measured_row(scene: Scene, operations_per_second: float, repeats: int) -> Ro
     """The cost of one picture."""
     settings = MarchSettings()
     counted = count_samples(scene.primitives, scene.camera, settings)
-    forward = best(lambda: march(scene.primitives, scene.camera, settings), repeats)
+    forward = best_ms(lambda: march(scene.primitives, scene.camera, settings), repeats)
     alpha = march(scene.primitives, scene.camera, settings).alpha
     return Row(
         group=scene.group,
@@ -116,7 +116,7 @@ def speed(person: Primitives, operations_per_second: float, repeats: int) -> Fig
     figures |= {f"boxes_of_stride_{s}": int((stride == s).sum()) for s in MarchSettings().strides}
     for name, settings in (("4mm", MarchSettings()), ("1mm", UNIFORM_MILLIMETRE)):
         counted = count_samples(person, camera, settings)
-        milliseconds = best(lambda settings=settings: march(person, camera, settings), repeats)
+        milliseconds = best_ms(lambda settings=settings: march(person, camera, settings), repeats)
         floor = roofline_ms(counted.inside_boxes, operations_per_second)
         figures |= {
             f"cpu_forward_{name}_ms": milliseconds,
@@ -127,8 +127,8 @@ def speed(person: Primitives, operations_per_second: float, repeats: int) -> Fig
         }
     people = crowd()
     far = look_at(torch.tensor([0.0, 0.0, 8.0]), torch.zeros(3), vertical_fov=0.5, width=256, height=256)
-    figures["cpu_forward_crowd_ms"] = best(lambda: march(people, far), repeats)
-    figures["cpu_forward_4mm_wall_ms"] = best(lambda: march(person, camera), repeats, time.perf_counter)
+    figures["cpu_forward_crowd_ms"] = best_ms(lambda: march(people, far), repeats)
+    figures["cpu_forward_4mm_wall_ms"] = best_ms(lambda: march(person, camera), repeats, time.perf_counter)
     forward, backward = backward_ms(person, camera, max(repeats // 2, 2))
     figures |= {
         "cpu_forward_recorded_4mm_ms": forward,
@@ -136,8 +136,8 @@ def speed(person: Primitives, operations_per_second: float, repeats: int) -> Fig
         "cpu_backward_ratio": backward / float(figures["cpu_forward_4mm_ms"] or 0),
     }
     small = portrait(128)
-    slow = best(lambda: march_reference(person, small), 2)
-    figures["reference_over_cpu_128"] = slow / best(lambda: march(person, small), repeats)
+    slow = best_ms(lambda: march_reference(person, small), 2)
+    figures["reference_over_cpu_128"] = slow / best_ms(lambda: march(person, small), repeats)
     return figures
 
 
@@ -272,7 +272,7 @@ def main() -> None:
 
     person = standing_person()
     figures: Figures = {"threads": numba.get_num_threads()}
-    figures["first_call_s"] = best(lambda: march(person, portrait(64)), 1, time.perf_counter) / 1e3
+    figures["first_call_s"] = best_ms(lambda: march(person, portrait(64)), 1, time.perf_counter) / 1e3
     ceiling = float32_operations_per_second()
     figures["cpu_gflops_per_thread"] = ceiling / 1e9
     figures |= speed(person, ceiling, repeats)

@@ -50,7 +50,7 @@ def strong_poses(count: int) -> np.ndarray:
     return BodyPose.from_axis_angle(turns).joint_rotation.numpy()
 
 
-def stepping() -> np.ndarray:
+def step_pose() -> np.ndarray:
     """Rotations [24, 3, 3] of the pose in the pictures: a step, with bent arms."""
     turns = torch.zeros(24, 3, dtype=torch.float64)
     turns[1, 0], turns[2, 0], turns[5, 0] = -0.5, 0.35, 0.6
@@ -140,8 +140,8 @@ def main() -> None:
     figures["surface_error_mm_max"], figures["surface_error_deg_max"] = surface_error(human, armature, strong)
 
     armature.animation_data_clear()
-    pose_from_joint_rotations(armature, stepping())
-    joints = pose_body(human.betas, BodyPose(torch.from_numpy(stepping()).float(), torch.zeros(3))).skinning
+    pose_from_joint_rotations(armature, step_pose())
+    joints = pose_body(human.betas, BodyPose(torch.from_numpy(step_pose()).float(), torch.zeros(3))).skinning
     posed = PosedPerson(folder / "person.human.safetensors", torch.eye(3, 4).tolist(), joints[:, :3].tolist())
     session = Session()
     began = time.perf_counter()

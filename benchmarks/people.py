@@ -70,7 +70,7 @@ def camera_at(bounds: np.ndarray, yaw: float, pitch: float) -> Camera:
 
 def compare(drawn: RasterImage, marched: Rendering) -> dict[str, float]:
     first, second = drawn.alpha > 0.5, marched.alpha.numpy() > 0.5
-    squared = (displayed(drawn.rgb) - displayed(marched.rgb.numpy())) ** 2
+    squared = (encoded(drawn.rgb) - encoded(marched.rgb.numpy())) ** 2
     rows, columns = np.nonzero(first)
     box = squared[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     return {
@@ -83,7 +83,7 @@ def compare(drawn: RasterImage, marched: Rendering) -> dict[str, float]:
     }
 
 
-def displayed(rgb: np.ndarray) -> np.ndarray:
+def encoded(rgb: np.ndarray) -> np.ndarray:
     """Linear colours as sRGB-encoded values, 0 ... 1."""
     return encode_srgb(np.clip(rgb, 0, 1))
 
@@ -93,7 +93,7 @@ def psnr(squared: np.ndarray) -> float:
     return float(-10 * np.log10(squared.mean()))
 
 
-def bent() -> BodyPose:
+def bent_pose() -> BodyPose:
     theta = torch.zeros(J, 3)
     for joint, axis_angle in BENDS.items():
         theta[JOINT_NAMES.index(joint)] = torch.tensor(axis_angle, dtype=torch.float32)
@@ -113,7 +113,7 @@ def measure(assets: Assets, people: int, directions: int, pictures: Path | None)
         payload, seconds_colour = timed(lambda field=field, mesh=person.mesh: colour(field, mesh))
         for name, value in zip(seconds, (seconds_person, seconds_field, seconds_colour), strict=True):
             seconds[name].append(value)
-        posed = shaped.pose(bent())
+        posed = shaped.pose(bent_pose())
         scenes = {
             "people": (person.mesh, frames),
             "posed": (person.mesh.posed(posed.skinning.numpy()), attach(anchors, posed.vertices, body.faces)),
@@ -140,7 +140,7 @@ def picture_of(
     camera = camera_at(mesh.bounds, yaw, pitch)
     drawn, marched = rasterise(mesh, camera, supersample=2), march(primitives, camera)
     if path:
-        pair = np.concatenate([displayed(drawn.rgb), displayed(marched.rgb.numpy())], axis=1)
+        pair = np.concatenate([encoded(drawn.rgb), encoded(marched.rgb.numpy())], axis=1)
         Image.fromarray(np.rint(pair * 255).astype(np.uint8)).save(path)
     return compare(drawn, marched)
 

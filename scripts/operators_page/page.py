@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import bpy
 
-BEGINNING = Path(__file__).with_name("beginning.md")
+INTRODUCTION = Path(__file__).with_name("introduction.md")
 _INHERITED = frozenset(bpy.types.Operator.bl_rna.properties.keys()) | {"rna_type"}
 _OURS = "PRIMDIFFUSION_"
 _OWNERS = (
@@ -22,7 +22,7 @@ _OWNERS = (
 
 def page() -> str:
     """The page: a handwritten introduction, then operators and settings, each sorted by name."""
-    parts = [BEGINNING.read_text(encoding="utf-8").rstrip(), "", "## Operators", ""]
+    parts = [INTRODUCTION.read_text(encoding="utf-8").rstrip(), "", "## Operators", ""]
     for operator in sorted(operators(), key=lambda cls: cls.bl_idname):
         parts += _operator(operator)
     parts += ["## Settings", ""]

@@ -1,4 +1,4 @@
-"""Runs inside Blender's window: installs the zip, then plays the scenes of `story.py` from a timer, step by step.
+"""Runs inside Blender's window: installs the zip, then plays the scenes of `scenes.py` from a timer, step by step.
 
 A scene is a generator. It yields seconds to wait, the name of a screenshot to take, or an input:
 {"point": [x, y], "click": True} or {"key": "Escape"}.
@@ -23,14 +23,14 @@ MODULE = "bl_ext.user_default.primdiffusion"
 
 def play() -> Iterator[float]:
     """Play all scenes; yields seconds to wait between steps."""
-    import story
+    import scenes
     from setting_up import set_up_real
 
     asked_for = {"set_up_real": set_up_real} if "set_up_real" in SCENES else {}
     yield 2.0
     install()
     yield 0.5
-    for name, scene in {**story.SCENES, **asked_for}.items():
+    for name, scene in {**scenes.SCENES, **asked_for}.items():
         if SCENES and name not in SCENES:
             continue
         print(f"scene {name}", flush=True)

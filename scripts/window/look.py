@@ -4,7 +4,7 @@
     python scripts/window/look.py --chroot DEBIAN_FOLDER --out window_out      # Blender of a distribution in a folder
 
 Builds the zip, starts Xvfb (Debian's package xvfb) and Blender with software OpenGL, and runs `drive.py` in it, which
-plays the scenes of `story.py` and requests screenshots of the whole screen (taken by ImageMagick's import) and clicks
+plays the scenes of `scenes.py` and requests screenshots of the whole screen (taken by ImageMagick's import) and clicks
 (made by xdotool). Next to each NAME.png, NAME.json gives the position of the sidebar. The exit code is Blender's, which
 is not 0 if a scene failed. A chroot needs /proc, /dev, /tmp/.X11-unix and this checkout mounted at their own paths.
 """

@@ -37,7 +37,7 @@ def show(*names: str | None) -> Iterator[float]:
     """
     global _shown
     _shown = None if names == (None,) else {name for name in names if name}
-    opened = bpy.types.PRIMDIFFUSION_PT_generate.__dict__.get("window_story")
+    opened = bpy.types.PRIMDIFFUSION_PT_generate.__dict__.get("window_scenes")
     if not opened:
         _open_all()
     yield from sidebar()
@@ -52,7 +52,7 @@ def _open_all() -> None:
         cls.bl_idname = getattr(cls, "bl_idname", cls.__name__)
         cls.bl_options = {*getattr(cls, "bl_options", ())} - {"DEFAULT_CLOSED"}
         cls.poll = _polled(cls, getattr(cls, "poll", None))
-        cls.window_story = True
+        cls.window_scenes = True
         bpy.utils.register_class(cls)
 
 

@@ -12,10 +12,10 @@ from importlib import import_module
 from pathlib import Path
 
 import bpy
-from beginnings import armatures, begin, cancel_all, people_file, queue_of, select, with_people
 from panels import show, sidebar, view, wide_view
 from press import Steps, invoke, press, wait
 from stalls import Stalls
+from start import armatures, begin, cancel_all, people_file, queue_of, select, with_people
 
 FIRST_SEED, SECOND_SEED = 3, 53
 
