@@ -28,8 +28,7 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.fit_data import FitDataset, FitSample, betas_of, fit_batches, fit_dataset
-from primdiffusion.training.fit_losses import Features, loss_terms
-from primdiffusion.training.fit_perceptual import load_perceptual
+from primdiffusion.training.fit_losses import Features, load_perceptual, loss_terms
 from primdiffusion.training.fit_run import MODEL, STATE, FitRecorder, FitState, begin, save
 from primdiffusion.training.recorder import Interrupt, StepMetrics, StepTimer
 from primdiffusion.training.run_folder import versions
