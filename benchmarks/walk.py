@@ -55,10 +55,11 @@ class Trace:
 
 
 def main() -> None:
-    parser = record.command_line(__doc__)
-    arguments = parser.parse_args()
-    import isolated_blender  # before bpy; not in the child
+    # not in the child; isolated_blender before bpy
+    import isolated_blender
     import record
+
+    arguments = record.command_line(__doc__).parse_args()
 
     with tempfile.TemporaryDirectory(prefix="primdiffusion_walk_") as name:
         folder = Path(name)

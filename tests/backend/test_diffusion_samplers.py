@@ -8,11 +8,11 @@ from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 from primdiffusion.diffusion.samplers import SAMPLERS, ddim, ddpm, dpmpp_2m, gaussian_noise
 from primdiffusion.diffusion.schedule import (
     CLEAN,
+    Schedule,
     leading_steps,
     linear,
     sqrt_linear,
     trailing_steps,
-    zero_terminal_snr,
 )
 
 F64 = torch.float64
@@ -226,7 +226,8 @@ def test_too_few_generators_are_refused():
 
 def test_dpmpp_2m_starts_where_there_is_no_signal():
     # the first step is then infinitely long, and the second must not extrapolate from it
-    schedule = zero_terminal_snr(linear())
+    root = linear().alpha_bar.sqrt()
+    schedule = Schedule(((root - root[-1]) * root[0] / (root[0] - root[-1])) ** 2)  # Lin et al. 2024, alg. 1
     chain = trailing_steps(1000, 6)
     steps = list(dpmpp_2m(of_mixture(schedule), schedule, start(), chain, []))
     assert steps[-1].x.isfinite().all()

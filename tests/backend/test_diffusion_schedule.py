@@ -4,16 +4,15 @@ import numpy as np
 import pytest
 import torch
 from diffusers import DDPMScheduler
-from diffusers.schedulers.scheduling_ddim import rescale_zero_terminal_snr
 from primdiffusion.diffusion.schedule import (
     CLEAN,
+    Schedule,
     dense_steps,
     fine_linear,
     leading_steps,
     linear,
     sqrt_linear,
     trailing_steps,
-    zero_terminal_snr,
 )
 from scipy.stats import kstest
 
@@ -60,14 +59,6 @@ def test_epsilon_inverts_q_sample():
     schedule, noise, x0 = linear(), torch.randn(3, 2, dtype=torch.float64), torch.randn(3, 2, dtype=torch.float64)
     x = schedule.q_sample(x0, torch.full((3,), 700), noise)
     assert torch.allclose(schedule.epsilon(x, x0, 700), noise, atol=1e-12)
-
-
-def test_zero_terminal_snr_is_that_of_diffusers_and_keeps_the_first_step():
-    ours, betas = zero_terminal_snr(linear()), torch.linspace(1e-4, 2e-2, 1000, dtype=torch.float64)
-    theirs = torch.cumprod(1 - rescale_zero_terminal_snr(betas), 0)
-    assert torch.allclose(ours.alpha_bar, theirs, atol=1e-12)
-    assert ours.signal(999) == 0
-    assert ours.signal(0) == pytest.approx(linear().signal(0), abs=1e-12)
 
 
 def test_trailing_steps_begin_at_the_end_and_leading_steps_are_the_released_ones():
@@ -127,7 +118,7 @@ def test_half_log_snr_is_the_logarithm_of_signal_over_noise(schedule):
 
 
 def test_half_log_snr_without_a_signal_is_minus_infinite():
-    assert zero_terminal_snr(linear()).half_log_snr(999) == -math.inf
+    assert Schedule(torch.tensor([0.5, 0.0], dtype=torch.float64)).half_log_snr(1) == -math.inf
 
 
 def test_betas_outside_their_range_are_refused():

@@ -94,15 +94,6 @@ def sqrt_linear(length: int = 1000, first: float = 1e-4, last: float = 2e-2) -> 
     return _from_betas(torch.linspace(first**0.5, last**0.5, length, dtype=torch.float64) ** 2)
 
 
-def zero_terminal_snr(schedule: Schedule) -> Schedule:
-    """The schedule shifted and scaled in sqrt(alpha_bar) so that step T-1 holds noise only (Lin et al. 2024, alg. 1).
-
-    A sampler may then start from pure noise without losing variety. Epsilon prediction is impossible at T-1; x0 is not.
-    """
-    root = schedule.alpha_bar.sqrt()
-    return Schedule(((root - root[-1]) * root[0] / (root[0] - root[-1])) ** 2)
-
-
 def fine_linear(length: int = 1000, last: float = 2e-2) -> Schedule:
     """beta linear in t from nearly 0, so that the first steps hold less noise than the finest detail of people.
 
