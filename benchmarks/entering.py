@@ -4,8 +4,8 @@
 without a pause. Scripts and background mode do it at once: at_once_build_ms, then at_once_evaluate_ms until Blender
 can draw. In a window, a timer writes the volumes in slices (write_ms) and reads their grids in slices (read_ms, each
 slice longest_read_ms at most); only enter_build_ms and enter_undo_ms, which includes evaluating the scene, block the
-window. second_* are the same for a second person in the scene. edit_* are for replacing that second person with all
-volumes changed (at_once_edit_ms is without slices, including evaluation). Drawing is not included;
+window. second_* are the same for a second person in the scene. edit_* are for replacing a person with all volumes
+changed; at_once_edit_ms and at_once_edit_evaluate_ms are the same without slices. Drawing is not included;
 `scripts/window/look.py --scenes stalls` includes it.
 """
 
@@ -79,14 +79,14 @@ def edit(person: bpy.types.Collection, human: Path, file: Path) -> dict[str, flo
 
 def main() -> None:
     parser = command_line(__doc__)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="primdiffusion_entering_") as folder:
         figures = measured(Path(folder))
-    report(figures, given.json)
+    report(figures, arguments.json)
 
 
 def measured(folder: Path) -> dict[str, float]:
-    """Figures of a person added at once, one added in parts, a second one beside them, and edits of the second one."""
+    """Figures of a person added at once, one added in parts, a second one beside them, and edits of both."""
     people = [folder / f"human_{seed}.npz" for seed in range(5)]
     for seed, path in enumerate(people):
         export_for_blender(path, checkered_human(seed))

@@ -1,4 +1,4 @@
-"""Three people walk side by side in an endless loop; the floor below each moves by their stride once per loop."""
+"""Three people walk side by side in an endless loop; the floor below each moves by one of their strides per loop."""
 
 from __future__ import annotations
 
