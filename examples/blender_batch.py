@@ -18,7 +18,7 @@ def main(options: list[str]) -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", type=int, nargs=2, default=(7, 8))
     parser.add_argument("--steps", type=int, default=30)
-    parser.add_argument("--motion", type=Path, help="of the second person: AMASS .npz, .bvh ...; not given: a walk")
+    parser.add_argument("--motion", type=Path, help="for the second person: AMASS .npz, .bvh, ...; default: a walk")
     parser.add_argument("--frames", type=int, nargs="+", default=[1, 12])
     parser.add_argument("--size", type=int, nargs=2, default=(640, 480))
     arguments = parser.parse_args(options)

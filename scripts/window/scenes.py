@@ -269,7 +269,7 @@ def cancelled(module: str, python: str) -> Steps:
         start = time.monotonic()
         press("primdiffusion.cancel")
         yield from wait(lambda: not queue.busy, 10)
-        print(f"a job is cancelled: {time.monotonic() - start:.2f} s", flush=True)
+        print(f"cancelling a job: {time.monotonic() - start:.2f} s", flush=True)
     yield "cancelled"
 
 
@@ -317,21 +317,21 @@ def stalls(module: str, python: str) -> Steps:
         press("primdiffusion.generate", seed=seed)
         yield from wait(lambda: not queue.busy, 240)
         yield 3.0
-        print(f"a person is added: {measured.end()}", flush=True)
+        print(f"adding a person: {measured.end()}", flush=True)
     yield "stalls_person"
     select(armatures()[0])
     measured = Stalls()
     press("primdiffusion.vary", seed=SECOND_SEED)
     yield from wait(lambda: not queue.busy, 240)
     yield 3.0
-    print(f"a person is varied: {measured.end()}", flush=True)
+    print(f"varying a person: {measured.end()}", flush=True)
     settings = armatures()[0].primdiffusion_human
     yield 2.0
     measured = Stalls()
     for move in range(10):
         settings.betas[0] = 0.2 * move
         yield 0.01
-    print(f"a slider is dragged: {measured.end()}", flush=True)
+    print(f"dragging a slider: {measured.end()}", flush=True)
 
 
 def paint(armature: bpy.types.Object) -> None:
