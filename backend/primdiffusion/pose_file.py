@@ -19,7 +19,7 @@ BODY_NUMBERS = 66
 """Axis-angle numbers of the 22 joints before the hands, the same in SMPL, SMPL-H and SMPL-X."""
 
 
-class PoseFileError(ValueError):
+class InvalidPoseError(ValueError):
     """A file without a valid pose."""
 
 
@@ -29,7 +29,7 @@ def read_pose(path: str | Path, frame: int = 0) -> BodyPose:
     JSON: a list of 72 numbers or 24 rows of 3, or an object with such a "pose" and a "translation" in metres.
     SMPL-H and SMPL-X give 22 joints (`body_theta`).
 
-    Raises FileNotFoundError and PoseFileError.
+    Raises FileNotFoundError and InvalidPoseError.
     """
     path = Path(path)
     if not path.is_file():
@@ -40,14 +40,14 @@ def read_pose(path: str | Path, frame: int = 0) -> BodyPose:
         else:
             content = read_arrays(path, optional=(*POSE_KEYS, *TRANSLATION_KEYS))
     except (ValueError, OSError) as e:
-        raise PoseFileError(
+        raise InvalidPoseError(
             f"{path} is neither JSON nor an npz of plain arrays ({e}): convert it to one of these"
         ) from e
     return pose_from_numbers(content, str(path), frame)
 
 
 def pose_from_numbers(content: Any, name: str, frame: int = 0) -> BodyPose:
-    """Parse a list, or a mapping with "pose" and "translation"; errors call it `name`. Raises PoseFileError."""
+    """Parse a list, or a mapping with "pose" and "translation"; errors call it `name`. Raises InvalidPoseError."""
     pose, translation = content, [0.0, 0.0, 0.0]
     if isinstance(content, dict):
         pose = _first(content, POSE_KEYS, None)
@@ -59,11 +59,11 @@ def pose_from_numbers(content: Any, name: str, frame: int = 0) -> BodyPose:
         if len(move) < 3:
             raise ValueError(f"{len(move)} numbers instead of 3")
     except (TypeError, ValueError, IndexError) as e:
-        raise PoseFileError(
+        raise InvalidPoseError(
             f"{name} holds no pose: it needs {3 * J} axis-angle numbers ({J} joints x 3, radians)"
         ) from e
     if not (np.isfinite(theta).all() and np.isfinite(move).all()):
-        raise PoseFileError(f"{name} holds NaN or infinite numbers: export the pose again")
+        raise InvalidPoseError(f"{name} holds NaN or infinite numbers: export the pose again")
     return BodyPose.from_axis_angle(torch.from_numpy(theta), torch.from_numpy(move))
 
 

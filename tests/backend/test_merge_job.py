@@ -10,7 +10,7 @@ import torch
 from primdiffusion.body.model import BodyPose
 from primdiffusion.commands.frame import PosedPerson
 from primdiffusion.commands.merge import FitGainRequest, MergeFramesRequest, MergeRequest
-from primdiffusion.commands.request import Request, read_request
+from primdiffusion.commands.request import RequestRecord, read_request
 from primdiffusion.commands.session import Session
 from primdiffusion.export.merged_file import upright_grid
 from primdiffusion.formats.requests import DENSITY_GAIN
@@ -45,7 +45,7 @@ def quiet(*_: object, **__: object) -> None:
     """Hears no report."""
 
 
-def done(request: Request, report=quiet) -> dict:
+def done(request: RequestRecord, report=quiet) -> dict:
     request.check()
     return request.run(Session(), report)
 

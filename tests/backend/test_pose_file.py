@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose
-from primdiffusion.pose_file import PoseFileError, pose_from_numbers, read_pose
+from primdiffusion.pose_file import InvalidPoseError, pose_from_numbers, read_pose
 
 THETA = np.linspace(-1, 1, 72).astype(np.float32)
 
@@ -46,7 +46,7 @@ def test_an_npz_that_would_run_code_is_refused(tmp_path):
 
     path = tmp_path / "trap.npz"
     np.savez(path, poses=np.array([Trap()], dtype=object))
-    with pytest.raises(PoseFileError, match=r"trap\.npz"):
+    with pytest.raises(InvalidPoseError, match=r"trap\.npz"):
         read_pose(path)
     assert not (tmp_path / "trapped").exists()
 
@@ -55,17 +55,17 @@ def test_an_npz_that_would_run_code_is_refused(tmp_path):
     "content", [[1, 2, 3], {"theta": None}, {"pose": "up"}, {}, [[0, 0, 0]] * 23, [math.nan] * 72, None, {"pose": []}]
 )
 def test_numbers_that_are_no_pose_are_refused_by_name(content):
-    with pytest.raises(PoseFileError, match=r"my pose"):
+    with pytest.raises(InvalidPoseError, match=r"my pose"):
         pose_from_numbers(content, "my pose")
 
 
 def test_a_frame_beyond_the_end_and_a_missing_file_are_errors(tmp_path):
     path = tmp_path / "one.npz"
     np.savez(path, poses=np.zeros((2, 72)))
-    with pytest.raises(PoseFileError):
+    with pytest.raises(InvalidPoseError):
         read_pose(path, frame=2)
     with pytest.raises(FileNotFoundError, match="none"):
         read_pose(tmp_path / "none.json")
     (tmp_path / "text.json").write_text("{")
-    with pytest.raises(PoseFileError):
+    with pytest.raises(InvalidPoseError):
         read_pose(tmp_path / "text.json")

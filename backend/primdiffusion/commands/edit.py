@@ -64,7 +64,7 @@ class EditRequest:
     """Width and height of previews while sampling, pixels; 0 for none."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         check_steps(self.steps)
         check_size(self.size)
         check_picture_px(self.picture_px)
@@ -174,7 +174,7 @@ class VaryRequest(EditRequest):
     """How closely attributes are followed; 1 is plain conditioning, more costs variety."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         super().check()
         check_unit_interval("amount", self.amount)
         check_seed(self.seed)
@@ -201,7 +201,7 @@ class InterpolateRequest(EditRequest):
     """0 is exactly the first human, 1 exactly the second."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         super().check()
         check_unit_interval("fraction", self.fraction)
         if self.steps < 2:
@@ -238,7 +238,7 @@ class InpaintRequest(EditRequest):
     """How closely attributes are followed; 1 is plain conditioning, more costs variety."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         super().check()
         self.region.check()
         check_seed(self.seed)
@@ -269,7 +269,7 @@ class TransferRequest(EditRequest):
     """Selects one of the possible results."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         super().check()
         self.region.check()
         check_unit_interval("harmonise", self.harmonise)

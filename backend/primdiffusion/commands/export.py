@@ -38,7 +38,7 @@ class ProxyRequest:
     """Spacing of the grid that the surface is extracted from, metres."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         check_betas(self.betas)
 
     def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
@@ -85,7 +85,7 @@ class GaussiansRequest:
     """Largest number of Gaussians."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         check_betas(self.betas)
         if (self.object is None) != (self.joints is None):
             raise ValueError("object and joints go together: give both, or neither for the T pose")
@@ -130,7 +130,7 @@ class HumanNpzRequest:
     """Width and height of the previews, pixels."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         check_size(self.size)
 
     def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
@@ -182,7 +182,7 @@ class ExportCommand:
     """Frame of a pose file with several."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         write = _writer(self.out)
         if self.pose is not None and write is not _write_gaussians:
             raise ValueError(f"{self.out.name} cannot store a pose: omit --pose, or export Gaussians to a .ply")

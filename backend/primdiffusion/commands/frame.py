@@ -59,7 +59,7 @@ class FrameSpec:
     """Metres between samples of a ray through humans of natural size; scaled humans are sampled in proportion."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         for person in self.people:
             person.check()
         check_sides(self.width, self.height)

@@ -68,7 +68,7 @@ class GenerateRequest:
     """Width and height of previews while sampling, pixels; 0 for none."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         check_seed(self.seed)
         check_steps(self.steps)
         check_size(self.size)
@@ -138,7 +138,7 @@ class GenerateCommand(GenerateRequest):
     humans in the last digits."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         super().check()
         for name in ("count", "batch"):
             if getattr(self, name) < 1:
@@ -187,7 +187,7 @@ class VariationsRequest:
     """Strength of the variation, as in `vary`."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         if not 1 <= len(self.seeds) <= MOST_VARIATIONS:
             raise ValueError(f"{len(self.seeds)} seeds were given: choose 1 to {MOST_VARIATIONS}")
         for seed in self.seeds:

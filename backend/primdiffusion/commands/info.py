@@ -26,7 +26,7 @@ class InfoCommand:
     """A .human.safetensors, a checkpoint or an encoder; without it versions, device, memory and the package's cards."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
 
     def show(self) -> None:
         """Print one JSON object."""
@@ -75,7 +75,7 @@ class AttributesRequest:
     """Trained model (.safetensors); the default is the one in the package."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
 
     def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
         """Raises as read_card."""

@@ -42,7 +42,7 @@ class MergeRequest:
     """Voxel size, metres."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         check_voxel(self.voxel)
         _check_people(self.people)
 
@@ -69,7 +69,7 @@ class MergeFramesRequest:
     """Voxel size, metres."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         check_voxel(self.voxel)
         _check_people(self.people)
 
@@ -102,7 +102,7 @@ class FitGainRequest:
     """Humans in the pose to fit in."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         _check_people(self.people)
 
     def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
@@ -206,7 +206,7 @@ class MergeCommand:
         print(self.out)
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         if not self.humans:
             raise ValueError("no file was given: give at least one .human file")
         if self.out.suffix.lower() not in (".vdb", ".npz"):

@@ -58,7 +58,7 @@ class ReconstructRequest:
     """Width and height of the previews, pixels."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         if self.frame < 0:
             raise ValueError(f"frame is {self.frame}: frames are numbered from 0")
         if self.views < 1:

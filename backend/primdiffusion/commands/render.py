@@ -42,7 +42,7 @@ class RenderRequest:
     """A second PNG, of the depth."""
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         check_sides(self.width, self.height)
         check_angle("yaw", self.yaw, "radians")
 
@@ -145,7 +145,7 @@ class RenderCommand:
         print(self.out)
 
     def check(self) -> None:
-        """See `Request`."""
+        """See `RequestRecord`."""
         check_angle("yaw", self.yaw, "degrees")
         check_step(self.step)
         if self.depth is not None and self.depth.resolve() == self.out.resolve():

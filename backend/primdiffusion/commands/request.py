@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from primdiffusion.diffusion.samplers import SamplerStep
 
 R = TypeVar("R")
-AnyRequest = TypeVar("AnyRequest", bound="Request")
+AnyRequest = TypeVar("AnyRequest", bound="RequestRecord")
 AnyChecked = TypeVar("AnyChecked", bound="Checked")
 LARGEST_SEED = 2**63 - 1
 STEP_LIMIT = 1000
@@ -47,12 +47,8 @@ class ReportProgress(Protocol):
         ...
 
 
-class Request(Protocol):
+class RequestRecord(Checked, Protocol):
     """A request of a program or a user; the records of this package are such dataclasses."""
-
-    def check(self) -> None:
-        """Raise ValueError, naming the field, for values out of range; reads no files."""
-        ...
 
     def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
         """Run the request; the result is that of JSON-RPC (docs/design/protocol.md). `report` may raise to cancel."""

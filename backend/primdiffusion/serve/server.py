@@ -29,7 +29,7 @@ from primdiffusion.commands.info import AttributesRequest
 from primdiffusion.commands.merge import FitGainRequest, MergeFramesRequest, MergeRequest
 from primdiffusion.commands.reconstruct import ReconstructRequest
 from primdiffusion.commands.render import DrawRequest, RenderRequest
-from primdiffusion.commands.request import ParameterError, Request, read_record, read_request
+from primdiffusion.commands.request import ParameterError, RequestRecord, read_record, read_request
 from primdiffusion.failures import ErrorDescription, describe
 from primdiffusion.machine import memory, share_processors
 from primdiffusion.serve.rpc import (
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 R = TypeVar("R")
 PROTOCOL = 1
 HEARTBEAT_S = 0.5
-REQUESTS: dict[str, type[Request]] = {
+REQUESTS: dict[str, type[RequestRecord]] = {
     "generate": GenerateRequest,
     "variations": VariationsRequest,
     "attributes": AttributesRequest,
@@ -95,7 +95,7 @@ class Running:
     """The running request."""
 
     message: RpcRequest
-    request: Request
+    request: RequestRecord
     cancelled: threading.Event = dataclasses.field(default_factory=threading.Event)
 
 
