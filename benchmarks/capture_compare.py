@@ -11,8 +11,8 @@ from PIL import Image
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.reader import Captures, Subject
+from primdiffusion.capture.render import JPEG_QUALITY, sit, srgb_bytes
 from primdiffusion.capture.sheet import default_joints, joints_of
-from primdiffusion.capture.subject import JPEG_QUALITY, sit, srgb_bytes
 from primdiffusion.formats.picture_files import DEPTH_UNIT
 from primdiffusion.raster.multisample import shoot
 

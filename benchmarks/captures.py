@@ -32,12 +32,11 @@ import numpy as np
 import psutil
 from capture_compare import compare, joint_error_px
 from primdiffusion.capture.dataset import CaptureDataset, SampleSettings, batches
-from primdiffusion.capture.pack import pack
+from primdiffusion.capture.dataset import pack
 from primdiffusion.capture.people_files import find_people, read_person
 from primdiffusion.capture.poses import built_in_poses
-from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import Captures, open_captures
-from primdiffusion.capture.subject import begin, draw_frames, sit
+from primdiffusion.capture.render import Job, begin, draw_frames, render, sit
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.folder import PeopleSet, make_people

@@ -70,8 +70,7 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.image_metrics import detail_energy
 from primdiffusion.people.assets import Assets, open_assets
-from primdiffusion.people.fitted import head_centre
-from primdiffusion.people.payloads import make_payloads, rest_frames
+from primdiffusion.people.payloads import head_centre, make_payloads, rest_frames
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
 from record import report

@@ -22,8 +22,16 @@ from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.human import Human, people_of
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh
-from primdiffusion.people.fitted import HEAD_EXTENT, HEAD_FOV, fitted_payloads, head_centre, orbit_camera
-from primdiffusion.people.payloads import VARIANT_STRIDE, rest_frames, voxels_from_payload
+from primdiffusion.people.payloads import (
+    HEAD_EXTENT,
+    HEAD_FOV,
+    VARIANT_STRIDE,
+    fitted_payloads,
+    head_centre,
+    orbit_camera,
+    rest_frames,
+    voxels_from_payload,
+)
 from primdiffusion.people.person import Person, make_person, recolour
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field

@@ -22,8 +22,8 @@ from encoder_speed import VIEWS, reconstruct_seconds, step_seconds
 from march import from_script
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
-from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import Captures, open_captures
+from primdiffusion.capture.render import Job, render
 from primdiffusion.encoder.model import EncoderModel, load_encoder
 from primdiffusion.evaluation.image_metrics import Lpips, load_lpips
 from primdiffusion.evaluation.reconstruction import EvaluationSettings, Means, evaluate, summary, table

@@ -21,8 +21,8 @@ from primdiffusion.capture.conditioning import conditioning_views, default_betas
 from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
-from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import open_captures
+from primdiffusion.capture.render import Job, render
 from primdiffusion.commands.reconstruct import split_cameras
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import encode_srgb

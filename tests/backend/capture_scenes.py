@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.poses import built_in_poses
-from primdiffusion.capture.rasterised import PASSES, Job, render
+from primdiffusion.capture.render import PASSES, Job, render
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart

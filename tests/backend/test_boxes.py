@@ -9,7 +9,7 @@ import torch
 from march_scenes import camera_at, one_box, random_boxes
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.boxes import EDGE_LIGHT, LIT, box_colours, draw_boxes
+from primdiffusion.render.solids import EDGE_LIGHT, LIT, box_colours, draw_boxes
 
 
 def every_hit(boxes: Primitives, camera: Camera, start: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

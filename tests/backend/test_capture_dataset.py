@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 import torch
 from capture_scenes import captured
-from primdiffusion.capture.dataset import CaptureDataset, Position, SampleSettings, batches
-from primdiffusion.capture.pack import open_pack, pack, pack_path
-from primdiffusion.capture.reader import open_captures
-from primdiffusion.capture.windows import Window, resample, through, whole
+from primdiffusion.capture.dataset import CaptureDataset, Position, SampleSettings, batches, open_pack, pack, pack_path
+from primdiffusion.capture.reader import Window, open_captures, resample, through, whole
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.geometry.records import TensorRecord
 

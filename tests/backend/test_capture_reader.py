@@ -14,10 +14,9 @@ from primdiffusion import cli
 from primdiffusion.body.model import BodyPose
 from primdiffusion.body.smpl_pickle import UnsafePickleError
 from primdiffusion.capture.people_files import read_person
-from primdiffusion.capture.rasterised import render
 from primdiffusion.capture.reader import CaptureFileError, open_captures
+from primdiffusion.capture.render import render, sit
 from primdiffusion.capture.sheet import default_joints, draw_sheet, reprojection_error
-from primdiffusion.capture.subject import sit
 from primdiffusion.capture.verify import verify
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.arrays import ArrayFileError, read_numbers

@@ -14,9 +14,8 @@ import psutil
 import pytest
 from capture_scenes import box_person, captured, save_person, small_job
 from primdiffusion import cli
-from primdiffusion.capture.glb import GlbError, read_glb
-from primdiffusion.capture.people_files import find_people, read_person
-from primdiffusion.capture.rasterised import render
+from primdiffusion.capture.people_files import GlbError, find_people, read_glb, read_person
+from primdiffusion.capture.render import render
 from primdiffusion.capture.verify import verify
 from primdiffusion.commands.captures import parse_shard
 from primdiffusion.formats import capture_layout
@@ -154,7 +153,7 @@ def test_a_killed_run_is_gone_on_with_and_leaves_the_same_files(tmp_path):
 import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
 from pathlib import Path
 from capture_scenes import small_job
-from primdiffusion.capture.rasterised import render
+from primdiffusion.capture.render import render
 from primdiffusion.capture.verify import verify
 list(render(small_job(Path({str(tmp_path)!r}), frames=12)))
 """

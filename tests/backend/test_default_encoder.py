@@ -7,8 +7,8 @@ from fit_scenes import patched_person
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.conditioning import conditioning_views, default_betas
 from primdiffusion.capture.poses import built_in_poses
-from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import open_captures
+from primdiffusion.capture.render import Job, render
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import default_encoder, load_encoder
 from primdiffusion.formats.camera_rig import Rig

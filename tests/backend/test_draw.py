@@ -7,18 +7,16 @@ import numpy as np
 import pytest
 import torch
 from march_scenes import camera_at, one_box, random_boxes
-from primdiffusion.drawing.bands import FIRST_PIXELS, GROWTH, draw_in_bands
-from primdiffusion.drawing.draw import depth_span, draw
+from primdiffusion.drawing.draw import FIRST_PIXELS, GROWTH, depth_span, draw, draw_in_bands
 from primdiffusion.drawing.scene import NOTHING, Look, Picture, Scene
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.z_buffer import nearest_triangles
-from primdiffusion.render.boxes import draw_boxes
 from primdiffusion.render.image import depth_colours
 from primdiffusion.render.lattice import MarchSettings, Span
 from primdiffusion.render.reference import march_reference
-from primdiffusion.render.solids import Solids, shade_solids
+from primdiffusion.render.solids import Solids, draw_boxes, shade_solids
 
 RED = (0.8, 0.1, 0.1)
 BACKGROUND = (0.1, 0.3, 0.6)

@@ -5,7 +5,7 @@ import torch
 from capture_scenes import save_person
 from fit_scenes import forget_processes, patched_person, rows
 from primdiffusion.capture.poses import built_in_poses
-from primdiffusion.capture.rasterised import Job, render
+from primdiffusion.capture.render import Job, render
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.training.fit import fit
 from primdiffusion.training.fit_config import FitConfig

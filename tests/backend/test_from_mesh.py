@@ -7,9 +7,8 @@ import torch
 import trimesh
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, UnusableMesh
-from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, from_mesh, surface_field, voxel_centres
+from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, from_mesh, nearest, surface_field, voxel_centres
 from primdiffusion.primitives.primitives import Frames, Primitives
-from primdiffusion.primitives.surface_points import nearest
 from primdiffusion.raster.rasterise import RasterImage, rasterise
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.march import march

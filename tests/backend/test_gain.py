@@ -8,8 +8,8 @@ import torch
 from primdiffusion.formats.requests import DENSITY_GAIN
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.gain import FAINT, fit_gain, unclamped_alpha
 from primdiffusion.render.march import march
+from primdiffusion.render.merge import FAINT, fit_gain, unclamped_alpha
 
 
 def pile(density: float) -> Primitives:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, UnusableMesh
-from primdiffusion.people.fitted import fitted_payloads, orbit_camera
+from primdiffusion.people.payloads import fitted_payloads, orbit_camera
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.cpu import march_cpu
 from primdiffusion.render.inverse import InverseSettings, Target, fit_colours, fit_payload

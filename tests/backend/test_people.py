@@ -15,15 +15,14 @@ import pytest
 import torch
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.people import assets as assets_module
-from primdiffusion.people import fitted as fitted_module
 from primdiffusion.people import load_base_mesh, make_person, open_assets, recolour
+from primdiffusion.people import payloads as payloads_module
 from primdiffusion.people import person as person_module
+from primdiffusion.people.appearance import SkinColours, skin_texture
 from primdiffusion.people.assets import ENVIRONMENT_VARIABLE, AssetsMissingError
-from primdiffusion.people.fitted import fitted_payloads, orbit_camera
 from primdiffusion.people.fitting import shown_faces, under_hat, under_hem
 from primdiffusion.people.mhclo import parse_mhclo
-from primdiffusion.people.payloads import is_complete, make_payloads, rest_frames
-from primdiffusion.people.skin import SkinColours, skin_texture
+from primdiffusion.people.payloads import fitted_payloads, is_complete, make_payloads, orbit_camera, rest_frames
 from primdiffusion.people.wardrobe import HAIR, HATS, OUTFITS, choose, draw_body, required_meshes
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, from_mesh
 from primdiffusion.primitives.primitives import Payload, Primitives
@@ -253,14 +252,14 @@ def test_payloads_are_stored_whole_and_mended(assets, tmp_path):
 def test_fitted_payloads_look_more_like_the_mesh_in_each_colouring_from_sides_that_were_not_shown(
     assets, people, monkeypatch
 ):
-    monkeypatch.setattr(fitted_module, "BODY_VIEWS", 8)
-    monkeypatch.setattr(fitted_module, "HEAD_VIEWS", 6)
+    monkeypatch.setattr(payloads_module, "BODY_VIEWS", 8)
+    monkeypatch.setattr(payloads_module, "HEAD_VIEWS", 6)
     colourings = [people[0].mesh, recolour(people[0], 77).mesh]
     frames = rest_frames(people[0].betas)
     low, high = people[0].mesh.bounds
     views = {
         "body": orbit_camera((low + high) / 2, 1.1 * float((high - low).max()), 33, 3, 0.5, 256),
-        "head": orbit_camera(fitted_module.head_centre(people[0].betas), 0.42, 21, 5, 0.2, 128),
+        "head": orbit_camera(payloads_module.head_centre(people[0].betas), 0.42, 21, 5, 0.2, 128),
     }
 
     def psnr(payload: Payload, mesh, view: str) -> float:

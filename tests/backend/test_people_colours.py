@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from primdiffusion.people import palette, patterns
-from primdiffusion.people.colour import bytes_from_lab, lab_from_bytes
-from primdiffusion.people.texel_map import connected_faces, texel_map, uv_islands
+from primdiffusion.people.colours import bytes_from_lab, hair_colour, lab_from_bytes
+from primdiffusion.people.fitting import connected_faces, uv_islands
+from primdiffusion.people.garments import PATTERNS, SHOULDER_X, SHOULDER_Y, hanging_height
+from primdiffusion.raster.uv_atlas import texel_map
 
 SQUARE = np.array([[[0.0, 0], [0.5, 0], [0.5, 0.5]], [[0, 0], [0.5, 0.5], [0, 0.5]]])
 
@@ -53,7 +54,7 @@ def test_islands_part_where_texture_coordinates_do():
     assert uv_islands(corner_uv).tolist() == [0, 0, 1]
 
 
-@pytest.mark.parametrize(("name", "pattern"), patterns.PATTERNS)
+@pytest.mark.parametrize(("name", "pattern"), PATTERNS)
 def test_patterns_show_both_colours_and_are_mirror_symmetric(name, pattern):
     draws = np.random.default_rng(1)
     position = draws.uniform((-0.6, -0.1, -0.2), (0.6, 0.5, 0.2), (4000, 3))
@@ -65,14 +66,14 @@ def test_patterns_show_both_colours_and_are_mirror_symmetric(name, pattern):
 
 
 def test_bands_run_on_from_body_to_sleeve():
-    body = np.array([[patterns.SHOULDER_X - 1e-6, patterns.SHOULDER_Y, 0.0]])
-    sleeve = np.array([[patterns.SHOULDER_X + 1e-6, patterns.SHOULDER_Y, 0.0]])
-    assert patterns.hanging_height(body) == pytest.approx(patterns.hanging_height(sleeve), abs=1e-5)
+    body = np.array([[SHOULDER_X - 1e-6, SHOULDER_Y, 0.0]])
+    sleeve = np.array([[SHOULDER_X + 1e-6, SHOULDER_Y, 0.0]])
+    assert hanging_height(body) == pytest.approx(hanging_height(sleeve), abs=1e-5)
 
 
 @pytest.mark.parametrize("tone", [0.0, 0.3, 1.0])
 def test_hair_shares_are_those_of_the_tone(tone):
     draws = np.random.default_rng(2)
-    names = [palette.hair_colour(tone, False, draws)[0] for _ in range(600)]
+    names = [hair_colour(tone, False, draws)[0] for _ in range(600)]
     dark = sum(name in ("black", "darkbrown") for name in names) / 600
     assert dark == pytest.approx({0.0: 0.36, 0.3: 0.5904, 1.0: 0.84}[tone], abs=0.06)

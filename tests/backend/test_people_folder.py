@@ -16,10 +16,9 @@ import pytest
 from primdiffusion.people import assets as assets_module
 from primdiffusion.people import folder as folder_module
 from primdiffusion.people import load_base_mesh, make_person, open_assets
-from primdiffusion.people.assets import ENVIRONMENT_VARIABLE
-from primdiffusion.people.covering import cover
+from primdiffusion.people.assets import ENVIRONMENT_VARIABLE, licence_of
+from primdiffusion.people.fitting import cover
 from primdiffusion.people.folder import OtherPeopleError, PeopleSet, is_whole, make_people
-from primdiffusion.people.licences import licence_of
 from primdiffusion.people.wardrobe import SKIRTS, required_meshes
 
 NEARBY = Path(__file__).resolve().parents[3] / "shared" / "data" / "makehuman"

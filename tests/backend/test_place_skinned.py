@@ -5,8 +5,7 @@ import math
 
 import pytest
 import torch
-from primdiffusion.body.model import BodyModel, BodyPose, default_body
-from primdiffusion.body.skinning import relative_rotations
+from primdiffusion.body.model import BodyModel, BodyPose, default_body, relative_rotations
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.rotation import axis_angle_to_matrix, polar
 from primdiffusion.human import Human, generate, place, place_skinned, pose_body

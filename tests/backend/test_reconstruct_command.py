@@ -13,7 +13,7 @@ from capture_scenes import box, captured, save_person, small_job
 from PIL import Image
 from primdiffusion import cli
 from primdiffusion.capture.conditioning import captured_person, choose_subject, conditioning_views
-from primdiffusion.capture.rasterised import render
+from primdiffusion.capture.render import render
 from primdiffusion.commands import output
 from primdiffusion.commands.reconstruct import ReconstructRequest
 from primdiffusion.commands.request import read_request

@@ -12,8 +12,8 @@ from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.capture.conditioning import conditioning_views
 from primdiffusion.capture.dataset import Views, stack
 from primdiffusion.capture.poses import built_in_poses
-from primdiffusion.capture.rasterised import Job, render
 from primdiffusion.capture.reader import open_captures
+from primdiffusion.capture.render import Job, render
 from primdiffusion.commands.reconstruct import split_cameras
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import encode_srgb

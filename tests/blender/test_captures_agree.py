@@ -11,7 +11,7 @@ import torch
 from blender_primdiffusion.formats.camera_rig import Rig, bounding_sphere
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.people_files import read_person
-from primdiffusion.capture.subject import sit
+from primdiffusion.capture.render import sit
 from primdiffusion.formats import camera_rig as backend_rig
 from test_scan_rigs import load, own_person
 

@@ -15,9 +15,17 @@ from torch import Tensor
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.dataset import Views, stack
 from primdiffusion.capture.people_files import LARGEST_BETA
-from primdiffusion.capture.reader import CAMERAS_FILE, Captures, Subject, as_camera, open_captures
+from primdiffusion.capture.reader import (
+    CAMERAS_FILE,
+    Captures,
+    Subject,
+    as_camera,
+    open_captures,
+    resample,
+    through,
+    whole,
+)
 from primdiffusion.capture.sheet import default_joints, joints_of
-from primdiffusion.capture.windows import resample, through, whole
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
 

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import MotionFileError, choose_poses, read_motion, read_motions
-from primdiffusion.capture.rasterised import PASSES, Job, render
+from primdiffusion.capture.render import PASSES, Job, render
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
 
@@ -156,7 +156,7 @@ class InfoOfCaptures:
     def run(self) -> None:
         """Print one JSON object."""
         # used by this subcommand alone
-        from primdiffusion.capture.pack import open_pack
+        from primdiffusion.capture.dataset import open_pack
         from primdiffusion.capture.reader import open_captures
 
         captures = open_captures(self.root)
@@ -185,7 +185,7 @@ class PackCaptures:
     def run(self) -> None:
         """Pack, and print a line for each subject."""
         # used by this subcommand alone
-        from primdiffusion.capture.pack import pack
+        from primdiffusion.capture.dataset import pack
         from primdiffusion.capture.reader import open_captures
 
         captures = open_captures(self.root)

@@ -6,9 +6,8 @@ import dataclasses
 from pathlib import Path
 
 from primdiffusion.commands.request import check_betas, check_numbers, check_sides
-from primdiffusion.drawing.steps import check_step
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.requests import RAY_STEP, VIEWS, View
+from primdiffusion.formats.requests import RAY_STEP, VIEWS, View, check_step
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,7 @@ import torch
 from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.commands.frame import FrameSpec
 from primdiffusion.commands.request import ReportProgress
-from primdiffusion.drawing.bands import BAND_SECONDS, FIRST_PIXELS, draw_in_bands
+from primdiffusion.drawing.draw import BAND_SECONDS, FIRST_PIXELS, draw_in_bands
 from primdiffusion.drawing.scene import Look, Picture, Scene
 from primdiffusion.failures import PictureOutOfMemory, out_of_memory
 from primdiffusion.formats.arrays import read_arrays

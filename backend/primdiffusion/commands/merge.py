@@ -111,7 +111,7 @@ class FitGainRequest:
 
         # torch is loaded late
         from primdiffusion.human import framing
-        from primdiffusion.render.gain import fit_gain, unclamped_alpha
+        from primdiffusion.render.merge import fit_gain, unclamped_alpha
 
         primitives = _together(self.people)
         reached = []

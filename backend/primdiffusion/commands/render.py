@@ -14,8 +14,7 @@ import tyro
 
 from primdiffusion.commands.frame import FrameSpec
 from primdiffusion.commands.request import ReportProgress, check_angle, check_sides, parse
-from primdiffusion.drawing.steps import check_step
-from primdiffusion.formats.requests import PICTURE_SIZE, RAY_STEP, VIEWS, View
+from primdiffusion.formats.requests import PICTURE_SIZE, RAY_STEP, VIEWS, View, check_step
 from primdiffusion.staging import written_whole
 
 if TYPE_CHECKING:

@@ -60,3 +60,14 @@ def check_unit_interval(name: str, value: float) -> None:
     """Raise ValueError unless `value` is in [0, 1]."""
     if not 0 <= value <= 1:
         raise ValueError(f"{name} is {value}: choose a number from 0 to 1")
+
+
+FINEST_STEP = 1e-4
+"""Metres; a finer step takes hours without visible gain."""
+COARSEST_STEP = 1.0
+
+
+def check_step(step: float) -> None:
+    """Raise ValueError if `step`, metres between samples of a ray, is out of range."""
+    if not FINEST_STEP <= step <= COARSEST_STEP:
+        raise ValueError(f"the step is {step} m: choose {FINEST_STEP} to {COARSEST_STEP}")

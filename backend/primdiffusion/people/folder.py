@@ -26,13 +26,12 @@ import torch
 
 from primdiffusion.body.model import default_body
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.people.assets import Assets
+from primdiffusion.people.assets import UNKNOWN, Assets, licence_of
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.gltf import Skeleton, glb
-from primdiffusion.people.licences import UNKNOWN, licence_of
 from primdiffusion.people.person import Person, make_person
-from primdiffusion.people.pool import each
 from primdiffusion.staging import written_whole
+from primdiffusion.worker_process import each
 
 FORMAT, VERSION = "primdiffusion-people", 1
 MANIFEST, GLB, CARD = "manifest.json", "person.glb", "person.json"

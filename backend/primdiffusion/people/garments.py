@@ -1,21 +1,27 @@
-"""Recolour clothes: replace the colours of each piece and keep the texture's shading."""
+"""Recolour clothes: replace the colours of each piece, keep the texture's shading, and draw two-colour patterns.
+
+A pattern takes rest positions on the average body (metres, arms level) and returns the weight of the second colour,
+0 to 1. Phases are fixed and features are at least a few centimetres wide: voxels of about one centimetre cannot
+represent more detail, and a network could not learn random phases.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.ndimage import binary_erosion, distance_transform_edt, gaussian_filter
 
-from primdiffusion.people import palette, patterns
+from primdiffusion.people import colours
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import BaseMesh
-from primdiffusion.people.colour import bytes_from_linear, lab_from_bytes, luminance
-from primdiffusion.people.fitting import fit_item
-from primdiffusion.people.texel_map import connected_faces, texel_map, uv_islands
+from primdiffusion.people.colours import bytes_from_linear, lab_from_bytes, luminance
+from primdiffusion.people.fitting import connected_faces, fit_item, uv_islands
 from primdiffusion.people.wardrobe import Garment, Kind, Piece, stream
+from primdiffusion.raster.uv_atlas import texel_map
 
 SIZE = 512
 """Texture size; a texel covers about 3 mm of cloth."""
@@ -58,7 +64,7 @@ class Paint:
     trim: Float[np.ndarray, "3"]
     second: Float[np.ndarray, "3"]
     pattern: str
-    """A name of `patterns.PATTERNS`, "solid", or "original" for the pack's own colours."""
+    """A name of `PATTERNS`, "solid", or "original" for the pack's own colours."""
 
 
 @functools.lru_cache(maxsize=24)
@@ -116,7 +122,7 @@ def coloured(fabric: Cloth, paints: tuple[Paint, ...]) -> UInt8[np.ndarray, "H W
     trim = np.stack([paint.trim for paint in paints]).astype(np.float64)
     target = np.where(fabric.trim[..., None], trim[fabric.piece], main[fabric.piece])
     for number, paint in enumerate(paints):
-        pattern = dict(patterns.PATTERNS).get(paint.pattern)
+        pattern = dict(PATTERNS).get(paint.pattern)
         if pattern is not None:
             here = (fabric.piece == number) & ~fabric.trim
             share = pattern(fabric.position[here])[:, None].astype(np.float64)
@@ -139,15 +145,15 @@ def _is_skin(colour: Float[np.ndarray, "3"], skin: UInt8[np.ndarray, "3"]) -> bo
 def _paint(piece: Piece, draws: np.random.Generator) -> Paint:
     """Draw the colours of a piece; only tops may be patterned."""
     kind = piece.kind
-    main = palette.garment_colour(kind, draws)
+    main = colours.garment_colour(kind, draws)
     partner = "shirt" if kind == "suit" else "top"
-    trim = palette.contrasting(main, partner, draws)
+    trim = colours.contrasting(main, partner, draws)
     if kind != "suit" and draws.random() < PLAIN_TRIM_SHARE:
         trim = main
-    second = palette.contrasting(main, "top", draws)
+    second = colours.contrasting(main, "top", draws)
     pattern = "solid"
-    if kind == "top" and draws.random() > patterns.SOLID_SHARE:
-        pattern = patterns.PATTERNS[draws.integers(len(patterns.PATTERNS))][0]
+    if kind == "top" and draws.random() > SOLID_SHARE:
+        pattern = PATTERNS[draws.integers(len(PATTERNS))][0]
     if draws.random() < ORIGINAL_SHARE.get(kind, 0.0) and not piece.smooth:
         pattern = "original"
     return Paint(main, trim, second, pattern)
@@ -187,3 +193,73 @@ def _occlusion(assets: Assets, garment: Garment) -> Float[np.ndarray, "H W"] | n
     if not assets.has_picture(name):
         return np.float64(1)
     return 0.45 + 0.55 * assets.picture(name, SIZE)[..., :3].astype(np.float64).mean(-1) / 255
+
+
+Pattern = Callable[[Float[np.ndarray, "*b 3"]], Float[np.ndarray, "*b"]]
+
+SHOULDER_X, SHOULDER_Y, EDGE = 0.2, 0.254, 0.003
+"""Start of the sleeves, height of the arms, and half width of soft edges, metres."""
+
+
+def hanging_height(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
+    """Height with the arms hanging down, along which bands are drawn, metres."""
+    along_arm = np.abs(position[..., 0]) - SHOULDER_X
+    return np.where(along_arm > 0, np.minimum(position[..., 1], SHOULDER_Y) - along_arm, position[..., 1])
+
+
+def bands(position: Float[np.ndarray, "*b 3"], period: float = 0.14) -> Float[np.ndarray, "*b"]:
+    """Horizontal stripes around body and sleeves."""
+    return _soft(_wave(hanging_height(position) / period) - 0.25, EDGE / period)
+
+
+def plaid(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
+    """Crossing bands: weight 1 at crossings, 0.5 elsewhere on a band."""
+    across = np.where(np.abs(position[..., 0]) > SHOULDER_X, position[..., 2], position[..., 0])
+    along = _soft(_wave(across / 0.12) - 0.25, EDGE / 0.12)
+    return 0.5 * (bands(position, 0.12) + along)
+
+
+def dots(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
+    """Large dots in staggered rows, projected from the front."""
+    row = np.floor(position[..., 1] / 0.08)
+    x = position[..., 0] / 0.1 + 0.5 * (row % 2)
+    distance = np.hypot((x - np.rint(x)) * 0.1, position[..., 1] - (row + 0.5) * 0.08)
+    return _soft(0.026 - distance, EDGE)
+
+
+def sleeves(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
+    """Sleeves in the second colour."""
+    # Excludes the hips, which can be as wide.
+    raised = position[..., 1] > SHOULDER_Y - 0.25
+    return np.where(raised, _soft(np.abs(position[..., 0]) - SHOULDER_X + 0.02, EDGE), 0)
+
+
+def yoke(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
+    """Shoulders and arms in the second colour, down to the chest."""
+    return _soft(position[..., 1] - (SHOULDER_Y - 0.1), EDGE)
+
+
+def chest_band(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
+    """One wide band around the chest and both upper arms."""
+    return _soft(0.06 - np.abs(hanging_height(position) - (SHOULDER_Y - 0.14)), EDGE)
+
+
+SOLID_SHARE = 0.7
+PATTERNS: tuple[tuple[str, Pattern], ...] = (
+    ("sleeves", sleeves),
+    ("yoke", yoke),
+    ("chest band", chest_band),
+    ("bands", bands),
+    ("plaid", plaid),
+    ("dots", dots),
+)
+
+
+def _wave(phase: np.ndarray) -> np.ndarray:
+    """A triangle wave of period 1 between 0 and 0.5."""
+    return np.abs(phase - np.rint(phase))
+
+
+def _soft(signed: np.ndarray, width: float) -> np.ndarray:
+    """Ramp from 0 at `signed` = -width to 1 at +width."""
+    return np.clip(0.5 + 0.5 * signed / width, 0, 1)

@@ -9,13 +9,20 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
-from primdiffusion.people import eyes, faces, garments, hair, palette, skin
+from primdiffusion.people import appearance, colours, garments
 from primdiffusion.people.assets import Assets
-from primdiffusion.people.base_mesh import BaseMesh
-from primdiffusion.people.colour import bytes_from_linear
-from primdiffusion.people.covering import cover, sunk
-from primdiffusion.people.fitting import fit_item, item_skinning, shown_faces, under_hat, under_hem
-from primdiffusion.people.texel_map import connected_faces
+from primdiffusion.people.base_mesh import BaseMesh, draw_face, with_face
+from primdiffusion.people.colours import bytes_from_linear
+from primdiffusion.people.fitting import (
+    connected_faces,
+    cover,
+    fit_item,
+    item_skinning,
+    shown_faces,
+    sunk,
+    under_hat,
+    under_hem,
+)
 from primdiffusion.people.wardrobe import EYES, Choice, choose, hair_path, stream
 
 BROW_SIZE = 512
@@ -50,7 +57,7 @@ def make_person(assets: Assets, base: BaseMesh, seed: int) -> Person:
         AssetsMissingError, ProxyFileError: asset files are missing or damaged.
     """
     choice = choose(seed, femininity(base))
-    return _coloured(assets, base, choice, _geometry(assets, base, choice, faces.draw_face(stream(seed, "face"))), seed)
+    return _coloured(assets, base, choice, _geometry(assets, base, choice, draw_face(stream(seed, "face"))), seed)
 
 
 def recolour(person: Person, seed: int) -> Person:
@@ -68,7 +75,7 @@ def femininity(base: BaseMesh) -> Float[np.ndarray, "10"]:
 
 def _geometry(assets: Assets, base: BaseMesh, choice: Choice, face: Float[np.ndarray, " M"]) -> TexturedMesh:
     """Fit all parts, with plain textures; coordinates are rounded so that they do not depend on the machine."""
-    vertices = faces.with_face(base.vertices(choice.betas), base, face)
+    vertices = with_face(base.vertices(choice.betas), base, face)
     paths = {
         "outfit": choice.outfit.path,
         "shoes": choice.shoes.path,
@@ -124,25 +131,25 @@ def _compact(part: TexturedPart) -> TexturedPart:
 
 def _coloured(assets: Assets, base: BaseMesh, choice: Choice, mesh: TexturedMesh, seed: int) -> Person:
     """Draw all colours from a seed and texture the geometry."""
-    complexion = skin.draw_skin(assets, choice.sex, stream(seed, "skin"))
-    hair_name, hair_linear = palette.hair_colour(complexion.tone, complexion.age == "old", stream(seed, "hair colour"))
-    iris = eyes.draw_eyes(assets, complexion.tone, stream(seed, "eye colour"))
-    skin_picture = skin.skin_texture(assets, complexion)
+    complexion = appearance.draw_skin(assets, choice.sex, stream(seed, "skin"))
+    hair_name, hair_linear = colours.hair_colour(complexion.tone, complexion.age == "old", stream(seed, "hair colour"))
+    iris = appearance.draw_eyes(assets, complexion.tone, stream(seed, "eye colour"))
+    skin_picture = appearance.skin_texture(assets, complexion)
     bare = np.median(skin_picture[::16, ::16, :3].reshape(-1, 3), axis=0).astype(np.uint8)
     outfit = garments.paint_garment(choice.outfit, stream(seed, "outfit colour"), bare)
     shoes = garments.paint_garment(choice.shoes, stream(seed, "shoe colour"))
     textures: dict[str, UInt8[np.ndarray, "H W 4"]] = {
         "body": skin_picture,
-        "eyes": eyes.eye_texture(assets, iris),
-        "eyebrows": hair.tinted_cutout(assets.picture(choice.eyebrows, BROW_SIZE), 0.35 * hair_linear),
-        "eyelashes": hair.tinted_cutout(assets.picture(choice.eyelashes, BROW_SIZE), np.full(3, 0.006)),
+        "eyes": appearance.eye_texture(assets, iris),
+        "eyebrows": appearance.tinted_cutout(assets.picture(choice.eyebrows, BROW_SIZE), 0.35 * hair_linear),
+        "eyelashes": appearance.tinted_cutout(assets.picture(choice.eyelashes, BROW_SIZE), np.full(3, 0.006)),
         "outfit": garments.coloured(garments.cloth(assets, base, choice.outfit), outfit),
         "shoes": garments.coloured(garments.cloth(assets, base, choice.shoes), shoes),
     }
     if choice.hair:
-        textures["hair"] = hair.coloured_strands(hair.strands(assets, choice.hair), hair_linear)
+        textures["hair"] = appearance.coloured_strands(appearance.strands(assets, choice.hair), hair_linear)
     if choice.hat:
-        colour = palette.garment_colour("hat", stream(seed, "hat colour"))
+        colour = colours.garment_colour("hat", stream(seed, "hat colour"))
         textures["hat"] = np.append(bytes_from_linear(colour), np.uint8(255)).reshape(1, 1, 4)
     parts = tuple(dataclasses.replace(part, texture=textures[part.name]) for part in mesh.parts)
     attributes: dict[str, str | float] = {
@@ -158,7 +165,9 @@ def _coloured(assets: Assets, base: BaseMesh, choice: Choice, mesh: TexturedMesh
         "eyes": iris,
         "height": round(float(mesh.parts[0].vertices[:, 1].max() - mesh.bounds[0, 1]), 4),
     }
-    used = (choice.outfit.path, choice.shoes.path, choice.eyebrows, choice.eyelashes, EYES, complexion.base,
-            complexion.other, eyes.picture_of(iris), choice.hair and hair_path(choice.hair), choice.hat)  # fmt: skip
+    used = (
+        choice.outfit.path, choice.shoes.path, choice.eyebrows, choice.eyelashes, EYES, complexion.base,
+        complexion.other, appearance.picture_of(iris), choice.hair and hair_path(choice.hair), choice.hat,
+    )  # fmt: skip
     sources = tuple(dict.fromkeys(file for name in used if name for file in assets.files(name)))
     return Person(TexturedMesh(parts), choice.betas, attributes, sources, choice, assets, base)

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
+from scipy.ndimage import distance_transform_edt
 
 from primdiffusion.raster.z_buffer import barycentrics, z_buffer
 
@@ -78,3 +79,36 @@ def closest_in_uv(
         barycentric[n, first[nearest]] = 1 - fraction[nearest]
         barycentric[n, second[nearest]] += fraction[nearest]
     return face, barycentric
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TexelMap:
+    """The mesh point of each texel of an image, whose row 0 is v = 1.
+
+    Texels between islands map to the nearest one, so that seams do not bleed.
+    """
+
+    face: Int[Array, "H W"]
+    barycentric: Float[Array, "H W 3"]
+    """Clamped to the triangle for texels outside every island."""
+    inside: Array
+    """[H, W] bool: the texel's centre is inside a triangle."""
+
+    def sample(self, per_vertex: Float[Array, "V C"], faces: Int[Array, "F 3"]) -> Float[Array, "H W C"]:
+        """Interpolate a vertex quantity at each texel, float64."""
+        corners = per_vertex[faces[self.face]]
+        return np.einsum("hwk,hwkc->hwc", self.barycentric, corners)
+
+
+def texel_map(corner_uv: Float[Array, "F 3 2"], size: int) -> TexelMap:
+    """Rasterise texture coordinates at `size` x `size` texels.
+
+    Raises:
+        ValueError: no texel's centre is inside a triangle.
+    """
+    raster = rasterise_uv(np.asarray(corner_uv, np.float64) * (1, -1) + (0, 1), size, size)
+    inside = raster.covered
+    if not inside.any():
+        raise ValueError(f"no texel of {size} x {size} is covered: the mesh has no texture coordinates")
+    nearest = np.asarray(distance_transform_edt(~inside, return_distances=False, return_indices=True))
+    return TexelMap(raster.face[tuple(nearest)], raster.barycentric[tuple(nearest)].astype(np.float32), inside)

@@ -13,19 +13,24 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 from numpy import ndarray
 
-from primdiffusion.render.cpu_compiled import index, kernel, part, take
+from primdiffusion.render.cpu_compiled import TILE, index, kernel, part, take
 from primdiffusion.render.cpu_forward import NEVER
-from primdiffusion.render.cpu_hits import ENTER, HIT_ROWS, LANES, LEAVE, TABLE_ROWS, hit_rays, lowest
 from primdiffusion.render.cpu_sampling import (
+    ENTER,
+    HIT_ROWS,
+    LANES,
+    LEAVE,
     PIXELS,
     SAMPLES,
+    TABLE_ROWS,
+    hit_rays,
+    lowest,
     place_samples,
     reference_point,
     tabulate,
     tile_rays,
 )
 from primdiffusion.render.cpu_vectors import adjoin_sample
-from primdiffusion.render.tiles import TILE
 
 RAYS = 4096
 """Rays that are weighed at a time."""

@@ -9,18 +9,23 @@ from jaxtyping import Float32, Int32, Int64, UInt64
 from numpy import ndarray
 
 from primdiffusion.render.compositing import SURFACE_OPACITY
-from primdiffusion.render.cpu_compiled import index, kernel, part, take
-from primdiffusion.render.cpu_hits import ENTER, HIT_ROWS, LANES, LEAVE, TABLE_ROWS, hit_boxes, lowest
+from primdiffusion.render.cpu_compiled import TILE, index, kernel, part, take
 from primdiffusion.render.cpu_sampling import (
+    ENTER,
+    HIT_ROWS,
+    LANES,
+    LEAVE,
     PIXELS,
     SAMPLES,
+    TABLE_ROWS,
     add_segment,
+    hit_boxes,
     leave_empty,
+    lowest,
     reference_point,
     tabulate,
     tile_rays,
 )
-from primdiffusion.render.tiles import TILE
 
 CHUNK = 16
 """Lattice points gathered before they are composited: long enough to amortise the loop, short enough to stop early."""

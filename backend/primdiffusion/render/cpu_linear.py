@@ -18,12 +18,22 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu import draw_with_ends
 from primdiffusion.render.cpu_adjoint import counted_steps
-from primdiffusion.render.cpu_compiled import index, kernel, part
+from primdiffusion.render.cpu_compiled import TILE, index, kernel, part
 from primdiffusion.render.cpu_forward import NEVER
-from primdiffusion.render.cpu_hits import HIT_ROWS, LANES, TABLE_ROWS, hit_rays, lowest
-from primdiffusion.render.cpu_sampling import PIXELS, SAMPLES, place_samples, reference_point, tabulate, tile_rays
+from primdiffusion.render.cpu_sampling import (
+    HIT_ROWS,
+    LANES,
+    PIXELS,
+    SAMPLES,
+    TABLE_ROWS,
+    hit_rays,
+    lowest,
+    place_samples,
+    reference_point,
+    tabulate,
+    tile_rays,
+)
 from primdiffusion.render.lattice import MarchSettings
-from primdiffusion.render.tiles import TILE
 
 COLOUR, DENSITY, OPACITY = 0, 1, 4
 """Columns of `PictureJacobian.weight`: of a voxel's colour, of its density for red, green and blue, and for alpha."""

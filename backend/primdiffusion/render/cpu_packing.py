@@ -10,10 +10,19 @@ from jaxtyping import Bool, Float, Float64, Int32, Int64
 from numpy import ndarray
 from torch import Tensor
 
-from primdiffusion.render.cpu_compiled import kernel, on_all_threads, part, take
+from primdiffusion.render.cpu_compiled import (
+    NOTHING,
+    boxes_per_tile,
+    kernel,
+    on_all_threads,
+    part,
+    row_lists,
+    take,
+    tile_rectangle,
+    tiles_across,
+)
 from primdiffusion.render.cpu_sampling import PackedBoxes
 from primdiffusion.render.lattice import ORTHOGONAL
-from primdiffusion.render.tiles import NOTHING, boxes_per_tile, row_lists, tile_rectangle, tiles_across
 
 
 class Scene(NamedTuple):

@@ -1,19 +1,75 @@
-"""Primitives to one grid of voxels, for renderers that draw a volume fast and a thousand of them slowly."""
+"""Boxes summed into one grid of voxels: the compiled loop of `merge`."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
+from torch import Tensor
 
-from primdiffusion.formats.requests import VOXEL
-from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.cpu_compiled import on_all_threads
-from primdiffusion.render.cpu_merge import sum_boxes
+from primdiffusion.formats.requests import DENSITY_GAIN, VOXEL
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives
+from primdiffusion.render.cpu_compiled import kernel, on_all_threads, take
+from primdiffusion.render.march import MarchSettings, march
+
+_HALF_POWER = WINDOW_POWER // 2
+
+
+@kernel
+def sum_boxes(taken, position, to_local, low, high, voxels, origin, voxel, points, density, colour):
+    """Adds every box to density [X, Y, Z] and colour [X, Y, Z, 3] (weighted by density), a slice along x at a time.
+
+    to_local [K, 3, 3] takes x - position to y in [-1, 1]^3; low and high [K, 3] are the indices that a box reaches,
+    high exclusive; voxels [K, D, H, W, 4] red, green, blue, density. A voxel is the mean of points^3 places in it.
+    """
+    share = 1.0 / (points * points * points)
+    depth, rows, columns = voxels.shape[1], voxels.shape[2], voxels.shape[3]
+    x = take(taken)
+    while x < density.shape[0]:
+        for k in range(len(position)):
+            if not low[k, 0] <= x < high[k, 0]:
+                continue
+            m = to_local[k]
+            for y in range(low[k, 1], high[k, 1]):
+                for z in range(low[k, 2], high[k, 2]):
+                    for p in range(points * points * points):
+                        sx, sy, sz = p // (points * points), p // points % points, p % points
+                        dx = origin[0] + (x + (sx + 0.5) / points - 0.5) * voxel - position[k, 0]
+                        dy = origin[1] + (y + (sy + 0.5) / points - 0.5) * voxel - position[k, 1]
+                        dz = origin[2] + (z + (sz + 0.5) / points - 0.5) * voxel - position[k, 2]
+                        u = m[0, 0] * dx + m[0, 1] * dy + m[0, 2] * dz
+                        v = m[1, 0] * dx + m[1, 1] * dy + m[1, 2] * dz
+                        w = m[2, 0] * dx + m[2, 1] * dy + m[2, 2] * dz
+                        if not (abs(u) < 1.0 and abs(v) < 1.0 and abs(w) < 1.0):
+                            continue
+                        faded = share * math.exp(
+                            -WINDOW_SHARPNESS
+                            * ((u * u) ** _HALF_POWER + (v * v) ** _HALF_POWER + (w * w) ** _HALF_POWER)
+                        )
+                        i, j, o = (w + 1) / 2 * (depth - 1), (v + 1) / 2 * (rows - 1), (u + 1) / 2 * (columns - 1)
+                        i0, j0, o0 = int(i), int(j), int(o)
+                        red, green, blue, opacity = 0.0, 0.0, 0.0, 0.0
+                        for corner in range(8):
+                            a, b, c = corner // 4, corner // 2 % 2, corner % 2
+                            weight = abs(1 - a - i + i0) * abs(1 - b - j + j0) * abs(1 - c - o + o0)
+                            value = voxels[k, min(i0 + a, depth - 1), min(j0 + b, rows - 1), min(o0 + c, columns - 1)]
+                            red += weight * value[0]
+                            green += weight * value[1]
+                            blue += weight * value[2]
+                            opacity += weight * value[3]
+                        opacity *= faded
+                        density[x, y, z] += np.float32(opacity)
+                        colour[x, y, z, 0] += np.float32(opacity * red)
+                        colour[x, y, z, 1] += np.float32(opacity * green)
+                        colour[x, y, z, 2] += np.float32(opacity * blue)
+        x = take(taken)
+
 
 POINTS = 2
 """Places along a voxel's side at which the primitives are read."""
@@ -127,3 +183,57 @@ def _around(values: ndarray) -> ndarray:
         total[:-1] += moved[1:]
         values = np.moveaxis(total, 0, axis)
     return values
+
+
+FAINT = 1e-4
+"""Factor on density with which no ray of a person is ever full."""
+MET = 1e-3
+"""Rays with less opacity than this miss the person."""
+SMALLEST_GAIN, LARGEST_GAIN = 0.1, 20.0
+
+
+@dataclasses.dataclass(frozen=True)
+class GainFit:
+    """The gain that meets the paper's alpha best."""
+
+    gain: float
+    error: float
+    """Mean difference of alpha over rays that meet the person, with this gain."""
+    error_before: float
+    """The same with DENSITY_GAIN."""
+    rays: int
+    """How many met the person."""
+
+
+def unclamped_alpha(
+    primitives: Primitives,
+    camera: Camera,
+    settings: MarchSettings = MarchSettings(),  # noqa: B008
+) -> Float[Tensor, "h w"]:
+    """The sum of all opacities along each ray, which the marcher's alpha is once clamped to 1 (SPEC 4).
+
+    The marcher itself adds them: with a thousandth of the density no ray is ever full.
+    """
+    faint = dataclasses.replace(primitives, density=primitives.density * FAINT)
+    return march(faint, camera, settings).alpha / FAINT
+
+
+def fit_gain(reached: Float[ndarray, "n"]) -> GainFit:
+    """The g that makes the mean of |(1 - exp(-g s)) - min(s, 1)| least, over rays with `unclamped_alpha` s >= MET.
+
+    To one part in a thousand, between SMALLEST_GAIN and LARGEST_GAIN. Raises ValueError where no ray meets anything.
+    """
+    met = np.asarray(reached, np.float64).ravel()
+    met = met[met >= MET]
+    if len(met) == 0:
+        raise ValueError("no ray meets the person: there is nothing to fit the gain to; generate the person again")
+
+    def error(gain: float) -> float:
+        return float(np.abs(-np.expm1(-gain * met) - np.minimum(met, 1)).mean())
+
+    candidates = np.geomspace(SMALLEST_GAIN, LARGEST_GAIN, 100)
+    for _ in range(2):
+        best = int(np.argmin([error(gain) for gain in candidates]))
+        candidates = np.geomspace(candidates[max(best - 1, 0)], candidates[min(best + 1, len(candidates) - 1)], 100)
+    gain = float(candidates[int(np.argmin([error(gain) for gain in candidates]))])
+    return GainFit(gain, error(gain), error(DENSITY_GAIN), len(met))

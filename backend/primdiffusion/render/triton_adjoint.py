@@ -17,7 +17,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from primdiffusion.render.triton_rays import NEVER, cell, channels, ray_in_box, window
+from primdiffusion.render.triton_lists import NEVER, cell, channels, ray_in_box, window
 
 SUMS = 24
 """Floats a unit leaves beside voxels: sums of G = dL/dy 0-2, of G y^T 3-11, of dc v^T 12-20 (see `_on_direction`)."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from primdiffusion.render.triton_rays import NEVER, cell, channels, ray_in_box, window
+from primdiffusion.render.triton_lists import NEVER, cell, channels, ray_in_box, window
 
 
 @triton.jit

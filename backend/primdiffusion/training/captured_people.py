@@ -16,8 +16,8 @@ from torch import Tensor
 
 from primdiffusion.capture.conditioning import conditioning_views, default_betas, spread_cameras
 from primdiffusion.capture.people_files import find_people
-from primdiffusion.capture.rasterised import Outcome
 from primdiffusion.capture.reader import Captures
+from primdiffusion.capture.render import Outcome
 from primdiffusion.encoder.model import EncoderModel, betas_of_frames
 from primdiffusion.failures import describe
 from primdiffusion.human import Human
