@@ -11,10 +11,10 @@ from PIL import Image
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.reader import Captures, Subject
-from primdiffusion.capture.render import JPEG_QUALITY, sit, srgb_bytes
+from primdiffusion.capture.render import JPEG_QUALITY, set_up_capture, srgb_bytes
 from primdiffusion.capture.sheet import default_joints, joints_of
 from primdiffusion.formats.picture_files import DEPTH_UNIT
-from primdiffusion.raster.multisample import shoot
+from primdiffusion.raster.multisample import render_view
 
 SAME_DEPTH_M = 0.002
 
@@ -40,11 +40,11 @@ def compare(captures: Captures, people: dict, samples: int) -> list[Difference]:
         subject = captures.subject(name)
         smpl = subject.smpl
         poses = BodyPose.from_axis_angle(torch.from_numpy(smpl.theta), torch.from_numpy(smpl.translation))
-        sitting = sit(read_person(people[name]), poses, subject.views)
+        sitting = set_up_capture(read_person(people[name]), poses, subject.views)
         for frame in range(subject.frames):
             posed = sitting.figure.posed(sitting.skinning[frame])
             for camera, view in enumerate(subject.views):
-                differences.append(_difference(subject, frame, camera, shoot(posed, view, samples)))
+                differences.append(_difference(subject, frame, camera, render_view(posed, view, samples)))
     return differences
 
 

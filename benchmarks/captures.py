@@ -36,7 +36,7 @@ from primdiffusion.capture.dataset import pack
 from primdiffusion.capture.people_files import find_people, read_person
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.reader import Captures, open_captures
-from primdiffusion.capture.render import Job, begin, draw_frames, render, sit
+from primdiffusion.capture.render import RenderJob, render, render_frames, set_up_capture, write_parameters
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
@@ -106,20 +106,22 @@ def _people_per_second(assets: Assets) -> float:
 def _rasteriser_figures(folder: Path, poses: int, cameras: int) -> dict[str, float]:
     """Draws every person in one process; the first view of each person is not timed."""
     taken = built_in_poses().map(lambda values: values[:poses])
-    job = Job(find_people(folder / "people"), taken, folder / "fast", Rig(count=cameras), samples=SAMPLES)
-    list(render(Job(dict(itertools.islice(job.people.items(), 1)), taken, folder / "warm", Rig(count=1, width=64))))
+    job = RenderJob(find_people(folder / "people"), taken, folder / "fast", Rig(count=cameras), samples=SAMPLES)
+    list(
+        render(RenderJob(dict(itertools.islice(job.people.items(), 1)), taken, folder / "warm", Rig(count=1, width=64)))
+    )
     shutil.rmtree(folder / "warm")
     per_view = []
     for name, path in job.people.items():
-        sitting = sit(read_person(path), taken, job.rig)
-        begin(folder / "timed" / name, sitting)
+        sitting = set_up_capture(read_person(path), taken, job.rig)
+        write_parameters(folder / "timed" / name, sitting)
         moments = [
             (time.perf_counter(), time.process_time())
-            for _ in draw_frames(folder / "timed" / name, sitting, range(poses), job.passes, SAMPLES)
+            for _ in render_frames(folder / "timed" / name, sitting, range(poses), job.passes, SAMPLES)
         ]
         per_view.append((np.array(moments[-1]) - moments[0]) / (len(moments) - 1))
     shutil.rmtree(folder / "timed")
-    assert all(outcome.what != "failed" for outcome in render(job))
+    assert all(outcome.status != "failed" for outcome in render(job))
     wall, processor = np.mean(per_view, axis=0)
     return {"seconds_a_view_fast_512": float(wall), "processor_seconds_a_view_fast_512": float(processor)}
 

@@ -23,7 +23,7 @@ from march import from_script
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import Captures, open_captures
-from primdiffusion.capture.render import Job, render
+from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.encoder.model import EncoderModel, load_encoder
 from primdiffusion.evaluation.image_metrics import Lpips, load_lpips
 from primdiffusion.evaluation.reconstruction import EvaluationSettings, Means, evaluate, summary, table
@@ -123,8 +123,10 @@ def made_people(folder: Path, assets: Path | None, count: int) -> Path:
     for _ in make_people(open_assets(assets, required_meshes()), PeopleSet(folder / "people", FIRST_SEED, count), 1):
         pass
     rig = Rig(count=CAMERAS, elevations=(5.0, 30.0))
-    job = Job(find_people(folder / "people"), choose_poses([], POSES, 0), folder / "heldout", rig, ("img", "mask"))
-    failed = [outcome.why for outcome in render(job) if outcome.what == "failed"]
+    job = RenderJob(
+        find_people(folder / "people"), choose_poses([], POSES, 0), folder / "heldout", rig, ("img", "mask")
+    )
+    failed = [outcome.error for outcome in render(job) if outcome.status == "failed"]
     assert not failed, failed
     return job.out
 

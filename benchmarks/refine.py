@@ -22,7 +22,7 @@ from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.capture.render import Job, render
+from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.commands.reconstruct import split_cameras
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import encode_srgb
@@ -57,9 +57,9 @@ def main() -> None:
         list(make_people(assets, PeopleSet(folder / "people", arguments.seed, 1), 1))
         (name, path), *_ = find_people(folder / "people").items()
         poses = choose_poses((), POSES, seed=0)
-        job = Job({name: path}, poses, folder / "captures", Rig(count=CAMERAS, width=SIZE, height=SIZE),
+        job = RenderJob({name: path}, poses, folder / "captures", Rig(count=CAMERAS, width=SIZE, height=SIZE),
                   ("img", "mask"))  # fmt: skip
-        assert all(outcome.what == "done" for outcome in render(job))
+        assert all(outcome.status == "done" for outcome in render(job))
         captures = open_captures(job.out)
         betas = default_betas(captures.subject(name))
         held, given = split_cameras(CAMERAS, HELD)

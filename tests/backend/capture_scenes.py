@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.poses import built_in_poses
-from primdiffusion.capture.render import PASSES, Job, render
+from primdiffusion.capture.render import PASSES, RenderJob, render
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
@@ -63,15 +63,15 @@ def save_person(path: Path, mesh: TexturedMesh | None = None) -> Path:
     return path
 
 
-def small_job(root: Path, people: int = 2, frames: int = 3, passes=PASSES, **more) -> Job:
+def small_job(root: Path, people: int = 2, frames: int = 3, passes=PASSES, **more) -> RenderJob:
     """Boxes in `frames` poses from 4 sides, 32 pixels wide."""
     paths = {f"person_{i:06d}": save_person(root / "people" / f"person_{i:06d}" / "person.glb") for i in range(people)}
     poses = built_in_poses().map(lambda values: values[:frames])
-    return Job(paths, poses, root / "captures", Rig("sphere", 4, width=32, height=32), passes, **more)
+    return RenderJob(paths, poses, root / "captures", Rig("sphere", 4, width=32, height=32), passes, **more)
 
 
 def captured(root: Path, **more) -> Path:
     """A folder of such captures."""
     job = small_job(root, **more)
-    assert {outcome.what for outcome in render(job)} == {"done"}
+    assert {outcome.status for outcome in render(job)} == {"done"}
     return job.out

@@ -9,7 +9,7 @@ import pytest
 import torch
 from capture_scenes import captured
 from primdiffusion.capture.dataset import CaptureDataset, Position, SampleSettings, batches, open_pack, pack, pack_path
-from primdiffusion.capture.reader import Window, open_captures, resample, through, whole
+from primdiffusion.capture.reader import Window, full_window, open_captures, resample, windowed_view
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.geometry.records import TensorRecord
 
@@ -133,9 +133,9 @@ def test_a_smaller_picture_is_the_mean_of_linear_light_and_its_camera_sees_the_s
     view = View(np.array([[5.0, 0.1, 2], [0, 5, 2], [0, 0, 1]]), np.eye(3), np.array([0, 0, 3.0]), 4, 4)
     point = np.array([0.3, -0.2, 0.4])
     window = Window(0.5, 1.25, 2, 2.5)
-    pixel, seen = view.project(point)[0], through(view, window, 16).project(point)[0]
+    pixel, seen = view.project(point)[0], windowed_view(view, window, 16).project(point)[0]
     np.testing.assert_allclose(seen, (pixel - (0.5, 1.25)) * (16 / 2, 16 / 2.5))
-    assert np.array_equal(through(view, whole(view), 4).intrinsics, view.intrinsics)
+    assert np.array_equal(windowed_view(view, full_window(view), 4).intrinsics, view.intrinsics)
 
 
 def test_crops_lie_in_the_picture_and_see_the_person(captures):

@@ -15,12 +15,12 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.body.smpl_pickle import UnsafePickleError
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.reader import CaptureFileError, open_captures
-from primdiffusion.capture.render import render, sit
+from primdiffusion.capture.render import render, set_up_capture
 from primdiffusion.capture.sheet import default_joints, draw_sheet, reprojection_error
 from primdiffusion.capture.verify import verify
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.arrays import ArrayFileError, read_numbers
-from primdiffusion.raster.multisample import shoot
+from primdiffusion.raster.multisample import render_view
 
 NAME = "person_000000"
 
@@ -41,10 +41,10 @@ def test_a_view_comes_back_as_it_was_drawn(root):
     assert captures.subjects == (NAME, "person_000001")
     subject = captures.subject(NAME)
     poses = BodyPose.from_axis_angle(torch.from_numpy(subject.smpl.theta), torch.from_numpy(subject.smpl.translation))
-    sitting = sit(read_person(root.parent / "people" / NAME / "person.glb"), poses, subject.views)
+    sitting = set_up_capture(read_person(root.parent / "people" / NAME / "person.glb"), poses, subject.views)
     for frame, camera in ((0, 0), (2, 3)):
         view = captures.view(NAME, frame, camera)
-        shot = shoot(sitting.figure.posed(sitting.skinning[frame]), subject.views[camera])
+        shot = render_view(sitting.figure.posed(sitting.skinning[frame]), subject.views[camera])
         assert (view.camera.width, view.camera.height) == (32, 32)
         np.testing.assert_allclose(view.mask.numpy() / 255, shot.coverage, atol=0.003)
         np.testing.assert_allclose(view.depth.numpy(), shot.depth, atol=0.00013)
@@ -241,7 +241,7 @@ def test_damage_is_found_and_repaired_so_that_only_it_is_made_again(root, capsys
     assert not any(path.exists() for path in gone)
     assert capture_layout.picture_path(root / NAME, "img", 0, 0).exists()
     assert open_captures(root).subjects == ("person_000001",)
-    assert sorted(outcome.what for outcome in render(small_job(root.parent))) == ["done", "skipped"]
+    assert sorted(outcome.status for outcome in render(small_job(root.parent))) == ["done", "skipped"]
     assert verify(root) == []
 
 

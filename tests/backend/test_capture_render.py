@@ -127,7 +127,7 @@ def test_two_workers_make_the_same_files_as_one(tmp_path):
 
 def test_few_people_are_shared_out_to_many_workers(tmp_path):
     one, many = captured(tmp_path / "one", people=1), small_job(tmp_path / "many", people=1)
-    assert [(outcome.what, outcome.views) for outcome in render(many, workers=2)] == [("done", 12)]
+    assert [(outcome.status, outcome.views) for outcome in render(many, workers=2)] == [("done", 12)]
     assert everything(one) == everything(many.out)
 
 
@@ -138,7 +138,7 @@ def test_what_is_there_is_kept_and_what_is_missing_is_made(tmp_path):
     lost.unlink()
     kept = capture_layout.picture_path(root / NAMES[1], "depth", 2, 2)
     kept_at = kept.stat().st_mtime_ns
-    assert {outcome.subject: outcome.what for outcome in render(small_job(tmp_path))} == {
+    assert {outcome.subject: outcome.status for outcome in render(small_job(tmp_path))} == {
         NAMES[0]: "skipped",
         NAMES[1]: "done",
     }
@@ -166,7 +166,7 @@ list(render(small_job(Path({str(tmp_path)!r}), frames=12)))
     os.kill(child.pid, signal.SIGKILL)
     child.wait()
     assert not (job.out / NAMES[1] / capture_layout.COMPLETE_FILE).exists()
-    assert {outcome.what for outcome in render(job)} <= {"done", "skipped"}
+    assert {outcome.status for outcome in render(job)} <= {"done", "skipped"}
     assert everything(job.out) == expected
     assert verify(job.out) == []
 
@@ -248,8 +248,8 @@ def test_another_person_or_pose_in_the_same_folder_is_refused(tmp_path):
     (job.out / NAMES[0] / capture_layout.COMPLETE_FILE).unlink()
     turned = job.poses.map(lambda values: values.flip(0))
     (outcome,) = render(dataclasses.replace(job, poses=turned))
-    assert outcome.what == "failed"
-    assert "other poses" in outcome.why
+    assert outcome.status == "failed"
+    assert "other poses" in outcome.error
 
 
 def test_other_settings_in_the_same_folder_are_refused(tmp_path):

@@ -41,7 +41,7 @@ def line(root, tmp_path):
 
 def outcomes(root, out, settings=AS_ENCODED, cards=None, model=None):
     work = encode_people(model or tiny_encoder(), open_captures(root / "captures"), out, settings, cards)
-    return [(outcome.subject, outcome.what) for outcome in work]
+    return [(outcome.subject, outcome.status) for outcome in work]
 
 
 def test_the_file_holds_what_the_encoder_makes_of_the_pictures(root, line, tmp_path, capsys):

@@ -62,7 +62,7 @@ def test_all_cameras_are_taken_where_there_are_no_more(tmp_path):
 
 
 def test_less_than_one_view_is_refused(tmp_path):
-    with pytest.raises(ConditioningError, match="0 views were asked for"):
+    with pytest.raises(ConditioningError, match="0 views were requested"):
         spread_cameras(ring(tmp_path, 5), 0, 0)
 
 
@@ -101,7 +101,9 @@ def test_several_subjects_and_none_named_is_an_error_that_names_some(dataset):
 
 
 def test_an_unknown_subject_is_an_error_that_names_the_nearest_first(dataset):
-    with pytest.raises(ConditioningError, match=r"no subject 'person_00001'.* choose of person_000001, person_000000"):
+    with pytest.raises(
+        ConditioningError, match=r"no subject 'person_00001'.* choose from person_000001, person_000000"
+    ):
         choose_subject(dataset, "person_00001")
 
 

@@ -8,7 +8,7 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.conditioning import conditioning_views, default_betas
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.capture.render import Job, render
+from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import default_encoder, load_encoder
 from primdiffusion.formats.camera_rig import Rig
@@ -35,8 +35,8 @@ def test_it_draws_somebody_it_never_saw_from_a_side_and_in_a_pose_it_was_not_giv
     people = {"person_000000": save_person(tmp_path / "person.glb", patched_person())}
     poses = built_in_poses().map(lambda values: values[:2])
     assert isinstance(poses, BodyPose)
-    job = Job(people, poses, tmp_path / "captures", Rig("sphere", 9, width=192, height=192), ("img", "mask"))
-    assert [outcome.what for outcome in render(job)] == ["done"]
+    job = RenderJob(people, poses, tmp_path / "captures", Rig("sphere", 9, width=192, height=192), ("img", "mask"))
+    assert [outcome.status for outcome in render(job)] == ["done"]
     captures = open_captures(job.out)
     betas = default_betas(captures.subject("person_000000"))
     payload = encoder.encode(conditioning_views(captures, "person_000000", 0, range(8)), betas)

@@ -13,7 +13,7 @@ from accelerate import Accelerator
 from capture_scenes import captured
 from fit_scenes import WHOLE, files, flags, make_small, rows, sentence, settings
 from PIL import Image
-from primdiffusion.capture.dataset import ALONE, FIRST
+from primdiffusion.capture.dataset import FIRST, SINGLE_PROCESS
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import load_encoder
@@ -243,7 +243,7 @@ def test_held_boxes_are_drawn_as_large_as_they_start_and_then_learn(captures, tm
     for hold_scale in (1, 0):
         config = settings(captures, tmp_path / "run", hold_scale=hold_scale)
         state, dataset = first_state(config), fit_dataset(open_captures(captures), config)
-        sample, _ = next(fit_batches(dataset, config, FIRST, ALONE))
+        sample, _ = next(fit_batches(dataset, config, FIRST, SINGLE_PROCESS))
         with torch.no_grad():
             state.network.scale_out.bias.fill_(30.0)  # as if boxes had learned to be larger
         clock = recorder_module.StepTimer(torch.device("cpu"))

@@ -5,7 +5,7 @@ import torch
 from capture_scenes import save_person
 from fit_scenes import forget_processes, patched_person, rows
 from primdiffusion.capture.poses import built_in_poses
-from primdiffusion.capture.render import Job, render
+from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.training.fit import fit
 from primdiffusion.training.fit_config import FitConfig
@@ -16,8 +16,8 @@ from primdiffusion.training.fit_config import FitConfig
 def test_the_default_encoder_overfits_one_person_beyond_32_db(tmp_path):
     people = {"person_000000": save_person(tmp_path / "person.glb", patched_person())}
     poses = built_in_poses().map(lambda values: values[:2])
-    job = Job(people, poses, tmp_path / "captures", Rig("sphere", 12, width=256, height=256), ("img", "mask"))
-    assert [outcome.what for outcome in render(job)] == ["done"]
+    job = RenderJob(people, poses, tmp_path / "captures", Rig("sphere", 12, width=256, height=256), ("img", "mask"))
+    assert [outcome.status for outcome in render(job)] == ["done"]
     forget_processes()
     torch.manual_seed(0)
     config = FitConfig(

@@ -10,7 +10,7 @@ from capture_scenes import BLUE, GREEN, RED, WHITE, box, square
 from primdiffusion.capture.reader import as_camera
 from primdiffusion.formats.camera_rig import View, look_at
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
-from primdiffusion.raster.multisample import figure_of, shoot
+from primdiffusion.raster.multisample import figure_from_mesh, render_view
 from primdiffusion.raster.rasterise import rasterise
 
 REST = np.tile(np.eye(4), (24, 1, 1))
@@ -18,7 +18,7 @@ HOLE = (9, 9, 9, 0)
 
 
 def shot_of(*parts: TexturedPart, view: View, samples: int = 3):
-    return shoot(figure_of(TexturedMesh(parts)).posed(REST), view, samples)
+    return render_view(figure_from_mesh(TexturedMesh(parts)).posed(REST), view, samples)
 
 
 def front(distance: float, focal: float, size: int) -> View:
@@ -156,6 +156,6 @@ def test_even_samples_are_refused():
 def test_skinning_moves_vertices_with_their_joints():
     moved = torch.eye(4).repeat(24, 1, 1).numpy().astype(np.float64)
     moved[3, :3, 3] = 1, 2, 3
-    posed = figure_of(TexturedMesh((box(joint=3), box("still")))).posed(moved)
+    posed = figure_from_mesh(TexturedMesh((box(joint=3), box("still")))).posed(moved)
     np.testing.assert_allclose(posed.vertices[:8].mean(0), [1, 2, 3])
     np.testing.assert_allclose(posed.vertices[8:].mean(0), 0, atol=1e-12)

@@ -39,7 +39,7 @@ def dataset(tmp_path_factory):
     job = small_job(tmp_path_factory.mktemp("reconstruct"), frames=2, passes=("img", "mask"))
     for path, colour in zip(job.people.values(), [(0, 200, 0, 255), (255, 255, 255, 255)], strict=True):
         save_person(path, TexturedMesh((box(half=1.1, colour=colour),)))
-    assert {outcome.what for outcome in render(job)} == {"done"}
+    assert {outcome.status for outcome in render(job)} == {"done"}
     return job.out
 
 

@@ -13,7 +13,7 @@ from primdiffusion.capture.conditioning import conditioning_views
 from primdiffusion.capture.dataset import Views, stack
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.capture.render import Job, render
+from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.commands.reconstruct import split_cameras
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import encode_srgb
@@ -307,9 +307,9 @@ def striped_body(betas: torch.Tensor) -> TexturedMesh:
 def test_a_bare_body_takes_on_the_captured_one_s_colours(tmp_path):
     """From grey to 33 dB on cameras that were held out, and to 31 dB in a pose that was."""
     people = {"striped": save_person(tmp_path / "people" / "striped.glb", striped_body(torch.zeros(10)))}
-    job = Job(people, built_in_poses().map(lambda t: t[:5]), tmp_path / "out", Rig(count=12, width=160, height=160),
-              ("img", "mask"))  # fmt: skip
-    assert {outcome.what for outcome in render(job)} == {"done"}
+    poses, rig = built_in_poses().map(lambda t: t[:5]), Rig(count=12, width=160, height=160)
+    job = RenderJob(people, poses, tmp_path / "out", rig, ("img", "mask"))
+    assert {outcome.status for outcome in render(job)} == {"done"}
     captures = open_captures(job.out)
     held, given = split_cameras(12, 3)
     shown = [conditioning_views(captures, "striped", frame, given) for frame in range(4)]

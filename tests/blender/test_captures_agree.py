@@ -11,7 +11,7 @@ import torch
 from blender_primdiffusion.formats.camera_rig import Rig, bounding_sphere
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.people_files import read_person
-from primdiffusion.capture.render import sit
+from primdiffusion.capture.render import set_up_capture
 from primdiffusion.formats import camera_rig as backend_rig
 from test_scan_rigs import load, own_person
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.any_blender
 def test_both_programs_put_cameras_and_joints_in_the_same_places(tmp_path, empty_scene):
     path = own_person(tmp_path / "anna.glb")
     poses = built_in_poses(3)
-    theirs = sit(
+    theirs = set_up_capture(
         read_person(path),
         BodyPose(torch.from_numpy(poses.rotations).float(), torch.from_numpy(poses.translations).float()),
         backend_rig.Rig(count=5),

@@ -1,1 +1,1 @@
-"""Pictures of textured meshes: the rasteriser, and what is measured on its pictures."""
+"""Multi-view captures of textured humans: rendering, reading, packing, training samples."""

@@ -1,4 +1,4 @@
-"""Which pictures of a captured person the encoder is given: views of one frame, spread around the person."""
+"""Choose the images of a captured subject that the encoder gets: views of one frame, spread around the subject."""
 
 from __future__ import annotations
 
@@ -20,76 +20,76 @@ from primdiffusion.capture.reader import (
     Captures,
     Subject,
     as_camera,
+    full_window,
     open_captures,
     resample,
-    through,
-    whole,
+    windowed_view,
 )
 from primdiffusion.capture.sheet import default_joints, joints_of
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
 
 LARGEST_SIDE = 512
-"""Pixels a side of what the encoder is trained on; larger pictures are averaged down to it."""
+"""Width and height of the encoder's training images, pixels; larger ones are downsampled."""
 SAME_BODY_M = 0.02
-"""How far joints may lie from the default body's; another body's are centimetres away."""
+"""Largest distance of joints from the default body's; those of other bodies are centimetres away."""
 LEAST_COVERED = 0.8
-"""Share of the body inside the masks; dressed people of the default body have more than 0.95."""
+"""Fraction of the body inside the masks; dressed humans on the default body have more than 0.95."""
 _EACH = 20
-"""Of the body's vertices only every so many-th is projected."""
+"""Every so many vertices of the body are projected."""
 _NAMED = 3
 
 
 class ConditioningError(ValueError):
-    """Captures that the encoder cannot be given; one sentence that says what to do."""
+    """Captures that the encoder cannot use."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CapturedPerson:
-    """A person as the encoder is given them."""
+    """The encoder's input for a subject."""
 
     subject: str
     frame: int
     cameras: tuple[int, ...]
-    """Numbers of the views in cameras.json."""
+    """Indices of the views in cameras.json."""
     views: Views
     """Unbatched, [v]."""
     betas: Float[Tensor, "10"]
-    """Of the default body."""
+    """Betas of the default body."""
     warnings: tuple[str, ...]
-    """Sentences for the user: what makes the result doubtful."""
+    """Messages for the user about problems of the captures."""
 
 
 def captured_person(path: str | Path, subject: str | None = None, frame: int = 0, views: int = 8) -> CapturedPerson:
-    """Somebody of a dataset, or of one subject's own folder, in one frame; `views` spread cameras, or all there are.
+    """A subject of a dataset, or of its own folder, in one frame; `views` spread cameras, or all if there are fewer.
 
     Raises:
-        FileNotFoundError: there is no such folder, or a file of the person's is missing.
-        ConditioningError: nobody, or several people, can be meant; no such frame; another body model.
-        CaptureFolderError, CaptureFileError, ArrayFileError, BodyFileError: a file is damaged or of another size.
+        FileNotFoundError: the folder or a file of the subject does not exist.
+        ConditioningError: the subject is missing or ambiguous, the frame is missing, or another body model was used.
+        CaptureFolderError, CaptureFileError, ArrayFileError, BodyFileError: a file is damaged or has another size.
     """
     captures, name = choose_subject(path, subject)
     person = captures.subject(name)
     betas = default_betas(person)
     _check_frame(person, frame)
     cameras = spread_cameras(person, frame, views)
-    given = conditioning_views(captures, name, frame, cameras)
-    warnings = [] if len(cameras) > 1 else ["one view only: sides that it does not see are guessed"]
-    covered = _covered_share(person, frame, cameras, given)
+    chosen = conditioning_views(captures, name, frame, cameras)
+    warnings = [] if len(cameras) > 1 else ["only one view: the sides that it does not show are guessed"]
+    covered = _covered_share(person, frame, cameras, chosen)
     if covered < LEAST_COVERED:
         warnings.append(
-            f"only {100 * covered:.0f} % of the body of {name} lies inside the masks: the betas or poses may be of "
-            "another body model, or the cameras of another scene"
+            f"only {100 * covered:.0f} % of the body of {name} is inside the masks: the betas or poses may belong to "
+            "another body model, or the cameras to another scene"
         )
-    return CapturedPerson(name, frame, cameras, given, betas, tuple(warnings))
+    return CapturedPerson(name, frame, cameras, chosen, betas, tuple(warnings))
 
 
 def choose_subject(path: str | Path, subject: str | None = None) -> tuple[Captures, str]:
-    """The captures of a folder, which may be one subject's own, and whom of them `subject` means.
+    """Open a dataset, or a subject's own folder, and return it with the name of the subject.
 
     Raises:
-        FileNotFoundError: there is no such folder, or nobody in it.
-        ConditioningError: there is no such subject, or several and none is named.
+        FileNotFoundError: the folder does not exist or contains no subjects.
+        ConditioningError: there is no such subject, or several and `subject` is None.
         CaptureFolderError, CaptureFileError: the dataset's own files are damaged.
     """
     path = Path(path).absolute()
@@ -105,10 +105,10 @@ def choose_subject(path: str | Path, subject: str | None = None) -> tuple[Captur
         return captures, subject
     shown = [*difflib.get_close_matches(subject or "", names, _NAMED, 0.8), *names][:_NAMED]
     others = f" and {len(names) - len(shown)} more" if len(names) > len(shown) else ""
-    there = f"{', '.join(shown)}{others}"
+    available = f"{', '.join(shown)}{others}"
     if subject is None:
-        raise ConditioningError(f"{path} holds several subjects: name one of them ({there})")
-    raise ConditioningError(f"there is no subject {subject!r} in {path}: choose of {there}")
+        raise ConditioningError(f"{path} contains several subjects: name one of them ({available})")
+    raise ConditioningError(f"there is no subject {subject!r} in {path}: choose from {available}")
 
 
 def conditioning_views(
@@ -118,15 +118,15 @@ def conditioning_views(
     cameras: Sequence[int] | None = None,
     largest_side: int = LARGEST_SIDE,
 ) -> Views:
-    """Views [v] of a person in a frame, squares over black; None: of all cameras.
+    """Square views [v] of a subject in a frame, over black; None for all cameras.
 
-    Their side is that of the largest picture, but `largest_side` at most; cameras see through the squares.
+    Their size is that of the largest image, at most `largest_side`; the cameras are adjusted to it.
 
     Raises:
-        KeyError: there is nobody of this name.
-        FileNotFoundError: a picture, or another file of the person's, is missing.
-        ConditioningError: there is no such frame or camera, or none of them shows the person.
-        CaptureFileError, ArrayFileError, BodyFileError: a file is damaged, or a mask of another size than its picture.
+        KeyError: there is no subject of this name.
+        FileNotFoundError: a file of the subject is missing.
+        ConditioningError: there is no such frame or camera, or no mask shows the subject.
+        CaptureFileError, ArrayFileError, BodyFileError: a file is damaged, or a mask and its image differ in size.
     """
     person = captures.subject(subject)
     _check_frame(person, frame)
@@ -140,8 +140,8 @@ def conditioning_views(
         view = person.views[number]
         image, mask = (person.picture(kind, frame, number) for kind in ("img", "mask"))
         rgba = np.concatenate([image, mask[..., None]], axis=-1)
-        pictures.append(resample(rgba, whole(view), side))
-        seen.append(as_camera(through(view, whole(view), side)))
+        pictures.append(resample(rgba, full_window(view), side))
+        seen.append(as_camera(windowed_view(view, full_window(view), side)))
     views = Views(torch.from_numpy(np.stack(pictures)), stack(seen), person.smpl.pose(frame))
     if not views.mask.any():
         raise ConditioningError(f"no mask of {subject} in frame {frame} shows a person: choose another frame or views")
@@ -149,13 +149,13 @@ def conditioning_views(
 
 
 def spread_cameras(subject: Subject, frame: int, count: int) -> tuple[int, ...]:
-    """Numbers of `count` cameras around a person, in order; all where there are no more.
+    """Indices of `count` cameras around a subject, sorted; all if there are fewer.
 
-    The first is the one that sees most of the face; each next is the farthest, as an angle, from those chosen.
-    Raises ConditioningError for less than one camera.
+    The first faces the subject most directly; each next is the farthest in angle from those chosen.
+    Raises ConditioningError if `count` is less than 1.
     """
     if count < 1:
-        raise ConditioningError(f"{count} views were asked for: the encoder needs one or more")
+        raise ConditioningError(f"{count} views were requested: the encoder needs 1 or more")
     if count >= len(subject.views):
         return tuple(range(len(subject.views)))
     pose = subject.smpl.pose(frame)
@@ -172,24 +172,24 @@ def spread_cameras(subject: Subject, frame: int, count: int) -> tuple[int, ...]:
 
 
 def default_betas(subject: Subject) -> Float[Tensor, "10"]:
-    """A person's betas as those of the default body; fewer than ten are filled up with zeros.
+    """Betas of the subject on the default body, padded with zeros to ten.
 
     Raises:
-        ConditioningError: there are more, impossible ones, or joints were noted that are not the default body's.
+        ConditioningError: there are more than ten, they are out of range, or stored joints are not the default body's.
         ArrayFileError: joints.npz is damaged.
     """
     betas, components = torch.from_numpy(subject.smpl.betas), default_body().shape_basis.shape[-1]
     remedy = "render the person again on the default body (primdiffusion captures, or Blender's without a body file)"
     if len(betas) > components or not (betas.abs() <= LARGEST_BETA).all():
         raise ConditioningError(
-            f"{subject.folder} has {len(betas)} betas, up to {float(betas.abs().max()):.3g} from 0: needed are at most "
-            f"{components} of the default body, within {LARGEST_BETA:g}; {remedy}"
+            f"{subject.folder} has {len(betas)} betas of up to {float(betas.abs().max()):.3g}; there may be at most "
+            f"{components} of the default body, within {LARGEST_BETA:g}: {remedy}"
         )
-    apart = float(np.linalg.norm(joints_of(subject) - default_joints(subject), axis=-1).max())
-    if not apart <= SAME_BODY_M:
+    distance = float(np.linalg.norm(joints_of(subject) - default_joints(subject), axis=-1).max())
+    if not distance <= SAME_BODY_M:
         raise ConditioningError(
-            f"the joints of {subject.folder} lie up to {100 * apart:.0f} cm from the default body's: its betas are of "
-            f"another body model; {remedy}"
+            f"the joints of {subject.folder} are up to {100 * distance:.0f} cm from the default body's, so its betas "
+            f"belong to another body model; {remedy}\"
         )
     return torch.nn.functional.pad(betas, (0, components - len(betas)))
 
@@ -200,29 +200,29 @@ def _check_frame(subject: Subject, frame: int) -> None:
 
 
 def _covered_share(subject: Subject, frame: int, cameras: Sequence[int], views: Views) -> float:
-    """Of the body's points that fall into the pictures, how many lie inside the masks.
+    """Fraction of the body's projected points that are inside the masks.
 
-    Raises ConditioningError where none does.
+    Raises ConditioningError if it is 0.
     """
     body = default_body().shape(torch.from_numpy(subject.smpl.betas)).pose(subject.smpl.pose(frame))
     points, size = body.vertices[::_EACH].double().numpy(), views.rgba.shape[-2]
     inside = [
         mask[pixels[:, 1], pixels[:, 0]] > 0
         for camera, mask in zip(cameras, views.mask.numpy(), strict=True)
-        for pixels in [_pixels(through(subject.views[camera], whole(subject.views[camera]), size), points)]
+        for pixels in [_pixels(windowed_view(subject.views[camera], full_window(subject.views[camera]), size), points)]
     ]
     covered = np.concatenate(inside)
     if not covered.any():
         raise ConditioningError(
-            f"no part of the body of {subject.name} is where its masks show a person: its poses, betas and "
-            "cameras.json do not belong together; take them from one source"
+            f"the body of {subject.name} projects outside its masks: its poses, betas and cameras.json do not belong "
+            "together; take them from one source"
         )
     return float(covered.mean())
 
 
 def _pixels(view: View, points: Float[np.ndarray, "n 3"]) -> np.ndarray:
-    """Columns and rows [m, 2] of the points that a view has in its picture."""
+    """Columns and rows [m, 2] of the points inside the image."""
     with np.errstate(divide="ignore", invalid="ignore"):
         pixel, depth = view.project(points)
-    there = (depth > 0) & (pixel >= 0).all(-1) & (pixel < [view.width, view.height]).all(-1)
-    return pixel[there].astype(np.int64)
+    visible = (depth > 0) & (pixel >= 0).all(-1) & (pixel < [view.width, view.height]).all(-1)
+    return pixel[visible].astype(np.int64)

@@ -1,7 +1,12 @@
-"""Captures as one array a subject that training maps into memory: nothing to decode, nothing read that is not used.
+"""Training samples of the encoder from captures: views to encode a subject from, and views to compare with.
+
+A sample follows from (seed, epoch, index) alone: batches do not depend on the number of workers, and training resumes
+from a `Position` exactly.
+
+Images may be packed into one array per subject, which is memory-mapped and needs no decoding:
 
 root/packed/{id}.npy     uint8 [F, C, H, W, 4]: sRGB over black, and the mask
-root/packed/{id}.json    what it was made from; a pack of other pictures than those that are there now is not used
+root/packed/{id}.json    digest of the source images; an outdated pack is ignored
 """
 
 from __future__ import annotations
@@ -28,9 +33,9 @@ from primdiffusion.capture.reader import (
     Subject,
     Window,
     as_camera,
+    full_window,
     resample,
-    through,
-    whole,
+    windowed_view,
 )
 from primdiffusion.formats import capture_layout
 from primdiffusion.geometry.camera import Camera
@@ -41,34 +46,36 @@ PACK_FOLDER, PACK_FORMAT, PACK_VERSION = "packed", "primdiffusion-packed-capture
 
 @dataclasses.dataclass(frozen=True)
 class Packing:
-    """How far a subject is."""
+    """The result of packing one subject."""
 
     subject: str
-    kept: bool
-    """Whether a pack of the same pictures was there."""
+    found: bool
+    """Whether a pack of the same images existed."""
     gigabytes: float
 
 
 def pack(captures: Captures) -> Iterator[Packing]:
-    """Pack every subject that is not; yields each when its array is whole.
+    """Pack all subjects that have no current pack; yields each when its array is complete.
 
     Raises:
-        FileNotFoundError, CaptureFileError: a picture is missing or damaged, or cameras differ in size.
-        OSError: there is no room.
+        FileNotFoundError, CaptureFileError: an image is missing or damaged, or cameras differ in size.
+        OSError: a file cannot be written.
     """
     for name in captures.subjects:
         subject = captures.subject(name)
-        kept = open_pack(subject) is not None
-        if not kept:
+        found = open_pack(subject) is not None
+        if not found:
             pack_subject(subject)
-        yield Packing(name, kept, pack_path(subject).stat().st_size / 1e9)
+        yield Packing(name, found, pack_path(subject).stat().st_size / 1e9)
 
 
 def pack_subject(subject: Subject) -> None:
-    """Write one subject's array. Raises what `pack` does."""
+    """Write one subject's array. Raises as `pack` does."""
     sizes = {(view.height, view.width) for view in subject.views}
     if len(sizes) != 1:
-        raise CaptureFileError(f"{subject.folder} has pictures of several sizes: these cannot be packed")
+        raise CaptureFileError(
+            f"{subject.folder} has images of several sizes, which cannot be packed: render it with one size"
+        )
     stamp = source_stamp(subject)
     shape = (subject.frames, len(subject.views), *sizes.pop(), 4)
     with capture_layout.replacing(pack_path(subject)) as path:
@@ -84,7 +91,7 @@ def pack_subject(subject: Subject) -> None:
 
 
 def open_pack(subject: Subject) -> UInt8[np.ndarray, "F C H W 4"] | None:
-    """A subject's array, mapped; None where there is none, or one of other pictures."""
+    """A subject's memory-mapped array; None if there is none or the images have changed since."""
     path = pack_path(subject)
     try:
         about = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
@@ -99,12 +106,12 @@ def open_pack(subject: Subject) -> UInt8[np.ndarray, "F C H W 4"] | None:
 
 
 def pack_path(subject: Subject) -> Path:
-    """Where a subject's array lies."""
+    """Path of a subject's array."""
     return subject.folder.parent / PACK_FOLDER / f"{subject.name}.npy"
 
 
 def source_stamp(subject: Subject) -> str:
-    """A digest that changes when pictures do: of the completion mark, or of all names, sizes and times without one."""
+    """Digest that changes with the images: of the completion mark, else of all names, sizes and modification times."""
     digest = hashlib.sha256()
     mark = subject.folder / capture_layout.COMPLETE_FILE
     if mark.is_file():
@@ -120,7 +127,7 @@ Record = TypeVar("Record", bound=TensorRecord)
 
 
 class Position(NamedTuple):
-    """Where in the endless order of samples training is."""
+    """A place in the endless sequence of samples."""
 
     epoch: int = 0
     index: int = 0
@@ -129,44 +136,44 @@ class Position(NamedTuple):
 FIRST = Position()
 
 
-class Share(NamedTuple):
-    """Which of the processes that train together this is."""
+class ProcessRank(NamedTuple):
+    """This process among those that train together."""
 
     index: int = 0
-    of: int = 1
+    count: int = 1
 
 
-ALONE = Share()
+SINGLE_PROCESS = ProcessRank()
 
 
 @dataclasses.dataclass(frozen=True)
 class SampleSettings:
-    """What a sample holds."""
+    """Settings of training samples."""
 
     conditioning: int = 4
-    """Views to encode the person from."""
+    """Views to encode the subject from."""
     targets: int = 4
-    """Views to compare with; others than the conditioning ones where there are enough cameras."""
+    """Views to compare with, distinct from the conditioning views if there are enough cameras."""
     size: int = 512
-    """Pixels a side."""
+    """Width and height of the images, pixels."""
     framing: Literal["whole", "crop"] = "whole"
-    """whole: pictures as they are; crop: of targets random squares about the person, no smaller than `size` pixels."""
+    """whole: entire images; crop: targets are random squares around the subject, at least `size` pixels wide."""
     conditioning_frame: Literal["first", "same", "any"] = "first"
-    """The pose of the conditioning views: near T, that of the targets, or any."""
+    """Frame of the conditioning views: the first (near the T pose), that of the targets, or a random one."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for samples without views or pixels."""
+        """Raise ValueError if a count is not positive."""
         for name in ("conditioning", "targets", "size"):
             if getattr(self, name) < 1:
-                raise ValueError(f"{name} of the samples is {getattr(self, name)}: it must be 1 or more")
+                raise ValueError(f"{name} of the samples is {getattr(self, name)}: give 1 or more")
 
 
 @dataclasses.dataclass(frozen=True)
 class Views(TensorRecord):
-    """Pictures of one person in one pose, or a batch of such."""
+    """Images of one subject in one pose, or a batch."""
 
     rgba: UInt8[Tensor, "*b v H W 4"]
-    """sRGB-encoded over black, and the mask; as one, because it is copied on its way from the workers."""
+    """sRGB-encoded over black, and the mask; one tensor, because workers send it by copying."""
     camera: Camera
     """A batch of views [*b, v]."""
     pose: BodyPose
@@ -179,36 +186,36 @@ class Views(TensorRecord):
 
     @property
     def mask(self) -> UInt8[Tensor, "*b v H W"]:
-        """Share of the pixel that the person covers, of 255."""
+        """Coverage of the pixel by the subject, of 255."""
         return self.rgba[..., 3]
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainingSample(TensorRecord):
-    """One person: what is given, and what is to come out; or a batch of such."""
+    """Input and target views of one subject, or a batch."""
 
     conditioning: Views
     target: Views
     betas: Float32[Tensor, "*b B"]
     subject: Int64[Tensor, "*b"]
-    """Number in the dataset's `captures.subjects`."""
+    """Index into the dataset's `captures.subjects`."""
     frame: Int64[Tensor, "*b"]
-    """Of the targets."""
+    """Frame of the targets."""
 
 
 class SampleSet(Dataset[Record], abc.ABC):
-    """Samples by `Position`; `len` is how many an epoch has."""
+    """Samples indexed by `Position`; `len` is the number per epoch."""
 
     @abc.abstractmethod
     def __len__(self) -> int:
-        """Samples of an epoch."""
+        """Samples per epoch."""
 
 
 class CaptureDataset(SampleSet[TrainingSample]):
-    """Samples by `Position`; an epoch shows every pose of everybody once."""
+    """Samples indexed by `Position`; an epoch shows every pose of every subject once."""
 
     def __init__(self, captures: Captures, settings: SampleSettings | None = None, seed: int = 0) -> None:
-        """Raises what `Captures.subject` does where frames must be counted (datasets without dataset.json)."""
+        """Raises as `Captures.subject` if frames must be counted, in datasets without dataset.json."""
         self.captures, self.settings, self.seed = captures, settings or SampleSettings(), seed
         frames = captures.about.get("frames")
         counts = [frames or captures.subject(name).frames for name in captures.subjects]
@@ -217,7 +224,7 @@ class CaptureDataset(SampleSet[TrainingSample]):
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, np.int64))
 
     def __len__(self) -> int:
-        """Samples of an epoch."""
+        """Samples per epoch."""
         return len(self._pairs)
 
     def __getitem__(self, position: tuple[int, int]) -> TrainingSample:
@@ -253,9 +260,9 @@ class CaptureDataset(SampleSet[TrainingSample]):
         size, pictures, seen = self.settings.size, [], []
         for camera in cameras:
             rgba, view = self._rgba(subject, frame, int(camera)), subject.views[camera]
-            window = whole(view) if crops is None else _about_the_person(rgba, size, crops)
+            window = full_window(view) if crops is None else _crop_around_subject(rgba, size, crops)
             pictures.append(resample(rgba, window, size))
-            seen.append(through(view, window, size))
+            seen.append(windowed_view(view, window, size))
         camera = stack([as_camera(view) for view in seen])
         return Views(torch.from_numpy(np.stack(pictures)), camera, subject.smpl.pose(frame))
 
@@ -269,14 +276,14 @@ class CaptureDataset(SampleSet[TrainingSample]):
         return np.concatenate([image, mask[..., None]], axis=-1)
 
     def __getstate__(self) -> dict[str, object]:
-        """Worker processes map the packs themselves."""
+        """Worker processes open the packs themselves."""
         return {**self.__dict__, "_packs": {}}
 
 
 class _Order(Sampler[Position]):
-    """Positions from `start` on, without end: of every `share.of` runs of `size`, the `share.index`-th."""
+    """Positions from `start` on, endlessly: of every `share.count` runs of `size`, the `share.index`-th."""
 
-    def __init__(self, length: int, start: Position, size: int, share: Share) -> None:
+    def __init__(self, length: int, start: Position, size: int, share: ProcessRank) -> None:
         self._length, self._start, self._size, self._share = length, start, size, share
 
     def __iter__(self) -> Iterator[Position]:
@@ -285,23 +292,27 @@ class _Order(Sampler[Position]):
             for _ in range(self._size):
                 yield position
                 position = _after(position, 1, self._length)
-            position = _after(position, (self._share.of - 1) * self._size, self._length)
+            position = _after(position, (self._share.count - 1) * self._size, self._length)
 
 
 def batches(
-    dataset: SampleSet[Record], size: int, start: Position = FIRST, workers: int = 0, share: Share = ALONE
+    dataset: SampleSet[Record],
+    size: int,
+    start: Position = FIRST,
+    workers: int = 0,
+    share: ProcessRank = SINGLE_PROCESS,
 ) -> Iterator[tuple[Record, Position]]:
-    """Batches without end, each with the position behind it: save it, and `start` there to go on.
+    """Endless batches, each with the position after it, which resumes training when passed as `start`.
 
-    Of several processes each gets its own batches, and behind them is the place where all are done. The dataset is a
-    `CaptureDataset`, or one that makes other records of its samples.
+    Each of several processes gets its own batches, and positions after the batches of all. The dataset is a
+    `CaptureDataset`, or one that derives other records from its samples.
 
     Raises:
         ValueError: the batch size is not positive.
         FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
     """
     if size < 1:
-        raise ValueError(f"a batch of {size} samples: ask for one or more")
+        raise ValueError(f"the batch size is {size}: give 1 or more")
     loader = DataLoader(
         dataset,
         batch_size=size,
@@ -309,16 +320,16 @@ def batches(
         num_workers=workers,
         collate_fn=stack,
         pin_memory=torch.cuda.is_available(),
-        generator=torch.Generator(),  # the loader draws seeds for its workers: not from what training draws from
+        generator=torch.Generator(),  # worker seeds must not come from the generator that training uses
     )
     position = Position(*start)
     for batch in loader:
-        position = _after(position, size * share.of, len(dataset))
+        position = _after(position, size * share.count, len(dataset))
         yield batch, position
 
 
 def stack(records: Sequence[Record]) -> Record:
-    """Records of one kind as one with a batch dimension in front; what is no tensor is the first one's."""
+    """Stack records of one type along a new first dimension; fields that are no tensors come from the first."""
     first = records[0]
     stacked = {}
     for field in dataclasses.fields(first):
@@ -331,7 +342,7 @@ def stack(records: Sequence[Record]) -> Record:
 
 
 def _stacked(values: Sequence[Tensor]) -> Tensor:
-    """In a worker straight into the memory that the training process sees, which saves a copy."""
+    """Stack; in a worker, directly into shared memory, which saves a copy."""
     if get_worker_info() is None:
         return torch.stack(list(values))
     shape = (len(values), *values[0].shape)
@@ -345,8 +356,8 @@ def _after(position: Position, samples: int, length: int) -> Position:
     return Position(position.epoch + total // length, total % length)
 
 
-def _about_the_person(rgba: np.ndarray, size: int, draws: np.random.Generator) -> Window:
-    """A random square inside of the picture whose middle is a place in the person's bounding box, as far as it can."""
+def _crop_around_subject(rgba: np.ndarray, size: int, draws: np.random.Generator) -> Window:
+    """A random square inside the image, centred in the subject's bounding box as far as the image allows."""
     height, width = rgba.shape[:2]
     largest = min(width, height)
     side = float(draws.uniform(min(size, largest), largest))

@@ -1,7 +1,7 @@
-"""Captures on many machines: Ray spreads the people of a dataset over workers, one renderer process at a time each.
+"""Render captures on many machines: Ray distributes the subjects of a dataset over renderer processes.
 
-A person is a task. Everything a renderer does is resumable and atomic (see `layout`), so a person whose worker was
-killed is given to another one and continues with the view that was not finished; nothing is lost, nothing made twice.
+One subject is one task. Renderers resume and write atomically (`formats/capture_layout.py`), so if a worker is killed,
+another continues its subject with the first unfinished view.
 """
 
 from __future__ import annotations
@@ -17,60 +17,62 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 LIST, ONLY = ("--list", "--progress", "json"), ("--progress", "none", "--only")
-"""What a renderer's command must understand: to tell its subjects, {"line": NAME} on marked lines; to render one."""
+"""Options that a renderer must support: list its subjects as {"line": NAME} on marked lines, and render one."""
 MARK = "PRIMDIFFUSION "
 _LINES_OF_ERROR = 5
 _SET_PARENT_DEATH_SIGNAL = 1
 
 
 class FarmError(ValueError):
-    """The farm cannot begin: no Ray, no cluster, or a command that lists no subjects."""
+    """The farm cannot start: no Ray, no cluster, or a command that lists no subjects."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Outcome:
-    """How one person's task ended."""
+class FarmResult:
+    """The result of rendering one subject."""
 
     subject: str
     exit_code: int
     seconds: float
     error: str
-    """The renderer's last lines where it failed, else empty."""
+    """The renderer's last lines if it failed, else empty."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Farm:
-    """Where the tasks run."""
+    """The cluster, and the resources of each renderer."""
 
     address: str | None = None
-    """Of a Ray cluster, "auto" for the one this machine belongs to; None starts one here."""
+    """Address of a Ray cluster, "auto" for the one this machine belongs to; None starts a local one."""
     workers: int = 1
-    """Renderers at once, where the cluster is started here."""
+    """Concurrent renderers of a local cluster."""
     processors_each: float = 1
     gpus_each: float = 0
-    """Of a cluster's GPUs to each renderer; Ray shows a renderer no others."""
+    """GPUs per renderer; Ray hides the others from it."""
     attempts: int = 3
-    """Times a person is tried whose worker or renderer is killed."""
+    """Attempts per subject if its worker or renderer is killed."""
 
 
 def subjects_of(command: Sequence[str]) -> list[str]:
-    """The subjects that a renderer's command would render. Raises FarmError where it names none."""
+    """List the subjects that a renderer's command would render. Raises FarmError if there are none."""
     try:
         ran = subprocess.run([*command, *LIST], capture_output=True, text=True, check=False)
     except OSError as e:
         raise FarmError(f"the renderer {command[0]!r} cannot be started ({e}): give its path") from e
-    told = [json.loads(line.removeprefix(MARK)) for line in ran.stdout.splitlines() if line.startswith(MARK)]
-    if ran.returncode or not told:
-        raise FarmError(f"{' '.join([*command, *LIST])} names no subjects: {_tail(ran.stderr) or 'it is silent'}")
-    return [line["line"] for line in told]
+    listed = [json.loads(line.removeprefix(MARK)) for line in ran.stdout.splitlines() if line.startswith(MARK)]
+    if ran.returncode or not listed:
+        raise FarmError(f"{' '.join([*command, *LIST])} names no subjects: {_tail(ran.stderr) or 'it printed nothing'}")
+    return [line["line"] for line in listed]
 
 
 def render_on(
-    farm: Farm, command: Sequence[str], report: Callable[[Outcome, int, int], None] = lambda outcome, done, total: None
-) -> list[Outcome]:
-    """Renders every subject of `command`, and returns how each ended; `report` hears of each as it ends.
+    farm: Farm,
+    command: Sequence[str],
+    report: Callable[[FarmResult, int, int], None] = lambda result, done, total: None,
+) -> list[FarmResult]:
+    """Render every subject of `command` and return the results; `report` gets each, the number done, and the total.
 
-    The command runs on whatever machine has room: its paths must mean the same files on all of them. Raises FarmError.
+    The command may run on any machine of the cluster, so its paths must be valid on all. Raises FarmError.
     """
     subjects = subjects_of(command)
     ray = _started(farm)
@@ -79,23 +81,23 @@ def render_on(
             num_cpus=farm.processors_each, num_gpus=farm.gpus_each, max_retries=farm.attempts - 1, max_calls=1
         )(render_one)
         waiting = {task.remote(list(command), subject, farm.attempts): subject for subject in subjects}
-        outcomes = []
+        results = []
         while waiting:
             finished, _ = ray.wait(list(waiting), num_returns=1)
             subject = waiting.pop(finished[0])
             try:
-                outcome = ray.get(finished[0])
+                result = ray.get(finished[0])
             except ray.exceptions.RayError as e:
-                outcome = Outcome(subject, -1, 0.0, f"its worker was lost {farm.attempts} times ({type(e).__name__})")
-            outcomes.append(outcome)
-            report(outcome, len(outcomes), len(subjects))
-        return sorted(outcomes, key=lambda outcome: outcome.subject)
+                result = FarmResult(subject, -1, 0.0, f"its worker was lost {farm.attempts} times ({type(e).__name__})")
+            results.append(result)
+            report(result, len(results), len(subjects))
+        return sorted(results, key=lambda result: result.subject)
     finally:
         ray.shutdown()
 
 
-def render_one(command: list[str], subject: str, attempts: int) -> Outcome:
-    """The task: one renderer process, started again where it is killed, but not where it says what is wrong."""
+def render_one(command: list[str], subject: str, attempts: int) -> FarmResult:
+    """The Ray task: run one renderer; restart it if it is killed, but not if it reports an error."""
     began, exit_code, error = time.monotonic(), -1, ""
     for _ in range(attempts):
         process = subprocess.Popen(
@@ -106,7 +108,7 @@ def render_one(command: list[str], subject: str, attempts: int) -> Outcome:
         exit_code = process.returncode
         if exit_code >= 0:
             break
-    return Outcome(subject, exit_code, time.monotonic() - began, error if exit_code else "")
+    return FarmResult(subject, exit_code, time.monotonic() - began, error if exit_code else "")
 
 
 def _started(farm: Farm) -> Any:
@@ -125,7 +127,7 @@ def _started(farm: Farm) -> Any:
 
 
 def _die_with_parent() -> None:
-    """A renderer must not go on alone when its worker is killed: the person is given to another one."""
+    """End the renderer with its worker, because another worker takes over the subject."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
 

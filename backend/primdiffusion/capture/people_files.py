@@ -1,6 +1,6 @@
-"""Binary glTF 2.0 files: their JSON and the arrays and pictures in them.
+"""Read humans from skinned .glb files in the default body's rest pose, as `primdiffusion people` writes them.
 
-Nothing outside the file is opened, whatever it names. Sparse accessors and compressed meshes are not read.
+The reader of binary glTF 2.0 opens no other files. Sparse accessors and compressed meshes are not supported.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 class GlbError(ValueError):
-    """A file that is no binary glTF, is damaged, or uses what is not read here."""
+    """A file that is damaged, not binary glTF, or uses unsupported features."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Glb:
-    """A file in memory."""
+    """A .glb file in memory."""
 
     path: Path
     content: dict[str, Any]
-    """The JSON."""
+    """The JSON chunk."""
     binary: bytes
 
     def array(self, accessor: int) -> NDArray:
-        """The numbers of an accessor, [count] or [count, width]; normalised integers as float32 of 0 ... 1.
+        """Values of an accessor, [count] or [count, width]; normalised integers as float32 in [0, 1].
 
         Raises:
-            GlbError: it is not there, reaches out of the file, or is sparse.
+            GlbError: it does not exist, exceeds the file, or is sparse.
         """
         try:
             about = self.content["accessors"][accessor]
             if "sparse" in about or accessor < 0:
-                raise GlbError(f"{self.path}: accessor {accessor} is sparse, which is not read: export without")
+                raise GlbError(f"{self.path}: accessor {accessor} is sparse, which is not supported: export without")
             view = self.content["bufferViews"][about["bufferView"]]
             number, width, count = np.dtype(NUMBERS[about["componentType"]]), WIDTHS[about["type"]], int(about["count"])
             first = int(view.get("byteOffset", 0)) + int(about.get("byteOffset", 0))
@@ -69,10 +69,10 @@ class Glb:
         return values[:, 0] if width == 1 else values
 
     def picture(self, image: int) -> UInt8[np.ndarray, "H W 4"]:
-        """An image, sRGB-encoded with straight alpha.
+        """An embedded image, sRGB-encoded with straight alpha.
 
         Raises:
-            GlbError: it is not there, not in the file, or no picture.
+            GlbError: it does not exist, is not embedded, or cannot be decoded.
         """
         try:
             view = self.content["bufferViews"][self.content["images"][image]["bufferView"]]
@@ -85,20 +85,20 @@ class Glb:
 
 
 def read_glb(path: str | Path) -> Glb:
-    """A .glb file.
+    """Read a .glb file.
 
     Raises:
-        FileNotFoundError: there is none.
-        GlbError: it is something else, or cut short.
+        FileNotFoundError: the file does not exist.
+        GlbError: it is not binary glTF 2.0, or truncated.
     """
     path = Path(path)
     data = path.read_bytes()
     try:
         magic, version, length = struct.unpack_from("<4sII", data)
         if magic != MAGIC or version != 2:
-            raise GlbError(f"{path} is no binary glTF 2.0 file: export it as .glb")
+            raise GlbError(f"{path} is not a binary glTF 2.0 file: export it as .glb")
         if length > len(data):
-            raise GlbError(f"{path} is cut short, {len(data)} of {length} bytes: write it again")
+            raise GlbError(f"{path} is truncated ({len(data)} of {length} bytes): write it again")
         chunks, at = {}, 12
         while at + 8 <= length:
             size, kind = struct.unpack_from("<I4s", data, at)
@@ -106,34 +106,34 @@ def read_glb(path: str | Path) -> Glb:
             at += 8 + size
         content = json.loads(chunks[JSON_CHUNK])
     except (struct.error, KeyError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as e:
-        raise GlbError(f"{path} is no whole .glb file ({e}): write it again") from e
+        raise GlbError(f"{path} is not a complete .glb file ({e}): write it again") from e
     if not isinstance(content, dict):
-        raise GlbError(f"{path} holds no glTF object: write it again")
+        raise GlbError(f"{path} contains no glTF object: write it again")
     return Glb(path, content, chunks.get(BINARY_CHUNK, b""))
 
 
 SUBJECT_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
 FARTHEST = 10.0
-"""Metres from the origin within which all of a person lies; one lost vertex would send the cameras far away."""
+"""Largest distance of a vertex from the origin, metres; a stray vertex would move the cameras far away."""
 LARGEST_BETA = 20.0
-"""Standard deviations; beyond, joints lie outside of any body."""
+"""Standard deviations; larger betas put joints outside any body."""
 OURS = "primdiffusion"
-"""Key of the extras that hold betas and body."""
+"""Key of the extras that contain betas and body."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SkinnedPerson:
-    """A dressed person in the rest pose of the default body."""
+    """A dressed human in the rest pose of the default body."""
 
     mesh: TexturedMesh
     betas: Float[np.ndarray, "n"]
 
 
 def find_people(folder: str | Path) -> dict[str, Path]:
-    """The .glb of every person in a folder, by name, sorted: NAME/person.glb or NAME.glb; several are told apart.
+    """Find the .glb files in a folder, sorted by name: NAME/person.glb or NAME.glb.
 
     Raises:
-        FileNotFoundError: there is no such folder, or nobody in it.
+        FileNotFoundError: the folder does not exist or contains none.
     """
     folder = Path(folder)
     inner = [p for p in folder.iterdir() if p.is_dir() and p.name == "people"] if folder.is_dir() else []
@@ -144,18 +144,16 @@ def find_people(folder: str | Path) -> dict[str, Path]:
             if SUBJECT_NAME.fullmatch(name):
                 found.setdefault(name, path)
     if not found:
-        raise FileNotFoundError(
-            f"there are no people (NAME/person.glb) in {folder}: make some with primdiffusion people"
-        )
+        raise FileNotFoundError(f"{folder} contains no NAME/person.glb: make some with primdiffusion people")
     return dict(sorted(found.items()))
 
 
 def read_person(path: str | Path) -> SkinnedPerson:
-    """A person of such a file.
+    """Read a human.
 
     Raises:
-        FileNotFoundError: there is none.
-        GlbError: it is no whole .glb, or not rigged with the 24 joints, or does not say whose body it is.
+        FileNotFoundError: the file does not exist.
+        GlbError: it is not a complete .glb, not rigged with the 24 joints, or has no betas.
     """
     glb = read_glb(path)
     try:
@@ -163,7 +161,7 @@ def read_person(path: str | Path) -> SkinnedPerson:
     except GlbError:
         raise
     except (LookupError, TypeError, ValueError, AttributeError) as e:
-        raise GlbError(f"{path} is no person of the default body ({type(e).__name__}: {e}): make it again") from e
+        raise GlbError(f"{path} is not a human on the default body ({type(e).__name__}: {e}): make it again") from e
 
 
 def _betas(glb: Glb) -> Float[np.ndarray, "n"]:
@@ -171,15 +169,15 @@ def _betas(glb: Glb) -> Float[np.ndarray, "n"]:
     places = [glb.content.get("asset", {}), *scenes]
     extras: Any = next((p["extras"][OURS] for p in places if OURS in (p.get("extras") or {})), None)
     if extras is None:
-        raise GlbError(f"{glb.path} does not say its betas: only files of primdiffusion people are read")
+        raise GlbError(f"{glb.path} has no betas: only files from primdiffusion people can be read")
     if extras.get("body", "default") != "default":
-        raise GlbError(f"{glb.path} is rigged on the body {extras['body']!r}: only the default body is known here")
+        raise GlbError(f"{glb.path} is rigged on the body {extras['body']!r}: only the default body is supported")
     betas = np.asarray(extras["betas"], np.float64)
     components = default_body().shape_basis.shape[-1]
     if betas.ndim != 1 or len(betas) > components or not (np.abs(betas) <= LARGEST_BETA).all():
         raise GlbError(
-            f"{glb.path} has betas of shape {betas.shape}, not up to {components} within {LARGEST_BETA:g} of 0: "
-            "make the person again"
+            f"{glb.path} has betas of shape {betas.shape}; at most {components}, within {LARGEST_BETA:g} of 0, are "
+            "supported: make the person again"
         )
     return betas
 
@@ -190,21 +188,21 @@ def _parts(glb: Glb) -> tuple[TexturedPart, ...]:
         if "mesh" not in node:
             continue
         if "skin" not in node:
-            raise GlbError(f"{glb.path}: the mesh {node.get('name')!r} is not rigged: make the person again")
+            raise GlbError(f"{glb.path}: the mesh {node.get('name')!r} has no skin: make the person again")
         joints = _joints(glb, node["skin"])
         for number, primitive in enumerate(glb.content["meshes"][node["mesh"]]["primitives"]):
             name = str(node.get("name", f"part {len(parts)}")) + (f" {number}" if number else "")
             parts.append(_part(glb, name, primitive, joints))
     if not parts:
-        raise GlbError(f"{glb.path} holds no mesh: make the person again")
+        raise GlbError(f"{glb.path} contains no mesh: make the person again")
     return tuple(parts)
 
 
 def _joints(glb: Glb, skin: int) -> Int[np.ndarray, "n"]:
-    """SMPL's number of each joint of a skin."""
+    """SMPL index of each joint of a skin."""
     names = [glb.content["nodes"][node].get("name") for node in glb.content["skins"][skin]["joints"]]
     if unknown := sorted({str(name) for name in names if name not in JOINT_NAMES}):
-        raise GlbError(f"{glb.path} has joints {', '.join(unknown[:3])}, not SMPL's {J}: rig it with these")
+        raise GlbError(f"{glb.path} has joints {', '.join(unknown[:3])}: rig it with SMPL's {J} joints")
     return np.array([JOINT_NAMES.index(name) for name in names], np.int32)
 
 
@@ -213,7 +211,7 @@ def _part(glb: Glb, name: str, primitive: dict[str, Any], joints: Int[np.ndarray
     vertices = glb.array(attributes["POSITION"]).astype(np.float64)
     faces = glb.array(primitive["indices"]).astype(np.int64) if "indices" in primitive else np.arange(len(vertices))
     if primitive.get("mode", 4) != 4 or len(faces) % 3 or int(faces.max(initial=0)) >= len(vertices):
-        raise GlbError(f"{glb.path}: the faces of {name!r} are no triangles of its vertices: make the person again")
+        raise GlbError(f"{glb.path}: the faces of {name!r} are not triangles of its vertices: make the person again")
     faces = faces.reshape(-1, 3).astype(np.int32)
     uv = glb.array(attributes["TEXCOORD_0"]) if "TEXCOORD_0" in attributes else np.zeros((len(vertices), 2), np.float32)
     index = joints[glb.array(attributes["JOINTS_0"]).astype(np.int64)]
@@ -221,8 +219,8 @@ def _part(glb: Glb, name: str, primitive: dict[str, Any], joints: Int[np.ndarray
     total = weight.sum(1, keepdims=True)
     if not (np.abs(vertices) < FARTHEST).all() or not (total > 0).all():
         raise GlbError(
-            f"{glb.path}: {name!r} has vertices {FARTHEST:g} m and more from the origin, not finite, or that follow no "
-            "joint: make it again"
+            f"{glb.path}: {name!r} has vertices that are not finite, without joints, or {FARTHEST:g} m from "
+            "the origin: make the person again"
         )
     return TexturedPart(
         name=name,
@@ -236,7 +234,7 @@ def _part(glb: Glb, name: str, primitive: dict[str, Any], joints: Int[np.ndarray
 
 
 def _texture(glb: Glb, primitive: dict[str, Any]) -> UInt8[np.ndarray, "H W 4"]:
-    """Base colour times factor; alpha only where the material cuts out."""
+    """Base colour times factor; opaque unless the material uses alpha."""
     material = glb.content["materials"][primitive["material"]] if "material" in primitive else {}
     surface = material.get("pbrMetallicRoughness", {})
     picture = np.full((1, 1, 4), 255, np.uint8)
@@ -249,7 +247,7 @@ def _texture(glb: Glb, primitive: dict[str, Any]) -> UInt8[np.ndarray, "H W 4"]:
     if material.get("alphaMode", "OPAQUE") == "OPAQUE":
         picture[..., 3] = 255
     else:
-        # The cutoff moves to one half, where drawing tests.
+        # Scale alpha so that the cutoff is one half, as the rasteriser tests.
         cutoff = float(material.get("alphaCutoff", 0.5)) if material["alphaMode"] == "MASK" else 0.5
         scaled = picture[..., 3] * (factor[3] * 0.5 / max(cutoff, 1e-3))
         picture[..., 3] = np.round(np.clip(scaled, 0, 255))

@@ -1,4 +1,4 @@
-"""Poses to capture people in: built-in ones, frames of motion files, and a choice of few that differ much."""
+"""Poses of captures: built-in ones, frames of motion files, and a selection of poses that differ most."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ POSES, ROOT, REST = ("poses", "pose", "theta", "fullpose"), ("global_orient", "r
 TRANSLATIONS = ("trans", "transl", "translation")
 KEYS = (*POSES, *ROOT, *REST, *TRANSLATIONS)
 CLEARLY_UP = 0.6
-"""Mean cosine between the pelvis' own up and an axis from which on that axis counts as up."""
+"""Smallest mean cosine between the pelvis' up and an axis for which that axis is up."""
 MOST_CANDIDATES = 2000
-"""Frames among which few are chosen; of more, these many evenly spaced."""
+"""Frames to choose from; longer motions are subsampled evenly."""
 BUILT_IN = Path(__file__).parent / "data" / "poses.json"
-"""Made by scripts/bake_poses: the poses that the extension has, 72 axis-angle numbers by name."""
+"""The extension's poses, 72 axis-angle values by name; made by scripts/bake_poses."""
 
 
 class MotionFileError(ValueError):
-    """A file of poses that cannot be understood; one sentence that names it."""
+    """An unreadable pose file; the message names it."""
 
 
 def built_in_poses() -> BodyPose:
@@ -39,23 +39,23 @@ def built_in_poses() -> BodyPose:
 
 
 def read_motion(path: str | Path) -> BodyPose:
-    """Every frame of a file: rotations [F, 24, 3, 3], translations [F, 3] in metres, y up.
+    """Read all frames of a file: rotations [F, 24, 3, 3], translations [F, 3] in metres, y up.
 
     .npz of AMASS, of "poses" or "pose" [F, 72 or more], or of "global_orient" and "body_pose"; .npy or .json of the
-    same. Hands of SMPL-H and SMPL-X are left out (`pose_file.body_theta`). AMASS (its names are "trans" with "poses"
-    or "pose_body") is turned so that y is up. The extension has a reader of its own, for it imports nothing of the
-    backend; a test holds both to the same poses. Raises FileNotFoundError, ArrayFileError or MotionFileError.
+    same. Hands of SMPL-H and SMPL-X are dropped (`pose_file.body_theta`). AMASS files ("trans" with "poses" or
+    "pose_body") are rotated so that y is up. The extension, which cannot import the backend, has its own reader; a test
+    compares both. Raises FileNotFoundError, ArrayFileError or MotionFileError.
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"there is no pose file {path}: check the path")
+        raise FileNotFoundError(f"the pose file {path} does not exist: check the path")
     content = read_numbers(path, (), KEYS) if path.suffix == ".npz" else _read_plain(path)
     turns = _turns(path, content)
     move = np.asarray(_first(content, TRANSLATIONS, np.zeros(3)), np.float64)
     if move.size not in (3, 3 * len(turns)) or not np.isfinite(move).all():
         raise MotionFileError(
-            f"{path} has {len(turns)} frames of poses but translations of shape {move.shape}, or not finite: export it "
-            "again"
+            f"{path} has {len(turns)} frames, but its translations have shape {move.shape} or are not finite: "
+            "export it again"
         )
     pose = _as_pose(turns, np.broadcast_to(move.reshape(-1, 3), (len(turns), 3)))
     is_amass = path.suffix == ".npz" and "trans" in content and ("poses" in content or "pose_body" in content)
@@ -63,7 +63,7 @@ def read_motion(path: str | Path) -> BodyPose:
 
 
 def read_motions(paths: Sequence[Path]) -> tuple[list[BodyPose], list[str]]:
-    """The motions of the files that can be read, and a sentence for each that cannot."""
+    """Read motion files; return the motions, and an error message for each unreadable file."""
     motions, failures = [], []
     for path in paths:
         try:
@@ -74,38 +74,38 @@ def read_motions(paths: Sequence[Path]) -> tuple[list[BodyPose], list[str]]:
 
 
 def choose_poses(motions: Sequence[BodyPose], count: int, seed: int) -> BodyPose:
-    """`count` poses: near T first, then those of `motions` (none: built in) that lie farthest from the ones before.
+    """Choose `count` poses: near T first, then those of `motions` (or the built-in ones) farthest from all before.
 
-    Distance is that of the joints about the pelvis of an average body. Poses are taken in place, without translation.
+    The distance of poses is that of the joints relative to the pelvis of an average body. Translations are dropped.
 
     Raises:
-        ValueError: count is not positive, or there are fewer poses.
+        ValueError: `count` is not positive or exceeds the number of poses.
     """
     near_t = built_in_poses().map(lambda t: t[:1])
     rest = list(motions) or [built_in_poses().map(lambda t: t[1:])]
     rotation = torch.cat([near_t.joint_rotation, *(pose.joint_rotation for pose in rest)])
     if not 1 <= count <= len(rotation):
-        raise ValueError(f"{count} poses were asked for: there are {len(rotation)}, the near-T pose included")
+        raise ValueError(f"{count} poses were requested: there are {len(rotation)}, including the near-T pose")
     chosen = rotation
     if motions:
         candidates = np.unique(np.linspace(1, len(rotation) - 1, min(MOST_CANDIDATES, len(rotation) - 1)).astype(int))
         if len(candidates) < count - 1:
             candidates = np.arange(1, len(rotation))
-        kept = np.concatenate([[0], candidates])
-        chosen = rotation[kept][_spread(rotation[kept], count, seed)]
+        considered = np.concatenate([[0], candidates])
+        chosen = rotation[considered][_spread(rotation[considered], count, seed)]
     return BodyPose(chosen[:count], torch.zeros(count, 3))
 
 
 def _spread(rotation: Float[torch.Tensor, "F J 3 3"], count: int, seed: int) -> list[int]:
-    """Farthest-point choice from frame 0; ties and near ties are broken by the seed."""
+    """Farthest-point sampling from frame 0; the seed breaks ties and near ties."""
     joints = default_body().shape(torch.zeros(1)).pose(BodyPose(rotation, torch.zeros(len(rotation), 3))).joints
     places = joints[..., :3, 3] - joints[..., :1, :3, 3]
-    liking = 1 + 0.1 * torch.from_numpy(np.random.default_rng(seed).random(len(rotation))).float()
+    preference = 1 + 0.1 * torch.from_numpy(np.random.default_rng(seed).random(len(rotation))).float()
     taken = [0]
     distance = torch.full((len(rotation),), torch.inf)
     while len(taken) < count:
         distance = torch.minimum(distance, (places - places[taken[-1]]).norm(dim=-1).mean(-1))
-        score = distance * liking
+        score = distance * preference
         score[taken] = -1
         taken.append(int(score.argmax()))
     return taken
@@ -125,7 +125,7 @@ def _read_plain(path: Path) -> dict[str, NDArray]:
             content = {"poses": content}
         return {key: np.asarray(content[key], np.float64) for key in KEYS if key in content}
     except (ValueError, TypeError, OSError, EOFError, RecursionError) as e:
-        raise MotionFileError(f"{path} is no pose file ({e}): give .npz, .npy or .json of axis-angle numbers") from e
+        raise MotionFileError(f"{path} is not a pose file ({e}): give axis-angle values as .npz, .npy or .json") from e
 
 
 def _turns(path: Path, content: Mapping[str, NDArray]) -> NDArray[np.float64]:
@@ -135,18 +135,18 @@ def _turns(path: Path, content: Mapping[str, NDArray]) -> NDArray[np.float64]:
         turns = body_theta(values).reshape(-1, J, 3)
     except (ValueError, TypeError) as e:
         raise MotionFileError(
-            f"{path} holds no poses ({e}): it needs {3 * J} axis-angle numbers a frame ({J} joints x 3, radians)"
+            f"{path} contains no poses ({e}): it needs {3 * J} axis-angle values per frame ({J} joints x 3, radians)"
         ) from e
     if not len(turns) or not np.isfinite(turns).all():
-        raise MotionFileError(f"{path} holds no frame, or NaN or infinite numbers: export it again")
+        raise MotionFileError(f"{path} has no frames, or NaN or infinite values: export it again")
     return turns
 
 
 def _rows(rest: NDArray | None, root: NDArray | None, poses: NDArray | None) -> NDArray[np.float64]:
-    """A row a frame [F, n], the pelvis first, of poses in two parts or whole."""
+    """Join the parts of a pose to one row per frame [F, n], pelvis first."""
     if rest is None:
         if poses is None:
-            raise ValueError("none of the usual names")
+            raise ValueError("it has no array with a known name")
         return _frames(poses)
     body = _frames(rest)
     turn = np.zeros(3) if root is None else np.asarray(root, np.float64)
@@ -166,7 +166,7 @@ def _first(content: Mapping[str, NDArray], keys: Sequence[str], default: NDArray
 
 
 def _upright(pose: BodyPose) -> BodyPose:
-    """With y up: people stand, sit and walk more than they lie, so the mean of the pelvis' up is the world's."""
+    """Rotate a motion so that y is up, assuming that the mean up direction of the pelvis is the world's."""
     mean = pose.joint_rotation[:, 0, :, 1].mean(0)
     axis = int(mean.abs().argmax())
     if (axis == 1 and mean[1] > 0) or mean[axis].abs() < CLEARLY_UP:
@@ -174,12 +174,12 @@ def _upright(pose: BodyPose) -> BodyPose:
     turn = _shortest_turn_to_y(axis, float(mean[axis].sign())).to(pose.joint_rotation)
     rotation = pose.joint_rotation.clone()
     rotation[:, 0] = turn @ rotation[:, 0]
-    pelvis = default_body().shape(torch.zeros(1)).joints[0]  # a translation moves a body whose pelvis rests there
+    pelvis = default_body().shape(torch.zeros(1)).joints[0]  # translations are relative to the pelvis of the rest pose
     return BodyPose(rotation, (pose.translation + pelvis) @ turn.T - pelvis)
 
 
 def _shortest_turn_to_y(axis: int, sign: float) -> Float[torch.Tensor, "3 3"]:
-    """The rotation that takes a world axis to y; half a turn, from -y, is about z."""
+    """Rotation from a world axis to y; from -y, half a turn about z."""
     if axis == 1:
         return torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
     turn = torch.zeros(3, 3)

@@ -1,4 +1,4 @@
-"""Parts of pictures at another size, in linear light, and the cameras that see them."""
+"""Read captures: our layout (`formats/capture_layout.py`) and the released code's (SPEC 5), which is a subset of it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from primdiffusion.raster.textures import BYTE_OF_LINEAR, LINEAR_OF_BYTE
 
 @dataclasses.dataclass(frozen=True)
 class Window:
-    """A rectangle of a picture, in pixels from its upper left corner."""
+    """A rectangle in an image, in pixels from the upper left corner."""
 
     left: float
     top: float
@@ -36,13 +36,13 @@ class Window:
     height: float
 
 
-def whole(view: View) -> Window:
-    """All of a view's picture."""
+def full_window(view: View) -> Window:
+    """The window that contains the whole image."""
     return Window(0, 0, view.width, view.height)
 
 
-def through(view: View, window: Window, size: int) -> View:
-    """The camera whose picture of `size` squared pixels is the window."""
+def windowed_view(view: View, window: Window, size: int) -> View:
+    """The camera whose image of `size` x `size` pixels shows the window."""
     change = np.array(
         [
             [size / window.width, 0, -window.left * size / window.width],
@@ -54,9 +54,9 @@ def through(view: View, window: Window, size: int) -> View:
 
 
 def resample(rgba: UInt8[np.ndarray, "H W 4"], window: Window, size: int) -> UInt8[np.ndarray, "size size 4"]:
-    """The window at `size` squared pixels: each is the mean of what it covers, colours averaged in linear light.
+    """Resample the window to `size` x `size` pixels with a box filter in linear light.
 
-    Colours are over black, so they average as they are; outside of the picture there is nothing.
+    Colours are premultiplied over black; outside the image everything is 0.
     """
     if window == Window(0, 0, size, size) and rgba.shape[:2] == (size, size):
         return rgba
@@ -95,31 +95,31 @@ PASSES_OF_RELEASED = ("img", "mask")
 
 
 class CaptureFileError(ValueError):
-    """A file of a capture that is damaged or not what it should be; one sentence that names it."""
+    """A damaged or unexpected capture file; the message names it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CapturedView(TensorRecord):
-    """One picture of a person and what is known of it."""
+    """One image of a subject with its camera, pose and passes."""
 
     image: UInt8[Tensor, "H W 3"]
     """sRGB-encoded, over black."""
     mask: UInt8[Tensor, "H W"]
-    """Share of the pixel that the person covers, of 255."""
+    """Coverage of the pixel by the subject, of 255."""
     camera: Camera
     pose: BodyPose
     betas: Float32[Tensor, "B"]
     depth: Float32[Tensor, "H W"] | None = None
-    """Metres along the optical axis; 0: nothing."""
+    """Metres along the optical axis; 0 for background."""
     normal: Float32[Tensor, "H W 3"] | None = None
-    """Of the world; 0: nothing."""
+    """World space; 0 for background."""
     part: UInt8[Tensor, "H W"] | None = None
-    """1 + the joint that moves the surface most; 0: nothing."""
+    """1 + the joint with the largest skin weight; 0 for background."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Subject:
-    """One person's captures."""
+    """The captures of one subject."""
 
     folder: Path
     views: tuple[View, ...]
@@ -127,24 +127,24 @@ class Subject:
 
     @property
     def name(self) -> str:
-        """The folder's name."""
+        """Name of the folder."""
         return self.folder.name
 
     @property
     def frames(self) -> int:
-        """How many poses."""
+        """Number of poses."""
         return len(self.smpl.theta)
 
     def camera(self, camera: int) -> Camera:
-        """One of its cameras, float32."""
+        """A camera, float32."""
         return as_camera(self.views[camera])
 
     def picture(self, kind: str, frame: int, camera: int) -> np.ndarray:
-        """The values of a picture file as they are stored.
+        """The stored values of an image file.
 
         Raises:
-            FileNotFoundError: there is none.
-            CaptureFileError: it is damaged, or of another size than the camera's.
+            FileNotFoundError: the file is missing.
+            CaptureFileError: it is damaged, or its size is not the camera's.
         """
         path = capture_layout.picture_path(self.folder, kind, camera, frame)
         view = self.views[camera]
@@ -153,25 +153,25 @@ class Subject:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Captures:
-    """A dataset on disk. Subjects are read when asked for and kept."""
+    """A dataset on disk. Subjects are read on first use and cached."""
 
     root: Path
     subjects: tuple[str, ...]
     """Names, sorted."""
     about: Mapping[str, Any]
-    """dataset.json; empty for the released layout, which has none."""
+    """Content of dataset.json; empty for the released layout, which has none."""
     _read: dict[str, Subject] = dataclasses.field(default_factory=dict, repr=False)
 
     @property
     def passes(self) -> tuple[str, ...]:
-        """Kinds of pictures that every view has."""
+        """Passes that every view has."""
         return tuple(self.about.get("passes", PASSES_OF_RELEASED))
 
     def subject(self, name: str) -> Subject:
-        """One person.
+        """Read a subject.
 
         Raises:
-            KeyError: there is nobody of this name.
+            KeyError: there is no subject of this name.
             FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
         """
         if name not in self.subjects:
@@ -182,7 +182,7 @@ class Captures:
         return self._read[name]
 
     def view(self, subject: str, frame: int, camera: int) -> CapturedView:
-        """One picture with all its passes.
+        """One image with all its passes.
 
         Raises:
             KeyError, IndexError: there is no such subject, frame or camera.
@@ -208,16 +208,16 @@ class Captures:
 
 
 def open_captures(root: str | Path) -> Captures:
-    """The captures of a folder: those in its list, or, where there is none, of all folders that hold cameras.
+    """Open a dataset: the subjects in its list, or, without a list, all folders with cameras.
 
     Raises:
-        FileNotFoundError: there is no such folder, or nobody in it.
+        FileNotFoundError: the folder does not exist or contains no subjects.
         CaptureFolderError: its dataset.json is damaged or of another version.
-        CaptureFileError: the list names what cannot be a subject.
+        CaptureFileError: the list contains an invalid name.
     """
     root = Path(root)
     if not root.is_dir():
-        raise FileNotFoundError(f"there is no folder of captures {root}: check the path")
+        raise FileNotFoundError(f"the folder of captures {root} does not exist: check the path")
     about = capture_layout.read_about(root) if (root / capture_layout.DATASET_FILE).exists() else {}
     listed = root / capture_layout.LIST_FILE
     if listed.is_file():
@@ -226,14 +226,14 @@ def open_captures(root: str | Path) -> Captures:
     else:
         names = sorted(path.parent.name for path in root.glob(f"*/{CAMERAS_FILE}"))
     if wrong := next((name for name in names if not SUBJECT_NAME.fullmatch(name)), None):
-        raise CaptureFileError(f"{listed} names {wrong!r}, which is no name of a subject: letters, digits, . _ - only")
+        raise CaptureFileError(f"{listed} contains {wrong!r}: names of subjects have only letters, digits and . _ -")
     if not names:
         raise FileNotFoundError(f"there are no finished captures in {root}: render some, or check the path")
     return Captures(root, tuple(names), about)
 
 
 def as_camera(view: View) -> Camera:
-    """A view as the backend's camera, float32."""
+    """Convert a view to the backend's camera, float32."""
     world_to_camera = np.concatenate([view.rotation, view.translation[:, None]], axis=1)
     return Camera(
         torch.from_numpy(view.intrinsics).float(), torch.from_numpy(world_to_camera).float(), view.width, view.height
@@ -241,18 +241,18 @@ def as_camera(view: View) -> Camera:
 
 
 def read_picture(path: Path, kind: str, width: int, height: int) -> np.ndarray:
-    """The values of a picture file: [H, W, 3] uint8 of img and normal, [H, W] uint8 of mask and part, uint16 of depth.
+    """Read an image file: [H, W, 3] uint8 for img and normal, [H, W] uint8 for mask and part, uint16 for depth.
 
     Raises:
-        FileNotFoundError: there is none.
+        FileNotFoundError: the file is missing.
         CaptureFileError: it is damaged or has another size.
     """
     try:
         with Image.open(path, formats=("JPEG", "PNG")) as picture:
             if picture.size != (width, height):
                 raise CaptureFileError(
-                    f"{path} has {picture.size[0]} x {picture.size[1]} pixels, its camera {width} x {height}: render "
-                    "it again"
+                    f"{path} has {picture.size[0]} x {picture.size[1]} pixels, its camera {width} x {height}: "
+                    "render it again"
                 )
             if kind == "depth":
                 return np.asarray(picture).astype(np.uint16)
@@ -262,11 +262,11 @@ def read_picture(path: Path, kind: str, width: int, height: int) -> np.ndarray:
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as e:
         if isinstance(e, CaptureFileError):
             raise
-        raise CaptureFileError(f"{path} is no whole picture ({e}): render it again") from e
+        raise CaptureFileError(f"{path} is not a complete image ({e}): render it again") from e
 
 
 def _read_views(folder: Path) -> list[View]:
-    """cameras.json, which says nothing of sizes: those are the pictures'."""
+    """Read cameras.json; image sizes are not in it and come from the images."""
     path = folder / CAMERAS_FILE
     try:
         named = json.loads(path.read_text(encoding="utf-8"))
@@ -282,7 +282,7 @@ def _read_views(folder: Path) -> list[View]:
             width, height = _size(folder, camera, k)
             t = t.reshape(3)
             if k.shape != (3, 3) or r.shape != (3, 3) or not all(np.isfinite(a).all() for a in (k, r, t)):
-                raise ValueError(f"camera {camera} is not finite, or of another shape than K 3x3, R 3x3, T 3")
+                raise ValueError(f"camera {camera} is not finite, or its shapes are not K 3x3, R 3x3, T 3")
             views.append(View(k, r, t, width, height))
     except FileNotFoundError:
         raise
@@ -291,12 +291,12 @@ def _read_views(folder: Path) -> list[View]:
             raise
         raise CaptureFileError(f"{path} is not a list of cameras ({e}): render the subject again") from e
     if not views:
-        raise CaptureFileError(f"{path} names no camera: render the subject again")
+        raise CaptureFileError(f"{path} contains no camera: render the subject again")
     return views
 
 
 def _size(folder: Path, camera: int, intrinsics: np.ndarray) -> tuple[int, int]:
-    """Width and height of a camera's pictures, from the header of its first."""
+    """Width and height of a camera's images, from the header of the first."""
     for kind in ("img", "mask"):
         pictures = sorted((folder / kind / f"camera{camera:04d}").glob(f"[0-9]*{capture_layout.ENDINGS[kind]}"))
         for path in pictures[:1]:
@@ -304,8 +304,8 @@ def _size(folder: Path, camera: int, intrinsics: np.ndarray) -> tuple[int, int]:
                 with Image.open(path, formats=("JPEG", "PNG")) as picture:
                     return picture.size
             except (OSError, SyntaxError, ValueError) as e:
-                raise CaptureFileError(f"{path} is no whole picture ({e}): render it again") from e
-    raise FileNotFoundError(f"{folder} has no pictures of camera {camera}: render the subject again")
+                raise CaptureFileError(f"{path} is not a complete image ({e}): render it again") from e
+    raise FileNotFoundError(f"{folder} has no images of camera {camera}: render the subject again")
 
 
 def _no_mask(view: View) -> Tensor:

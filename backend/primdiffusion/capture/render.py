@@ -1,4 +1,4 @@
-"""One person's views drawn by the rasteriser and written in the layout of captures."""
+"""Render captures of textured humans with the rasteriser, in several processes; skip complete subjects and views."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import math
 import multiprocessing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from primdiffusion.formats.arrays import ArrayFileError, read_numbers
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
-from primdiffusion.raster.multisample import Figure, Shot, figure_of, shoot
+from primdiffusion.raster.multisample import Figure, RenderedView, figure_from_mesh, render_view
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, encode_bytes
 from primdiffusion.worker_process import begin_worker
 
@@ -33,13 +33,13 @@ JPEG_QUALITY = 95
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Sitting:
-    """A person, the poses to take and the cameras about them."""
+class CaptureSetup:
+    """A subject, its poses and its cameras."""
 
     figure: Figure
     betas: Float[np.ndarray, "n"]
     poses: BodyPose
-    """Of F frames."""
+    """[F]."""
     skinning: Float[np.ndarray, "F J 4 4"]
     """World from rest."""
     joints: Float[np.ndarray, "F J 3"]
@@ -47,14 +47,14 @@ class Sitting:
     views: list[View]
 
 
-def sit(person: SkinnedPerson, poses: BodyPose, rig: Rig | Sequence[View]) -> Sitting:
-    """The person in all `poses` [F], the cameras of a rig as far away as shows all of them whole, or given ones.
+def set_up_capture(person: SkinnedPerson, poses: BodyPose, rig: Rig | Sequence[View]) -> CaptureSetup:
+    """Pose the subject in all `poses` [F] and place the cameras: a rig that shows every pose whole, or given views.
 
     Raises:
         UnusableMesh: the mesh cannot be drawn.
         ValueError: the poses are not finite.
     """
-    figure = figure_of(person.mesh)
+    figure = figure_from_mesh(person.mesh)
     with _one_thread():
         shaped = default_body().to(dtype=torch.float64).shape(torch.from_numpy(person.betas).double())
         body = shaped.pose(poses.to(dtype=torch.float64))
@@ -64,12 +64,12 @@ def sit(person: SkinnedPerson, poses: BodyPose, rig: Rig | Sequence[View]) -> Si
         views = rig.views(*bounding_sphere(np.concatenate(moved)))
     else:
         views = list(rig)
-    return Sitting(figure, person.betas, poses, skinning, joints, views)
+    return CaptureSetup(figure, person.betas, poses, skinning, joints, views)
 
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
-    """Sums in one order, so that any number of workers writes the same files to the last digit."""
+    """Fix the order of summation, so that files do not depend on the number of workers."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -78,89 +78,89 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def begin(subject: Path, sitting: Sitting) -> None:
-    """Write all but the pictures.
+def write_parameters(subject: Path, setup: CaptureSetup) -> None:
+    """Write SMPL parameters, joints and cameras.
 
     Raises:
-        CaptureFolderError: the folder holds pictures of other poses or another shape.
-        OSError: it cannot be written to.
+        CaptureFolderError: the folder contains other poses or another shape.
+        OSError: a file cannot be written.
     """
-    theta = matrix_to_axis_angle(sitting.poses.joint_rotation).numpy().reshape(len(sitting.skinning), -1)
-    translation = sitting.poses.translation.numpy()
-    _refuse_others(subject, theta, sitting.betas, translation)
-    capture_layout.write_smpl(subject, theta[:, :3], theta[:, 3:], sitting.betas, translation)
-    capture_layout.write_joints(subject, sitting.views, sitting.joints)
-    camera_files.write_cameras(subject, sitting.views)
-    camera_files.write_opencv(subject, sitting.views)
+    theta = matrix_to_axis_angle(setup.poses.joint_rotation).numpy().reshape(len(setup.skinning), -1)
+    translation = setup.poses.translation.numpy()
+    _check_same_parameters(subject, theta, setup.betas, translation)
+    capture_layout.write_smpl(subject, theta[:, :3], theta[:, 3:], setup.betas, translation)
+    capture_layout.write_joints(subject, setup.views, setup.joints)
+    camera_files.write_cameras(subject, setup.views)
+    camera_files.write_opencv(subject, setup.views)
     for frame in range(len(theta)):
-        camera_files.write_nerf(subject, sitting.views, frame)
-        camera_files.write_colmap(subject, sitting.views, frame)
+        camera_files.write_nerf(subject, setup.views, frame)
+        camera_files.write_colmap(subject, setup.views, frame)
 
 
-def draw_frames(
-    subject: Path, sitting: Sitting, frames: Iterable[int], passes: Sequence[str], samples: int
+def render_frames(
+    subject: Path, setup: CaptureSetup, frames: Iterable[int], passes: Sequence[str], samples: int
 ) -> Iterator[tuple[int, int]]:
-    """Draw the views of `frames` that are not there yet; yields frame and camera of each, drawn or found.
+    """Render the missing views of `frames`; yields frame and camera of every view, also of those found complete.
 
     Raises:
-        OSError: a picture cannot be written.
+        OSError: an image cannot be written.
     """
     for frame in frames:
         posed = None
-        for camera, view in enumerate(sitting.views):
-            if not is_drawn(subject, passes, camera, frame):
-                posed = sitting.figure.posed(sitting.skinning[frame]) if posed is None else posed
-                write_shot(subject, passes, camera, frame, shoot(posed, view, samples))
+        for camera, view in enumerate(setup.views):
+            if not is_complete_view(subject, passes, camera, frame):
+                posed = setup.figure.posed(setup.skinning[frame]) if posed is None else posed
+                write_view(subject, passes, camera, frame, render_view(posed, view, samples))
             yield frame, camera
 
 
 def last_pass(passes: Sequence[str]) -> str:
-    """The pass whose picture is written last: the view is done when it is whole."""
+    """The pass that is written last; its image marks the view as complete."""
     return "img" if "img" in passes else passes[-1]
 
 
-def is_drawn(subject: Path, passes: Sequence[str], camera: int, frame: int) -> bool:
-    """Whether all pictures of a view are there and whole."""
+def is_complete_view(subject: Path, passes: Sequence[str], camera: int, frame: int) -> bool:
+    """Whether all images of a view exist and are complete."""
     return all(
         picture_files.is_whole_picture(capture_layout.picture_path(subject, kind, camera, frame)) for kind in passes
     )
 
 
-def write_shot(subject: Path, passes: Sequence[str], camera: int, frame: int, shot: Shot) -> None:
-    """The pictures of one view, each written whole, the one that marks the view as done last."""
+def write_view(subject: Path, passes: Sequence[str], camera: int, frame: int, rendered: RenderedView) -> None:
+    """Write the images of one view atomically, the one that marks the view as complete last."""
     for kind in sorted(passes, key=lambda kind: kind == last_pass(passes)):
         path = capture_layout.picture_path(subject, kind, camera, frame)
         if kind == "img":
             with capture_layout.replacing(path) as partial:
-                Image.fromarray(srgb_bytes(shot.rgb)).save(partial, quality=JPEG_QUALITY, subsampling=0)
+                Image.fromarray(srgb_bytes(rendered.rgb)).save(partial, quality=JPEG_QUALITY, subsampling=0)
         elif kind == "mask":
-            picture_files.write_png(path, np.round(shot.coverage.clip(0, 1) * 255).astype(np.uint8))
+            picture_files.write_png(path, np.round(rendered.coverage.clip(0, 1) * 255).astype(np.uint8))
         elif kind == "depth":
-            picture_files.write_png(path, picture_files.depth_steps(shot.depth))
+            picture_files.write_png(path, picture_files.depth_steps(rendered.depth))
         elif kind == "normal":
-            picture_files.write_png(path, picture_files.normal_bytes(shot.normal, shot.depth > 0))
+            picture_files.write_png(path, picture_files.normal_bytes(rendered.normal, rendered.depth > 0))
         else:
-            picture_files.write_png(path, shot.part)
+            picture_files.write_png(path, rendered.part)
 
 
 def srgb_bytes(linear: np.ndarray) -> np.ndarray:
-    """Linear colours as sRGB-encoded bytes."""
+    """Encode linear colours as sRGB bytes."""
     encoded = np.empty(linear.shape, np.uint8)
     encode_bytes(np.ascontiguousarray(linear, np.float32).ravel(), BYTE_OF_LINEAR, encoded.ravel())
     return encoded
 
 
-def _refuse_others(subject: Path, theta: np.ndarray, betas: np.ndarray, translation: np.ndarray) -> None:
+def _check_same_parameters(subject: Path, theta: np.ndarray, betas: np.ndarray, translation: np.ndarray) -> None:
     path = subject / capture_layout.SMPL_FOLDER / capture_layout.SMPL_PLAIN_FILE
     wanted = {"global_orient": theta[:, :3], "body_pose": theta[:, 3:], "betas": betas[None], "transl": translation}
     try:
         present = read_numbers(path, tuple(wanted))
     except (FileNotFoundError, ArrayFileError):
-        return  # nothing yet, or cut short: it is written anew
+        return  # missing or truncated: it is written again
     for name, values in wanted.items():
         if present[name].shape != values.shape or not np.allclose(present[name], values, atol=1e-5):
             raise capture_layout.CaptureFolderError(
-                f"{subject} holds another person or other poses ({name} differ): choose another folder, or remove it"
+                f"{subject} contains another subject or other poses ({name} differs): choose another folder"
             )
 
 
@@ -168,29 +168,29 @@ PASSES = tuple(kind for kind in capture_layout.ENDINGS if kind in ("img", "mask"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Job:
-    """What to render."""
+class RenderJob:
+    """Subjects, poses, cameras and passes of a dataset."""
 
     people: Mapping[str, Path]
-    """.glb files by the names their captures get."""
+    """.glb files by subject name."""
     poses: BodyPose
-    """[F]; frame 0 is the near-T pose."""
+    """[F]; frame 0 is close to the T pose."""
     out: Path
     rig: Rig = dataclasses.field(default_factory=Rig)
     passes: tuple[str, ...] = PASSES
     samples: int = 3
-    """Of a pixel's side."""
+    """Samples along each side of a pixel."""
     seed: int = 0
     released_reference: bool = False
-    """Whether the dataset has the subject by whose name the released code finds its rest sizes."""
+    """Whether the dataset includes the subject whose name the released code looks up for rest sizes."""
     unread_poses: tuple[str, ...] = ()
-    """Why files of poses were left out: for the report."""
+    """Errors of skipped pose files, for the report."""
     part: str = "report"
-    """Name of the report, one for each of several runs that share the folder."""
+    """Name of the report; runs that share a folder need different ones."""
 
     @property
     def about(self) -> dict[str, Any]:
-        """The dataset's settings, which all that is rendered into the folder must share."""
+        """The dataset's settings, equal for everything rendered into one folder."""
         return {
             "seed": self.seed,
             "rig": dataclasses.asdict(self.rig),
@@ -208,51 +208,51 @@ class Job:
 
 
 @dataclasses.dataclass(frozen=True)
-class Outcome:
-    """What became of a subject."""
+class SubjectResult:
+    """The result of rendering one subject."""
 
     subject: str
-    what: str
-    """"done", "skipped" (it was there already) or "failed"."""
-    why: str = ""
+    status: Literal["done", "skipped", "failed"]
+    """Subjects that are already complete are skipped."""
+    error: str = ""
     views: int = 0
 
 
-def render(job: Job, workers: int = 1) -> Iterator[Outcome]:
-    """Render everybody; yields each subject's outcome. One that fails leaves the others alone.
+def render(job: RenderJob, workers: int = 1) -> Iterator[SubjectResult]:
+    """Render all subjects; yields the result of each. A failed subject does not stop the others.
 
-    A subject is skipped where its complete.json is there and all files have the size it notes.
+    A subject is skipped if it has a complete.json and all its files have the sizes listed there.
 
     Raises:
-        CaptureFolderError: the folder holds something else.
-        ValueError: a pass is unknown, or there is no worker.
-        OSError: the folder cannot be written to.
+        CaptureFolderError: the folder contains something else.
+        ValueError: a pass is unknown, or workers is less than 1.
+        OSError: the folder cannot be written.
     """
     if unknown := set(job.passes) - set(PASSES) or not job.passes:
-        raise ValueError(f"passes {unknown or '()'} cannot be rendered: choose of {', '.join(PASSES)}")
+        raise ValueError(f"passes {unknown or '()'} cannot be rendered: choose from {', '.join(PASSES)}")
     if workers < 1:
-        raise ValueError(f"{workers} workers: one process or more")
+        raise ValueError(f"workers is {workers}: give 1 or more")
     capture_layout.claim(job.out, job.about)
-    outcomes: list[Outcome] = []
+    outcomes: list[SubjectResult] = []
     for outcome in _outcomes(job, workers):
         outcomes.append(outcome)
-        _note(job, outcomes)
+        _write_report(job, outcomes)
         yield outcome
-    _note(job, outcomes)
+    _write_report(job, outcomes)
 
 
 def finished_subjects(root: Path) -> list[str]:
-    """Names of the folders with a completion mark."""
+    """Names of the subjects with a completion mark."""
     return sorted(path.parent.name for path in root.glob(f"*/{capture_layout.COMPLETE_FILE}"))
 
 
-def _outcomes(job: Job, workers: int) -> Iterator[Outcome]:
+def _outcomes(job: RenderJob, workers: int) -> Iterator[SubjectResult]:
     waiting = []
     for name in job.people:
         if capture_layout.damaged(job.out / name, checksums=False):
             waiting.append(name)
         else:
-            yield Outcome(name, "skipped")
+            yield SubjectResult(name, "skipped")
     shares = _shares(len(job.poses.translation), math.ceil(workers / max(len(waiting), 1)))
     if workers == 1:
         for name in waiting:
@@ -261,7 +261,7 @@ def _outcomes(job: Job, workers: int) -> Iterator[Outcome]:
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(workers, context, begin_worker) as pool:
         tasks = {pool.submit(_try, job, name, share): name for name in waiting for share in shares}
-        results: dict[str, list[Outcome]] = {name: [] for name in waiting}
+        results: dict[str, list[SubjectResult]] = {name: [] for name in waiting}
         try:
             for task in concurrent.futures.as_completed(tasks):
                 name = tasks[task]
@@ -273,57 +273,57 @@ def _outcomes(job: Job, workers: int) -> Iterator[Outcome]:
 
 
 def _shares(frames: int, parts: int) -> list[range]:
-    """Frames dealt to workers that share a subject, so that few people keep many cores busy."""
+    """Split the frames of a subject among workers, so that few subjects use many cores."""
     size = math.ceil(frames / max(1, min(parts, frames)))
     return [range(first, min(first + size, frames)) for first in range(0, frames, size)]
 
 
-def _result(task: concurrent.futures.Future[Outcome], name: str) -> Outcome:
+def _result(task: concurrent.futures.Future[SubjectResult], name: str) -> SubjectResult:
     try:
         return task.result()
     except concurrent.futures.process.BrokenProcessPool:
-        return Outcome(name, "failed", "a worker process was killed: run the same command again, it goes on from here")
+        return SubjectResult(name, "failed", "a worker process was killed: run the same command again to resume")
 
 
-def _try(job: Job, name: str, frames: Sequence[int]) -> Outcome:
-    """Draw some frames of a subject; errors of input and files become an outcome."""
+def _try(job: RenderJob, name: str, frames: Sequence[int]) -> SubjectResult:
+    """Render some frames of a subject; errors of input and files become a failed result."""
     try:
-        sitting = _sitting(job, name)
+        setup = _set_up(job, name)
         if frames[0] == 0:
-            begin(job.out / name, sitting)
-        views = sum(1 for _ in draw_frames(job.out / name, sitting, frames, job.passes, job.samples))
-        return Outcome(name, "done", views=views)
+            write_parameters(job.out / name, setup)
+        views = sum(1 for _ in render_frames(job.out / name, setup, frames, job.passes, job.samples))
+        return SubjectResult(name, "done", views=views)
     except Exception as e:
         failure = describe(e)
         if failure is None:
             raise
-        return Outcome(name, "failed", str(failure))
+        return SubjectResult(name, "failed", str(failure))
 
 
-def _sitting(job: Job, name: str) -> Sitting:
-    return sit(read_person(job.people[name]), job.poses, job.rig)
+def _set_up(job: RenderJob, name: str) -> CaptureSetup:
+    return set_up_capture(read_person(job.people[name]), job.poses, job.rig)
 
 
-def _finish(job: Job, name: str, outcomes: Sequence[Outcome]) -> Outcome:
-    failed = next((outcome for outcome in outcomes if outcome.what == "failed"), None)
+def _finish(job: RenderJob, name: str, outcomes: Sequence[SubjectResult]) -> SubjectResult:
+    failed = next((outcome for outcome in outcomes if outcome.status == "failed"), None)
     if failed is not None:
         return failed
     capture_layout.complete(job.out / name)
-    return Outcome(name, "done", views=sum(outcome.views for outcome in outcomes))
+    return SubjectResult(name, "done", views=sum(outcome.views for outcome in outcomes))
 
 
-def _note(job: Job, outcomes: Sequence[Outcome]) -> None:
-    """The list of subjects and the report, as far as it is."""
+def _write_report(job: RenderJob, outcomes: Sequence[SubjectResult]) -> None:
+    """Write the list of finished subjects and the report."""
     capture_layout.write_list(job.out, finished_subjects(job.out))
     report = {
-        "done": [outcome.subject for outcome in outcomes if outcome.what == "done"],
-        "failed": [{"subject": "", "what": "poses", "why": why} for why in job.unread_poses]
+        "done": [outcome.subject for outcome in outcomes if outcome.status == "done"],
+        "failed": [{"subject": "", "what": "poses", "why": error} for error in job.unread_poses]
         + [
-            {"subject": outcome.subject, "what": "render", "why": outcome.why}
+            {"subject": outcome.subject, "what": "render", "why": outcome.error}
             for outcome in outcomes
-            if outcome.what == "failed"
+            if outcome.status == "failed"
         ],
-        "skipped": [outcome.subject for outcome in outcomes if outcome.what == "skipped"],
+        "skipped": [outcome.subject for outcome in outcomes if outcome.status == "skipped"],
     }
     with capture_layout.replacing(job.out / f"{job.part}.json") as path:
         path.write_text(json.dumps(report, indent=1), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""A sheet of views with skeletons drawn on them: what captures look like, and whether cameras and poses fit."""
+"""Contact sheets of captures with skeletons drawn on them, to check images, cameras and poses."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ BONE, JOINT = (255, 255, 255), (255, 64, 64)
 
 
 def draw_sheet(captures: Captures, out: Path, rows: int, columns: int, size: int) -> float:
-    """Write the sheet, a person in a pose a row; returns the largest `reprojection_error` of those people, pixels.
+    """Write the sheet, one subject in one pose per row; return their largest `reprojection_error`, pixels.
 
-    Rows take turns through the poses; every other picture has the joints drawn on it.
+    Rows cycle through the poses; every other image has the joints drawn on it.
 
     Raises:
-        ValueError: there is no row, column or pixel.
+        ValueError: a size is not positive.
         FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
     """
     if min(rows, columns, size) < 1:
-        raise ValueError(f"a sheet of {rows} x {columns} pictures of {size} pixels: ask for one or more of each")
+        raise ValueError(f"rows, columns and size are {rows}, {columns} and {size}: give 1 or more")
     chosen = _chosen(captures, rows)
     lines = []
     for name, frame in chosen:
@@ -51,7 +51,7 @@ def draw_sheet(captures: Captures, out: Path, rows: int, columns: int, size: int
 
 
 def joints_of(subject: Subject) -> Float[np.ndarray, "F J 3"]:
-    """The joints in the world as they were noted; of the default body's where nothing was (released layout).
+    """World positions of the joints from joints.npz; without it (released layout), those of the default body.
 
     Raises:
         ArrayFileError: joints.npz is damaged.
@@ -63,37 +63,37 @@ def joints_of(subject: Subject) -> Float[np.ndarray, "F J 3"]:
 
 
 def default_joints(subject: Subject) -> Float[np.ndarray, "F J 3"]:
-    """The joints [F, 24, 3] of the default body in the subject's shape and poses, worked out anew."""
+    """World positions of the default body's joints in the subject's shape and poses."""
     smpl = subject.smpl
     pose = BodyPose.from_axis_angle(torch.from_numpy(smpl.theta), torch.from_numpy(smpl.translation))
     return default_body().shape(torch.from_numpy(smpl.betas)).pose(pose).joints[..., :3, 3].double().numpy()
 
 
 def reprojection_error(subject: Subject) -> float:
-    """Largest distance in pixels of the joints noted in joints.npz from the projection of the joints in the world.
+    """Largest distance between the image and the projected world positions of the joints in joints.npz, pixels.
 
-    The cameras are read from cameras.json. 0 where nothing was noted.
+    The cameras are those of cameras.json. 0 without joints.npz.
 
     Raises:
-        ArrayFileError: joints.npz is damaged or of another number of cameras.
+        ArrayFileError: joints.npz is damaged or has another number of cameras.
     """
     path = subject.folder / "joints.npz"
     try:
-        noted = read_numbers(path, ("world", "pixel"))
+        stored = read_numbers(path, ("world", "pixel"))
     except FileNotFoundError:
         return 0.0
-    if noted["pixel"].shape != (len(subject.views), *noted["world"].shape[:2], 2):
+    if stored["pixel"].shape != (len(subject.views), *stored["world"].shape[:2], 2):
         raise ArrayFileError(
-            f"{path} has joints of {noted['pixel'].shape}, not of {len(subject.views)} cameras: render again"
+            f"{path} has joints of shape {stored['pixel'].shape} for {len(subject.views)} cameras: render again"
         )
     errors = [
-        view.project(noted["world"])[0] - pixel for view, pixel in zip(subject.views, noted["pixel"], strict=True)
+        view.project(stored["world"])[0] - pixel for view, pixel in zip(subject.views, stored["pixel"], strict=True)
     ]
     return float(np.linalg.norm(errors, axis=-1).max())
 
 
 def _chosen(captures: Captures, rows: int) -> list[tuple[str, int]]:
-    """People and frames: as many people as there are rows for, each next one in the next pose."""
+    """Subjects and frames for the rows: as many subjects as possible, each in the next pose."""
     names = [captures.subjects[i] for i in _evenly(len(captures.subjects), rows)]
     frames = {name: captures.subject(name).frames for name in names}
     turns = [
@@ -126,5 +126,5 @@ def _draw_joints(picture: Image.Image, view: View, joints: Float[np.ndarray, "J 
 
 
 def _evenly(count: int, wanted: int) -> list[int]:
-    """At most `wanted` of `count` numbers, evenly spaced, the first among them."""
+    """At most `wanted` of `count` indices, evenly spaced, including the first."""
     return sorted({int(i * count / min(wanted, count)) for i in range(min(wanted, count))})

@@ -1,4 +1,4 @@
-"""A subject's SMPL parameters: the plain twin, or the released code's pickled file through the restricted reader."""
+"""SMPL parameters of a subject: our plain file, or the released code's pickle through the restricted reader."""
 
 from __future__ import annotations
 
@@ -20,56 +20,54 @@ KEYS = ("global_orient", "body_pose", "betas", "transl")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SmplParameters:
-    """A person's shape and poses."""
+    """Shape and poses of a subject."""
 
     theta: Float32[np.ndarray, "F n"]
-    """72 axis-angle numbers a frame, the pelvis first."""
+    """72 axis-angle values per frame, pelvis first."""
     translation: Float32[np.ndarray, "F 3"]
     """Metres."""
     betas: Float32[np.ndarray, "B"]
 
     def pose(self, frame: int) -> BodyPose:
-        """What the joints do in a frame."""
+        """The pose in a frame."""
         return BodyPose.from_axis_angle(torch.from_numpy(self.theta[frame]), torch.from_numpy(self.translation[frame]))
 
 
 def read_smpl(subject: Path) -> SmplParameters:
-    """The parameters of a subject's folder.
+    """Read the parameters in a subject's folder.
 
     Raises:
-        FileNotFoundError: neither file is there.
-        ArrayFileError: the file is damaged, or not of this form.
-        BodyFileError: its pickle is damaged, or asks for more than arrays.
+        FileNotFoundError: neither file exists.
+        ArrayFileError: the file is damaged or has other contents.
+        BodyFileError: its pickle is damaged or contains more than arrays.
     """
     plain, pickled = subject / SMPL_FOLDER / SMPL_PLAIN_FILE, subject / SMPL_FOLDER / SMPL_FILE
     if plain.is_file():
         return _checked(plain, read_numbers(plain, KEYS))
     if pickled.is_file():
         return _checked(pickled, _read_pickled(pickled))
-    raise FileNotFoundError(f"there is no {plain.name} nor {pickled.name} in {plain.parent}: render it again")
+    raise FileNotFoundError(f"{plain.parent} has neither {plain.name} nor {pickled.name}: render the subject again")
 
 
 def _read_pickled(path: Path) -> dict[str, np.ndarray]:
-    """The dictionary in an array without dimensions; nothing in it is run."""
+    """Read the dictionary from a 0-d object array, without executing code from it."""
     stream = io.BytesIO(read_member(path, "smpl.npy"))
     try:
         version = np.lib.format.read_magic(stream)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         _, _, kind = read(stream)
         if not kind.hasobject:
-            raise ValueError(f"it holds {kind}")
+            raise ValueError(f"it contains {kind}")
         (content,) = array_of_objects(load_restricted(stream, str(path)))
         if not isinstance(content, dict):
-            raise ValueError(f"it holds a {type(content).__name__}")
+            raise ValueError(f"it contains a {type(content).__name__}")
         return {key: as_array(content[key]) for key in KEYS}
     except BodyFileError:
         raise
     except KeyError as e:
-        raise ArrayFileError(f"{path} lacks {e}: render the subject again, or take the file from its publisher") from e
+        raise ArrayFileError(f"{path} lacks {e}: render the subject again, or download the file again") from e
     except (ValueError, SyntaxError, TypeError) as e:
-        raise ArrayFileError(
-            f"{path} holds no dictionary of SMPL parameters ({e}): take it from its publisher again"
-        ) from e
+        raise ArrayFileError(f"{path} contains no dictionary of SMPL parameters ({e}): download it again") from e
 
 
 def _checked(path: Path, arrays: dict[str, np.ndarray]) -> SmplParameters:
@@ -77,10 +75,10 @@ def _checked(path: Path, arrays: dict[str, np.ndarray]) -> SmplParameters:
     shapes = {"global_orient": (frames, 3), "body_pose": (frames, 3 * (J - 1)), "transl": (frames, 3)}
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
-            raise ArrayFileError(f"{path}: {name} has shape {arrays[name].shape}, not {shape}: make it again")
+            raise ArrayFileError(f"{path}: {name} has shape {arrays[name].shape}, not {shape}: render it again")
     betas = arrays["betas"].reshape(-1)
     if not all(np.isfinite(array).all() for array in arrays.values()) or not frames or arrays["betas"].ndim > 2:
-        raise ArrayFileError(f"{path} holds no frame, or NaN or infinite numbers: make it again")
+        raise ArrayFileError(f"{path} has no frames, or NaN or infinite values: render the subject again")
     return SmplParameters(
         theta=np.concatenate([arrays["global_orient"], arrays["body_pose"]], axis=1).astype(np.float32),
         translation=arrays["transl"].astype(np.float32),

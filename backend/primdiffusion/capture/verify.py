@@ -1,6 +1,6 @@
-"""Finding damage in captures, and clearing it away so that rendering again makes just what is missing.
+"""Find damaged files in captures, and remove them so that the next run renders only what is missing.
 
-The extension, which imports nothing of the backend, has a module of its own; `layout` tells both what damage is.
+The extension cannot import the backend and has its own module; both use `formats.capture_layout` to detect damage.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from primdiffusion.formats import capture_layout
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Something wrong with a file, or with a whole subject."""
+    """A problem with a file or a subject."""
 
     path: Path
     what: str
@@ -23,29 +23,29 @@ class Finding:
 
 
 def verify(root: Path, *, checksums: bool = True) -> list[Finding]:
-    """Everything wrong with the captures of a folder; empty where nothing is. Without `checksums` only sizes count.
+    """List the problems of a dataset. Without `checksums`, only file sizes are compared.
 
     Raises:
-        CaptureFolderError: it holds no captures of our capture_layout.
+        CaptureFolderError: the folder contains no captures in our layout.
     """
     capture_layout.read_about(root)
     findings = []
     for subject in subject_folders(root):
         damage = capture_layout.damage(subject, checksums=checksums)
         findings += [Finding(path, what) for path, what in damage.items()]
-        findings += [Finding(path, "left by a killed process") for path in _leftovers(subject)]
+        findings += [Finding(path, "left behind by a killed process") for path in _leftovers(subject)]
     listed = root / capture_layout.LIST_FILE
     names = listed.read_text(encoding="utf-8", errors="replace").split() if listed.is_file() else []
     there = [path.name for path in subject_folders(root) if (path / capture_layout.COMPLETE_FILE).is_file()]
     if sorted(names) != sorted(there):
-        findings.append(Finding(listed, f"names {len(names)} subjects, finished are {len(there)}"))
+        findings.append(Finding(listed, f"lists {len(names)} subjects, but {len(there)} are finished"))
     return findings
 
 
 def repair(root: Path, findings: list[Finding]) -> None:
-    """Remove what is damaged, all passes of a view together, and the completion marks of the subjects it belongs to.
+    """Remove damaged files, with all passes of their view, and the completion marks of their subjects.
 
-    The list is written anew. What was removed is made again by the command that rendered it. Raises OSError.
+    Rewrites the list. The command that rendered the dataset renders the removed files again. Raises OSError.
     """
     for finding in findings:
         if finding.path.is_dir() or finding.path == root / capture_layout.LIST_FILE:
@@ -61,7 +61,7 @@ def repair(root: Path, findings: list[Finding]) -> None:
 
 
 def subject_folders(root: Path) -> list[Path]:
-    """Folders that a renderer began, finished or not."""
+    """Folders of subjects, finished or not."""
     marks = ("cameras.json", capture_layout.COMPLETE_FILE)
     return sorted(
         path
@@ -75,7 +75,7 @@ def _leftovers(subject: Path) -> list[Path]:
 
 
 def _of_the_same_view(subject: Path, path: Path) -> list[Path]:
-    """The file and, of a picture, the other passes: the img tells that a view is done, so it goes with any of them."""
+    """The file and, for an image, the other passes: img marks a view as complete, so it is removed with any of them."""
     parts = path.relative_to(subject).parts
     if len(parts) != 3 or parts[0] not in capture_layout.ENDINGS or path.name.startswith("."):
         return [path]

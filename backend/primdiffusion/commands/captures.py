@@ -15,7 +15,7 @@ from tqdm import tqdm
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import MotionFileError, choose_poses, read_motion, read_motions
-from primdiffusion.capture.render import PASSES, Job, render
+from primdiffusion.capture.render import PASSES, RenderJob, render
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
 
@@ -72,7 +72,7 @@ class RenderCaptures:
         if self.pose_count == 0 and len(self.poses) != 1:
             raise ValueError("pose_count 0 takes all frames of one motion file: give one with --poses")
         poses, unread = self._poses()
-        job = Job(
+        job = RenderJob(
             people={name: people[name] for name in names},
             poses=poses,
             out=self.out,
@@ -88,8 +88,8 @@ class RenderCaptures:
             print(f"poses  failed  {error}", flush=True)
         outcomes = Counter()
         for outcome in tqdm(render(job, self.workers), total=len(names), unit="person", disable=None):
-            outcomes[outcome.what] += 1
-            print(f"{outcome.subject}  {outcome.what}  {outcome.why or f'{outcome.views} views'}", flush=True)
+            outcomes[outcome.status] += 1
+            print(f"{outcome.subject}  {outcome.status}  {outcome.error or f'{outcome.views} views'}", flush=True)
         if outcomes["failed"] or unread:
             poses_too = f" and {len(unread)} of {len(self.poses)} pose files" if unread else ""
             raise ValueError(
@@ -190,7 +190,9 @@ class PackCaptures:
 
         captures = open_captures(self.root)
         for packing in tqdm(pack(captures), total=len(captures.subjects), unit="person", disable=None):
-            print(f"{packing.subject}  {'kept' if packing.kept else 'packed'}  {packing.gigabytes:.3f} GB", flush=True)
+            print(
+                f"{packing.subject}  {'found' if packing.found else 'packed'}  {packing.gigabytes:.3f} GB", flush=True
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -242,9 +244,9 @@ class FarmCaptures:
     def run(self) -> None:
         """Render, and print a line for each human. Raises FarmError if the cluster cannot start or a human fails."""
         # used by this subcommand alone
-        from primdiffusion.capture.farm import Farm, FarmError, Outcome, render_on
+        from primdiffusion.capture.farm import Farm, FarmError, FarmResult, render_on
 
-        def show(outcome: Outcome, done: int, total: int) -> None:
+        def show(outcome: FarmResult, done: int, total: int) -> None:
             print(f"{done}/{total}  {outcome.subject}  {outcome.error or f'{outcome.seconds:.0f} s'}", flush=True)
 
         farm = Farm(self.address, self.workers, self.processors_each, self.gpus_each, self.attempts)

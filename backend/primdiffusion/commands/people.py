@@ -58,10 +58,10 @@ class EncodePayloads:
         outcomes = Counter()
         work = encode_people(model, captures, self.out, settings, cards)
         for outcome in tqdm(work, total=len(captures.subjects), unit="person", disable=None):
-            outcomes[outcome.what] += 1
+            outcomes[outcome.status] += 1
             unknown = self.people is not None and outcome.subject not in cards
-            note = outcome.why or ("attributes unknown" if unknown else "")
-            print(f"{outcome.subject}  {outcome.what}  {note}".rstrip(), flush=True)
+            note = outcome.error or ("attributes unknown" if unknown else "")
+            print(f"{outcome.subject}  {outcome.status}  {note}".rstrip(), flush=True)
         if outcomes["failed"]:
             raise ValueError(f"{outcomes['failed']} of {len(captures.subjects)} people failed: see the lines above")
 

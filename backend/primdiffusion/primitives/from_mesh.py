@@ -114,7 +114,7 @@ def _covered(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Nearest:
+class NearestPoints:
     """Nearest points of each query in two metrics; -1 if no point is within reach."""
 
     index: Int32[np.ndarray, "q"]
@@ -131,7 +131,7 @@ def nearest(
     axes: Float32[np.ndarray, "q 3"],
     stretch: float,
     reach: float,
-) -> Nearest:
+) -> NearestPoints:
     """Nearest points within `reach` metres; `along` scales distance along a query's unit axis by `stretch` (0 ... 1).
 
     Points are hashed into cubes of side `reach`, so a query searches 27 of them.
@@ -142,7 +142,7 @@ def nearest(
     number = (cube[:, 0] * shape[1] + cube[:, 1]) * shape[2] + cube[:, 2]
     order = np.argsort(number, kind="stable")
     start = np.searchsorted(number[order], np.arange(shape.prod() + 1))
-    result = Nearest(
+    result = NearestPoints(
         np.full(len(queries), -1, np.int32),
         np.full(len(queries), np.inf, np.float32),
         np.full(len(queries), -1, np.int32),

@@ -77,7 +77,7 @@ class PosedFigure:
     """Unit, out of the front of the faces."""
 
 
-def figure_of(mesh: TexturedMesh) -> Figure:
+def figure_from_mesh(mesh: TexturedMesh) -> Figure:
     """The mesh ready to be drawn.
 
     Raises:
@@ -112,7 +112,7 @@ def _joints_of_faces(part: TexturedPart) -> UInt8[np.ndarray, "F"]:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Shot:
+class RenderedView:
     """What a camera sees of a person. Colour and coverage are means about a pixel; the rest is at its centre."""
 
     rgb: Float32[np.ndarray, "H W 3"]
@@ -126,7 +126,7 @@ class Shot:
     """1 + the joint that moves the face most; 0 where there is nothing."""
 
 
-def shoot(posed: PosedFigure, view: View, samples: int = 3) -> Shot:
+def render_view(posed: PosedFigure, view: View, samples: int = 3) -> RenderedView:
     """The figure seen from `view` with `samples` squared samples a pixel; the same input gives the same bits.
 
     Raises:
@@ -136,7 +136,7 @@ def shoot(posed: PosedFigure, view: View, samples: int = 3) -> Shot:
         raise ValueError(f"{samples} samples a pixel's side: choose an odd number, 1, 3, 5, ...")
     figure, textures = posed.figure, posed.figure.textures
     in_camera = posed.vertices @ view.rotation.T + view.translation
-    shot = Shot(
+    shot = RenderedView(
         rgb=np.zeros((view.height, view.width, 3), np.float32),
         coverage=np.zeros((view.height, view.width), np.float32),
         depth=np.zeros((view.height, view.width), np.float32),

@@ -17,7 +17,7 @@ from torch import Tensor
 from primdiffusion.capture.conditioning import conditioning_views, default_betas, spread_cameras
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.reader import Captures
-from primdiffusion.capture.render import Outcome
+from primdiffusion.capture.render import SubjectResult
 from primdiffusion.encoder.model import EncoderModel, betas_of_frames
 from primdiffusion.failures import describe
 from primdiffusion.human import Human
@@ -56,7 +56,7 @@ def encode_people(
     out: Path,
     settings: EncodeSettings = EncodeSettings(),
     cards: Mapping[str, Mapping[str, Any]] | None = None,
-) -> Iterator[Outcome]:
+) -> Iterator[SubjectResult]:
     """Write NAME.npz of every subject into `out`; yields each outcome and continues after failures.
 
     The files are those of `primdiffusion payloads`, with delta scales and their source. A file of the same source is
@@ -75,7 +75,7 @@ def encode_people(
         path = out / f"{name}.npz"
         source = json.dumps({"captured": name, **about}, sort_keys=True)
         if _is_current(path, source, card.get("attributes", {})):
-            yield Outcome(name, "skipped")
+            yield SubjectResult(name, "skipped")
             continue
         try:
             payloads, betas = looks_of(model, captures, name, settings)
@@ -83,10 +83,10 @@ def encode_people(
             failure = describe(error)
             if failure is None:
                 raise
-            yield Outcome(name, "failed", str(failure))
+            yield SubjectResult(name, "failed", str(failure))
             continue
         _store(path, payloads, betas, source, card)
-        yield Outcome(name, "done", views=settings.views)
+        yield SubjectResult(name, "done", views=settings.views)
 
 
 def looks_of(

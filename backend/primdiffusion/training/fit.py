@@ -17,7 +17,7 @@ from torch import Tensor
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from primdiffusion import __version__
-from primdiffusion.capture.dataset import Position, Share
+from primdiffusion.capture.dataset import Position, ProcessRank
 from primdiffusion.capture.reader import Captures, open_captures
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import EncoderModel
@@ -113,7 +113,7 @@ def steps(
 ) -> Iterator[StepMetrics]:
     """Optimiser steps from where the state is to `config.steps`; the caller owns progress, saving and stopping."""
     accelerator = state.accelerator
-    share = Share(accelerator.process_index, accelerator.num_processes)
+    share = ProcessRank(accelerator.process_index, accelerator.num_processes)
     start = Position(*json.loads(state.place.get("position", "[0, 0]")))
     source = fit_batches(dataset, config, start, share)
     settings = MarchSettings(step=config.step)

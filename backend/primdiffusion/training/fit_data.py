@@ -10,7 +10,15 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from primdiffusion.capture.conditioning import default_betas
-from primdiffusion.capture.dataset import CaptureDataset, Position, SampleSet, SampleSettings, Share, Views, batches
+from primdiffusion.capture.dataset import (
+    CaptureDataset,
+    Position,
+    ProcessRank,
+    SampleSet,
+    SampleSettings,
+    Views,
+    batches,
+)
 from primdiffusion.capture.reader import Captures
 from primdiffusion.encoder.config import PRESETS, EncoderConfig
 from primdiffusion.encoder.model import frames_of, look_up
@@ -86,7 +94,7 @@ def fit_dataset(captures: Captures, config: FitConfig) -> FitDataset:
     return FitDataset(CaptureDataset(captures, settings, config.seed), PRESETS[config.encoder])
 
 
-def fit_batches(dataset: FitDataset, config: FitConfig, start: Position, share: Share) -> Iterator[Batch]:
+def fit_batches(dataset: FitDataset, config: FitConfig, start: Position, share: ProcessRank) -> Iterator[Batch]:
     """Yield the batches of a run, with the original errors of worker processes.
 
     Raises:
