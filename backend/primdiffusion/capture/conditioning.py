@@ -189,7 +189,7 @@ def default_betas(subject: Subject) -> Float[Tensor, "10"]:
     if not distance <= SAME_BODY_M:
         raise ConditioningError(
             f"the joints of {subject.folder} are up to {100 * distance:.0f} cm from the default body's, so its betas "
-            f"belong to another body model; {remedy}\"
+            f"belong to another body model; {remedy}"
         )
     return torch.nn.functional.pad(betas, (0, components - len(betas)))
 
