@@ -172,7 +172,7 @@ def test_skin_weights_of_anchors_add_up_to_one_and_carry_them_along():
     assert torch.allclose(carried[rigid], attach(ANCHORS, posed.vertices, BODY.faces).position[rigid], atol=1e-3)
 
 
-def test_vertices_that_are_not_finite_are_refused():
+def test_vertices_that_are_not_finite_are_rejected():
     vertices = BODY.template.clone()
     vertices[17, 1] = torch.nan
     with pytest.raises(ValueError, match="check the pose"):

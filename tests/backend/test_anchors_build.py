@@ -174,13 +174,13 @@ def test_the_default_bodys_skin_uv_gives_finite_frames_that_point_outward():
     assert ((frames.rotation[..., 2] * normal).sum(-1) > 0).all()
 
 
-def test_a_body_without_uv_is_refused_with_the_remedy():
+def test_a_body_without_uv_is_rejected_with_the_remedy():
     body = dataclasses.replace(cylinder(), uv=torch.zeros(0, 2, dtype=torch.float64))
     with pytest.raises(ValueError, match="load it with a UV map"):
         build_anchors(body)
 
 
-def test_a_template_that_is_not_finite_is_refused():
+def test_a_template_that_is_not_finite_is_rejected():
     body = cylinder()
     template = body.template.clone()
     template[0, 0] = torch.inf
@@ -188,6 +188,6 @@ def test_a_template_that_is_not_finite_is_refused():
         build_anchors(dataclasses.replace(body, template=template))
 
 
-def test_an_unknown_rule_is_refused():
+def test_an_unknown_rule_is_rejected():
     with pytest.raises((ValueError, TypeError)):
         build_anchors(cylinder(), "other")  # type: ignore[arg-type]

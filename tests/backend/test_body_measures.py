@@ -39,6 +39,6 @@ def test_a_change_follows_the_shapes_that_people_have(default_body):
     assert (moved[:2] != 0).all()
 
 
-def test_bodies_that_nobody_has_are_refused(default_body):
+def test_bodies_that_no_human_has_are_rejected(default_body):
     with pytest.raises(ValueError, match=r"2\.60 m.*30 kg"):
         betas_of_measures(torch.zeros(10), torch.eye(10), default_body, 2.6, 30.0)

@@ -158,7 +158,7 @@ def test_gradients_are_those_of_the_function():
     assert torch.autograd.gradcheck(lambda theta: posed(betas.detach(), theta, translation.detach()), at_rest)
 
 
-def test_fewer_betas_count_as_zeros_and_more_are_refused():
+def test_fewer_betas_count_as_zeros_and_more_are_rejected():
     body = small_body()
     padded = torch.tensor([0.5, -1.0, 0, 0, 0, 0], dtype=torch.float64)
     torch.testing.assert_close(body.shape(padded[:2]).vertices, body.shape(padded).vertices)
@@ -166,6 +166,6 @@ def test_fewer_betas_count_as_zeros_and_more_are_refused():
         body.shape(torch.zeros(7, dtype=torch.float64))
 
 
-def test_poses_with_hand_joints_are_refused_with_advice():
+def test_poses_with_hand_joints_are_rejected_with_advice():
     with pytest.raises(ValueError, match=r"72 numbers.*\(2, 156\).*drop the hand joints"):
         BodyPose.from_axis_angle(torch.zeros(2, 156))

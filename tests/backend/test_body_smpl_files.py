@@ -139,7 +139,7 @@ def test_without_texture_coordinates_the_body_is_unwrapped(tmp_path):
     assert 0 <= body.uv.min() < body.uv.max() <= 1
 
 
-def test_without_xatlas_a_body_without_texture_coordinates_is_refused_with_what_to_do(tmp_path, monkeypatch):
+def test_without_xatlas_a_body_without_texture_coordinates_is_rejected_with_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "xatlas", None)
     with pytest.raises(BodyFileError, match="give them by a second file"):
         load_body(pickled(tmp_path, smpl_arrays()))
@@ -175,7 +175,7 @@ class Hostile:
 
 @pytest.mark.parametrize("protocol", range(6))
 @pytest.mark.parametrize("where", ["v_template", "bs_style", "extra"])
-def test_hostile_pickle_is_refused_by_name_and_does_not_run(tmp_path, protocol, where):
+def test_hostile_pickle_is_rejected_by_name_and_does_not_run(tmp_path, protocol, where):
     trace = tmp_path / "trace"
     content = {**smpl_arrays(), where: Hostile(pathlib.os.mkdir, str(trace))}
     path = pickled(tmp_path, content, protocol)
@@ -196,7 +196,7 @@ def test_hostile_pickle_is_refused_by_name_and_does_not_run(tmp_path, protocol, 
         b"ccopy_reg\n_reconstructor\n(cbuiltins\nint\ncbuiltins\nobject\nNtR.",
     ],
 )
-def test_other_ways_to_reach_code_are_refused(tmp_path, program):
+def test_other_ways_to_reach_code_are_rejected(tmp_path, program):
     path = tmp_path / "SMPL_NEUTRAL.pkl"
     path.write_bytes(program)
     assert list(pickletools.genops(program))
@@ -253,7 +253,7 @@ def test_files_cut_short_are_named(tmp_path, uv_pair, kind, keep):
         load_body(path, uv=uv_pair)
 
 
-def test_npz_with_pickled_objects_is_refused(tmp_path, uv_pair):
+def test_npz_with_pickled_objects_is_rejected(tmp_path, uv_pair):
     np.savez(tmp_path / "body.npz", **spoiled("v_template", np.array([Hostile(print, "ran")] * V)))
     with pytest.raises(BodyFileError, match="'v_template' cannot be read"):
         load_body(tmp_path / "body.npz", uv=uv_pair)

@@ -40,7 +40,7 @@ def test_the_vertical_field_of_view_spans_the_height():
     assert camera.project(top)[0][1].item() == pytest.approx(0.0, abs=1e-6)
 
 
-def test_looking_along_up_is_refused_with_a_remedy():
+def test_looking_along_up_is_rejected_with_a_remedy():
     with pytest.raises(ValueError, match="move one of the points"):
         look_at(torch.tensor([0.0, 3.0, 0.0]), torch.zeros(3), vertical_fov=0.8, width=8, height=8)
 

@@ -149,7 +149,7 @@ def test_crops_lie_in_the_picture_and_see_the_person(captures):
 
 
 @pytest.mark.parametrize("wrong", [{"conditioning": 0}, {"targets": -1}, {"size": 0}])
-def test_samples_without_views_are_refused(wrong):
+def test_samples_without_views_are_rejected(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         SampleSettings(**wrong)
 

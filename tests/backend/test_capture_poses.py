@@ -79,7 +79,7 @@ def test_fingers_are_not_taken_for_smpls_hand_joints(tmp_path, numbers):
 
 
 @pytest.mark.parametrize("moves", [[[0, 0, 0]] * 4, [[0, 0, float("nan")]] * 5])
-def test_translations_that_do_not_fit_are_refused_by_name(tmp_path, moves):
+def test_translations_that_do_not_fit_are_rejected_by_name(tmp_path, moves):
     (tmp_path / "a.json").write_text(json.dumps({"poses": THETA.tolist(), "trans": moves}))
     with pytest.raises(MotionFileError, match=r"a\.json has 5 frames"):
         read_motion(tmp_path / "a.json")
@@ -90,7 +90,7 @@ def test_translations_that_do_not_fit_are_refused_by_name(tmp_path, moves):
     [("a.json", b"{}"), ("a.json", b"[[1, 2]]"), ("a.json", b"{"), ("a.npy", b"no"), ("a.npz", b"no"),
      ("a.json", b"[]"), ("a.json", json.dumps([float("nan")] * 72).encode()), ("a.json", b'{"poses": "up"}')],
 )  # fmt: skip
-def test_files_that_are_no_poses_are_refused_by_name(tmp_path, name, content):
+def test_files_that_are_no_poses_are_rejected_by_name(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises((MotionFileError, ArrayFileError), match=name):
         read_motion(tmp_path / name)
@@ -114,7 +114,7 @@ def test_few_poses_are_chosen_to_differ_and_the_choice_is_the_seeds(tmp_path):
     assert torch.equal(chosen.joint_rotation, choose_poses([read_motion(tmp_path / "a.npz")], 3, seed=0).joint_rotation)
 
 
-def test_more_poses_than_there_are_are_refused():
+def test_more_poses_than_there_are_are_rejected():
     with pytest.raises(ValueError, match="there are 20"):
         choose_poses([], 21, 0)
     with pytest.raises(ValueError, match="0 poses"):

@@ -115,7 +115,7 @@ def test_any_protocol_of_the_pickle_is_read(root, protocol):
     assert np.array_equal(open_captures(root).subject(NAME).smpl.theta[:, 3:], expected)
 
 
-def test_a_pickle_that_would_run_code_is_refused(root, tmp_path):
+def test_a_pickle_that_would_run_code_is_rejected(root, tmp_path):
     class Trap:
         def __reduce__(self):
             return (open, (str(tmp_path / "trapped"), "w"))
@@ -129,7 +129,7 @@ def test_a_pickle_that_would_run_code_is_refused(root, tmp_path):
 
 
 @pytest.mark.parametrize("content", [{}, {"global_orient": "up"}, [1, 2], {"global_orient": np.zeros((3, 3))}])
-def test_a_pickle_without_parameters_is_refused_by_name(root, content):
+def test_a_pickle_without_parameters_is_rejected_by_name(root, content):
     as_released(root)
     path = root / NAME / capture_layout.SMPL_FOLDER / capture_layout.SMPL_FILE
     np.savez(path, smpl=np.array(content, dtype=object))
@@ -138,7 +138,7 @@ def test_a_pickle_without_parameters_is_refused_by_name(root, content):
 
 
 @pytest.mark.parametrize("name", ["../../etc", "/etc", ".ssh", "a/b", "..", "a b"])
-def test_a_list_that_names_folders_outside_is_refused(root, name):
+def test_a_list_that_names_folders_outside_is_rejected(root, name):
     (root / capture_layout.LIST_FILE).write_text(f"{NAME}\n{name}\n")
     with pytest.raises(CaptureFileError, match=capture_layout.LIST_FILE):
         open_captures(root)
@@ -164,13 +164,13 @@ def test_zip_paths_that_lead_out_are_not_followed(tmp_path):
         ({"y": np.zeros(2)}, "no array 'x'"),
     ],
 )
-def test_npz_files_of_other_things_are_refused(tmp_path, arrays, why):
+def test_npz_files_of_other_things_are_rejected(tmp_path, arrays, why):
     np.savez(tmp_path / "a.npz", **arrays)
     with pytest.raises(ArrayFileError, match=why):
         read_numbers(tmp_path / "a.npz", ("x",))
 
 
-def test_an_npz_that_claims_petabytes_is_refused(tmp_path):
+def test_an_npz_that_claims_petabytes_is_rejected(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive, archive.open("x.npy", "w") as member:
         about = {"descr": "<f8", "fortran_order": False, "shape": (1 << 50,)}
         np.lib.format.write_array_header_1_0(member, about)
@@ -182,14 +182,14 @@ def test_an_npz_that_claims_petabytes_is_refused(tmp_path):
     ("file", "content", "why"),
     [
         ("img/camera0002/0001.jpg", None, "missing"),
-        ("img/camera0002/0001.jpg", 200, "no whole picture"),
-        ("mask/camera0002/0001.png", b"", "no whole picture"),
+        ("img/camera0002/0001.jpg", 200, "not a complete image"),
+        ("mask/camera0002/0001.png", b"", "not a complete image"),
         ("mask/camera0002/0001.png", "small", "5 x 5 pixels, its camera 32 x 32"),
-        ("depth/camera0002/0001.png", 60, "no whole picture"),
+        ("depth/camera0002/0001.png", 60, "not a complete image"),
         ("cameras.json", None, "missing"),
         ("cameras.json", b"[1, 2]", "not a list of cameras"),
         ("cameras.json", b'{"camera0000": {"K": [[1]]}}', "not a list of cameras"),
-        ("cameras.json", b"{}", "names no camera"),
+        ("cameras.json", b"{}", "contains no camera"),
         ("cameras.json", b"{", "cannot be read"),
         (f"{capture_layout.SMPL_FOLDER}/{capture_layout.SMPL_PLAIN_FILE}", 100, "not a whole .npz"),
     ],
@@ -214,7 +214,7 @@ def test_no_captures_are_no_captures(tmp_path):
         open_captures(tmp_path)
 
 
-def test_frames_and_cameras_that_are_not_there_are_refused(root):
+def test_frames_and_cameras_that_are_not_there_are_rejected(root):
     for frame, camera in ((3, 0), (0, 4), (-1, 0)):
         with pytest.raises(IndexError, match="3 frames and 4 cameras"):
             open_captures(root).view(NAME, frame, camera)

@@ -42,7 +42,7 @@ def test_a_persons_file_is_read_as_it_was_written(tmp_path):
 
 
 @pytest.mark.parametrize("cut", [0, 11, 300, -400, -1])
-def test_a_file_cut_short_is_refused_by_name(tmp_path, cut):
+def test_a_file_cut_short_is_rejected_by_name(tmp_path, cut):
     path = save_person(tmp_path / "a.glb")
     path.write_bytes(path.read_bytes()[:cut])
     with pytest.raises(GlbError, match=r"a\.glb"):
@@ -72,13 +72,13 @@ def change(path: Path, edit) -> None:
         (lambda c: c["asset"]["extras"]["primdiffusion"].update(body="smplx"), "smplx"),
         (lambda c: c["asset"]["extras"]["primdiffusion"].update(betas=[1e6] * 10), "betas"),
         (lambda c: c["asset"]["extras"]["primdiffusion"].update(betas=[0.0] * 5000), "betas"),
-        (lambda c: c["nodes"][24].update(skin=-7), "no person"),
-        (lambda c: c.pop("nodes"), "no person"),
+        (lambda c: c["nodes"][24].update(skin=-7), "not a human"),
+        (lambda c: c.pop("nodes"), "not a human"),
         (lambda c: c["nodes"].__setitem__(slice(24, None), []), "no mesh"),
-        (lambda c: c["nodes"][24].pop("skin"), "not rigged"),
+        (lambda c: c["nodes"][24].pop("skin"), "has no skin"),
     ],
 )
-def test_files_that_are_no_people_are_refused_in_words(tmp_path, edit, why):
+def test_files_without_a_human_are_rejected(tmp_path, edit, why):
     path = save_person(tmp_path / "a.glb")
     change(path, edit)
     with pytest.raises(GlbError, match=why):
@@ -242,7 +242,7 @@ def test_one_that_fails_leaves_the_others_alone_and_is_reported(tmp_path):
     assert (job.out / capture_layout.LIST_FILE).read_text().split() == [NAMES[1]]
 
 
-def test_another_person_or_pose_in_the_same_folder_is_refused(tmp_path):
+def test_another_person_or_pose_in_the_same_folder_is_rejected(tmp_path):
     captured(tmp_path, people=1)
     job = small_job(tmp_path, people=1)
     (job.out / NAMES[0] / capture_layout.COMPLETE_FILE).unlink()
@@ -252,7 +252,7 @@ def test_another_person_or_pose_in_the_same_folder_is_refused(tmp_path):
     assert "other poses" in outcome.error
 
 
-def test_other_settings_in_the_same_folder_are_refused(tmp_path):
+def test_other_settings_in_the_same_folder_are_rejected(tmp_path):
     captured(tmp_path, people=1)
     with pytest.raises(capture_layout.CaptureFolderError, match="samples is 9, wanted is 25"):
         list(render(small_job(tmp_path, people=1, samples=5)))
@@ -275,12 +275,12 @@ def test_the_command_renders_a_shard_and_exits_with_1_on_failure(tmp_path, capsy
 
 
 @pytest.mark.parametrize("text", ["2/2", "-1/2", "1", "a/b", "0/0", "1/2/3"])
-def test_shards_that_are_none_are_refused(text):
+def test_shards_that_are_none_are_rejected(text):
     with pytest.raises(ValueError, match="shard"):
         parse_shard(text)
 
 
 @pytest.mark.parametrize(("more", "why"), [({"passes": ("img", "rgba")}, "rgba"), ({"passes": ()}, "passes")])
-def test_passes_that_cannot_be_drawn_are_refused(tmp_path, more, why):
+def test_passes_that_cannot_be_drawn_are_rejected(tmp_path, more, why):
     with pytest.raises(ValueError, match=why):
         list(render(small_job(tmp_path, **more)))

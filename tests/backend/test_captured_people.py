@@ -123,7 +123,7 @@ def test_a_damaged_card_is_named(root, tmp_path):
 
 
 @pytest.mark.parametrize("settings", [{"views": 0}, {"looks": 0}, {"refine_steps": -1}])
-def test_settings_that_cannot_be_are_refused(settings):
+def test_settings_that_cannot_be_are_rejected(settings):
     with pytest.raises(ValueError, match=next(iter(settings))):
         EncodeSettings(**settings)
 

@@ -61,7 +61,7 @@ def test_all_cameras_are_taken_where_there_are_no_more(tmp_path):
     assert spread_cameras(ring(tmp_path, 5), 0, 8) == (0, 1, 2, 3, 4)
 
 
-def test_less_than_one_view_is_refused(tmp_path):
+def test_less_than_one_view_is_rejected(tmp_path):
     with pytest.raises(ConditioningError, match="0 views were requested"):
         spread_cameras(ring(tmp_path, 5), 0, 0)
 
@@ -106,7 +106,7 @@ def test_an_unknown_subject_is_an_error_that_names_the_nearest_first(dataset):
 
 
 @pytest.mark.parametrize("frame", [-1, 2])
-def test_a_frame_that_was_not_captured_is_refused(dataset, frame):
+def test_a_frame_that_was_not_captured_is_rejected(dataset, frame):
     with pytest.raises(ConditioningError, match=f"frames 0 to 1, not {frame}"):
         captured_person(dataset, FIRST, frame)
 
@@ -126,7 +126,7 @@ def test_a_mask_of_another_size_is_named(folder):
         captured_person(folder, FIRST)
 
 
-def test_masks_without_anybody_are_refused(folder):
+def test_masks_without_anybody_are_rejected(folder):
     for camera in range(4):
         Image.new("L", (32, 32), 0).save(picture_path(folder / FIRST, "mask", camera, 0))
     with pytest.raises(ConditioningError, match="shows a person"):
@@ -139,13 +139,13 @@ def rewrite_betas(folder, betas) -> None:
     write_smpl(folder / FIRST, np.zeros((2, 3)), np.zeros((2, 69)), np.asarray(betas), np.zeros((2, 3)))
 
 
-def test_more_betas_than_the_default_body_has_are_refused(folder):
+def test_more_betas_than_the_default_body_has_are_rejected(folder):
     rewrite_betas(folder, np.zeros(300))
     with pytest.raises(ConditioningError, match=r"300 betas.* at most 10 of the default body.*render the person again"):
         captured_person(folder, FIRST)
 
 
-def test_betas_whose_body_has_other_joints_than_were_noted_are_refused(folder):
+def test_betas_whose_body_has_other_joints_than_were_noted_are_rejected(folder):
     rewrite_betas(folder, [4.0, -4.0, 4.0, 0, 0, 0, 0, 0, 0, 0])
     with pytest.raises(ConditioningError, match=r"cm from the default body's.*another body model"):
         captured_person(folder, FIRST)
@@ -168,7 +168,7 @@ def test_masks_beside_the_body_are_a_warning_and_masks_around_it_are_none(datase
     assert captured_person(job.out).warnings == ()
 
 
-def test_cameras_that_look_past_the_body_are_refused(folder):
+def test_cameras_that_look_past_the_body_are_rejected(folder):
     path = folder / FIRST / "cameras.json"
     cameras = json.loads(path.read_text())
     for about in cameras.values():

@@ -21,7 +21,7 @@ def test_what_is_not_asked_for_is_zero():
         ({"height": float("nan")}, "height"),
     ],
 )
-def test_what_a_model_does_not_know_is_refused_with_what_it_knows(asked, words):
+def test_what_a_model_does_not_know_is_rejected_with_what_it_knows(asked, words):
     with pytest.raises(ValueError, match=words):
         WORDS.encode(asked)
     with pytest.raises(ValueError, match="nothing"):

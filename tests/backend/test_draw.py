@@ -242,6 +242,6 @@ def test_an_empty_scene_is_the_background(camera):
 @pytest.mark.parametrize(
     "wrong", [{"view": "x-ray"}, {"clip": (2.0, 1.0)}, {"clip": (-1.0, 1.0)}, {"clip": (1, math.nan)}]
 )
-def test_unknown_views_and_impossible_planes_are_refused(wrong):
+def test_unknown_views_and_impossible_planes_are_rejected(wrong):
     with pytest.raises(ValueError, match=r"x-ray|clip"):
         Look(**wrong)

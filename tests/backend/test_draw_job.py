@@ -153,7 +153,7 @@ def test_several_people_stand_in_one_picture(human, pose, params):
     assert want.combined[..., 3].mean() > 1.2 * alone.combined[..., 3].mean()
 
 
-def test_nobody_is_a_picture_too(params):
+def test_no_human_is_a_picture_too(params):
     empty = drawn(dataclasses.replace(params, people=[], background=[0.1, 0.2, 0.3]))
     assert np.allclose(empty.combined, (0.1, 0.2, 0.3, 1))
     assert (empty.depth == np.float32(1e10)).all()
@@ -175,7 +175,7 @@ def test_solids_come_from_a_file_of_plain_arrays_and_are_read_again_when_it_chan
     assert drawn(scene, drawer).combined[20, 20, 0] == 0
 
 
-def test_a_frame_of_another_size_is_refused_and_left_alone(params, tmp_path):
+def test_a_frame_of_another_size_is_rejected_and_left_alone(params, tmp_path):
     frame = new_frame(tmp_path / "small", WIDTH, HEIGHT - 1)
     with pytest.raises(ValueError, match=f"{WIDTH} x {HEIGHT} pixels need {WIDTH * HEIGHT * 20}"):
         drawn(dataclasses.replace(params, frame=frame))
@@ -246,7 +246,7 @@ def test_samples_are_those_of_the_default_for_people_of_about_natural_size():
     assert frame_drawer.settings_for(0.004, objects(1e-6, 1e6)).strides[0] == 4 * 2**frame_drawer.MOST_DOUBLINGS
 
 
-def test_a_camera_that_scales_is_refused_before_anything_is_drawn(params):
+def test_a_camera_that_scales_is_rejected_before_anything_is_drawn(params):
     for view in ("colour", "boxes"):
         wrong = (3 * np.array(params.world_to_camera)).tolist()
         with pytest.raises(ValueError, match=r"world_to_camera .* scales or shears"):

@@ -211,7 +211,7 @@ def test_what_bulges_out_keeps_its_colour():
     assert from_mesh(TexturedMesh(parts), frames).rgb[:, 0].numpy()[below].max() < 0.1
 
 
-def test_unusable_input_is_refused_in_words():
+def test_unusable_input_is_rejected():
     ball, frames = two_coloured_ball(), frames_on_ball(8)
     part = ball.parts[0]
     broken = dataclasses.replace(part, vertices=np.full_like(part.vertices, np.nan))

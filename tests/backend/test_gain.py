@@ -59,6 +59,6 @@ def test_rays_that_miss_count_nothing():
     assert fit_gain(np.array([0.5, 0.0, 1e-5])) == fit_gain(np.array([0.5]))
 
 
-def test_a_person_whom_no_ray_meets_is_refused():
-    with pytest.raises(ValueError, match="no ray meets"):
+def test_a_person_whom_no_ray_meets_is_rejected():
+    with pytest.raises(ValueError, match="no ray hits"):
         fit_gain(np.zeros(5))

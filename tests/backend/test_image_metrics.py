@@ -77,7 +77,7 @@ def test_metrics_take_any_batch_and_none():
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
-def test_pictures_of_two_shapes_are_refused(metric):
+def test_pictures_of_two_shapes_are_rejected(metric):
     with pytest.raises(ValueError, match=r"\[\.\.\., H, W, 3\]"):
         metric(torch.zeros(20, 20, 3), torch.zeros(20, 21, 3))
     with pytest.raises(ValueError, match=r"\[\.\.\., H, W, 3\]"):
@@ -152,7 +152,7 @@ def test_gradients_of_lpips_are_finite_also_in_black():
     assert image.grad.abs().max() > 0
 
 
-def test_files_of_another_network_are_refused(tmp_path):
+def test_files_of_another_network_are_rejected(tmp_path):
     torch.save(PictureFeatures(VGG16, ["relu5_3"]).state_dict(), tmp_path / "vgg16.pth")
     alex = torchmetrics_lpips.__file__.removesuffix("lpips.py") + "lpips_models/alex.pth"
     with pytest.raises(WeightsFileError, match=r"'linear\.0\.weight'"):

@@ -175,15 +175,15 @@ def test_reflected_frames_mirror_what_is_in_the_box():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_broken_scenes_are_refused_with_a_way_out(dtype):
+def test_broken_scenes_are_rejected_with_a_way_out(dtype):
     boxes, camera = random_boxes(3).to(dtype=dtype), camera_at((0.0, 0.0, 0.5)).to(dtype=dtype)
-    with pytest.raises(ValueError, match=r"no rotation in box [012]: R\^T R is off the identity by 3"):
+    with pytest.raises(ValueError, match=r"of box [012] is not a rotation: R\^T R differs from the identity by 3"):
         march(dataclasses.replace(boxes, rotation=boxes.rotation * 2), camera)
     with pytest.raises(ValueError, match="do not broadcast"):
         march(people(0, 1).to(dtype=dtype), views(3).to(dtype=dtype))
     with pytest.raises(ValueError, match="leading dimensions of Primitives do not broadcast"):
         march(broken(people(0, 1), rgb=people(0, 1, 2).rgb), camera)
-    with pytest.raises(ValueError, match="holds no picture"):
+    with pytest.raises(ValueError, match="is empty"):
         march(people(0, 1).map(lambda tensor: tensor[:0]).to(dtype=dtype), camera)
     with pytest.raises(ValueError, match=r"span.near has shape \(5, 5\)"):
         march(boxes, camera, span=Span(torch.zeros(5, 5), torch.zeros(5, 5)))
@@ -198,7 +198,7 @@ def test_broken_scenes_are_refused_with_a_way_out(dtype):
     with pytest.raises(ValueError, match="compositing is 'nearest'; choose from"):
         MarchSettings(compositing="nearest")  # pyright: ignore[reportArgumentType]
     for strides in ((), (1, 2), (4, 3), (4, 2, 0), (2.5,), (2**40, 1)):
-        with pytest.raises(ValueError, match="must fall and each divide the one before it"):
+        with pytest.raises(ValueError, match="divisor of the previous one"):
             MarchSettings(strides=strides)  # pyright: ignore[reportArgumentType]
     for step in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match=r"the step is .* m; it must be positive and finite"):
@@ -208,7 +208,7 @@ def test_broken_scenes_are_refused_with_a_way_out(dtype):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_cameras_whose_rays_start_nowhere_are_refused(dtype):
+def test_cameras_whose_rays_start_nowhere_are_rejected(dtype):
     boxes, camera = random_boxes(3).to(dtype=dtype), camera_at((0.0, 0.0, 0.5)).to(dtype=dtype)
     flat = torch.tensor([1.0, 1.0, 0.0], dtype=dtype)[:, None]
     for change in (2.0, 0.0, flat):
@@ -217,12 +217,12 @@ def test_cameras_whose_rays_start_nowhere_are_refused(dtype):
     for axis in (0, 1):
         lens = camera.intrinsics.clone()
         lens[axis, axis] = 0
-        with pytest.raises(ValueError, match=r"focal lengths are .* give ones other than 0"):
+        with pytest.raises(ValueError, match=r"focal lengths are .* must not be 0"):
             march(boxes, dataclasses.replace(camera, intrinsics=lens))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_boxes_that_would_take_hours_are_refused(dtype):
+def test_boxes_that_would_take_hours_are_rejected(dtype):
     boxes, camera = random_boxes(3).to(dtype=dtype), camera_at((0.0, 0.0, 0.5)).to(dtype=dtype)
     boxes.half_extent[1] = 1e9
     with pytest.raises(ValueError, match=r"box 1 has half extents .* choose a larger step"):

@@ -116,16 +116,16 @@ def test_boxes_without_extent_draw_nothing_and_disturb_nothing():
 
 @pytest.mark.parametrize("render", [march_cpu, march_reference, march])
 @pytest.mark.parametrize("name", ["position", "rotation", "half_extent", "rgb", "density"])
-def test_nan_is_refused_by_name(render, name):
+def test_nan_is_rejected_by_name(render, name):
     boxes, camera = random_boxes(2).to(dtype=torch.float32), camera_at((0.0, 0.0, 0.5)).to(dtype=torch.float32)
     getattr(boxes, name).view(-1)[-1] = torch.nan
     with pytest.raises(ValueError, match=rf"primitives\.{name} holds NaN"):
         render(boxes, camera)
 
 
-def test_negative_density_broken_shapes_and_cameras_are_refused():
+def test_negative_density_broken_shapes_and_cameras_are_rejected():
     boxes, camera = random_boxes(2).to(dtype=torch.float32), camera_at((0.0, 0.0, 0.5)).to(dtype=torch.float32)
-    with pytest.raises(ValueError, match="density falls to -1"):
+    with pytest.raises(ValueError, match="smallest density is -1"):
         march(dataclasses.replace(boxes, density=boxes.density * 0 - 1), camera)
     with pytest.raises(ValueError, match="give a batch to `march`"):
         march_cpu(boxes.map(lambda tensor: tensor[None]), camera)
@@ -223,7 +223,7 @@ def test_spans_that_meet_put_a_picture_together():
     torch.testing.assert_close(front.rgb + back.rgb, whole.rgb, rtol=0, atol=1e-6)
 
 
-def test_a_span_of_the_wrong_shape_or_with_nan_is_refused():
+def test_a_span_of_the_wrong_shape_or_with_nan_is_rejected():
     boxes, camera = random_boxes(3).to(dtype=torch.float32), camera_at((0.0, 0.0, 0.5)).to(dtype=torch.float32)
     near, far = torch.zeros(20, 24), torch.ones(20, 24)
     with pytest.raises(ValueError, match=r"span\.far"):

@@ -171,7 +171,7 @@ def test_boxes_out_of_sight_or_without_extent_receive_zeros():
             assert gradient[[0, 3]].abs().max() > 0, name
 
 
-def test_a_second_derivative_is_refused():
+def test_a_second_derivative_is_rejected():
     boxes = random_boxes(4, 12).to(dtype=torch.float32)
     camera = camera_at((0.2, 0.1, 0.6), fov=0.5).to(dtype=torch.float32)
     density = boxes.density.clone().requires_grad_()

@@ -316,7 +316,7 @@ def test_gradients_are_finite_with_grazed_empty_and_flat_boxes():
     assert all(tensor.grad.abs().max() > 0 for tensor in vars(inputs).values())
 
 
-def test_mixed_and_narrow_dtypes_are_refused_with_a_way_out():
+def test_mixed_and_narrow_dtypes_are_rejected_with_a_way_out():
     boxes, camera = random_boxes(2), camera_at((0.0, 0.0, 0.5))
     with pytest.raises(ValueError, match=r"mix dtypes .*convert one with \.to\(\)"):
         march_reference(boxes.to(dtype=torch.float32), camera)

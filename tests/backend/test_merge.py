@@ -118,12 +118,12 @@ def test_boxes_without_extent_or_content_hold_nothing():
     ("voxel", "message"),
     [(0.0, "above zero"), (-1.0, "above zero"), (1e-5, r"choose .* mm or more"), (float("nan"), "above zero")],
 )
-def test_voxels_that_cannot_be_are_refused_with_what_to_do(voxel, message):
+def test_voxels_that_cannot_be_are_rejected_with_what_to_do(voxel, message):
     with pytest.raises(ValueError, match=message):
         merge(boxes(), voxel)
 
 
-def test_a_batch_is_refused():
+def test_a_batch_is_rejected():
     primitives = boxes()
     with pytest.raises(ValueError, match="one person at a time"):
         merge(Primitives(**{name: value[None] for name, value in vars(primitives).items()}))

@@ -74,7 +74,7 @@ def test_a_vdb_holds_the_same_numbers_where_they_belong(saved, tmp_path, blender
     assert density.transform.voxelSize()[0] == pytest.approx(0.03)
 
 
-def test_without_openvdb_a_vdb_is_refused_before_any_work(saved, tmp_path, monkeypatch):
+def test_without_openvdb_a_vdb_is_rejected_before_any_work(saved, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "openvdb", None)
     with pytest.raises(NoOpenVDB, match=r"or write an \.npz"):
         cli.run(["merge", str(saved), "--out", str(tmp_path / "anna.vdb")])
@@ -92,7 +92,7 @@ def test_without_openvdb_a_vdb_is_refused_before_any_work(saved, tmp_path, monke
         (["--out", "anna.npz", "--apart", "inf"], "apart is inf"),
     ],
 )
-def test_what_cannot_be_merged_is_refused_and_leaves_nothing(saved, tmp_path, monkeypatch, more, sentence):
+def test_what_cannot_be_merged_is_rejected_and_leaves_nothing(saved, tmp_path, monkeypatch, more, sentence):
     monkeypatch.chdir(tmp_path)
     with pytest.raises((ValueError, FileNotFoundError), match=sentence):
         cli.run(["merge", str(saved), *more])

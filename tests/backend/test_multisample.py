@@ -148,7 +148,7 @@ def test_normals_are_smooth_across_seams_and_face_the_camera():
     assert cosine.min() > 0.99
 
 
-def test_even_samples_are_refused():
+def test_even_samples_are_rejected():
     with pytest.raises(ValueError, match="odd"):
         shot_of(box(), view=front(3, 40, 40), samples=2)
 

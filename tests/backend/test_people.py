@@ -277,7 +277,7 @@ def test_fitted_payloads_look_more_like_the_mesh_in_each_colouring_from_sides_th
             assert psnr(payload, mesh, view) > psnr(from_mesh(mesh, frames), mesh, view) + gain, view
 
 
-def test_counts_that_make_nothing_are_refused(tmp_path):
+def test_counts_that_make_nothing_are_rejected(tmp_path):
     with pytest.raises(ValueError, match="variants is 0"):
         make_payloads(assets_module.Assets(tmp_path), tmp_path, 1, 0, 0, 1)
 

@@ -39,7 +39,7 @@ def test_texels_outside_take_the_nearest_island():
     assert set(np.unique(texels.face[:4, -4:])) <= {2, 3}
 
 
-def test_mesh_without_texture_coordinates_is_refused():
+def test_mesh_without_texture_coordinates_is_rejected():
     with pytest.raises(ValueError, match="no texture coordinates"):
         texel_map(np.zeros((3, 3, 2)), 16)
 

@@ -77,7 +77,7 @@ def test_damaged_people_are_made_anew_and_whole_ones_kept(assets, two):
     assert kept.stat().st_mtime_ns == moment
 
 
-def test_other_sets_of_people_are_refused(assets, two):
+def test_other_sets_of_people_are_rejected(assets, two):
     with pytest.raises(OtherPeopleError, match="2 samples from seed 3, but 2 from seed 4"):
         list(make_people(assets, PeopleSet(two, 4, 2), 1))
     with pytest.raises(OtherPeopleError, match="person_000004"):
@@ -85,7 +85,7 @@ def test_other_sets_of_people_are_refused(assets, two):
 
 
 @pytest.mark.parametrize(("seed", "count", "word"), [(0, 0, "count is 0"), (-1, 2, "seed is -1")])
-def test_sets_without_people_are_refused(tmp_path, seed, count, word):
+def test_sets_without_people_are_rejected(tmp_path, seed, count, word):
     with pytest.raises(ValueError, match=word):
         PeopleSet(tmp_path, seed, count)
 

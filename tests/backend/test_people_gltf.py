@@ -150,7 +150,7 @@ def test_extras_are_kept_with_the_asset_and_the_scene(written):
 
 
 @pytest.mark.parametrize("where", ["joints", "vertices"])
-def test_numbers_that_are_none_are_refused(where):
+def test_numbers_that_are_none_are_rejected(where):
     mesh, bones = person(), skeleton()
     if where == "joints":
         bones.positions[3] = np.nan

@@ -60,7 +60,7 @@ def test_proxy_vertex_is_hidden_only_if_all_its_references_are():
 
 
 @pytest.mark.parametrize(("text", "words"), [("name x\nverts 0\n", "no vertices"), ("verts 0\n1 2 3 4\n", "4 val")])
-def test_damaged_mhclo_is_refused_with_what_is_wrong(text, words):
+def test_damaged_mhclo_is_rejected_with_what_is_wrong(text, words):
     with pytest.raises(ProxyFileError, match=words):
         parse_mhclo(text)
 
@@ -71,12 +71,12 @@ def test_polygons_become_fans_with_their_own_texture_coordinates():
     assert mesh.corner_uv[1].tolist() == [[0, 0], [1, 1], [0, 1]]
 
 
-def test_faces_that_name_missing_vertices_are_refused():
+def test_faces_that_name_missing_vertices_are_rejected():
     with pytest.raises(ProxyFileError, match="outside"):
         parse_obj("v 0 0 0\nf 1 2 3\n")
 
 
-def test_files_of_different_size_are_refused_with_both_counts(tmp_path):
+def test_files_of_different_size_are_rejected_with_both_counts(tmp_path):
     (tmp_path / "a.mhclo").write_text(MHCLO)
     (tmp_path / "a.obj").write_text(OBJ)
     with pytest.raises(ProxyFileError, match=r"3 vertices.*has 4"):

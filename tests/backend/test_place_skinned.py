@@ -125,7 +125,7 @@ def test_a_person_stretched_along_the_world_keeps_its_boxes_on_the_stretched_bod
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
-def test_matrices_that_are_not_finite_are_refused_by_name(human, joints, wrong):
+def test_matrices_that_are_not_finite_are_rejected_by_name(human, joints, wrong):
     broken = joints.clone()
     broken[3, 1, 2] = wrong
     with pytest.raises(ValueError, match="skinning holds NaN"):
@@ -136,7 +136,7 @@ def test_matrices_that_are_not_finite_are_refused_by_name(human, joints, wrong):
         place_skinned(human, joints, still)
 
 
-def test_a_flat_object_is_refused(human, joints):
+def test_a_flat_object_is_rejected(human, joints):
     with pytest.raises(ValueError, match="mean scale is"):
         place_skinned(human, joints, object_matrix(torch.diag(torch.tensor([1.0, 1.0, 0.0]))))
 
@@ -152,7 +152,7 @@ def test_polar_factors_are_orthogonal_and_symmetric_and_multiply_to_the_matrix(s
     assert torch.equal(torch.linalg.det(orthogonal).sign(), torch.linalg.det(matrix).sign())
 
 
-def test_a_flat_joint_is_refused_by_name(human, joints):
+def test_a_flat_joint_is_rejected_by_name(human, joints):
     flat = joints.clone()
     flat[4, :, :3] = 0
     with pytest.raises(ValueError, match="'left_knee'"):

@@ -177,7 +177,7 @@ def test_a_view_along_a_direction_holds_the_whole_box():
         assert math.isclose(np.linalg.det(view.world_to_view[:, :3]), 1)
 
 
-def test_unusable_meshes_are_refused_in_words():
+def test_unusable_meshes_are_rejected():
     good = part([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
     broken = dataclasses.replace(good, vertices=np.full((3, 3), np.nan))
     with pytest.raises(UnusableMesh, match=r"no triangles in its 0 parts"):

@@ -108,7 +108,7 @@ def test_gradients_flow_through_both_directions():
     torch.testing.assert_close(payload.rgb.grad, torch.ones_like(payload.rgb), atol=1e-9, rtol=0)
 
 
-def test_wrong_shapes_densities_and_nan_are_refused():
+def test_wrong_shapes_densities_and_nan_are_rejected():
     with pytest.raises(ValueError, match=r"must end in \(56, 256, 256\)"):
         # Under the tests' shape checks the annotation would speak first.
         inspect.unwrap(unpack)(torch.zeros(56, 256, 128), FULL_DENSITY)

@@ -34,7 +34,7 @@ def test_faces_without_area_and_outside_the_square_draw_nothing():
     assert not rasterise_uv(line, 32, 32).covered.any()
 
 
-def test_coordinates_that_are_not_finite_are_refused():
+def test_coordinates_that_are_not_finite_are_rejected():
     with pytest.raises(ValueError, match="UV map again"):
         rasterise_uv(np.full((1, 3, 2), np.nan), 4, 4)
 

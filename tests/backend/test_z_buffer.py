@@ -131,7 +131,7 @@ def test_degenerate_triangles_and_none_at_all_are_no_error():
     assert (nearest_triangles(line[:0], camera).triangle == -1).all()
 
 
-def test_solids_of_wrong_shapes_or_with_nan_are_refused_by_name():
+def test_solids_of_wrong_shapes_or_with_nan_are_rejected_by_name():
     good = one_triangle()
     with pytest.raises(UnusableSolids, match="colour"):
         Solids(good.corners, good.colour[:, :2], good.holdout)

@@ -15,7 +15,7 @@ from trimesh.triangles import cross
 
 
 class UnusableMesh(ValueError):
-    """A textured mesh that cannot be drawn: empty, not finite, or with faces that name no vertex."""
+    """A textured mesh that is empty, not finite, or has faces with invalid indices."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

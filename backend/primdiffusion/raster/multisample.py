@@ -31,27 +31,27 @@ LINEAR_OF_SIXTEENTH = decode_srgb(np.arange(255 * 16 + 1) / (255 * 16)).astype(n
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Figure:
-    """What of a person no pose changes. All parts one after the other."""
+    """A mesh prepared for rendering in many poses: everything that does not depend on the pose, all parts concatenated."""
 
     mesh: TexturedMesh
     """In the rest pose."""
     faces: Int32[np.ndarray, "F 3"]
     corner_uv: Float32[np.ndarray, "F 3 2"]
     part: Int32[np.ndarray, "F"]
-    """Which part a face belongs to."""
+    """Part of each face."""
     textures: TexturePyramid
     joint: UInt8[np.ndarray, "F"]
-    """The joint with the most weight on a face's corners."""
+    """Joint with the largest weight at each face's corners."""
     corner: Int32[np.ndarray, "V"]
-    """Vertices in one place of a part share a number; normals are means over these."""
+    """Index shared by coincident vertices of a part, over which normals are averaged."""
 
     def posed(self, skinning: Float[np.ndarray, "J 4 4"]) -> PosedFigure:
-        """The figure moved by linear blend skinning, world <- rest."""
+        """Pose the figure by linear blend skinning, world <- rest."""
         vertices = np.concatenate([part.posed(skinning).vertices for part in self.mesh.parts])
         return PosedFigure(self, vertices, self._normals(vertices))
 
     def _normals(self, vertices: np.ndarray) -> np.ndarray:
-        """Means of the normals of the faces about each place, weighted with their areas; unit length."""
+        """Area-weighted unit normals of vertices."""
         corners = vertices[self.faces]
         doubled_area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         places = self.corner[self.faces]
@@ -68,21 +68,20 @@ class Figure:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PosedFigure:
-    """A person in a pose."""
+    """A figure in a pose."""
 
     figure: Figure
     vertices: Float64[np.ndarray, "V 3"]
     """Metres."""
     normals: Float32[np.ndarray, "V 3"]
-    """Unit, out of the front of the faces."""
+    """Unit, outwards from the front of faces."""
 
 
 def figure_from_mesh(mesh: TexturedMesh) -> Figure:
-    """The mesh ready to be drawn.
+    """Prepare a mesh for `render_view`.
 
     Raises:
-        UnusableMesh: no part has a face, a coordinate is not finite, a face names a vertex that is not there, or a
-            texture has no texel.
+        UnusableMesh: as `flatten`.
     """
     soup = flatten(mesh)
     first = 0
@@ -113,30 +112,30 @@ def _joints_of_faces(part: TexturedPart) -> UInt8[np.ndarray, "F"]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RenderedView:
-    """What a camera sees of a person. Colour and coverage are means about a pixel; the rest is at its centre."""
+    """The passes of a view. Colour and coverage are means over each pixel; the others are samples at its centre."""
 
     rgb: Float32[np.ndarray, "H W 3"]
     """Linear, premultiplied by `coverage`."""
     coverage: Float32[np.ndarray, "H W"]
     depth: Float32[np.ndarray, "H W"]
-    """Metres along the optical axis; 0 where there is nothing."""
+    """Metres along the optical axis; 0 for background."""
     normal: Float32[np.ndarray, "H W 3"]
-    """Of the world, unit, towards the camera; 0 where there is nothing."""
+    """World space, unit, towards the camera; 0 for background."""
     part: UInt8[np.ndarray, "H W"]
-    """1 + the joint that moves the face most; 0 where there is nothing."""
+    """1 + the joint that moves the face most; 0 for background."""
 
 
 def render_view(posed: PosedFigure, view: View, samples: int = 3) -> RenderedView:
-    """The figure seen from `view` with `samples` squared samples a pixel; the same input gives the same bits.
+    """Render the figure with `samples` x `samples` samples per pixel; deterministic.
 
     Raises:
-        ValueError: `samples` is not odd and positive, so that no sample would lie in a pixel's centre.
+        ValueError: `samples` is not odd and positive, so that no sample would be at the pixel's centre.
     """
     if samples < 1 or samples % 2 == 0:
-        raise ValueError(f"{samples} samples a pixel's side: choose an odd number, 1, 3, 5, ...")
+        raise ValueError(f"samples is {samples}: give an odd number, 1, 3, 5, ...")
     figure, textures = posed.figure, posed.figure.textures
     in_camera = posed.vertices @ view.rotation.T + view.translation
-    shot = RenderedView(
+    rendered = RenderedView(
         rgb=np.zeros((view.height, view.width, 3), np.float32),
         coverage=np.zeros((view.height, view.width), np.float32),
         depth=np.zeros((view.height, view.width), np.float32),
@@ -145,7 +144,7 @@ def render_view(posed: PosedFigure, view: View, samples: int = 3) -> RenderedVie
     )
     left, top, right, bottom = _extent(in_camera, view)
     if left >= right or top >= bottom:
-        return shot
+        return rendered
     # Sample (column, row) of the fine grid lies at pixel (left, top) + ((column, row) + 1/2) / samples.
     grid = np.array([[samples, 0, -left * samples], [0, samples, -top * samples], [0, 0, 1.0]]) @ view.intrinsics
     points = project(in_camera, grid, NEAR)
@@ -158,17 +157,17 @@ def render_view(posed: PosedFigure, view: View, samples: int = 3) -> RenderedVie
     _edge_functions(points, figure.faces, face, edges)
     _shade(
         face, samples, left, top, edges, figure.corner_uv, figure.part, rgba, textures.start, textures.size,
-        textures.last, textures.cut_out, LINEAR_OF_SIXTEENTH, shot.rgb, shot.coverage,
+        textures.last, textures.cut_out, LINEAR_OF_SIXTEENTH, rendered.rgb, rendered.coverage,
     )  # fmt: skip
     _look_up(
         face, nearest.depth, samples, left, top, edges, figure.faces, figure.joint, posed.normals, posed.vertices,
-        view.position, shot.depth, shot.normal, shot.part,
+        view.position, rendered.depth, rendered.normal, rendered.part,
     )  # fmt: skip
-    return shot
+    return rendered
 
 
 def _extent(in_camera: np.ndarray, view: View) -> tuple[int, int, int, int]:
-    """Pixels from (left, top) up to (right, bottom) outside of which nothing is seen."""
+    """Bounds of the visible pixels: left, top, right and bottom, the last two exclusive."""
     if in_camera[:, 2].max() < NEAR:
         return 0, 0, 0, 0
     if in_camera[:, 2].min() < NEAR:
@@ -198,7 +197,7 @@ def _edge_functions(points, faces, face, edges):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
 def _level(u, v, e, uv, scale, texels_of_uv, last):
-    """Which halved texture suits a sample: by the texels in its footprint, the determinant of d(u, v) / d(x, y)."""
+    """Mip level of a sample, from the texels in its footprint, the determinant of d(u, v) / d(x, y)."""
     ux = e[0, 0] * (uv[0, 0] - u) + e[1, 0] * (uv[1, 0] - u) + e[2, 0] * (uv[2, 0] - u)
     uy = e[0, 1] * (uv[0, 0] - u) + e[1, 1] * (uv[1, 0] - u) + e[2, 1] * (uv[2, 0] - u)
     vx = e[0, 0] * (uv[0, 1] - v) + e[1, 0] * (uv[1, 1] - v) + e[2, 0] * (uv[2, 1] - v)
@@ -223,7 +222,7 @@ def _shade(
                     covered += face[row, column] >= 0
             if covered == 0:
                 continue
-            # Where nothing but the person is seen, every other sample, as on a chessboard, tells its colour.
+            # In fully covered pixels, every other sample is shaded, in a checkerboard.
             stride = 2 if covered == samples * samples else 1
             red, green, blue, hits, before, level, part, holed = one * 0, one * 0, one * 0, 0, -1, 0, 0, False
             for row in range(pixel_row * samples, (pixel_row + 1) * samples):

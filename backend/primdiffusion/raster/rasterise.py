@@ -37,35 +37,35 @@ class OrthographicView:
 
     @property
     def direction(self) -> Float[np.ndarray, "3"]:
-        """Where the rays go."""
+        """Direction of the rays."""
         return self.world_to_view[2, :3]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TriangleSoup:
-    """Triangles of all parts, parts one after the other."""
+    """The triangles of all parts, concatenated."""
 
     vertices: Float64[np.ndarray, "V 3"]
     """Metres."""
     faces: Int32[np.ndarray, "F 3"]
-    """Numbers into `vertices`."""
+    """Indices into `vertices`."""
     corner_uv: Float32[np.ndarray, "F 3 2"]
     """v up, as in TexturedPart."""
     part: Int32[np.ndarray, "F"]
-    """Which part a face belongs to."""
+    """Part of each face."""
     texels: Textures
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fragments:
-    """What is seen through each pixel's centre."""
+    """The surface point seen at each pixel centre."""
 
     face: Int32[np.ndarray, "H W"]
-    """Number of the face in the soup, -1 where there is none."""
+    """Face of the soup, -1 for background."""
     barycentric: Float32[np.ndarray, "H W 3"]
-    """Where on the face, in space (perspective-correct)."""
+    """Perspective-correct barycentric coordinates on the face."""
     depth: Float32[np.ndarray, "H W"]
-    """Metres along the axis of the view; inf where there is nothing."""
+    """Metres along the optical axis; inf for background."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -83,10 +83,10 @@ class RasterImage:
 
 
 def rasterise(mesh: TexturedMesh, view: Camera | OrthographicView, supersample: int = 1) -> RasterImage:
-    """The mesh seen from `view`, unlit, from both sides of its faces.
+    """Render the mesh from `view`, unlit and two-sided.
 
-    `supersample` squared samples a pixel are averaged in linear light, which is the remedy for aliasing of edges
-    and fine textures; the time grows with it. The same input gives the same bits. Not differentiable.
+    `supersample` x `supersample` samples per pixel are averaged in linear light, which antialiases edges and textures.
+    Deterministic. Not differentiable.
 
     Raises:
         UnusableMesh: see `flatten`.
@@ -98,14 +98,14 @@ def rasterise(mesh: TexturedMesh, view: Camera | OrthographicView, supersample: 
 def rasterise_colourings(
     meshes: Sequence[TexturedMesh], view: Camera | OrthographicView, supersample: int = 1
 ) -> list[RasterImage]:
-    """As `rasterise`, of meshes that differ only in the colours of their textures: triangles are drawn once.
+    """As `rasterise`, for meshes that differ only in the colours of their textures; triangles are drawn once.
 
     Raises:
         UnusableMesh: see `flatten`.
         ValueError: `supersample` is less than 1.
     """
     if supersample < 1:
-        raise ValueError(f"supersample is {supersample}; it must be 1 or more.")
+        raise ValueError(f"supersample is {supersample}: give 1 or more")
     soup = flatten(meshes[0])
     fragments = draw(soup, _finer(view, supersample))
     pictures = []
@@ -152,7 +152,7 @@ def draw(soup: TriangleSoup, view: Camera | OrthographicView) -> Fragments:
 
 
 def shade(soup: TriangleSoup, fragments: Fragments) -> Float32[np.ndarray, "H W 3"]:
-    """Linear colour of every fragment, bilinear between texels that pass the alpha test; black where there is none."""
+    """Linear colour of every fragment, bilinear between texels that pass the alpha test; black for background."""
     rgb = np.zeros((*fragments.face.shape, 3), np.float32)
     texels = soup.texels
     _shade(
@@ -163,7 +163,7 @@ def shade(soup: TriangleSoup, fragments: Fragments) -> Float32[np.ndarray, "H W 
 
 
 def _finer(view: Camera | OrthographicView, factor: int) -> Camera | OrthographicView:
-    """The same picture with `factor` times as many pixels a side."""
+    """The same view with `factor` times as many pixels along each side."""
     larger: dict[str, Any] = {"width": view.width * factor, "height": view.height * factor}
     if isinstance(view, OrthographicView):
         return dataclasses.replace(view, pixel_size=view.pixel_size / factor, **larger)
@@ -173,7 +173,7 @@ def _finer(view: Camera | OrthographicView, factor: int) -> Camera | Orthographi
 
 
 def _ray_lengths(view: Camera | OrthographicView, supersample: int) -> Float32[np.ndarray, "H W"] | np.float32:
-    """How much longer the way along the ray is than along the axis of the view."""
+    """Distance along the ray per metre along the optical axis."""
     if isinstance(view, OrthographicView):
         return np.float32(1)
     finer = _finer(view, supersample)
@@ -193,7 +193,7 @@ def _blocks(picture: np.ndarray, side: int) -> np.ndarray:
 def view_along(
     direction: tuple[float, float, float], bounds: Float[np.ndarray, "2 3"], pixel_size: float
 ) -> OrthographicView:
-    """The view along `direction` that just holds the box `bounds` and starts in front of it; y of the world is up.
+    """The smallest view along `direction` that contains the box `bounds`, starting in front of it; y is up.
 
     Raises:
         ValueError: `direction` is zero or `pixel_size` is not positive.
@@ -202,7 +202,7 @@ def view_along(
     length = float(np.linalg.norm(forward))
     if length == 0 or pixel_size <= 0:
         raise ValueError(
-            f"No view along {direction} with pixels of {pixel_size} m: give a direction and a positive pixel size."
+            f"the direction is {direction} and the pixel size {pixel_size} m: give a nonzero direction and a positive size"
         )
     forward = forward / length
     up = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.999 else np.array([0.0, 0.0, 1.0])
@@ -216,15 +216,14 @@ def view_along(
 
 
 def flatten(mesh: TexturedMesh) -> TriangleSoup:
-    """The mesh as a soup.
+    """Concatenate the parts of a mesh.
 
     Raises:
-        UnusableMesh: no part has a face, a coordinate is NaN or infinite, a face names a vertex that is not there, or a
-            texture has no texel.
+        UnusableMesh: the mesh has no faces, values that are not finite, faces with invalid indices, or empty textures.
     """
     parts = [part for part in mesh.parts if len(part.faces)]
     if not parts:
-        raise UnusableMesh(f"The mesh has no triangles in its {len(mesh.parts)} parts; give it at least one.")
+        raise UnusableMesh(f"the mesh has no triangles in its {len(mesh.parts)} parts: give at least one")
     for part in parts:
         _check(part)
     first = np.cumsum([0] + [len(part.vertices) for part in mesh.parts])
@@ -238,18 +237,18 @@ def flatten(mesh: TexturedMesh) -> TriangleSoup:
 
 
 def _check(part: TexturedPart) -> None:
-    """Refuse what a compiled loop would read out of bounds or lose silently."""
+    """Check for values that compiled loops would read out of bounds or drop."""
     for name, values in (("vertices", part.vertices), ("corner_uv", part.corner_uv)):
         if not np.isfinite(values).all():
             raise UnusableMesh(
-                f"Part {part.name!r} has {int((~np.isfinite(values)).sum())} NaN or infinite values in {name}; "
-                "repair or drop the part."
+                f"part {part.name!r} has {int((~np.isfinite(values)).sum())} NaN or infinite values in {name}: "
+                "repair or remove the part"
             )
     low, high = int(part.faces.min()), int(part.faces.max())
     if low < 0 or high >= len(part.vertices):
         raise UnusableMesh(
-            f"Part {part.name!r} has faces that name vertices {low} to {high}, but only {len(part.vertices)} vertices; "
-            "repair the faces."
+            f"part {part.name!r} has faces with vertices {low} to {high}, but only {len(part.vertices)} vertices: "
+            "repair the faces"
         )
 
 

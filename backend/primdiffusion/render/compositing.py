@@ -1,4 +1,4 @@
-"""What a marcher returns, and how the samples of a ray become a pixel (SPEC 4)."""
+"""The marcher's output, and the compositing of a ray's samples to a pixel (SPEC 4)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from torch import Tensor
 from primdiffusion.geometry.records import TensorRecord
 
 SURFACE_OPACITY = 0.5
-"""The accumulated opacity that counts as having hit something."""
+"""Accumulated opacity that defines the first hit."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Rendering(TensorRecord):
-    """One picture of the primitives."""
+    """An image of the primitives."""
 
     rgb: Float[Tensor, "*r 3"]
     """Linear RGB, premultiplied by alpha (over black)."""
@@ -25,8 +25,8 @@ class Rendering(TensorRecord):
     depth: Float[Tensor, "*r"]
     """Expected depth: the weighted mean of the samples' distances along the ray, metres; inf where alpha is 0."""
     first_hit: Float[Tensor, "*r"]
-    """Distance along the ray, metres, of the first sample at which the opacity has reached 0.5; inf where it never
-    does. Not differentiable."""
+    """Distance along the ray, metres, of the first sample at which the opacity has reached 0.5; inf if there is none.
+    Not differentiable."""
 
 
 def composite(
@@ -34,10 +34,10 @@ def composite(
 ) -> Rendering:
     """Additive, clamped accumulation A <- min(A + a, 1), front to back along the last axis (SPEC 4).
 
-    `opacity` are the samples' a = density * window * length >= 0, `weighted_rgb` their a * colour, `distance` their
-    places along the ray (metres). The sample that takes A to 1 counts with the part that was missing (kappa * a); those
-    after it not at all, nor do they receive a gradient, so stopping there loses nothing. A sample with a = 0 has the
-    gradient of one that is barely there: what is empty can become something.
+    `opacity` is a = density * window * length >= 0 of each sample, `weighted_rgb` a * colour, `distance` its position
+    along the ray (metres). The sample that takes A to 1 contributes the missing part, kappa * a; later samples
+    contribute nothing and receive no gradient, so marching may stop there. A sample with a = 0 receives the gradient in
+    the limit a -> 0, so empty voxels can become opaque.
     """
     reached = opacity.cumsum(-1)
     missing = 1 - torch.cat([torch.zeros_like(opacity[..., :1]), reached[..., :-1]], dim=-1)

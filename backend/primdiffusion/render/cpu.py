@@ -1,7 +1,7 @@
 """The fast marcher for CPUs: numba, float32, differentiable; the same rule as `reference.py` (SPEC 4).
 
-Pixels are worked on in tiles, each with the boxes whose projected corners touch it. A ray is tested against its tile's
-boxes, gathers opacity and colour over a chunk of lattice points, composites the chunk, and stops when it is opaque.
+Pixels are processed in tiles, each with the boxes whose projection overlaps it. A ray is tested against its tile's
+boxes, accumulates opacity and colour over a chunk of lattice points, composites the chunk, and stops when opaque.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from primdiffusion.render.cpu_packing import Scene, heaviest_first, pack
 from primdiffusion.render.lattice import MarchSettings, Span, check_camera, check_scene, check_unbatched, strides_of
 
 LARGEST_PAYLOAD = 256
-"""Voxels along a side: cells are numbered in float32, exact below 2^24."""
+"""Voxels along each side; cell indices are float32, exact below 2^24."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SampleCount:
-    """How many samples a picture takes."""
+    """Number of samples of an image."""
 
     inside_boxes: int
-    """Samples of the rule (SPEC 4): lattice points in boxes, in each box's stride, up to where rays become opaque."""
+    """Samples by the rule (SPEC 4): lattice points in boxes, at each box's stride, until rays become opaque."""
     evaluated: int
-    """Samples that `march_cpu` takes: without cells that hold nothing, but to the end of the chunk of an opaque ray."""
+    """Samples evaluated by `march_cpu`: empty cells are skipped, but the last chunk of an opaque ray is completed."""
 
 
 def march_cpu(
@@ -65,7 +65,7 @@ def count_samples(
     settings: MarchSettings = MarchSettings(),  # noqa: B008
     span: Span | None = None,
 ) -> SampleCount:
-    """How many samples `march_cpu` takes for a picture, and how many the rule asks for; costs two pictures."""
+    """Count the samples of `march_cpu` and of the rule; takes as long as two images."""
     view = _view(primitives, camera, settings, span)
     inputs = (primitives.rgb.float(), primitives.density.float(), view.to_local, view.offset, view.pixel_to_world)
     counts = []
@@ -79,7 +79,7 @@ def count_samples(
 def draw_with_ends(
     primitives: Primitives, camera: Camera, settings: MarchSettings
 ) -> tuple[Rendering, _View, Scene, Ends]:
-    """The picture without gradients, and what a derivative of it needs: boxes with empty cells, ends of the rays."""
+    """Render without gradients; also return the scene with empty cells and the ends of the rays, for derivatives."""
     view = _view(primitives.map(lambda tensor: tensor.detach()), camera, settings, None)
     inputs = (primitives.rgb.float(), primitives.density.float(), view.to_local, view.offset, view.pixel_to_world)
     ends = _ends(camera.width * camera.height)
@@ -89,15 +89,15 @@ def draw_with_ends(
 
 
 class _View(NamedTuple):
-    """A scene without its payload, in float64; the tensors carry gradients to the records they came from."""
+    """A scene without its payload, in float64; the tensors are differentiable functions of the records."""
 
     to_local: Float[Tensor, "k 3 3"]
     offset: Float[Tensor, "k 3"]
     """From each box's centre to the camera."""
     pixel_to_world: Float[Tensor, "3 3"]
-    """A pixel's place [u, v, 1] to its ray's direction, not of unit length."""
+    """From a pixel [u, v, 1] to its ray's direction, not normalised."""
     stride: Int64[Tensor, "k"]
-    """In units of the least one, as are all lattice indices here."""
+    """In units of the smallest stride, as are all lattice indices here."""
     solid: Bool[Tensor, "k"]
     limits: Int64[ndarray, "r 2"]
     """First and last lattice index of each ray; empty without a span."""
@@ -113,12 +113,12 @@ def _view(primitives: Primitives, camera: Camera, settings: MarchSettings, span:
         check_scene(primitives, camera, span)
         check_unbatched(primitives, camera, span)
         raise ValueError(
-            f"march_cpu draws boxes of 1 to {LARGEST_PAYLOAD} voxels a side on the CPU; these have "
-            f"{primitives.density.shape[-1]} and lie on {primitives.density.device}"
+            f"march_cpu renders boxes with 1 to {LARGEST_PAYLOAD} voxels along each side, on the CPU; these have "
+            f"{primitives.density.shape[-1]} and are on {primitives.density.device}: call march_reference"
         )
     half_extent = primitives.half_extent
     solid = (half_extent > 0).all(-1)
-    # Boxes without extent are never drawn; any finite matrix does for them.
+    # Boxes without extent are never rendered, so any finite matrix will do.
     inverse = 1 / torch.where(half_extent <= 0, 1, half_extent).double()
     strides = strides_of(primitives, settings)
     unit = int(strides.min()) if len(strides) else 1
@@ -139,7 +139,7 @@ def _view(primitives: Primitives, camera: Camera, settings: MarchSettings, span:
 
 
 def _is_one_scene(primitives: Primitives, camera: Camera, span: Span | None) -> bool:
-    """Whether shapes and the small fields are right; boxes are checked where they are packed."""
+    """Whether shapes and small fields are valid; boxes are checked when they are packed."""
     k, size = primitives.position.shape[0] if primitives.position.ndim else 0, primitives.density.shape[-1]
     shapes = [
         *((primitives.position, (k, 3)), (primitives.rotation, (k, 3, 3)), (primitives.half_extent, (k, 3))),
@@ -157,7 +157,7 @@ def _is_one_scene(primitives: Primitives, camera: Camera, span: Span | None) -> 
 
 
 def _pixel_to_world(camera: Camera) -> Float[Tensor, "3 3"]:
-    """The matrix behind `Camera.rays`."""
+    """The matrix that `Camera.rays` applies."""
     k = camera.intrinsics.double()
     fx, skew, cx, fy, cy = k[0, 0], k[0, 1], k[0, 2], k[1, 1], k[1, 2]
     none, one = torch.zeros_like(fx), torch.ones_like(fx)
@@ -176,7 +176,7 @@ Inputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 def _scene(view: _View, inputs: Inputs, *, empty_cells: bool) -> Scene:
     rgb, density, to_local, offset, pixel_to_world = (tensor.detach() for tensor in inputs)
-    if density.shape[-1] == 1:  # one voxel is the same everywhere, as two equal ones are
+    if density.shape[-1] == 1:  # one voxel is constant, like two equal ones
         rgb, density = rgb.expand(-1, -1, 2, 2, 2), density.expand(-1, 2, 2, 2)
     scene = pack(
         rgb, density, to_local, offset, view.given[0].rotation.detach(), view.stride, view.solid, pixel_to_world,
@@ -188,7 +188,7 @@ def _scene(view: _View, inputs: Inputs, *, empty_cells: bool) -> Scene:
 
 
 def _ends(rays: int) -> Ends:
-    """Room for so many rays."""
+    """Allocate for a number of rays."""
     return Ends(
         np.empty(rays, np.int64), np.empty(rays, np.int32), np.empty(rays, np.float32), np.empty((rays, 3), np.float32)
     )
@@ -197,7 +197,7 @@ def _ends(rays: int) -> Ends:
 def _draw(
     view: _View, scene: Scene, ends: Ends, counts: Int64[ndarray, "tiles 2"] | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """rgb, alpha, depth and first hit, a row per pixel. Fills `ends` and `counts` unless they are empty."""
+    """Return rgb, alpha, depth and first hit, one row per pixel. Fills `ends` and `counts` unless they are empty."""
     rays = view.width * view.height
     picture = Picture(np.empty((rays, 3), np.float32), *(np.empty(rays, np.float32) for _ in range(3)))
     counts = np.empty((0, 2), np.int64) if counts is None else counts
@@ -211,11 +211,11 @@ def _draw(
 
 
 class _March(torch.autograd.Function):
-    """The picture as a function of `Inputs`; everything before them is differentiated by torch."""
+    """The image as a function of `Inputs`; torch differentiates `Inputs`."""
 
     @staticmethod
     def forward(ctx, rgb, density, to_local, offset, pixel_to_world, view):
-        """Keeps where each ray ends, not its samples."""
+        """Saves where each ray ends, not its samples."""
         inputs = (rgb, density, to_local, offset, pixel_to_world)
         ctx.view, ctx.ends = view, _ends(view.width * view.height)
         fields = _draw(view, _scene(view, inputs, empty_cells=False), ctx.ends)
@@ -225,10 +225,10 @@ class _March(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *cotangents):
-        """The box-parallel adjoint; what no input needs is not summed."""
+        """The box-parallel adjoint; skips gradients that are not required."""
         if torch.is_grad_enabled():
             raise RuntimeError(
-                "march_cpu cannot be differentiated twice: leave out create_graph=True, or call march_reference"
+                "march_cpu cannot be differentiated twice: omit create_graph=True, or call march_reference"
             )
         *inputs, alpha, depth = ctx.saved_tensors
         upstream = _upstream(ctx.ends, ctx.view.spacing, alpha, depth, *cotangents[:3])
@@ -243,7 +243,7 @@ class _March(torch.autograd.Function):
 def _upstream(
     ends: Ends, spacing: float, alpha: Tensor, depth: Tensor, g_rgb: Tensor, g_alpha: Tensor, g_depth: Tensor
 ) -> Upstream:
-    """What each ray's samples are worth (SPEC 4)."""
+    """Gradients of each ray's samples (SPEC 4)."""
     distance, origin, constant = np.empty((3, len(alpha)), np.float32)
     upstream = Upstream(g_rgb.contiguous().numpy(), distance, origin, constant, ends.index, ends.box, ends.share)
     fields = (value.contiguous().numpy() for value in (alpha, depth, g_alpha, g_depth))
@@ -254,7 +254,7 @@ def _upstream(
 def _adjoin(
     view: _View, scene: Scene, upstream: Upstream, *, payload: bool, geometry: bool, camera: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The gradients of `Inputs`; those not asked for are empty."""
+    """Gradients of `Inputs`, empty if not required."""
     k, size = len(scene.rectangle), scene.size
     held, moved = (k if payload else 0), (k if geometry else 0)
     gradients = Gradients(

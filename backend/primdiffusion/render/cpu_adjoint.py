@@ -1,7 +1,7 @@
-"""The CPU's adjoint (SPEC 4): boxes in parallel, each with sums of its own, so nothing is atomic and results repeat.
+"""The adjoint on the CPU (SPEC 4): parallel over boxes, each with its own sums, hence deterministic without atomics.
 
-Compositing is additive, so what a sample's opacity is worth follows from the sample and from a few numbers of its ray
-(`Upstream`) alone, in whatever order: the backward pass needs no sorting and no memory of the forward pass's samples.
+Compositing is additive, so the gradient of a sample's opacity depends only on the sample and a few numbers of its ray
+(`Upstream`), in any order: the backward pass needs no sorting and stores no samples of the forward pass.
 """
 
 from __future__ import annotations
@@ -33,40 +33,40 @@ from primdiffusion.render.cpu_sampling import (
 from primdiffusion.render.cpu_vectors import adjoin_sample
 
 RAYS = 4096
-"""Rays that are weighed at a time."""
+"""Rays weighed at a time."""
 
 
 class Upstream(NamedTuple):
-    """What each ray's samples are worth: dL/da = <rgb, colour> + distance * (t - origin) + constant, up to its end."""
+    """Gradient of a ray's samples: dL/da = <rgb, colour> + distance * (t - origin) + constant, up to its end."""
 
     rgb: Float32[ndarray, "r 3"]
     distance: Float32[ndarray, "r"]
     origin: Float32[ndarray, "r"]
     constant: Float32[ndarray, "r"]
     end: Int64[ndarray, "r"]
-    """The lattice index of the last sample that counts; what lies behind receives nothing."""
+    """Lattice index of the last sample that contributes; later ones receive no gradient."""
     box: Int32[ndarray, "r"]
-    """With index order: the last box that counts there."""
+    """With index order: the last box that contributes there."""
     share: Float32[ndarray, "r"]
-    """kappa: the part of the last sample that counts."""
+    """kappa: the fraction of the last sample that contributes."""
 
 
 class Gradients(NamedTuple):
-    """Sums over all rays. Those that nobody needs are empty."""
+    """Sums over all rays; empty if not required."""
 
     rgb: Float32[ndarray, "k 3 n"]
     density: Float32[ndarray, "k n"]
     to_local: Float64[ndarray, "k 3 3"]
     offset: Float64[ndarray, "k 3"]
     pixel_to_world: Float64[ndarray, "k 3 3"]
-    """Each box's part of it."""
+    """Contribution of each box."""
 
 
 @kernel
 def weigh_rays(taken, upstream, alpha, depth, g_alpha, g_depth, end_rgb, spacing):
-    """Fills distance, origin and constant from the picture's and its gradient's fields.
+    """Fill distance, origin and constant from the image and its gradient.
 
-    With distance as a fourth colour: depth = sum w t / alpha.
+    Distance is treated as a fourth colour: depth = sum w t / alpha.
     """
     begin = take(taken) * RAYS
     while begin < len(alpha):
@@ -88,10 +88,10 @@ def _weigh_ray(upstream, ray, alpha, depth, g_alpha, g_depth, end_rgb, spacing):
 
 
 class _Room(NamedTuple):
-    """What one thread needs for a box."""
+    """Buffers of one thread."""
 
     own: Float32[ndarray, "floats"]
-    """dL/d(voxels), interleaved; empty where nobody needs it, as are the slopes."""
+    """dL/d(voxels), interleaved; empty if not required, as are the slopes."""
     slopes: Float32[ndarray, "8"]
     path: Float32[ndarray, "8"]
     table: Float32[ndarray, "floats"]
@@ -107,7 +107,7 @@ def adjoin_boxes(
     taken, gradients, upstream, boxes, size, rectangle, order, limits, pixel_to_world, width, height, spacing,
     index_order,
 ):  # fmt: skip
-    """Fills `gradients`, which must hold zeros. The rest as in `march_tiles`."""
+    """Accumulate into `gradients`, which must be zero. Other arguments as in `march_tiles`."""
     payload, geometry = len(gradients.density) > 0, len(gradients.to_local) > 0
     room = _Room(
         np.zeros(4 * size * size * size if payload else 0, np.float32),
@@ -131,7 +131,7 @@ def _adjoin_box(
     gradients, upstream, boxes, size, rectangle, k, limits, pixel_to_world, width, height, spacing, index_order,
     room,
 ):  # fmt: skip
-    """All rays through box k."""
+    """Process all rays through box k."""
     own, slopes, rays, hits, d_point, d_direction = (
         room.own, room.slopes, room.rays, room.hits, room.d_point, room.d_direction
     )  # fmt: skip
@@ -185,7 +185,7 @@ def _adjoin_box(
 
 @part(inline=True)
 def counted_steps(hits, lane, reference, stride, limits, ray, end, k, last_box):
-    """First and last step, from the reference point, of a ray in box k that count."""
+    """First and last contributing step of a ray in box k, from the reference point."""
     enter, leave = np.int64(hits[ENTER * LANES + lane]), np.int64(hits[LEAVE * LANES + lane])
     last = end if k <= last_box else end - 1
     first = np.int64(1)
@@ -230,9 +230,9 @@ def _adjoin_segment(
 
 @part()
 def _turn_and_move(d_point, d_direction, slopes, middle, rays, pixel, distance, step):
-    """Adds one ray to a tile's sums of dL/dy and of t * dL/dy times the direction, less distance * middle.
+    """Add one ray to a tile's sums of dL/dy, and of t * dL/dy times the direction minus distance * middle.
 
-    y = to_local (o - T + t d) with t = distance + step * i; slopes hold sum dL/dy and sum i * dL/dy.
+    y = to_local (o - T + t d) with t = distance + step * i; slopes contain sum dL/dy and sum i * dL/dy.
     """
     dx, dy, dz = rays[pixel], rays[PIXELS + pixel], rays[2 * PIXELS + pixel]
     x, y, z = middle[0] + dx, middle[1] + dy, middle[2] + dz
@@ -246,7 +246,7 @@ def _turn_and_move(d_point, d_direction, slopes, middle, rays, pixel, distance, 
 
 @part()
 def _aim(d_camera, slopes, to_local, k, distance, step, m, row, column):
-    """Adds one ray to dL/d(pixel_to_world): d = r / |r|, r = pixel_to_world [u, v, 1]."""
+    """Add one ray to dL/d(pixel_to_world): d = r / |r|, r = pixel_to_world [u, v, 1]."""
     vx, vy, vz = 0.0, 0.0, 0.0  # dL/dd
     for axis in range(3):
         s = distance * slopes[axis] + step * slopes[4 + axis]
@@ -268,7 +268,7 @@ def _aim(d_camera, slopes, to_local, k, distance, step, m, row, column):
 
 @part()
 def _add_tile(d_matrix, d_offset, d_point, d_direction, boxes, k, middle, distance):
-    """Adds a tile's sums to dL/d(to_local) and dL/d(offset)."""
+    """Add a tile's sums to dL/d(to_local) and dL/d(offset)."""
     for axis in range(3):
         for other in range(3):
             near = boxes.offset[k, other] + distance * middle[other]
@@ -278,7 +278,7 @@ def _add_tile(d_matrix, d_offset, d_point, d_direction, boxes, k, middle, distan
 
 @part()
 def _separate(rgb, density, own, k, count):
-    """From interleaved voxels to colour and density."""
+    """Split interleaved voxels into colour and density."""
     for i in range(count):
         rgb[k, 0, i], rgb[k, 1, i], rgb[k, 2, i] = own[4 * i], own[4 * i + 1], own[4 * i + 2]
         density[k, i] = own[4 * i + 3]

@@ -1,4 +1,4 @@
-"""numba's compiler as the CPU marcher uses it: kernels, which threads run, and the parts they are made of."""
+"""Numba compilation and threading for the CPU marcher, and the list of boxes that each tile sees."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from numba.extending import intrinsic
 from numpy import ndarray
 
 FASTMATH = frozenset({"contract", "arcp", "nsz", "reassoc"})
-"""Rounding may differ from the source's; NaN and infinity keep their meaning."""
+"""Allows different rounding, but keeps the semantics of NaN and infinity."""
 
 THREADS: int = vars(config)["NUMBA_NUM_THREADS"]
-"""All that this process may run on, or as many as the environment variable of that name says."""
+"""All processors available to this process, or the value of the environment variable NUMBA_NUM_THREADS."""
 
-_njit: Any = numba.njit  # its overloads do not know all options
-_compiled_call: Any = intrinsic  # its callers do not give the typing context, nor see the real types
+_njit: Any = numba.njit  # the type stubs lack some options
+_compiled_call: Any = intrinsic  # untyped: callers omit the typing context and pass other types
 _SOURCES = ("cpu_*.py", "merge.py", "lattice.py", "compositing.py")
 
 Function = Callable[..., Any]
 
 
 def kernel(function: Function) -> Any:
-    """Compiled for `on_all_threads` to call, and cached on disk.
+    """Compile a kernel for `on_all_threads`, cached on disk.
 
-    numba 0.68 compiles a cached kernel again when the kernel's own file has changed, but not when a function or a
-    constant it takes from another file has. Here the files that hold them are part of the cache's stamp.
+    numba 0.68 invalidates a cached kernel when its own file changes, but not when functions or constants from other
+    files do. Here the cache stamp covers all of those files.
     """
     dispatcher = _njit(nogil=True, cache=True, fastmath=set(FASTMATH), error_model="numpy")(function)
     dispatcher._cache._cache_file._source_stamp = _stamp()
@@ -43,10 +43,10 @@ def kernel(function: Function) -> Any:
 
 
 def part(*, inline: bool = False) -> Callable[[Function], Any]:
-    """Compiled for kernels and other parts to call, not for Python.
+    """Compile a function that only kernels and other parts call.
 
-    `inline` puts the function into its callers, whose loops can then be vectorised. Parts count no references and so
-    cannot allocate: their kernel holds all arrays, and the atomic counters would cost more than the samples.
+    `inline` inlines it, so that loops of the caller can be vectorised. Parts have no reference counting and cannot
+    allocate: kernels own all arrays, and atomic counters would cost more than the samples.
     """
     return _njit(
         forceinline=inline,
@@ -59,38 +59,36 @@ def part(*, inline: bool = False) -> Callable[[Function], Any]:
 
 
 def on_all_threads(function: Any, *arguments: Any) -> None:
-    """Calls the kernel `function(taken, *arguments)` on all threads at once, which share the work by `take`.
+    """Run the kernel `function(taken, *arguments)` on all threads, which distribute the work with `take`.
 
-    These are Python's threads and not numba's: its OpenMP threads wait by spinning, which on a busy machine costs more
-    than a picture and takes the processors from torch's; and its own built-in pool ends the process when two threads
-    use it at once.
+    Uses Python threads instead of numba's: numba's OpenMP threads spin while waiting, which can cost more than an image
+    on a busy machine and slows down torch, and its built-in pool aborts the process if two threads use it.
     """
     taken = np.zeros(1, np.int64)
     others = [_pool(os.getpid()).submit(function, taken, *arguments) for _ in range(THREADS - 1)]
     function(taken, *arguments)
     for other in others:
-        if not other.cancel():  # one that has not begun has nothing left to do
+        if not other.cancel():  # cancelled if it has not started: no work is left
             other.result()
 
 
 @functools.cache
 def _pool(process: int) -> ThreadPoolExecutor:
-    """Threads of this process: those of the one it was forked from are not there."""
+    """Thread pool of this process; threads do not survive a fork."""
     return ThreadPoolExecutor(THREADS, thread_name_prefix=f"march-{process}")
 
 
 @part(inline=True)
 def index(i):
-    """i, which is not negative and below 2^32: numba looks before each use of an index whether it is negative."""
+    """Convert i in [0, 2^32) to an index without numba's check for negative indices."""
     return np.int64(np.uint32(i))
 
 
 @_compiled_call
 def take(typingctx, taken):
-    """The first of the numbers 0, 1, 2, ... that no thread has taken yet; `taken` int64 [1], at first 0, counts them.
+    """Atomically take the next of the numbers 0, 1, 2, ...; `taken`, int64 [1], starts at 0 and counts them.
 
-    Threads that take their work piece by piece finish together, which shares fixed beforehand do not, least of all on
-    a busy machine; and what a thread needs to work with is allocated once a thread and not once a piece.
+    Dynamic scheduling lets threads finish together even on a busy machine, and needs one set of buffers per thread.
     """
 
     def generate(context, builder, signature, arguments):

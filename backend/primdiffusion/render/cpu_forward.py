@@ -1,4 +1,4 @@
-"""The CPU's forward pass: tiles of pixels in parallel, boxes nearest first, lattice points in chunks."""
+"""The forward pass on the CPU: parallel over tiles, boxes nearest first, lattice points in chunks."""
 
 from __future__ import annotations
 
@@ -28,19 +28,18 @@ from primdiffusion.render.cpu_sampling import (
 )
 
 CHUNK = 16
-"""Lattice points gathered before they are composited: long enough to amortise the loop, short enough to stop early."""
+"""Lattice points accumulated before compositing: enough to amortise the loop, few enough to stop early."""
 NEVER = np.iinfo(np.int64).max
-"""The lattice index at which a ray saturates that does not."""
+"""Lattice index of saturation for rays that do not saturate."""
 NO_BOX = np.iinfo(np.int32).max
 
 COLUMNS = 7
-# A hit: its box and its stride, the reference point, its place among the tests, the first, the next and the last
-# lattice point.
+# A hit: box, stride, reference point, index of its test, and first, next and last lattice point.
 _BOX, _STRIDE, _REFERENCE, _LINE, _FIRST, _NEXT, _LAST = range(COLUMNS)
 
 
 class Picture(NamedTuple):
-    """What the forward pass fills, a row per pixel."""
+    """Output of the forward pass, one row per pixel."""
 
     rgb: Float32[ndarray, "r 3"]
     alpha: Float32[ndarray, "r"]
@@ -49,27 +48,27 @@ class Picture(NamedTuple):
 
 
 class Ends(NamedTuple):
-    """Where each ray becomes opaque: all that the adjoint needs of the forward pass. May be empty, then not filled."""
+    """Where each ray becomes opaque, as the adjoint needs it. Not filled if empty."""
 
     index: Int64[ndarray, "r"]
-    """The lattice index, in units of the least stride; NEVER where the ray stays transparent."""
+    """Lattice index in units of the smallest stride; NEVER if the ray stays transparent."""
     box: Int32[ndarray, "r"]
-    """With index order: the box that made it opaque. NO_BOX with mixed compositing."""
+    """With index order, the box that made it opaque; NO_BOX with mixed compositing."""
     share: Float32[ndarray, "r"]
-    """kappa: the part of that sample's opacity that was used (SPEC 4)."""
+    """kappa: the fraction of that sample's opacity that contributes (SPEC 4)."""
     rgb: Float32[ndarray, "r 3"]
-    """That sample's colour."""
+    """Colour of that sample."""
 
 
 class _Room(NamedTuple):
-    """What one thread needs to draw a tile, for as many boxes as the fullest tile sees."""
+    """Buffers of one thread, sized for the tile with the most boxes."""
 
     listed: Int64[ndarray, "n"]
     """The tile's boxes, nearest first."""
     reference: Int64[ndarray, "n"]
-    """Their reference points (see `reference_point`)."""
+    """Reference points of these boxes (see `reference_point`)."""
     earliest: Int64[ndarray, "n"]
-    """A lattice index before which no ray enters any of the boxes from here on."""
+    """Lower bound of the lattice index at which a ray enters this or any later box."""
     table: Float32[ndarray, "floats"]
     rays: Float32[ndarray, "floats"]
     tests: Float32[ndarray, "floats"]
@@ -78,9 +77,9 @@ class _Room(NamedTuple):
     per_stride: Float32[ndarray, "n"]
     """1 / stride of each hit."""
     sequence: UInt64[ndarray, "n"]
-    """The hits, sorted by their first lattice points; unsigned, as numba looks whether signed indices are negative."""
+    """The hits sorted by first lattice point; unsigned, because numba checks the sign of signed indices."""
     points: Float32[ndarray, "floats"]
-    """[CHUNK + 1, 4], flat: colour times opacity and opacity at each lattice point of a chunk; one more to work in."""
+    """[CHUNK + 1, 4], flat: colour times opacity and opacity at each lattice point of a chunk; one more as scratch."""
     block: Float32[ndarray, "floats"]
 
 
@@ -89,10 +88,10 @@ def march_tiles(
     taken, picture, ends, counts, boxes, size, rectangle, row_start, row_box, seen, order, limits,
     pixel_to_world, width, height, spacing, index_order,
 ):  # fmt: skip
-    """Draws all tiles in their `order`, each of which has `seen` so many boxes.
+    """Render all tiles in the given `order`; `seen` is the number of boxes of each.
 
-    limits [r, 2]: first and last lattice index of each ray, may be empty.
-    counts [tiles, 2], may be empty: samples evaluated, and samples up to where rays become opaque.
+    limits [r, 2], may be empty: first and last lattice index of each ray.
+    counts [tiles, 2], may be empty: samples evaluated, and samples before rays become opaque.
     """
     most = seen.max()
     blocks = (most + LANES - 1) // LANES
@@ -117,7 +116,7 @@ def _march_tile(
     picture, ends, counts, boxes, size, rectangle, row_start, row_box, tile, listed, limits, pixel_to_world, width,
     height, spacing, index_order, room,
 ):  # fmt: skip
-    """Draws one tile, which sees `listed` boxes."""
+    """Render one tile with `listed` boxes."""
     across = (width + TILE - 1) // TILE
     row0, column0 = (tile // across) * TILE, (tile % across) * TILE
     if listed == 0:
@@ -171,7 +170,7 @@ def _tabulate_tile(room, row_box, row_start, rectangle, tile, across, boxes, mid
 
 @part(inline=True)
 def _test_boxes(room, number, begin, pixel, strides, first, last):
-    """Adds to the ray's `number` hits those among LANES boxes from `begin` on; returns how many there are then."""
+    """Append the hits among LANES boxes from `begin` on to the ray's `number` hits; return their new number."""
     dx, dy, dz = room.rays[pixel], room.rays[PIXELS + pixel], room.rays[2 * PIXELS + pixel]
     begin, number = index(begin), index(number)
     place = begin * HIT_ROWS
@@ -204,7 +203,7 @@ def _test_boxes(room, number, begin, pixel, strides, first, last):
 
 @part(inline=True)
 def _march_ray(picture, ends, ray, pixel, room, listed, first, last, voxels, strides, size, spacing, index_order):
-    """Composites one ray; returns how many samples it took and how many hits it looked at."""
+    """Composite one ray; return the numbers of samples and of hits examined."""
     hits, sequence, points = room.hits, room.sequence, room.points
     red, green, blue, alpha, moment, first_hit = 0.0, 0.0, 0.0, 0.0, 0.0, np.inf
     evaluated, number, done = 0, 0, 0  # hits before `done` end before the chunk
@@ -254,7 +253,7 @@ def _march_ray(picture, ends, ray, pixel, room, listed, first, last, voxels, str
 
 @part(inline=True)
 def _gather(room, begin, done, number, voxels, strides, size, spacing):
-    """Adds what all boxes have at the lattice points from `begin` to `begin + CHUNK`; returns how many samples."""
+    """Accumulate all boxes at the lattice points from `begin` to `begin + CHUNK`; return the number of samples."""
     hits, sequence = room.hits, room.sequence
     evaluated, end = 0, begin + CHUNK
     for place in range(done, number):
@@ -265,7 +264,7 @@ def _gather(room, begin, done, number, voxels, strides, size, spacing):
         if upcoming > last:
             continue
         k, stride = hits[hit, _BOX], hits[hit, _STRIDE]
-        # Division of small whole numbers by way of float32, exact and far faster than the processor's own.
+        # Division of small integers through float32: exact, and much faster than integer division.
         inverse = room.per_stride[hit]
         count = np.int64((np.float32(last - upcoming) + np.float32(0.5)) * inverse) + 1
         first = np.float32(upcoming - hits[hit, _REFERENCE]) * inverse
@@ -282,7 +281,7 @@ def _gather(room, begin, done, number, voxels, strides, size, spacing):
 
 @part()
 def _sum(points):
-    """The chunk's colour and opacity, and sum of slot * opacity."""
+    """Colour and opacity of the chunk, and the sum of slot * opacity."""
     r, g, b, a, m = np.float32(0), np.float32(0), np.float32(0), np.float32(0), np.float32(0)
     for slot in range(CHUNK):
         r += points[4 * slot]
@@ -295,7 +294,7 @@ def _sum(points):
 
 @part()
 def _sum_to_opaque(points, alpha):
-    """The slot that takes alpha to 1 or beyond, CHUNK if rounding alone did; as `_sum`, of what lies before it."""
+    """The slot that takes alpha to 1 (CHUNK if only rounding did), and as `_sum` for the slots before it."""
     r, g, b, a, m = 0.0, 0.0, 0.0, 0.0, 0.0
     for slot in range(CHUNK):
         opacity = points[4 * slot + 3]
@@ -308,7 +307,7 @@ def _sum_to_opaque(points, alpha):
 
 @part()
 def _slot_of_surface(points, alpha, last):
-    """The slot at which alpha has grown to SURFACE_OPACITY, `last` at the latest."""
+    """The slot at which alpha reaches SURFACE_OPACITY, at most `last`."""
     for slot in range(min(last, CHUNK - 1)):
         alpha += points[4 * slot + 3]
         if alpha >= SURFACE_OPACITY:
@@ -318,9 +317,9 @@ def _slot_of_surface(points, alpha, last):
 
 @part()
 def _in_index_order(room, slot, index, alpha, number, voxels, strides, size, spacing):
-    """The boxes of one lattice point one after the other, the lowest index first, until the ray is opaque.
+    """Composite the boxes at one lattice point, lowest index first, until the ray is opaque.
 
-    points[slot] becomes the sample that does it. Returns its box and the colour and opacity of the samples before it.
+    Sets points[slot] to the saturating sample; returns its box, and colour and opacity of the samples before it.
     """
     hits, points = room.hits, room.points
     r, g, b, a = 0.0, 0.0, 0.0, 0.0
@@ -334,7 +333,7 @@ def _in_index_order(room, slot, index, alpha, number, voxels, strides, size, spa
             if inside and hits[hit, _BOX] > box and (following < 0 or hits[hit, _BOX] < hits[following, _BOX]):
                 following = hit
         if following < 0:
-            break  # by rounding, all together do not reach 1: the last one counts as the one that does
+            break  # because of rounding the sum does not reach 1: the last box counts as saturating
         box = hits[following, _BOX]
         stride = strides[box]
         scratch = 4 * CHUNK
@@ -362,7 +361,7 @@ def _note_end(ends, ray, index, box, share, points, slot):
 
 @part()
 def _needed(hits, number, strides, end):
-    """Samples of a ray's hits at lattice points up to `end`."""
+    """Number of samples of a ray's hits at lattice points up to `end`."""
     needed = 0
     for hit in range(number):
         last = min(hits[hit, _LAST], end)

@@ -1,8 +1,8 @@
-"""The derivative of a picture by the voxels of its boxes, as a sparse matrix (SPEC 4); numba, float32, CPU.
+"""The derivative of an image with respect to voxels, as a sparse matrix (SPEC 4); numba, float32, CPU.
 
-With the places where rays saturate held fixed, a picture is linear in colour and in density: a ray is the sum of its
-samples, and each sample is a trilinear mean of eight voxels. `linearise` stores those sums, merged over the samples
-that a ray takes in a box, so that products with the matrix and its transpose cost a fraction of a march.
+If the points where rays saturate are held fixed, an image is linear in colour and in density: a ray is the sum of its
+samples, and each sample is a trilinear mean of eight voxels. `linearise` stores these sums, merged over the samples of
+a ray in a box, so that products with the matrix and its transpose cost a fraction of a march.
 """
 
 from __future__ import annotations
@@ -39,26 +39,26 @@ COLOUR, DENSITY, OPACITY = 0, 1, 4
 """Columns of `PictureJacobian.weight`: of a voxel's colour, of its density for red, green and blue, and for alpha."""
 WEIGHTS = 5
 SHORTEST = 4e-5
-"""Metres of ray: voxels that a ray sees less of are left out. 0.8 % of opacity at a density of 200 per metre."""
+"""Entries with less than this length of ray (metres) are dropped: 0.8 % of opacity at a density of 200 per metre."""
 FIRST_ROOM = 2_000_000
-"""Entries that there is room for at first; a picture of 176 x 176 pixels of a person has about 1.5 million."""
+"""Initial capacity in entries; an image of a human with 176 x 176 pixels has about 1.5 million."""
 
 
 class PictureJacobian(NamedTuple):
-    """d(rgb, alpha) / d(colour, density) of one picture, row by row of segments: what a ray sees of a box."""
+    """d(rgb, alpha) / d(colour, density) of one image; a segment is the part of a ray in one box."""
 
     box_start: Int64[ndarray, "k+1"]
     """First segment of each box."""
     ray: Int32[ndarray, "segments"]
-    """The segment's pixel, row-major."""
+    """Pixel of each segment, row-major."""
     start: Int64[ndarray, "segments+1"]
     """First entry of each segment."""
     voxel: Int16[ndarray, "entries"]
-    """Number of the voxel in its box, D, H, W."""
+    """Index of the voxel in its box, order D, H, W."""
     weight: Float32[ndarray, "entries 5"]
     """See COLOUR, DENSITY and OPACITY."""
     rays: int
-    """Pixels of the picture."""
+    """Number of pixels."""
 
     @property
     def voxels(self) -> int:
@@ -67,7 +67,7 @@ class PictureJacobian(NamedTuple):
 
 
 VOXELS = 512
-"""Of a box; voxel numbers are 16 bits wide."""
+"""Voxels of a box; indices have 16 bits."""
 
 
 def linearise(
@@ -76,9 +76,9 @@ def linearise(
     background: float,
     settings: MarchSettings = MarchSettings(),  # noqa: B008
 ) -> tuple[Rendering, PictureJacobian]:
-    """The picture that `march_cpu` draws over black, and its derivative when composited over a grey `background`.
+    """The image of `march_cpu` over black, and its derivative when composited over a grey `background`.
 
-    `background` is linear. Boxes have 8^3 voxels. Raises ValueError as `march_reference` does, and for other boxes.
+    `background` is linear. Raises ValueError as `march_reference` does, and for boxes of other than 8^3 voxels.
     """
     boxes, size = primitives.density.shape[0], primitives.density.shape[-1]
     if size**3 != VOXELS:
@@ -116,7 +116,7 @@ def linearise(
 def apply(
     jacobian: PictureJacobian, change: Float32[ndarray, "v 4"], alpha_free: Float32[ndarray, "r"]
 ) -> Float32[ndarray, "r 4"]:
-    """J x: how rgb and alpha of every pixel change with the voxels' colours and densities (1/m).
+    """J x: the change of rgb and alpha of every pixel with the voxels' colours and densities (1/m).
 
     `alpha_free` is 1 where alpha follows density and 0 where the ray is opaque.
     """
@@ -151,7 +151,7 @@ def add_diagonal(
 
 
 class ColourMatrix(NamedTuple):
-    """The part of a `PictureJacobian` that colours need: exact, as opacity does not depend on colour."""
+    """The colour part of a `PictureJacobian`; exact, because opacity does not depend on colour."""
 
     box_start: Int64[ndarray, "k+1"]
     ray: Int32[ndarray, "segments"]
@@ -162,12 +162,12 @@ class ColourMatrix(NamedTuple):
 
     @classmethod
     def of(cls, jacobian: PictureJacobian) -> ColourMatrix:
-        """Shares all but the weights with the Jacobian."""
+        """The colour part of a Jacobian; shares all arrays except the weights."""
         weight = np.ascontiguousarray(jacobian.weight[:, COLOUR])
         return cls(jacobian.box_start, jacobian.ray, jacobian.start, jacobian.voxel, weight, jacobian.rays)
 
     def apply(self, colours: Float32[ndarray, "v c"]) -> Float32[ndarray, "r c"]:
-        """A x of any number of columns, such as the red, green and blue of several colourings."""
+        """A x for any number of columns, such as red, green and blue of several colourings."""
         out = np.zeros((self.rays, colours.shape[1]), np.float32)
         _apply_colours(self.box_start, self.ray, self.start, self.voxel, self.weight, colours, out)
         return out
@@ -187,7 +187,7 @@ def _linearise(
     box_start, ray_of, start, voxel, weight, density, rgb, ends, shares, last_box, behind, boxes, size, rectangle,
     limits, pixel_to_world, width, height, spacing,
 ):  # fmt: skip
-    """Fills the matrix; numbers of segments and entries, or -1 where there is no room for them."""
+    """Fill the matrix; return the numbers of segments and entries, or -1 if they exceed its capacity."""
     rays = np.empty(3 * PIXELS, np.float32)
     table = np.empty(LANES * TABLE_ROWS, np.float32)
     hits = np.empty(HIT_ROWS * LANES, np.float32)
@@ -250,7 +250,7 @@ def _linearise(
 
 @part()
 def _merge_segment(sums, touched, seen, density, rgb, behind, block, hits, lane, enter, leave, size, length, share):
-    """Adds the samples of a ray in a box to `sums`; how many voxels they touch, which `touched` lists."""
+    """Add the samples of a ray in a box to `sums`; return the number of voxels touched, listed in `touched`."""
     count, slab = 0, size * size
     for begin in range(enter, leave + 1, SAMPLES):
         place_samples(block, hits, lane, np.float32(begin), size, length)

@@ -1,4 +1,4 @@
-"""Boxes and camera as the CPU's kernels want them: checked, bounded, interleaved, nearest first."""
+"""Pack boxes and camera for the CPU kernels: checked, bounded, interleaved, nearest first."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from primdiffusion.render.lattice import ORTHOGONAL
 
 
 class Scene(NamedTuple):
-    """One picture's boxes and which of them each part of it can see."""
+    """The packed boxes of an image, and the lists of boxes that its tiles see."""
 
     boxes: PackedBoxes
     rectangle: Int32[ndarray, "k 4"]
-    """First and last column, first and last row of tiles of each box; last < first where it is not seen."""
+    """First and last column, first and last row of tiles of each box; last < first if it is not visible."""
     row_start: Int64[ndarray, "down+1"]
     row_box: Int32[ndarray, "entries"]
     """The boxes of each row of tiles, nearest first (see `row_lists`)."""
     tile_boxes: Int64[ndarray, "tiles"]
-    """How many boxes each tile sees."""
+    """Number of boxes that each tile sees."""
     pixel_to_world: Float64[ndarray, "3 3"]
     size: int
-    """Voxels along a side of a box."""
+    """Voxels along each side of a box."""
     suspect: bool
-    """Whether a box may hold NaN, infinite or negative values or no rotation: `check_scene` says which."""
+    """Whether a box may have NaN, infinite or negative values or an invalid rotation; `check_scene` finds which."""
 
 
 def pack(
@@ -57,9 +57,9 @@ def pack(
     *,
     empty_cells: bool,
 ) -> Scene:
-    """The scene of one picture; boxes that are not `solid` are not seen.
+    """Pack one image's scene; boxes that are not `solid` are invisible.
 
-    Boxes are cut down to the cells that hold density unless `empty_cells` are wanted too, as for density's gradient.
+    Boxes are cropped to the cells with density, except with `empty_cells`, which the gradient of density needs.
     """
     k, size = density.shape[0], density.shape[-1]
     across, down = tiles_across(width), tiles_across(height)
@@ -84,7 +84,7 @@ def pack(
 
 
 def heaviest_first(work: Int64[ndarray, "n"]) -> Int64[ndarray, "n"]:
-    """The order in which threads take pieces of so much work: light ones fill the end."""
+    """Order tasks by descending work, so that threads finish together."""
     return np.argsort(-work, kind="stable")
 
 
@@ -108,7 +108,7 @@ def _pack_box(
     voxels, low, high, rectangle, nearest, suspect, rgb, density, size, k, to_local, offset, rotation, solid,
     world_to_pixel, across, down, empty_cells, corners, to_world,
 ):  # fmt: skip
-    """Packs box k, of which some arguments are the rows; the last two are room to work in."""
+    """Pack box k, given some of its rows; the last two arguments are scratch."""
     count = size**3
     own = density[k * count : (k + 1) * count]
     colour = rgb[3 * k * count : 3 * (k + 1) * count]
@@ -149,7 +149,7 @@ def _is_suspect(density, rgb, to_local, offset, rotation):
 
 @part()
 def _shrink(low, high, density, size):
-    """Narrows low ... high to where trilinear density can be above 0; False where that is nowhere."""
+    """Narrow low ... high to where trilinear density can be positive; return False if it is nowhere."""
     first_w, last_w, first_h, last_h, first_d, last_d = size, -1, size, -1, size, -1
     for d in range(size):
         for h in range(size):
@@ -181,9 +181,9 @@ def _narrow(low, high, axis, first, last, size):
 
 @part()
 def _place_corners(corners, to_world, low, high, offset, world_to_pixel):
-    """The box's corners as homogeneous pixels; returns how near the camera it comes at least, metres.
+    """Compute the box's corners as homogeneous pixels; return a lower bound of its distance to the camera, metres.
 
-    That is along the direction to its middle: what is farther in any one direction is farther altogether.
+    The bound is the smallest projection of a corner onto the direction to the box's centre.
     """
     middle, distance = (0.0, 0.0, 0.0), 0.0
     for axis in range(3):

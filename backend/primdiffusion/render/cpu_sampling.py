@@ -1,7 +1,8 @@
-"""Where rays enter and leave boxes, LANES of them at once, as LLVM vector code: one ray and many boxes, or the reverse.
+"""Ray-box tests and samples of the CPU marcher.
 
-A box is LANES rows of a table, by which `tabulate` describes it as seen along a tile's middle ray; a ray is how its
-direction differs from that one.
+Tests run on LANES rays or boxes at once, as LLVM vector code: one ray and many boxes, or one box and many rays. A box
+is a lane of a table of TABLE_ROWS rows, relative to the middle ray of its tile; a ray is the difference of its
+direction from the middle ray's.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from primdiffusion.render.cpu_compiled import TILE, index, part
 from primdiffusion.render.cpu_vectors import add_sample, power_of_two
 
 LANES = 8
-"""Rays or boxes that are tested together."""
+"""Rays or boxes tested at once."""
 # Rows of a table of boxes; box i is lane i % LANES of block i // LANES, so a row of a block is one vector.
 AT_CENTRE, PER_STEP, TO_LOCAL, STEPS, LOW, HIGH, FIRST = 0, 3, 6, 15, 16, 19, 22
 TABLE_ROWS = 23
@@ -30,17 +31,17 @@ TABLE_ROWS = 23
 ENTER, LEAVE = 6, 7
 HIT_ROWS = 8
 
-_compiled_call: Any = intrinsic  # its callers do not give the typing context, nor see the real types
+_compiled_call: Any = intrinsic  # untyped: callers omit the typing context and pass other types
 
 _FLOAT, _INT32, _INT64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 _VECTOR = ir.VectorType(_FLOAT, LANES)
 _LEAST_SLOPE = 1e-12
-"""What a ray parallel to a face gets instead of a division by zero; beside the box it then still misses."""
+"""Slope of rays parallel to a face, which avoids division by zero; such rays still miss a box beside them."""
 
 
 @_compiled_call
 def hit_boxes(typingctx, hits, begin, table, block, dx, dy, dz):
-    """One ray against the LANES boxes of the table from `block` on; returns which it hits, as bits, the lowest first.
+    """Test one ray against the LANES boxes of the table from `block` on; return a bit mask of hits, lowest first.
 
     Fills hits [HIT_ROWS, LANES] from `begin` on.
     """
@@ -57,7 +58,7 @@ def hit_boxes(typingctx, hits, begin, table, block, dx, dy, dz):
 
 @_compiled_call
 def hit_rays(typingctx, hits, table, rays, first, pixels):
-    """The LANES rays from `first` on of rays [3, pixels] against the table's first box; otherwise as `hit_boxes`."""
+    """Test LANES rays, from `first` on in rays [3, pixels], against the first box of the table; else as `hit_boxes`."""
     signature = types.int64(hits, table, rays, types.int64, types.int64)
 
     def generate(context, builder, signature, arguments):
@@ -74,7 +75,7 @@ def hit_rays(typingctx, hits, table, rays, first, pixels):
 
 @_compiled_call
 def lowest(typingctx, bits):
-    """The place of the lowest bit that is set; bits is not 0."""
+    """Index of the lowest set bit; bits is not 0."""
 
     def generate(context, builder, signature, arguments):
         return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
@@ -83,7 +84,7 @@ def lowest(typingctx, bits):
 
 
 class _Lanes:
-    """The test, written into one LLVM builder."""
+    """Emits the test with an LLVM builder."""
 
     def __init__(self, context: Any, builder: Any) -> None:
         self.context, self.builder = context, builder
@@ -144,7 +145,7 @@ class _Lanes:
 
 
 SAMPLES = 8
-"""Samples whose places and weights are computed together."""
+"""Samples whose positions and weights are computed at once."""
 PIXELS = TILE * TILE
 
 _DECAY = np.float32(-WINDOW_SHARPNESS / math.log(2))
@@ -152,16 +153,16 @@ _EXPONENT = np.float32(-126)
 
 
 class PackedBoxes(NamedTuple):
-    """The boxes as the kernels read them. y = to_local (x - T) is in [-1, 1]^3 (SPEC 4)."""
+    """Boxes in the layout of the kernels. y = to_local (x - T) is in [-1, 1]^3 (SPEC 4)."""
 
     to_local: Float64[ndarray, "k 3 3"]
     offset: Float64[ndarray, "k 3"]
     """From each box's centre to the camera, metres."""
     stride: Int64[ndarray, "k"]
     nearest: Float64[ndarray, "k"]
-    """No point of the box is nearer to the camera, metres; may be negative."""
+    """Lower bound of the distance to the camera, metres; may be negative."""
     low: Float32[ndarray, "k 3"]
-    """Where in y the box holds density: from low to high, per axis."""
+    """Bounds of the density in y: low and high per axis."""
     high: Float32[ndarray, "k 3"]
     voxels: Float32[ndarray, "floats"]
     """[k, d, h, w, (red, green, blue, density)], flat."""
@@ -169,7 +170,7 @@ class PackedBoxes(NamedTuple):
 
 @part()
 def tile_rays(rays, pixel_to_world, row0, column0):
-    """Fills rays [3, PIXELS] (flat) with each pixel's unit direction less the middle's, which it returns."""
+    """Fill rays [3, PIXELS] (flat) with each pixel's unit direction minus the middle one, which is returned."""
     m = pixel_to_world
     ux, uy, uz, vx, vy, vz = m[0, 0], m[1, 0], m[2, 0], m[0, 1], m[1, 1], m[2, 1]
     u, v = column0 + 0.5 * TILE, row0 + 0.5 * TILE
@@ -197,7 +198,7 @@ def reference_point(boxes, k, middle, spacing):
 
 @part(inline=True)
 def tabulate(table, place, boxes, k, middle, reference, spacing):
-    """Writes box k's row entries at `place`, seen along the tile's middle ray from its reference point."""
+    """Write the table entries of box k at `place`, relative to its reference point on the tile's middle ray."""
     stride = boxes.stride[k]
     distance, step = reference * spacing, stride * spacing
     x = boxes.offset[k, 0] + distance * middle[0]
@@ -219,7 +220,7 @@ def tabulate(table, place, boxes, k, middle, reference, spacing):
 
 @part()
 def leave_empty(table, place):
-    """A lane that no ray hits."""
+    """Write a lane that no ray hits."""
     for row in range(TABLE_ROWS):
         table[place + row * LANES] = 0
     table[place + FIRST * LANES] = np.inf
@@ -227,10 +228,10 @@ def leave_empty(table, place):
 
 @part(inline=True)
 def place_samples(block, hits, hit, first, size, length):
-    """Cells, weights and windows of SAMPLES samples from step `first` on: fills block [8, SAMPLES], flat.
+    """Fill block [8, SAMPLES] (flat) with cells, weights and windows of SAMPLES samples from step `first` on.
 
-    Lane `hit` of `hits` holds y at step 0 and dy per step (see `hit_boxes`). Rows of block: 0-3 the weights of a cell's
-    edges, 4 and 5 those of an edge's ends, 6 window * length, 7 the cell's first voxel.
+    Lane `hit` of `hits` contains y at step 0 and dy per step (see `hit_boxes`). Rows of block: 0-3 the weights of a
+    cell's edges, 4 and 5 those of an edge's ends, 6 window * length, 7 the cell's first voxel.
     """
     hit = index(hit)
     one = np.float32(1)
@@ -269,7 +270,7 @@ def _window(x, y, z):
     exponent = max(_DECAY * (x4 * x4 + y4 * y4 + z4 * z4), _EXPONENT)
     whole = np.floor(exponent)
     f = exponent - whole
-    # 2^f on [0, 1), minimax; in pairs, which wait for one another less than Horner's rule does.
+    # 2^f on [0, 1), minimax; pairs have shorter dependency chains than Horner's rule.
     square = f * f
     low = np.float32(6.9315308e-1) * f + np.float32(9.9999994e-1)
     middle = np.float32(5.5826318e-2) * f + np.float32(2.4015361e-1)
@@ -279,7 +280,7 @@ def _window(x, y, z):
 
 @part(inline=True)
 def add_segment(points, slot, slots, voxels, base, size, block, hits, hit, first, count, length):
-    """Adds `count` samples of one box, from step `first` on, to points[slot], points[slot + slots], ..."""
+    """Add `count` samples of one box, from step `first` on, to points[slot], points[slot + slots], ..."""
     row = size * 4
     slab = size * row
     for begin in range(0, count, SAMPLES):

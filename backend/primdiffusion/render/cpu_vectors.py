@@ -1,8 +1,8 @@
-"""What numba's language lacks and the marcher lives on: four channels and two voxels as one vector register.
+"""Vector operations that numba lacks: four channels and two voxels in one vector register.
 
 Voxels are stored [d, h, w, channel] with the channels (red, green, blue, density), so the two voxels of a cell's edge
-along w are eight floats in a row. The functions below are LLVM vector code, for any processor LLVM knows; a cell's
-corners are then four loads instead of thirty-two, which numba's own vectoriser does not find.
+along w are eight contiguous floats. The functions below emit LLVM vector code, so a cell's corners take four loads
+instead of thirty-two, which numba's own vectoriser does not achieve.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numba.extending import intrinsic
 
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS
 
-_compiled_call: Any = intrinsic  # its callers do not give the typing context, nor see the real types
+_compiled_call: Any = intrinsic  # untyped: callers omit the typing context and pass other types
 
 _FLOAT, _INT32, _INT64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 _FOUR, _EIGHT = ir.VectorType(_FLOAT, 4), ir.VectorType(_FLOAT, 8)
@@ -25,7 +25,7 @@ _WINDOW_SLOPE = _FLOAT(-WINDOW_SHARPNESS * WINDOW_POWER)
 
 @_compiled_call
 def power_of_two(typingctx, exponent):
-    """2 ** exponent for a whole-numbered float32 in -126 ... 127."""
+    """2 ** exponent for an integral float32 in -126 ... 127."""
 
     def generate(context, builder, signature, arguments):
         bits = builder.shl(builder.add(builder.fptosi(arguments[0], _INT32), _INT32(127)), _INT32(23))
@@ -67,7 +67,7 @@ def adjoin_sample(
     typingctx, gradient, slopes, path, voxels, base, corner, row, slab, w00, w01, w10, w11, gu, fu, length, half,
     red, green, blue, constant, step,
 ):  # fmt: skip
-    """The adjoint of one sample, whose opacity's worth is dL/da = <colour, (red, green, blue)> + constant.
+    """The adjoint of one sample with dL/da = <colour, (red, green, blue)> + constant.
 
     The box's voxels begin at `base`; its gradient, laid out like them, receives dL/d(voxels). path [2, 4] holds the
     ray: y = path[0] + step * path[1]. slopes [2, 4] receives dL/dy and the same times `step`; `half` are the voxels per
@@ -100,7 +100,7 @@ def adjoin_sample(
             for place, weight in zip(places, weights, strict=True):
                 code.accumulate(array.data, place, code.multiply(bars, weight))
         array = context.make_array(signature.args[1])(context, builder, slopes)
-        # Where there is no density, moving changes nothing.
+        # Without density, the position has no gradient.
         dense = builder.fcmp_ordered(">", density, _FLOAT(0))
         with builder.if_then(builder.and_(dense, builder.icmp_signed(">", array.nitems, _INT64(0)))):
             v, w = builder.fadd(w01, w11), builder.fadd(w10, w11)
@@ -116,7 +116,7 @@ def adjoin_sample(
 
 
 class _Vectors:
-    """The few vector operations of both functions, written into one LLVM builder."""
+    """Vector operations of both functions, emitted with an LLVM builder."""
 
     def __init__(self, builder: Any) -> None:
         self.builder = builder
@@ -197,7 +197,7 @@ class _Vectors:
         return self.add(a, self.multiply(self.subtract(b, a), self.splat(share, a.type)))
 
     def slope(self, bar, bars, edge, edges, v, w):
-        """The derivative in the cell's coordinates (u, v, w) of what `bar`, dL/d(value), stands for."""
+        """Derivative of the loss in the cell's coordinates (u, v, w), from `bar`, dL/d(value)."""
         near, up, far, far_up = edges
         along_u = self.multiply(bar, self.subtract(self.half(edge, 1), self.half(edge, 0)))
         rise = self.mix(self.subtract(up, near), self.subtract(far_up, far), w)
@@ -215,7 +215,7 @@ class _Vectors:
         return self.multiply(self.multiply(cube, cube), y)
 
     def totals(self, a, b, c):
-        """The sums over the lanes of a, of b and of c, and 0."""
+        """Sums over the lanes of a, b and c, and 0."""
         none = ir.Constant(_FOUR, [0.0] * 4)
         ab, cd = self._paired(a, b, (0, 4, 1, 5), (2, 6, 3, 7)), self._paired(c, none, (0, 4, 1, 5), (2, 6, 3, 7))
         return self._paired(ab, cd, (0, 1, 4, 5), (2, 3, 6, 7))

@@ -1,7 +1,7 @@
-"""The fast marcher for CUDA devices: Triton kernels, float32, batched, with an adjoint of its own (SPEC 4).
+"""The fast marcher for CUDA devices: Triton kernels, float32, batched, with a hand-written adjoint (SPEC 4).
 
-The same rule as `reference.py`. Triton compiles the kernels on first use and keeps them on disk; it is imported only
-then, so that this file loads without it. A frame takes the launches of `_prepare` and one of `march_tiles`.
+The same rule as `reference.py`. Triton compiles the kernels on first use and caches them on disk; it is imported only
+then, so that this module loads without it. An image takes the launches of `_prepare` and one of `march_tiles`.
 """
 
 from __future__ import annotations
@@ -24,49 +24,49 @@ from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.lattice import MarchSettings, Span, check_scene
 
 LIST_LIMIT = 1 << 24
-"""Entries of tile lists, 16 bytes each; pictures that need more use the bins' lists, shorter but coarser."""
+"""Limit for entries of tile lists, 16 bytes each; images that need more use the lists of bins, shorter but coarser."""
 LAST_POINT = (1 << 30) - 1
-"""Lattice points are counted in 32 bits."""
+"""Lattice indices have 32 bits."""
 LANES = 32
-"""Boxes of a program of `place_boxes`."""
+"""Boxes per program of `place_boxes`."""
 LANES_OF_SEEDS = 256
-"""Rays of a program of `seed_rays`."""
+"""Rays per program of `seed_rays`."""
 LANES_OF_BIN = 512
 LANES_OF_TILE = 64
-"""Boxes that a bin, and a tile, looks at at once."""
+"""Boxes that a bin, and a tile, tests at once."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Shapes:
-    """How work is cut into Triton programs; no effect on the result."""
+    """How work is divided into Triton programs; does not change the result."""
 
     tile: tuple[int, int] = (8, 4)
-    """Pixels of a program of the forward pass, across and down."""
+    """Pixels per program of the forward pass, across and down."""
     bin: int = 8
     """Tiles along a side of a bin."""
     samples: int = 8
-    """Samples of a chunk that each pixel takes at once of a box; half as many where boxes of three strides mix."""
+    """Samples of a chunk per pixel and box; half as many if boxes of three strides overlap."""
     march_warps: int = 4
     march_registers: int = 160
-    """Of a thread; fewer make room for more programs, but spill."""
+    """Registers per thread; fewer increase occupancy, but spill."""
     block: tuple[int, int] = (8, 4)
-    """Pixels of a step of the backward pass."""
+    """Pixels per step of the backward pass."""
     blocks_of_unit: int = 16
-    """Steps of a program of the backward pass in pictures of up to 512 x 512; more in larger ones."""
+    """Steps per program of the backward pass in images of up to 512 x 512; more in larger ones."""
     adjoint_warps: int = 1
 
     def blocks_for(self, pixels: int) -> int:
-        """Blocks of a program of the backward pass: enough programs at any size, and no more memory for them."""
+        """Blocks per program of the backward pass: enough programs at any size, in constant memory."""
         return self.blocks_of_unit * max(pixels, 512 * 512) // (512 * 512)
 
 
 def available(device: torch.device | str = "cuda") -> bool:
-    """Whether `march_cuda` can run on `device`: a CUDA device, and Triton is installed."""
+    """Whether `march_cuda` can run on `device`, which requires CUDA and Triton."""
     return torch.device(device).type == "cuda" and importlib.util.find_spec("triton") is not None
 
 
 def suits(primitives: Primitives, camera: Camera, settings: MarchSettings) -> bool:
-    """Whether `march_cuda` draws such a scene: float32, voxels of 8^3, "mixed" compositing."""
+    """Whether `march_cuda` supports the scene: float32, voxels of 8^3, "mixed" compositing."""
     tensors = [*vars(primitives).values(), camera.intrinsics, camera.world_to_camera]
     single = all(tensor.dtype == torch.float32 for tensor in tensors)
     return single and primitives.density.shape[-3:] == (S, S, S) and settings.compositing == "mixed"
@@ -79,15 +79,14 @@ def march_cuda(
     span: Span | None = None,
     shapes: Shapes = Shapes(),
 ) -> Rendering:
-    """As `march_reference` with "mixed" compositing, in float32 on a CUDA device; pictures [B, H, W].
+    """As `march_reference` with "mixed" compositing, in float32 on a CUDA device; images [B, H, W].
 
     `primitives` have one leading dimension, 1 or B (1: all views see the same boxes), `camera` and `span` B.
-    Differentiable once in every tensor of primitives and camera. No sum is in an order left to chance: the same inputs
-    give the same pictures and gradients. Voxel gradients are summed in tf32 (eleven significant bits a term). The host
-    waits for the device once a call, for the checks and the lists' lengths. Memory beyond inputs and outputs: 9 KB a
-    box and 16 bytes for each tile that a box touches, at most `LIST_LIMIT` of them; for gradients 40 bytes a pixel
-    more, and while they are computed another 32 a pixel and 8 KB for every 512 pixels of a box, or more pixels in
-    larger pictures.
+    Differentiable once in every tensor of primitives and camera. Images and gradients are deterministic. Voxel
+    gradients are summed in tf32 (eleven significant bits per term). Synchronises with the device once per call, for
+    checks and the lengths of lists. Memory beyond inputs and outputs: 9 KB per box, and 16 bytes for each tile that a
+    box touches, at most `LIST_LIMIT` of them; with gradients 40 bytes per pixel, and during the backward pass another
+    32 per pixel and 8 KB for every 512 pixels of a box (for more pixels in larger images).
 
     Raises ValueError as `check_scene` does, for other compositing, voxels other than 8^3 and dtypes other than float32;
     ImportError without Triton.
@@ -95,8 +94,8 @@ def march_cuda(
     _check(primitives, camera, settings, span)
     if importlib.util.find_spec("triton") is None:
         raise ImportError(
-            "march_cuda compiles its kernels with Triton, which is not installed: install the package triton that your "
-            "torch names (`pip show torch`), or call march_reference"
+            "march_cuda needs Triton, which is not installed: install the version of triton that your torch requires "
+            "(`pip show torch`), or call march_reference"
         )
     tensors = [getattr(primitives, name) for name in BOX_FIELDS] + [camera.intrinsics, camera.world_to_camera]
     keep = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
@@ -110,7 +109,7 @@ BOX_FIELDS = ("position", "rotation", "half_extent", "rgb", "density")
 
 
 class _Scene(NamedTuple):
-    """What `_March` is told besides its differentiable inputs."""
+    """Arguments of `_March` that are not differentiable."""
 
     primitives: Primitives
     camera: Camera
@@ -122,12 +121,12 @@ class _Scene(NamedTuple):
 
     @property
     def unit(self) -> int:
-        """Lattice points to which all strides are multiples: the kernels count in these."""
+        """Common divisor of all strides, in lattice points: the unit of the kernels."""
         return math.gcd(*self.settings.strides)
 
     @property
     def spacing(self) -> float:
-        """Metres of a unit."""
+        """Length of a unit, metres."""
         return self.settings.spacing * self.unit
 
     @property
@@ -137,7 +136,7 @@ class _Scene(NamedTuple):
 
 
 class _Prepared(NamedTuple):
-    """Boxes as the kernels read them (see `triton_boxes`), and the boxes of each tile."""
+    """Packed boxes (see `triton_boxes`), and the lists of boxes of each tile."""
 
     voxels: Float[Tensor, "p k 512 4"]
     record: Float[Tensor, "b k 32"]
@@ -148,18 +147,18 @@ class _Prepared(NamedTuple):
     count: Int[Tensor, "b lists"]
     tiles_of_list: int
     gap: int
-    """The largest of 1, 2, 4 that divides the strides of all boxes in sight."""
+    """The largest of 1, 2, 4 that divides the strides of all visible boxes."""
     units: int
-    """Programs of the backward pass."""
+    """Number of programs of the backward pass."""
 
 
 def _launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, **options: Any) -> None:
-    """Runs a Triton kernel. One stage: copies ahead through shared memory cost more registers than they hide."""
+    """Launch a Triton kernel, with one stage: prefetching through shared memory costs more registers than it gains."""
     kernel[grid](*arguments, **options, num_stages=1)
 
 
 def _check(primitives: Primitives, camera: Camera, settings: MarchSettings, span: Span | None) -> None:
-    """What can be seen without looking into tensors on the device."""
+    """Check everything that needs no synchronisation with the device."""
     tensors = [*vars(primitives).values(), camera.intrinsics, camera.world_to_camera]
     if any(tensor.dtype != torch.float32 for tensor in tensors):
         dtypes = sorted({str(tensor.dtype) for tensor in tensors})
@@ -169,15 +168,15 @@ def _check(primitives: Primitives, camera: Camera, settings: MarchSettings, span
     b, k = camera.intrinsics.shape[0] if camera.intrinsics.ndim == 3 else -1, primitives.position.shape[-2]
     p = primitives.position.shape[0] if primitives.position.ndim == 3 else -1
     shapes = [(p, k, 3), (p, k, 3, 3), (p, k, 3), (p, k, 3, S, S, S), (p, k, S, S, S), (b, 3, 3), (b, 3, 4)]
-    given = [tuple(getattr(primitives, name).shape) for name in BOX_FIELDS]
-    given += [tuple(camera.intrinsics.shape), tuple(camera.world_to_camera.shape)]
+    actual = [tuple(getattr(primitives, name).shape) for name in BOX_FIELDS]
+    actual += [tuple(camera.intrinsics.shape), tuple(camera.world_to_camera.shape)]
     fits = span is None or {tuple(span.near.shape), tuple(span.far.shape)} == {(b, camera.height, camera.width)}
     pixels = camera.width > 0 and camera.height > 0
-    if given != shapes or p not in (1, b) or b < 1 or not pixels or not fits:
+    if actual != shapes or p not in (1, b) or b < 1 or not pixels or not fits:
         check_scene(primitives, camera, span)
         raise ValueError(
             f"march_cuda takes primitives [1 or B, K, ...] of {S}^3 voxels, a camera [B, ...] and a span [B, H, W]; "
-            f"given are {dict(zip((*BOX_FIELDS, 'intrinsics', 'world_to_camera'), given, strict=True))}: call march"
+            f"these are {dict(zip((*BOX_FIELDS, 'intrinsics', 'world_to_camera'), actual, strict=True))}: call march"
         )
     if len({tensor.device for tensor in tensors}) > 1:
         check_scene(primitives, camera, span)
@@ -185,12 +184,13 @@ def _check(primitives: Primitives, camera: Camera, settings: MarchSettings, span
 
 @functools.lru_cache(maxsize=32)
 def _lattice(spacing: float, thresholds: tuple[float, ...], device: torch.device) -> Tensor:
-    """The argument `lattice` of `place_boxes`; kept, for copying to the device makes the host wait."""
+    """The argument `lattice` of `place_boxes`, cached because copying it to the device synchronises."""
     return torch.tensor([spacing, *thresholds], dtype=torch.float64, device=device)
 
 
 def _prepare(scene: _Scene, boxes: list[Tensor], intrinsics: Tensor, world_to_camera: Tensor) -> _Prepared:
-    """Packs and places the boxes, checks them and lists them by tiles."""
+    """Pack, place and check the boxes, and list them by tile."""
+    # triton is optional
     from primdiffusion.render import triton_boxes, triton_lists
 
     position, rotation, half_extent, rgb, density = boxes
@@ -259,16 +259,17 @@ def _prepare(scene: _Scene, boxes: list[Tensor], intrinsics: Tensor, world_to_ca
 
 
 def march_constants(shapes: Shapes, sets: int, gap: int) -> dict[str, int]:
-    """What `march_tiles` is compiled for: `sets` of lattice points, `gap` apart."""
+    """Compile-time constants of `march_tiles`: `sets` of lattice points, `gap` apart."""
     coarse = shapes.samples // (2 if sets == 4 else 1)
     return {"TILE_WIDTH": shapes.tile[0], "TILE_HEIGHT": shapes.tile[1], "COARSE": coarse, "SETS": sets, "GAP": gap}
 
 
 class _March(torch.autograd.Function):
-    """Forward and adjoint (SPEC 4). A sample's gradient depends on itself and on a few numbers of its ray."""
+    """Forward pass and adjoint (SPEC 4). The gradient of a sample depends on it and a few numbers of its ray."""
 
     @staticmethod
     def forward(ctx: Any, scene: _Scene, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        # triton is optional
         from primdiffusion.render import triton_march
 
         *boxes, intrinsics, world_to_camera = [tensor.detach().contiguous() for tensor in tensors]
@@ -318,6 +319,7 @@ def _adjoint(
     shapes: Shapes, spacing: float, units: int, on_rgb: Tensor, on_alpha: Tensor, on_depth: Tensor, *saved: Tensor
 ) -> tuple[Tensor, ...]:
     """Gradients in the order of `_March.forward`'s tensors."""
+    # triton is optional
     from primdiffusion.render import triton_adjoint
 
     position, rotation, half_extent, intrinsics, world_to_camera, voxels, record, indices, reach, kept, ends = saved

@@ -1,4 +1,4 @@
-"""Renderings as picture files."""
+"""Write renderings as PNG files."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from primdiffusion.staging import written_whole
 
 Background = tuple[float, float, float]
 NEAR_TO_FAR = ((1.0, 0.95, 0.75), (0.98, 0.62, 0.25), (0.80, 0.25, 0.33), (0.42, 0.12, 0.47), (0.10, 0.07, 0.28))
-"""Encoded sRGB of the depth picture, brightness falling with distance."""
+"""Colour ramp of depth images, sRGB-encoded, darker with distance."""
 
 
 def over(rendering: Rendering, background: Background) -> Float[Tensor, "*r 3"]:
-    """The rendering's linear colours over a plain linear background."""
+    """Composite the rendering over a linear background colour."""
     return _over(rendering.rgb, rendering.alpha, background)
 
 
 def to_png(path: str | Path, rendering: Rendering, background: Background | None = (0.0, 0.0, 0.0)) -> None:
-    """Writes an 8 bit sRGB picture: over `background` (linear RGB), or with straight alpha where that is None.
+    """Write an 8 bit sRGB image over `background` (linear RGB), or with straight alpha if it is None.
 
-    A reader never sees half a file: it is written beside `path` and renamed. Raises OSError as `written_whole` does.
+    The file is written atomically. Raises OSError as `written_whole` does.
     """
     rgba_to_png(path, torch.cat([rendering.rgb, rendering.alpha[..., None]], dim=-1), background)
 
 
 def rgba_to_png(path: str | Path, rgba: Float[Tensor, "h w 4"], background: Background | None) -> None:
-    """As `to_png`, of linear RGB premultiplied by alpha, and alpha."""
+    """As `to_png`, from linear RGB premultiplied by alpha, and alpha."""
     rgb, alpha = rgba[..., :3], rgba[..., 3]
     if background is not None:
         _save(path, _to_bytes(encode_srgb(_over(rgb, alpha, background))))
@@ -50,9 +50,9 @@ def _over(rgb: Float[Tensor, "*r 3"], alpha: Float[Tensor, "*r"], background: Ba
 def depth_to_png(
     path: str | Path, rendering: Rendering, *, near: float | None = None, far: float | None = None
 ) -> None:
-    """Writes the expected depth in colours, bright where near, black where nothing is seen.
+    """Write the expected depth in false colours, bright for near, black for background.
 
-    The colours span `near` to `far` (metres), by default the smallest and largest depth of pixels at least half opaque.
+    The ramp spans `near` to `far` (metres), by default the range of depth of pixels with alpha of at least 0.5.
     """
     depth = rendering.depth.detach().double().cpu().numpy()
     solid = depth[(rendering.alpha >= 0.5).cpu().numpy()]
@@ -64,10 +64,10 @@ def depth_to_png(
 
 
 def depth_colours(depth: Float[ndarray, "*r"], near: float, far: float) -> Float64[ndarray, "*r 3"]:
-    """Encoded sRGB colours, from bright at `near` or nearer to dark at `far` or farther (`NEAR_TO_FAR`)."""
-    place = np.clip((depth - near) / max(far - near, 1e-9), 0, 1) if near <= far else np.zeros_like(depth)
+    """Map depth to sRGB-encoded colours, from bright at `near` to dark at `far` (`NEAR_TO_FAR`)."""
+    position = np.clip((depth - near) / max(far - near, 1e-9), 0, 1) if near <= far else np.zeros_like(depth)
     stops = np.linspace(0, 1, len(NEAR_TO_FAR))
-    return np.stack([np.interp(place, stops, channel) for channel in np.array(NEAR_TO_FAR).T], axis=-1)
+    return np.stack([np.interp(position, stops, channel) for channel in np.array(NEAR_TO_FAR).T], axis=-1)
 
 
 def _to_bytes(values: Float[Tensor, "h w c"]) -> UInt8[ndarray, "h w c"]:

@@ -1,14 +1,14 @@
-"""Inverse rendering: colours and densities whose pictures are given ones, by damped Gauss-Newton on the CPU.
+"""Inverse rendering: fit colours and densities to images by damped Gauss-Newton on the CPU.
 
-Minimises over the voxels z = (sRGB-encoded colour, density / full density), with boxes held where they are,
+Minimises over the voxels z = (sRGB-encoded colour, density / full density), for fixed boxes,
 
     sum over pixels of w |J (z - z_0) - r|^2  +  pull |z - z_start|^2  +  smoothness |grad (z - z_start)|^2
 
-where r is what the picture of z_0 lacks and J its derivative (`cpu_linear`), both in encoded colours: dark and bright
-people are alike. The slope of the encoding is held at the target's pixels and at the start's voxels. A step marches all
-pictures, stores J and solves by a few iterations of conjugate gradients; stopping early and the two penalties keep out
-what the pictures do not show, so that other pictures of the same person give nearly the same voxels. The same input
-gives the same bits on the same machine.
+where r is the residual of the image of z_0 and J its derivative (`cpu_linear`), both in encoded colours, so that dark
+and bright humans count alike. The slope of the encoding is constant, taken at the target's pixels and the start's
+voxels. A step marches all images, stores J and solves by a few iterations of conjugate gradients. Early stopping and
+the two penalties suppress what the images do not determine, so that other images of the same human give nearly the same
+voxels. Results are deterministic on one machine.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ from primdiffusion.render.cpu_linear import (
 )
 
 BACKGROUND = float(decode_srgb(torch.tensor(0.5)))
-"""Linear grey behind target and picture: dark and light figures both stand out against it."""
+"""Linear grey behind target and image, in contrast to dark and light humans."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Target:
-    """A picture that the boxes are to show."""
+    """An image to fit."""
 
     frames: Frames
-    """The boxes in the pose of the picture, unbatched."""
+    """The boxes in the pose of the image, unbatched."""
     camera: Camera
     rgba: Float32[ndarray, "height width 4"]
     """Linear, premultiplied by alpha."""
     weight: float = 1.0
-    """Of the mean square error over the picture's figure."""
+    """Weight of the image's mean square error."""
 
     def __post_init__(self) -> None:
         expected = (self.camera.height, self.camera.width, 4)
@@ -60,30 +60,30 @@ class Target:
 
 @dataclasses.dataclass(frozen=True)
 class InverseSettings:
-    """How far the voxels may follow the pictures."""
+    """Iterations and penalties of the fit."""
 
     steps: int = 3
-    """Gauss-Newton steps. The last sees all pictures; those before it, far from the end, every other one in turn."""
+    """Gauss-Newton steps. The last uses all images, earlier ones every other image in turn."""
     iterations: int = 6
-    """Of conjugate gradients a step; more fit noise."""
+    """Iterations of conjugate gradients per step; more would fit noise."""
     colour_iterations: int = 10
-    """Of conjugate gradients for colours alone, which take one step."""
+    """Iterations of conjugate gradients for colours alone, which take one step."""
     pull: float = 0.03
-    """Towards the start, in units of the mean diagonal of J^T W J."""
+    """Weight of the distance from the start, in units of the mean diagonal of J^T W J."""
     smoothness: float = 0.1
-    """Of the change between neighbouring voxels of a box, in the same units."""
+    """Weight of differences between neighbouring voxels of a box, in the same units."""
     opacity_weight: float = 0.3
-    """Of square errors of alpha beside those of encoded colours."""
+    """Weight of square errors of alpha relative to those of encoded colours."""
     darkest: float = 0.02
-    """Linear intensity below which errors count as at it: the slope of sRGB is steepest at black."""
+    """Linear intensity below which the slope of sRGB is constant; it is steepest at black."""
 
     def __post_init__(self) -> None:
         for name in ("steps", "iterations", "colour_iterations"):
             if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must be 1 or more")
+                raise ValueError(f"{name} is {getattr(self, name)}: give 1 or more")
         for name in ("pull", "smoothness", "opacity_weight", "darkest"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must be 0 or more")
+                raise ValueError(f"{name} is {getattr(self, name)}: give 0 or more")
 
 
 def fit_payload(
@@ -92,12 +92,12 @@ def fit_payload(
     full_density: float,
     settings: InverseSettings = InverseSettings(),
 ) -> Payload:
-    """The payload near `start` that shows the targets: colours in [0, 1], densities from 0 to `full_density` (1/m).
+    """Fit a payload to the targets, from `start`: colours in [0, 1], densities from 0 to `full_density` (1/m).
 
-    Delta scales stay. Costs about 0.1 s and 15 MB per picture of 176 x 176 pixels in each step.
+    Delta scales do not change. Costs about 0.1 s and 15 MB per image of 176 x 176 pixels in each step.
 
     Raises:
-        ValueError: there are no targets, or the start is not one person's.
+        ValueError: there are no targets, or `start` is a batch.
     """
     _check(start, targets)
     first = _voxels(start)
@@ -131,10 +131,10 @@ def fit_colours(
     targets: Sequence[Sequence[Target]],
     settings: InverseSettings = InverseSettings(),
 ) -> list[Payload]:
-    """Colours of several colourings of one geometry, whose densities are those of `density`.
+    """Fit the colours of several colourings of one geometry, with the densities of `density`.
 
-    `starts` are their payloads, `targets[i]` their pictures, all from the same cameras in the same order. March and
-    matrix are shared, and each iteration solves for all of them, which costs little more than for one.
+    `starts` are their payloads, `targets[i]` their images, all from the same cameras in the same order. They share
+    marches and matrices, so that several cost little more than one.
 
     Raises:
         ValueError: as `fit_payload`, or colourings have different numbers of targets.
@@ -172,7 +172,7 @@ def fit_colours(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _View:
-    """One target at the voxels of now."""
+    """One target, linearised at the current voxels."""
 
     jacobian: PictureJacobian
     residual: Float32[ndarray, "r 4"]
@@ -229,19 +229,19 @@ class _ColourView:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Penalty:
-    """What beside the pictures holds the voxels."""
+    """The penalties, the preconditioner and the active bounds."""
 
     unit: Float32[ndarray, "c"]
-    """What pull and smoothness of 1 weigh."""
+    """Scale of pull and smoothness."""
     settings: InverseSettings
     diagonal: Float32[ndarray, "v c"]
-    """Of the pictures' part, for the preconditioner."""
+    """Diagonal of the image term, for the preconditioner."""
     held: Bool[ndarray, "v c"]
-    """At a bound that the gradient points beyond: these do not move."""
+    """Voxels fixed at a bound, because the gradient points beyond it."""
 
 
 def conjugate_gradients(curvature, penalty: _Penalty, gradient: ndarray, iterations: int) -> ndarray:
-    """A few iterations of Jacobi-preconditioned conjugate gradients for (curvature + penalty) x = gradient."""
+    """Iterate Jacobi-preconditioned conjugate gradients for (curvature + penalty) x = gradient."""
     settings, unit = penalty.settings, penalty.unit
     own = settings.pull + 6 * settings.smoothness
     inverse = np.where(penalty.held, 0, 1 / np.maximum(penalty.diagonal + unit * own, 1e-30))
@@ -267,7 +267,7 @@ def conjugate_gradients(curvature, penalty: _Penalty, gradient: ndarray, iterati
 
 
 def laplacian(x: Float32[ndarray, "v c"]) -> Float32[ndarray, "v c"]:
-    """Sum over the neighbours of a voxel in its box of x less theirs."""
+    """Sum of the differences to the neighbours of a voxel in its box."""
     grid = x.reshape(-1, S, S, S, x.shape[1])
     out = np.zeros_like(grid)
     for axis in (1, 2, 3):
@@ -282,14 +282,14 @@ def laplacian(x: Float32[ndarray, "v c"]) -> Float32[ndarray, "v c"]:
 
 def _check(start: Payload, targets: Sequence[Target]) -> None:
     if not targets:
-        raise ValueError("there are no pictures to fit to: give at least one target")
+        raise ValueError("there are no images to fit: give at least one target")
     start.validate()
     if start.density.ndim != 4:
-        raise ValueError(f"the start holds a batch {tuple(start.density.shape[:-4])}: give one person")
+        raise ValueError(f"the start is a batch {tuple(start.density.shape[:-4])}: give one human")
 
 
 def _over_background(target: Target) -> tuple[ndarray, ndarray]:
-    """Colours over the background, and alpha; a row per pixel."""
+    """Colours over the background, and alpha; one row per pixel."""
     rgba = target.rgba.reshape(-1, 4)
     return rgba[:, :3] + (1 - rgba[:, 3:]) * BACKGROUND, rgba[:, 3:]
 
@@ -302,12 +302,12 @@ def _encoding_slope(linear: ndarray, darkest: float) -> ndarray:
 
 
 def _linear_unit(colours: ndarray, settings: InverseSettings) -> ndarray:
-    """What a unit of encoded colour is in linear colour, at these colours."""
+    """Change of linear colour per unit of encoded colour, at these colours."""
     return 1 / _encoding_slope(colours.clip(0, 1), settings.darkest)
 
 
 def _mean_diagonal(diagonal: ndarray) -> ndarray:
-    """The mean over voxels that are seen, of all colour columns together and of density (column 3 of 4)."""
+    """Mean over visible voxels, of all colour columns together and of density (column 3 of 4)."""
     density = diagonal.shape[1] == 4
     colours = diagonal[:, :3] if density else diagonal
     seen = colours[colours > 0]

@@ -1,4 +1,4 @@
-"""The marcher: primitives and a camera to a picture (SPEC 4; paper sec. 3.1, "Efficient Decoder-free Rendering")."""
+"""The marcher: render primitives from a camera (SPEC 4; paper sec. 3.1, "Efficient Decoder-free Rendering")."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ def march(
     span: Span | None = None,
     background: Float[Tensor, "*h w 3"] | Sequence[float] | None = None,
 ) -> Rendering:
-    """Pictures [*b, H, W] of `primitives` from `camera`: premultiplied linear rgb, alpha, depths (metres).
+    """Render `primitives` from `camera`: premultiplied linear rgb, alpha and depths (metres), [*b, H, W].
 
-    The leading dimensions of primitives, camera and span broadcast against each other to *b: people [p, 1] and cameras
-    [v] give pictures [p, v, H, W]. Several people in one picture are one set of boxes (`Primitives.together`). The rule
-    is in `march_reference`; `RELEASED` as settings draws as the released code does. A `background`, linear, [3] or
-    [*b, H, W, 3], is put behind the rgb; alpha remains what the boxes cover. Reflecting rotations mirror a box's
-    contents; boxes with an extent of zero or less are not drawn.
+    The leading dimensions of primitives, camera and span broadcast to *b: humans [p, 1] and cameras [v] give images
+    [p, v, H, W]. Several humans in one image form one set of boxes (`Primitives.together`). `march_reference` defines
+    the rule; the settings `RELEASED` reproduce the released code. A linear `background`, [3] or [*b, H, W, 3], is
+    composited behind rgb and does not change alpha. Rotations that reflect mirror the contents of a box; boxes with an
+    extent of zero or less are not rendered.
 
-    Differentiable in every tensor but the span. float32 goes to the fast back end of its device (`march_cpu`, or
-    `march_cuda` where Triton is installed), anything else to `march_reference`, which is slow. Raises ValueError as
-    `check_scene` does, and where leading dimensions do not broadcast.
+    Differentiable in every tensor except the span. float32 runs on the fast back end of its device (`march_cpu`, or
+    `march_cuda` if Triton is installed), everything else on `march_reference`, which is slow. Raises ValueError as
+    `check_scene` does, and if leading dimensions do not broadcast.
     """
     check_one_device(primitives, camera, span)
-    if camera.intrinsics.device.type == "cpu":  # the kernels of other devices look themselves: reading here would wait
+    if camera.intrinsics.device.type == "cpu":  # on GPUs the kernels check it, as reading it here would synchronise
         check_camera(camera)
     if settings.pixel_centre != 0.5:
         shift = 0.5 - settings.pixel_centre
@@ -75,7 +75,7 @@ def _march_one_by_one(
 def _march_at_once(
     primitives: Primitives, camera: Camera, settings: MarchSettings, span: Span | None, batch: torch.Size
 ) -> Rendering:
-    """All pictures by one call of `march_cuda`; one person seen in all of them is not copied."""
+    """Render all images with one call of `march_cuda`, without copying a single human seen in all of them."""
     people = _leading(primitives, PRIMITIVE_DIMENSIONS)
     pictures = cuda.march_cuda(
         _flat(primitives, PRIMITIVE_DIMENSIONS, batch if people.numel() > 1 else people),
@@ -89,21 +89,21 @@ def _march_at_once(
 PRIMITIVE_DIMENSIONS = {"position": 2, "rotation": 3, "half_extent": 2, "rgb": 5, "density": 4}
 CAMERA_DIMENSIONS = {"intrinsics": 2, "world_to_camera": 2}
 SPAN_DIMENSIONS = {"near": 2, "far": 2}
-"""Dimensions of each field of one scene; those before them are the batch."""
+"""Dimensions of each unbatched field."""
 
 
 def _leading(record: TensorRecord, dimensions: dict[str, int]) -> torch.Size:
-    """The record's batch shape; ValueError where its fields' do not broadcast."""
+    """Batch shape of a record. Raises ValueError if its fields do not broadcast."""
     shapes = [tuple(getattr(record, name).shape) for name in dimensions]
     if any(len(shape) < count for shape, count in zip(shapes, dimensions.values(), strict=True)):
-        given = dict(zip(dimensions, shapes, strict=True))
-        raise ValueError(f"{type(record).__name__} has shapes {given}; its fields need {dimensions} dimensions")
+        actual = dict(zip(dimensions, shapes, strict=True))
+        raise ValueError(f"{type(record).__name__} has shapes {actual}; its fields need {dimensions} dimensions")
     leads = [shape[: len(shape) - count] for shape, count in zip(shapes, dimensions.values(), strict=True)]
     try:
         return torch.broadcast_shapes(*leads)
     except RuntimeError:
-        given = dict(zip(dimensions, shapes, strict=True))
-        raise ValueError(f"the leading dimensions of {type(record).__name__} do not broadcast: {given}") from None
+        actual = dict(zip(dimensions, shapes, strict=True))
+        raise ValueError(f"the leading dimensions of {type(record).__name__} do not broadcast: {actual}") from None
 
 
 def _batch_shape(primitives: Primitives, camera: Camera, span: Span | None) -> torch.Size:
@@ -115,20 +115,20 @@ def _batch_shape(primitives: Primitives, camera: Camera, span: Span | None) -> t
     except RuntimeError:
         named = ", ".join(str(tuple(lead)) for lead in leads)
         raise ValueError(
-            f"the leading dimensions of primitives, camera and span, {named}, do not broadcast: people [p, 1] and "
-            "cameras [v] give [p, v] pictures"
+            f"the leading dimensions of primitives, camera and span, {named}, do not broadcast: humans [p, 1] and "
+            "cameras [v] give images [p, v]"
         ) from None
     if 0 in batch:
-        raise ValueError(f"a batch of {tuple(batch)} holds no picture: give at least one person and one camera")
+        raise ValueError(f"a batch of {tuple(batch)} is empty: give at least one human and one camera")
     return batch
 
 
 def _unbound(record: Record, dimensions: dict[str, int], batch: torch.Size) -> list[Record]:
-    """One unbatched record a picture. Records that are used in several pictures are the same object."""
+    """Split into one unbatched record per image; images that share a record get the same object."""
     lead = _leading(record, dimensions)
     if not lead:
         return [record] * batch.numel()
-    # unbind and not indexing: its gradient is one stack, not a whole batch of zeros for each scene.
+    # unbind instead of indexing: its gradient is one stack, not a batch of zeros for each record.
     fields = {
         name: getattr(record, name).expand(*lead, *getattr(record, name).shape[-count:]).flatten(0, len(lead) - 1)
         for name, count in dimensions.items()
@@ -137,12 +137,12 @@ def _unbound(record: Record, dimensions: dict[str, int], batch: torch.Size) -> l
         dataclasses.replace(record, **dict(zip(fields, values, strict=True)))
         for values in zip(*(field.unbind(0) for field in fields.values()), strict=True)
     ]
-    place = torch.arange(len(singles)).reshape(lead).expand(batch).flatten()
-    return [singles[i] for i in place.tolist()]
+    index = torch.arange(len(singles)).reshape(lead).expand(batch).flatten()
+    return [singles[i] for i in index.tolist()]
 
 
 def _flat(record: Record, dimensions: dict[str, int], batch: torch.Size) -> Record:
-    """The record broadcast to `batch`, as one leading dimension."""
+    """Broadcast the record to `batch`, flattened to one leading dimension."""
     fields = {}
     for name, count in dimensions.items():
         value = getattr(record, name)
@@ -168,7 +168,7 @@ def _over(rendering: Rendering, background: Float[Tensor, "*h w 3"] | Sequence[f
         rgb = behind
     if rgb.shape != rendering.rgb.shape:
         raise ValueError(
-            f"the background has shape {tuple(behind.shape)}: give 3 linear values or a picture "
+            f"the background has shape {tuple(behind.shape)}: give 3 linear values or an image "
             f"{tuple(rendering.rgb.shape)}"
         )
     return dataclasses.replace(rendering, rgb=rgb)

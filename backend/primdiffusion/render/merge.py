@@ -1,4 +1,4 @@
-"""Boxes summed into one grid of voxels: the compiled loop of `merge`."""
+"""Merge all boxes into one voxel grid for renderers with exponential absorption, and fit their gain on density."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _HALF_POWER = WINDOW_POWER // 2
 
 @kernel
 def sum_boxes(taken, position, to_local, low, high, voxels, origin, voxel, points, density, colour):
-    """Adds every box to density [X, Y, Z] and colour [X, Y, Z, 3] (weighted by density), a slice along x at a time.
+    """Add every box to density [X, Y, Z] and colour [X, Y, Z, 3] (weighted by density), slice by slice along x.
 
-    to_local [K, 3, 3] takes x - position to y in [-1, 1]^3; low and high [K, 3] are the indices that a box reaches,
-    high exclusive; voxels [K, D, H, W, 4] red, green, blue, density. A voxel is the mean of points^3 places in it.
+    to_local [K, 3, 3] maps x - position to y in [-1, 1]^3; low and high [K, 3] bound the indices of a box, high
+    exclusive; voxels [K, D, H, W, 4] are red, green, blue, density. A voxel is the mean of points^3 samples in it.
     """
     share = 1.0 / (points * points * points)
     depth, rows, columns = voxels.shape[1], voxels.shape[2], voxels.shape[3]
@@ -72,41 +72,41 @@ def sum_boxes(taken, position, to_local, low, high, voxels, origin, voxel, point
 
 
 POINTS = 2
-"""Places along a voxel's side at which the primitives are read."""
+"""Samples along each side of a voxel."""
 MOST_VOXELS = 2**27
-"""Of a grid: 2 GB. A person of 1.8 m takes 5 million at 6 mm."""
+"""Limit for a grid: 2 GB. A human 1.8 m tall takes 5 million at 6 mm."""
 FULLEST = 1.0
-"""Opacity a voxel may have along its side. More cannot be seen in the additive, clamped rule, and would spread over the
-empty voxels next to it where a renderer interpolates."""
+"""Largest opacity of a voxel along its side. More is invisible in the additive, clamped rule, and interpolation would
+spread it to neighbouring empty voxels."""
 FAINTEST = 0.05
 """Opacity per metre below which a voxel is empty."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Merged:
-    """One grid in the axes of the primitives; what lies outside it is empty."""
+    """A voxel grid in the axes of the primitives, empty outside."""
 
     density: Float[ndarray, "x y z"]
-    """Opacity per metre, the window and all overlapping primitives in it; float32."""
+    """Opacity per metre, including the window and all overlapping primitives; float32."""
     colour: Float[ndarray, "x y z 3"]
-    """Linear RGB; empty voxels next to others have their colour, so that interpolation does not darken the rim."""
+    """Linear RGB; empty voxels take the colour of their neighbours, so that interpolation does not darken edges."""
     origin: Float[ndarray, "3"]
-    """The centre of voxel [0, 0, 0], metres: a whole number of voxels, so that several poses share a lattice."""
+    """Centre of voxel [0, 0, 0], metres; a multiple of the voxel size, so that all poses share a lattice."""
     voxel: float
-    """Their side, metres."""
+    """Voxel size, metres."""
 
 
 def merge(primitives: Primitives, voxel: float = VOXEL, points: int = POINTS) -> Merged:
-    """All of `primitives` (unbatched) in one grid.
+    """Merge `primitives` (unbatched) into one grid.
 
-    A voxel's density is the mean of sum_i d_i w_i over points^3 places in it (d: trilinear, w: the window; SPEC 4), at
-    most FULLEST / voxel; its colour sum d_i w_i c_i / sum d_i w_i: what the additive rule adds at one sample. Boxes
-    with an extent of zero or less hold nothing. Not differentiable. Raises ValueError for a voxel that is not positive,
-    or so small that the grid would have more than MOST_VOXELS, and for a batch.
+    A voxel's density is the mean of sum_i d_i w_i over points^3 samples in it (d: trilinear density, w: window;
+    SPEC 4), at most FULLEST / voxel; its colour is sum d_i w_i c_i / sum d_i w_i, as in the additive rule. Boxes with
+    an extent of zero or less are ignored. Not differentiable. Raises ValueError for a batch, and if the voxel size is
+    not positive or the grid would exceed MOST_VOXELS.
     """
     if primitives.density.ndim != 4:
         raise ValueError(
-            f"the primitives are a batch {tuple(primitives.density.shape[:-4])}: merge one person at a time"
+            f"the primitives are a batch {tuple(primitives.density.shape[:-4])}: merge one human at a time"
         )
     if not voxel > 0:
         raise ValueError(f"the voxel is {voxel} m: give a size above zero")
@@ -133,13 +133,13 @@ def merge(primitives: Primitives, voxel: float = VOXEL, points: int = POINTS) ->
 
 
 class _Boxes(NamedTuple):
-    """Boxes that hold something, in float64; y in [-1, 1]^3 are places in a box."""
+    """Boxes that are not empty, in float64; y in [-1, 1]^3 are coordinates in a box."""
 
     position: ndarray
     rotation: ndarray
     half_extent: ndarray
     low: ndarray
-    """Where in y a box begins to hold density [K, 3]; most are empty outside the skin."""
+    """Lower bound of the density in y [K, 3]; most boxes are empty outside the skin."""
     high: ndarray
     voxels: ndarray
     """[K, D, H, W, 4]: red, green, blue, density; float32."""
@@ -164,7 +164,7 @@ def _boxes(primitives: Primitives) -> _Boxes:
 
 
 def _finished(density: ndarray, colour: ndarray, fullest: float) -> tuple[ndarray, ndarray]:
-    """Density with its limits and colour that is no longer weighted, spread to the empty voxels around."""
+    """Limit density, divide colour by it, and extend colour to neighbouring empty voxels."""
     empty = density < FAINTEST
     density[empty], colour[empty] = 0, 0
     weight, around = _around(density), _around(colour)
@@ -175,7 +175,7 @@ def _finished(density: ndarray, colour: ndarray, fullest: float) -> tuple[ndarra
 
 
 def _around(values: ndarray) -> ndarray:
-    """Sums over the 3 x 3 x 3 voxels around each; the outermost are empty."""
+    """Sums over the 3 x 3 x 3 neighbourhood of each voxel; the outermost voxels are empty."""
     for axis in range(3):
         moved = np.moveaxis(values, axis, 0)
         total = moved.copy()
@@ -186,23 +186,23 @@ def _around(values: ndarray) -> ndarray:
 
 
 FAINT = 1e-4
-"""Factor on density with which no ray of a person is ever full."""
+"""Factor on density with which no ray of a human saturates."""
 MET = 1e-3
-"""Rays with less opacity than this miss the person."""
+"""Rays with less opacity than this miss the human."""
 SMALLEST_GAIN, LARGEST_GAIN = 0.1, 20.0
 
 
 @dataclasses.dataclass(frozen=True)
 class GainFit:
-    """The gain that meets the paper's alpha best."""
+    """The gain that reproduces the paper's alpha best."""
 
     gain: float
     error: float
-    """Mean difference of alpha over rays that meet the person, with this gain."""
+    """Mean absolute difference of alpha over rays that hit the human, with this gain."""
     error_before: float
-    """The same with DENSITY_GAIN."""
+    """The same for DENSITY_GAIN."""
     rays: int
-    """How many met the person."""
+    """Number of rays that hit the human."""
 
 
 def unclamped_alpha(
@@ -210,23 +210,23 @@ def unclamped_alpha(
     camera: Camera,
     settings: MarchSettings = MarchSettings(),  # noqa: B008
 ) -> Float[Tensor, "h w"]:
-    """The sum of all opacities along each ray, which the marcher's alpha is once clamped to 1 (SPEC 4).
+    """Sum of all opacities along each ray, before the marcher clamps it to 1 (SPEC 4).
 
-    The marcher itself adds them: with a thousandth of the density no ray is ever full.
+    Computed by marching with density scaled by FAINT, so that no ray saturates.
     """
     faint = dataclasses.replace(primitives, density=primitives.density * FAINT)
     return march(faint, camera, settings).alpha / FAINT
 
 
 def fit_gain(reached: Float[ndarray, "n"]) -> GainFit:
-    """The g that makes the mean of |(1 - exp(-g s)) - min(s, 1)| least, over rays with `unclamped_alpha` s >= MET.
+    """Minimise the mean of |(1 - exp(-g s)) - min(s, 1)| over g, for rays with `unclamped_alpha` s >= MET.
 
-    To one part in a thousand, between SMALLEST_GAIN and LARGEST_GAIN. Raises ValueError where no ray meets anything.
+    Accurate to 0.1 %, between SMALLEST_GAIN and LARGEST_GAIN. Raises ValueError if no ray hits anything.
     """
     met = np.asarray(reached, np.float64).ravel()
     met = met[met >= MET]
     if len(met) == 0:
-        raise ValueError("no ray meets the person: there is nothing to fit the gain to; generate the person again")
+        raise ValueError("no ray hits the human, so the gain cannot be fitted: generate the human again")
 
     def error(gain: float) -> float:
         return float(np.abs(-np.expm1(-gain * met) - np.minimum(met, 1)).mean())

@@ -1,4 +1,4 @@
-"""The marcher to read: plain torch, float32 or 64, any device, differentiable; the oracle of the fast one (SPEC 4)."""
+"""The reference marcher: plain torch, readable, differentiable, any device, float32 or float64 (SPEC 4)."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from primdiffusion.render.lattice import (
 )
 
 PAIRS_AT_ONCE = 2**20
-"""Rays times boxes: bounds the memory of their table; no effect on the result."""
+"""Pairs of rays and boxes per batch; limits memory without changing the result."""
 SAMPLES_AT_ONCE = 2**21
-"""Bounds the memory of the samples, some 400 bytes each; no effect on the result."""
+"""Samples per batch, about 400 bytes each; limits memory without changing the result."""
 
 
 def march_reference(
@@ -33,19 +33,18 @@ def march_reference(
     settings: MarchSettings = MarchSettings(),  # noqa: B008
     span: Span | None = None,
 ) -> Rendering:
-    """The picture of `primitives` from `camera` (both unbatched): SPEC 4.
+    """Render `primitives` from `camera` (both unbatched) by the rule of SPEC 4.
 
     At lattice point t_n = n * spacing each box whose stride s divides n and that contains the point adds the opacity
     a_i = density * window * s * spacing. With "mixed" compositing the point's opacity is sum a_i, its colour
-    sum a_i c_i / sum a_i, so the order of the boxes does not matter; with "index_order" they follow one another, the
-    lowest index first, which differs at the point that saturates a ray. Points are composited front to back as
-    `composite` says. Boxes with an extent of zero or less hold no point.
+    sum a_i c_i / sum a_i, independent of the order of the boxes; with "index_order" boxes are composited one after the
+    other, lowest index first, which differs at the point that saturates a ray. Points are composited front to back by
+    `composite`. Boxes with an extent of zero or less contain no points.
 
-    Differentiable in every tensor of `primitives` and `camera`; the number and places of the samples are treated as
-    fixed, so the steps of 3.4e-4 (the window's value) at the boxes' faces give no gradient. Cost: memory in proportion
-    to all samples of the picture when gradients are recorded. Raises ValueError as `check_scene` does, where the
-    tensors are batched, differ in dtype or are narrower than float32, and where one ray takes more than
-    SAMPLES_AT_ONCE samples.
+    Differentiable in every tensor of `primitives` and `camera`; the number and positions of the samples are treated as
+    constant, so the steps of 3.4e-4 (the window's value) at the faces of boxes give no gradient. With gradients, memory
+    is proportional to all samples of the image. Raises ValueError as `check_scene` does, if tensors are batched, differ
+    in dtype or are narrower than float32, and if a ray takes more than SAMPLES_AT_ONCE samples.
     """
     check_scene(primitives, camera, span)
     check_unbatched(primitives, camera, span)
@@ -71,7 +70,7 @@ def march_reference(
 def trilinear(
     voxels: Float[Tensor, "k c d h w"], box: Int[Tensor, "m"], local: Float[Tensor, "m 3"]
 ) -> Float[Tensor, "m c"]:
-    """Values of boxes `box` at `local` in [-1, 1]^3, whose axes are W, H, D (SPEC 4).
+    """Interpolate boxes `box` at `local` in [-1, 1]^3, axes W, H, D (SPEC 4).
 
     Corner-aligned: -1 and 1 are the centres of the outermost voxels, index = (y + 1) / 2 * (size - 1).
     """
@@ -91,7 +90,7 @@ def trilinear(
 
 
 def window(local: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
-    """exp(-8 * sum |y|^8), the fading of density towards a box's faces (SPEC 4)."""
+    """exp(-8 * sum |y|^8), which fades density towards the faces of a box (SPEC 4)."""
     return torch.exp(-WINDOW_SHARPNESS * local.pow(WINDOW_POWER).sum(-1))
 
 
@@ -101,11 +100,11 @@ def _check_dtype(tensors: list[Tensor]) -> None:
         raise ValueError(f"primitives and camera mix dtypes {sorted(map(str, dtypes))}: convert one with .to()")
     dtype = tensors[0].dtype
     if torch.finfo(dtype).bits < 32:
-        raise ValueError(f"{dtype} cannot tell lattice points a millimetre apart: use float32 or float64")
+        raise ValueError(f"{dtype} cannot resolve lattice points a millimetre apart: use float32 or float64")
 
 
 def _reach(camera: Camera, span: Span | None, spacing: float) -> Float[Tensor, "r 2"]:
-    """First and last lattice index that may be sampled on each ray; as floats, for the last may be infinite."""
+    """First and last lattice index of each ray; floats, because the last may be infinite."""
     if span is None:
         no_limit = camera.intrinsics.new_tensor([1.0, torch.inf])
         return no_limit.expand(camera.height * camera.width, 2)
@@ -146,17 +145,17 @@ def _to_local(primitives: Primitives, box: Int[Tensor, "m"], point: Float[Tensor
 
 
 class Crossings(NamedTuple):
-    """Where rays may cross boxes, ordered by ray, then box."""
+    """Candidate intersections of rays and boxes, ordered by ray, then box."""
 
     ray: Int[Tensor, "c"]
     box: Int[Tensor, "c"]
     first: Int[Tensor, "c"]
-    """The first and the last of the box's own lattice points, in its strides."""
+    """First and last lattice point in the box, in units of its stride."""
     last: Int[Tensor, "c"]
 
     @property
     def count(self) -> Int[Tensor, "c"]:
-        """Lattice points of each."""
+        """Number of lattice points of each."""
         return self.last - self.first + 1
 
 
@@ -168,24 +167,24 @@ def _crossings(
     stride: Int[Tensor, "k"],
     spacing: float,
 ) -> Crossings:
-    """Boxes with an extent of zero (or less) hold no point and are left out."""
+    """Skips boxes with an extent of zero or less."""
     solid = (primitives.half_extent > 0).all(-1).nonzero()[:, 0]
     inverse = 1 / primitives.half_extent[solid]
     p = torch.einsum("ki,kij->kj", origin - primitives.position[solid], primitives.rotation[solid]) * inverse
     q = torch.einsum("ri,kij->rkj", directions, primitives.rotation[solid]) * inverse
-    # A ray parallel to a face gets a tiny slope instead of a division by zero; |p| > 1 then still misses.
+    # A tiny slope for rays parallel to a face avoids division by zero; rays with |p| > 1 still miss.
     q = torch.where(q.abs() < 1e-12, torch.full_like(q, 1e-12), q)
     near, far = ((-1 - p) / q), ((1 - p) / q)
     enter, leave = torch.minimum(near, far).amax(-1), torch.maximum(near, far).amin(-1)
     step = stride[solid].to(origin.dtype) * spacing
-    # A little too wide, because of rounding; the test of |y| < 1 in _samples decides.
+    # Slightly too wide, for rounding; _samples tests |y| < 1.
     first, last = (enter / step - 1e-3).ceil().clamp_min(1), (leave / step + 1e-3).floor()
     ray, candidate = (first <= last).nonzero(as_tuple=True)
     return Crossings(ray, solid[candidate], first[ray, candidate].long(), last[ray, candidate].long())
 
 
 def _portions(crossings: Crossings, rays: int) -> Iterator[tuple[int, int, Crossings]]:
-    """Runs of rays, begin and end, with at most SAMPLES_AT_ONCE samples, and their crossings, rays numbered anew."""
+    """Batches of rays (begin, end) with at most SAMPLES_AT_ONCE samples, and their crossings with rays renumbered."""
     samples = crossings.ray.new_zeros(rays).index_add(0, crossings.ray, crossings.count).tolist()
     begin, held = 0, 0
     for end in range(1, rays + 1):
@@ -208,7 +207,7 @@ def _samples(
     spacing: float,
     crossings: Crossings,
 ) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"], Int[Tensor, "m"]]:
-    """Ray, box and lattice index of all samples inside boxes, ordered by ray, then box, then lattice index."""
+    """Ray, box and lattice index of all samples inside boxes, in this order of precedence."""
     count = crossings.count
     ray, box, first = (field.repeat_interleave(count) for field in (crossings.ray, crossings.box, crossings.first))
     begin = (count.cumsum(0) - count).repeat_interleave(count)
@@ -219,14 +218,14 @@ def _samples(
 
 
 def _by_point(ray: Int[Tensor, "m"], n: Int[Tensor, "m"]) -> tuple[Int[Tensor, "m"], Int[Tensor, "g"]]:
-    """All samples at one lattice point of one ray form a group: each sample's group, and each group's first sample."""
+    """Group the samples at one lattice point of a ray; return each sample's group, and each group's first sample."""
     new = torch.ones_like(ray, dtype=torch.bool)
     new[1:] = (ray[1:] != ray[:-1]) | (n[1:] != n[:-1])
     return new.cumsum(0) - 1, new.nonzero()[:, 0]
 
 
 def _by_sample(ray: Int[Tensor, "m"], n: Int[Tensor, "m"]) -> tuple[Int[Tensor, "m"], Int[Tensor, "g"]]:
-    """Each sample is a group of its own."""
+    """Put each sample in its own group."""
     every = torch.arange(len(ray), device=ray.device)
     return every, every
 
@@ -235,7 +234,7 @@ GROUPING: dict[Compositing, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]] =
     "mixed": _by_point,
     "index_order": _by_sample,
 }
-"""Which samples of a ray are composited as one."""
+"""Grouping of the samples that are composited together."""
 
 
 def _rows(
@@ -245,7 +244,7 @@ def _rows(
     rgb: Float[Tensor, "g 3"],
     distance: Float[Tensor, "g"],
 ) -> tuple[Float[Tensor, "r n"], Float[Tensor, "r n 3"], Float[Tensor, "r n"]]:
-    """One row per ray, padded with opacity 0: sums then run along a ray and never across rays, which float32 needs."""
+    """One row per ray, padded with opacity 0, so that cumulative sums never span rays, where float32 loses digits."""
     count = torch.bincount(ray, minlength=rays)
     slot = torch.arange(len(ray), device=ray.device) - (count.cumsum(0) - count)[ray]
     width = int(count.max()) if len(ray) else 0

@@ -1,4 +1,4 @@
-"""Opaque things beside people: triangles of one colour each, lit just enough to be read as shapes."""
+"""Opaque objects beside humans, and primitives as boxes: flat-coloured triangles with simple lighting."""
 
 from __future__ import annotations
 
@@ -18,29 +18,28 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.z_buffer import NearestTriangle, nearest_triangles
 
 SKY = 0.45
-"""Light from all above: SKY * (1 + n_up) / 2."""
+"""Light from above: SKY * (1 + n_up) / 2."""
 HEADLIGHT = 0.55
-"""Light from where the viewer stands: HEADLIGHT * |n . ray|. With the sky's no more than 1: colours are never
-brighter than they were given."""
+"""Light from the viewer: HEADLIGHT * |n . ray|. SKY + HEADLIGHT is 1, so colours are never brightened."""
 
 
 class UnusableSolids(ValueError):
-    """Triangles that cannot be drawn: of wrong shapes, or not finite."""
+    """Triangles with wrong shapes, or that are not finite."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Solids:
-    """Opaque triangles in the world, seen from both sides."""
+    """Opaque two-sided triangles in world space."""
 
     corners: Float32[ndarray, "f 3 3"]
     """Metres."""
     colour: Float32[ndarray, "f 3"]
     """Linear RGB."""
     holdout: Bool[ndarray, "f"]
-    """Whether it cuts a hole into the picture: it hides what is behind it and is itself not seen."""
+    """Whether the triangle is a holdout: it hides what is behind it and leaves a hole."""
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not belong together, and NaN."""
+        """Raise UnusableSolids if shapes do not match or values are not finite."""
         count = len(self.corners)
         for name, shape in (("corners", (count, 3, 3)), ("colour", (count, 3)), ("holdout", (count,))):
             value = getattr(self, name)
@@ -52,27 +51,26 @@ class Solids:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Layer:
-    """A picture that others are put over or behind."""
+    """An image to be composited."""
 
     rgb: Float32[ndarray, "h w 3"]
     """Linear, premultiplied by alpha."""
     alpha: Float32[ndarray, "h w"]
     depth: Float32[ndarray, "h w"]
-    """Metres along the optical axis to what is seen; inf where there is nothing."""
+    """Metres along the optical axis; inf for background."""
 
     @classmethod
     def nothing(cls, camera: Camera) -> Layer:
-        """An empty picture; read only."""
+        """An empty, read-only layer."""
         size = (camera.height, camera.width)
         zero, infinity = np.float32(0), np.float32(np.inf)
         return cls(np.broadcast_to(zero, (*size, 3)), np.broadcast_to(zero, size), np.broadcast_to(infinity, size))
 
 
 def shade_solids(solids: Solids, nearest: NearestTriangle, camera: Camera) -> Layer:
-    """The solids lit by a sky and a headlight, flat over a triangle; empty at holdouts, whose depth is inf as well.
+    """Shade the solids with a sky and a headlight, flat per triangle; holdouts are empty, with infinite depth.
 
-    colour * (SKY (1 + n_up) / 2 + HEADLIGHT |n . ray|), n the normal on the viewer's side. Pixels are wholly covered
-    or not at all.
+    colour * (SKY (1 + n_up) / 2 + HEADLIGHT |n . ray|), with the normal n towards the viewer. No antialiasing.
     """
     nothing = Layer.nothing(camera)
     layer = Layer(nothing.rgb.copy(), nothing.alpha.copy(), nothing.depth.copy())
@@ -83,7 +81,7 @@ def shade_solids(solids: Solids, nearest: NearestTriangle, camera: Camera) -> La
 
 
 def eye_of(camera: Camera) -> tuple[ndarray, ndarray]:
-    """The camera's place [3], and [3, 3] that takes (u, v, 1) to the direction in the world with depth 1."""
+    """Camera position [3], and the matrix [3, 3] from (u, v, 1) to the world direction with depth 1."""
     k = camera.intrinsics.detach().cpu().double().numpy()
     view = camera.world_to_camera.detach().cpu().double().numpy()
     return -view[:, :3].T @ view[:, 3], view[:, :3].T @ np.linalg.inv(k)
@@ -115,15 +113,15 @@ def _shade(corners, colour, holdout, triangle, distance, direction, rgb, alpha, 
 
 
 LIT = (0.35, 0.65)
-"""A face's light: the first part always, the second times |n . ray|."""
+"""Light of a face: constant part, and factor on |n . ray|."""
 EDGE_PIXELS = 0.7
 """Half the width of the dark lines along a box's edges."""
 EDGE_SHARE = 0.12
-"""The same as a share of the box's shortest half side at most: small boxes keep their colour."""
+"""Its limit relative to the box's shortest half extent, so that small boxes are not all line."""
 EDGE_LIGHT = 0.3
-"""What a line leaves of the light."""
+"""Factor on the light along a line."""
 TRIANGLES = 12
-"""Of a box: two for each face, faces in the order -x, +x, -y, +y, -z, +z."""
+"""Triangles of a box: two for each face, in the order -x, +x, -y, +y, -z, +z."""
 
 
 def draw_boxes(
@@ -132,11 +130,11 @@ def draw_boxes(
     group: Int[Tensor, "k"] | None = None,
     clip: tuple[float, float] = (0.0, np.inf),
 ) -> Layer:
-    """The nearest box in each pixel: a colour for each box, faces lit by how they are turned, edges darkened.
+    """Render the boxes themselves, as in the paper's figure: a colour for each, faces lit, edges darkened.
 
-    `primitives` are unbatched. Boxes of one `group` (say, a UV chart) share a hue and differ in lightness; without
-    groups hues differ. `clip` are depths along the optical axis: a box that crosses one is cut open there. Boxes with
-    an extent of zero or less are not drawn. Pixels are wholly covered or not at all. Not differentiable.
+    `primitives` are unbatched. Boxes of one `group` (such as a UV chart) share a hue and differ in lightness; without
+    groups hues differ. Boxes are cut at the depths `clip` along the optical axis; those with an extent of zero or less
+    are not drawn. No antialiasing. Not differentiable.
     """
     boxes = primitives.map(lambda tensor: tensor.detach().cpu().double())
     position, rotation, half_extent = (t.numpy() for t in (boxes.position, boxes.rotation, boxes.half_extent))
@@ -151,7 +149,7 @@ def draw_boxes(
 
 
 def box_colours(count: int, group: Int[Tensor, "k"] | None = None) -> Float32[ndarray, "k 3"]:
-    """Linear colours of boxes 0, 1, ...: hue by group (by number without groups), lightness by number."""
+    """Linear colours of boxes 0, 1, ...: hue by group (by index without groups), lightness by index."""
     k = np.arange(count)
     hue = ((k if group is None else torch.as_tensor(group).cpu().numpy()) * 0.618034) % 1
     lightness = 0.42 + 0.33 * ((k * 0.754878) % 1)
@@ -160,7 +158,7 @@ def box_colours(count: int, group: Int[Tensor, "k"] | None = None) -> Float32[nd
 
 
 def _triangles(position: ndarray, rotation: ndarray, half_extent: ndarray) -> Float[ndarray, "f 3 3"]:
-    """Two triangles for each face of each box."""
+    """Corners of two triangles per face of each box."""
     faces = np.empty((6, 4, 3))
     around = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     for face in range(6):

@@ -1,8 +1,8 @@
-"""The marcher's backward pass as Triton kernels: a program is a box in a view, or a part of its pixels (SPEC 4).
+"""The backward pass as Triton kernels: a program processes a box in a view, or a part of its pixels (SPEC 4).
 
 Compositing is additive, so the gradient of a sample depends on itself and on a few numbers of its ray, which
-`seed_rays` writes: no order is needed. At lattice point n, with share = 1 before the point that saturates the ray,
-kappa at it and 0 behind it,
+`seed_rays` writes, in any order. At lattice point n, with share = 1 before the point that saturates the ray, kappa at
+it and 0 behind it,
 
     dL/da = share (<c, g_rgb> + g_distance (n - base) spacing + h),      dL/dc = share a g_rgb.
 
@@ -20,12 +20,12 @@ import triton.language as tl
 from primdiffusion.render.triton_lists import NEVER, cell, channels, ray_in_box, window
 
 SUMS = 24
-"""Floats a unit leaves beside voxels: sums of G = dL/dy 0-2, of G y^T 3-11, of dc v^T 12-20 (see `_on_direction`)."""
+"""Floats per unit besides voxels: sums of G = dL/dy 0-2, of G y^T 3-11, of dc v^T 12-20 (see `_on_direction`)."""
 
 
 @triton.jit
 def seed_rays(g_rgb, g_alpha, g_depth, kept, ends, seeds, rays, spacing, LANES: tl.constexpr):
-    """Gradients of pixels to what samples need: g_rgb 0-2, g_distance 3, h 4, kappa 5."""
+    """Per-ray inputs of the samples' gradients: g_rgb 0-2, g_distance 3, h 4, kappa 5."""
     ray = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     here = ray < rays
     red = tl.load(g_rgb + ray * 3, here, 0.0)
@@ -35,7 +35,7 @@ def seed_rays(g_rgb, g_alpha, g_depth, kept, ends, seeds, rays, spacing, LANES: 
     base = tl.load(ends + ray * 2 + 1, here, 0)
     mean = tl.load(kept + ray * 8 + 4, here, 0.0)
     alpha = tl.load(kept + ray * 8 + 5, here, 0.0)
-    # depth = moment / alpha; it is infinite, and has no gradient, where there is nothing.
+    # depth = moment / alpha; it is infinite and has no gradient for background.
     seen = alpha > 0
     distance = tl.where(seen, tl.load(g_depth + ray, here, 0.0) / tl.where(seen, alpha, 1.0), 0.0)
     opaque = end < NEVER
@@ -52,7 +52,7 @@ def seed_rays(g_rgb, g_alpha, g_depth, kept, ends, seeds, rays, spacing, LANES: 
 
 @triton.jit
 def _interval(p, q, low, high):
-    """Where p + s q enters and leaves [-1, 1], cut to [low, high]."""
+    """Interval of s with p + s q in [-1, 1], clipped to [low, high]."""
     q = tl.where(tl.abs(q) < 1e-12, 1e-12, q)
     inverse = 1.0 / q
     middle, half = -p * inverse, tl.abs(inverse)
@@ -73,7 +73,7 @@ def _mixed(a, b, f):
 
 @triton.jit
 def _rounded(x):
-    """x to the ten bits of mantissa that tensor cores read (tf32): they cut off the rest, which would bias sums."""
+    """Round x to tf32, ten bits of mantissa: tensor cores truncate, which would bias sums."""
     return ((x.to(tl.int32, bitcast=True) + 0x1000) & -0x2000).to(tl.float32, bitcast=True)
 
 
@@ -155,7 +155,7 @@ def adjoint_boxes(
         low, high = _interval(px, qx, low, high)
         low, high = _interval(py, qy, low, high)
         low, high = _interval(pz, qz, low, high)
-        # A little too wide, because of rounding; the test of |y| < 1 below decides.
+        # Slightly too wide, for rounding; |y| < 1 is tested below.
         met = here & (low <= high + 0.1 * step)
         low = tl.where(met, low, 0.0) / spacing
         high = tl.where(met, high, -1.0) / spacing
@@ -182,7 +182,7 @@ def adjoint_boxes(
                 t = (n - n0).to(tl.float32) * spacing
                 x, y, z = px + t * qx, py + t * qy, pz + t * qz
                 inside = (i < number) & (tl.abs(x) < 1) & (tl.abs(y) < 1) & (tl.abs(z) < 1)
-                # High powers of places far outside would be infinite, and times 0 no number.
+                # High powers far outside would be infinite, and NaN when multiplied by 0.
                 x, y, z = tl.where(inside, x, 0.0), tl.where(inside, y, 0.0), tl.where(inside, z, 0.0)
                 ix, fx = cell(x)
                 iy, fy = cell(y)
@@ -209,7 +209,7 @@ def adjoint_boxes(
                     on_a * visible,
                 )
 
-                # By position: through the interpolation, and through the window.
+                # Gradient by position, through interpolation and window.
                 c000 = _weighted(v000, on_red, on_green, on_blue, on_density)
                 c001 = _weighted(v001, on_red, on_green, on_blue, on_density)
                 c010 = _weighted(v010, on_red, on_green, on_blue, on_density)
@@ -229,12 +229,12 @@ def adjoint_boxes(
                 a0, a1, a2 = a0 + on_x, a1 + on_y, a2 + on_z
                 b0, b1, b2 = b0 + t * on_x, b1 + t * on_y, b2 + t * on_z
 
-                # By contents. Samples outside have on_* = 0.
+                # Gradient by contents. Samples outside have on_* = 0.
                 rows = _hats(iz.to(tl.float32) + fz, grid_z) * _hats(iy.to(tl.float32) + fy, grid_y)
                 c = channel[:, None]
                 low_c = tl.where(c == 0, on_red[None, :], on_green[None, :])
                 high_c = tl.where(c == 2, on_blue[None, :], on_density[None, :])
-                # Written as [32, LANES], so that a thread keeps to its sample.
+                # Written as [32, LANES], so that each thread stays with its sample.
                 columns = _hats(ix.to(tl.float32) + fx, grid_x) * tl.where(c < 2, low_c, high_c)
                 gradient = tl.dot(_rounded(rows), tl.trans(_rounded(columns)), gradient, input_precision="tf32")
 
@@ -275,10 +275,10 @@ def finish_boxes(
     unit_end, unit_voxels, unit_sums, rotation, half_extent,
     on_position, on_rotation, on_half_extent, on_rgb, on_density, on_camera, views, boxes, own_boxes,
 ):  # fmt: skip
-    """One box: adds up its units of all views that share it, and turns the sums into gradients.
+    """One box: sum its units of all views that share it, and convert the sums to gradients.
 
-    `unit_end` [view, box] counts units up to and with those of a box. `on_camera` [view, box, 12] gets the box's share
-    of dL/do, o the camera's place, and of sum dc v^T.
+    `unit_end` [view, box] is the cumulative number of units. `on_camera` [view, box, 12] gets the box's contribution to
+    dL/do, o the camera position, and to sum dc v^T.
     """
     k = tl.program_id(0).to(tl.int64)
     box = tl.program_id(1) * own_boxes + k

@@ -1,12 +1,12 @@
-"""Triton kernels that prepare boxes for the marcher: contents as 16-byte voxels, places as a record a view (SPEC 4).
+"""Triton kernels that pack boxes for the marcher: contents as 16-byte voxels, positions as a record per view (SPEC 4).
 
 A sample is y = W (o + t d - T), W = diag(1 / half_extent) R^T. Far from the camera t d and T - o nearly cancel, so a
-box keeps a point of reference near itself, found in float64: the lattice point n0 on the ray through its centre, whose
+box has a reference point near itself, computed in float64: the lattice point n0 on the ray through its centre, whose
 direction is D and whose pixel is (u0, v0). With d = D + delta and t = (n0 + n) * spacing
 
     y = e + t0 W delta + n spacing W d,      e = W (o + t0 D - T),
 
-in which every term is of the size of the box, and delta follows from pixel differences: m = R_c^T K^-1 [u, v, 1] is
+in which every term has the magnitude of the box, and delta follows from pixel differences: m = R_c^T K^-1 [u, v, 1] is
 m0 + du a + dv b, and delta = (du a + dv b - D (|m| - |m0|)) / |m| with |m|^2 = |m0|^2 + du (g + ...) + dv (h + ...).
 """
 
@@ -24,14 +24,14 @@ INDICES = 16
 """Integers of a box as one view sees it: n0 0, first and last lattice point of its content 1-2, stride 3, tile
 columns and rows that its content touches 4-7, pixel columns and rows that all of it touches 8-11, blocks in them 12."""
 
-# What is wrong with a scene; any bit sends it to `check_scene`, which says it in words.
+# Errors of a scene, as bits; `check_scene` produces the message.
 BAD_CONTENT = tl.constexpr(1)
 BAD_PLACE = tl.constexpr(2)
 BAD_CAMERA = tl.constexpr(4)
 ORTHOGONAL = tl.constexpr(1e-2)
 NEARLY_ORTHOGONAL = tl.constexpr(0.045)  # of a camera, the rows of whose matrix are compared here, not its columns
-# Totals: 0 what is wrong, 1 pairs of boxes and bins, 2 pairs of boxes and tiles, 3 units of the adjoint, 4-5 written so
-# far, 6 spans that are no numbers, 7 whether a stride is odd (1), or even and no multiple of 4 (2).
+# Totals: 0 errors, 1 pairs of boxes and bins, 2 pairs of boxes and tiles, 3 units of the adjoint, 4-5 written so
+# far, 6 spans with NaN, 7 whether a stride is odd (1), or even and no multiple of 4 (2).
 TOTALS = 8
 
 OPTICAL = tl.constexpr(1e-2)  # a centre further off the optical axis than arccos of this has no pixel to refer to
@@ -42,7 +42,7 @@ LAST_POINT = tl.constexpr(1 << 30)
 
 @triton.jit
 def pack_boxes(rgb, density, voxels, bounds, totals):
-    """One box: [3, 512] and [512] to [512, 4], the range of voxel indices that can be seen, and what is wrong."""
+    """One box: [3, 512] and [512] to [512, 4], the range of visible voxel indices, and errors."""
     box = tl.program_id(0).to(tl.int64)
     i = tl.arange(0, 512)
     red = tl.load(rgb + box * 1536 + i)
@@ -57,7 +57,7 @@ def pack_boxes(rgb, density, voxels, bounds, totals):
     if tl.min(sound.to(tl.int32), 0) == 0:
         tl.atomic_or(totals, 1)
 
-    # A cell beside a voxel that holds something may hold something; the others are empty.
+    # A cell next to a voxel with density may have density; the others are empty.
     seen = opacity > 0
     for axis in tl.static_range(3):
         index = (i // (8**axis)) % 8
@@ -119,7 +119,7 @@ def _place(a, b, c, centre, x, y, z):
 
 @triton.jit
 def _rectangle(centre, x, y, z, lx, ly, lz, hx, hy, hz, near, width, height, fx, skew, cx, fy, cy):
-    """First and last pixel column and row that see the part [l, h] of a box, and how far that part reaches.
+    """First and last pixel column and row that see the part [l, h] of a box, and how far that part extends.
 
     The box's centre and half axes are in the camera's coordinates, in float32. Edges are cut at the plane z = near.
     """
@@ -158,8 +158,8 @@ def place_boxes(
 ):  # fmt: skip
     """LANES boxes in one view: their records (see RECORD, INDICES), and the totals by which lists are allocated.
 
-    `own_boxes` is 0 where all views share one set of boxes. `lattice` holds, in float64, the distance between lattice
-    points and for each of STRIDES the least edge of a voxel that it suits.
+    `own_boxes` is 0 if all views share one set of boxes. `lattice` contains, in float64, the spacing of lattice points
+    and for each of STRIDES the smallest voxel edge that it suits.
     """
     view = tl.program_id(1)
     k = tl.program_id(0) * LANES + tl.arange(0, LANES)
@@ -270,7 +270,7 @@ def place_boxes(
     tl.store(row + 28, (k * 0 + 2 * _dot(ax, ay, az, bx, by, bz)).to(tl.float32), here)
     tl.store(row + 29, (k * 0 + _dot(bx, by, bz, bx, by, bz)).to(tl.float32), here)
 
-    # The part of the box that can be seen.
+    # The visible part of the box.
     l0 = tl.load(bounds + source * 8, here, 0) / 3.5 - 1.0
     l1 = tl.load(bounds + source * 8 + 1, here, 0) / 3.5 - 1.0
     l2 = tl.load(bounds + source * 8 + 2, here, 0) / 3.5 - 1.0

@@ -1,4 +1,4 @@
-"""What the marcher's forward and backward Triton kernels share: a ray as a box sees it, and a box's voxels."""
+"""Triton functions shared by forward and backward kernels, and the kernels that list the boxes of each tile (SPEC 4)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import triton.language as tl
 
 SHARPNESS = tl.constexpr(8.0)
 NEVER = tl.constexpr(1 << 30)
-"""Lattice point behind all others."""
+"""Lattice index behind all others."""
 
 
 @triton.jit
@@ -36,7 +36,7 @@ def ray_in_box(row, u, v):
 
 @triton.jit
 def cell(y):
-    """The voxel below a coordinate in [-1, 1] and the way from it to the next, in voxels."""
+    """Index of the voxel below a coordinate in [-1, 1], and the fraction to the next."""
     u = (y + 1.0) * 3.5
     low = tl.minimum(tl.maximum(u.to(tl.int32), 0), 6)
     return low, u - low.to(tl.float32)
@@ -44,7 +44,7 @@ def cell(y):
 
 @triton.jit
 def window(x, y, z):
-    """exp(-8 * sum |y|^8), the fading of density towards a box's faces (SPEC 4)."""
+    """exp(-8 * sum |y|^8), which fades density towards the faces of a box (SPEC 4)."""
     x2, y2, z2 = x * x, y * y, z * z
     x4, y4, z4 = x2 * x2, y2 * y2, z2 * z2
     return tl.exp((x4 * x4 + y4 * y4 + z4 * z4) * -SHARPNESS)
@@ -60,8 +60,8 @@ def channels(value):
 
 
 ENTRY = 4
-WIDE_TILE = tl.constexpr(0.5)  # a tile wider than this (radians, about) is not bounded by its middle ray
-BLUR = tl.constexpr(1e-4)  # of a box, against rounding
+WIDE_TILE = tl.constexpr(0.5)  # tiles wider than this (about radians) are not bounded by their middle ray
+BLUR = tl.constexpr(1e-4)  # relative margin of a box for rounding
 
 
 @triton.jit
@@ -129,7 +129,7 @@ def list_tiles(
 
 @triton.jit
 def _write(entries, place, here, k, sorted_by, first, last):
-    """Entries for those `here`, from `place` on; the place after them."""
+    """Append entries for those `here`, from `place` on; return the next free place."""
     at = entries + (place + tl.cumsum(here.to(tl.int32), 0) - 1) * 4
     tl.store(at, k, here)
     tl.store(at + 1, sorted_by, here)
@@ -150,7 +150,7 @@ def _meets(indices, first_box, k, here, column, row, SIZE: tl.constexpr):
 
 @triton.jit
 def _reached(record, indices, k, column, row, spacing, TILE_WIDTH: tl.constexpr, TILE_HEIGHT: tl.constexpr):
-    """First and last lattice point of the boxes' contents that any ray of a tile can meet; last < first for none.
+    """First and last lattice point of the boxes' contents that any ray of a tile can reach; last < first for none.
 
     A ray differs from the tile's middle one by d - d0 = Dm / |m0| + d (|m0| - |m|) / |m0|, Dm at most w a + h b for
     half a tile of w x h pixels. On an axis of the box the first term is at most A / |m0|, A = w |W a| + h |W b|;

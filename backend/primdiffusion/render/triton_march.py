@@ -1,9 +1,10 @@
-"""The marcher's forward pass as a Triton kernel: a program is a tile of pixels (SPEC 4).
+"""The forward pass as a Triton kernel: a program processes a tile of pixels (SPEC 4).
 
-A tile walks along its rays in chunks of lattice points. Every box of its list that reaches into the chunk adds opacity
-and colour for all points of all pixels at once; the chunk is composited; the tile ends when its rays are opaque or its
-list is done. Of all lattice points the multiples of GAP are used, in SETS sets: point n is in set n / GAP % SETS. Boxes
-whose stride is a multiple of GAP * SETS touch the first set only, so that coarse boxes do not pay for fine ones.
+A tile advances along its rays in chunks of lattice points. Every box of its list that overlaps the chunk adds opacity
+and colour for all points and pixels at once; then the chunk is composited. The tile ends when its rays are opaque or
+its list is finished. Only lattice points that are multiples of GAP are used, in SETS sets: point n is in set
+n / GAP % SETS. Boxes whose stride is a multiple of GAP * SETS use the first set only, so that coarse boxes do not pay
+for fine ones.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
