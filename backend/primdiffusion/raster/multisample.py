@@ -31,7 +31,7 @@ LINEAR_OF_SIXTEENTH = decode_srgb(np.arange(255 * 16 + 1) / (255 * 16)).astype(n
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Figure:
-    """A mesh prepared for rendering in many poses: everything that does not depend on the pose, all parts concatenated."""
+    """A mesh prepared for rendering in many poses: what does not depend on the pose, all parts concatenated."""
 
     mesh: TexturedMesh
     """In the rest pose."""

@@ -202,7 +202,7 @@ def view_along(
     length = float(np.linalg.norm(forward))
     if length == 0 or pixel_size <= 0:
         raise ValueError(
-            f"the direction is {direction} and the pixel size {pixel_size} m: give a nonzero direction and a positive size"
+            f"the direction is {direction} and the pixel size {pixel_size} m: give a direction and a positive size"
         )
     forward = forward / length
     up = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.999 else np.array([0.0, 0.0, 1.0])

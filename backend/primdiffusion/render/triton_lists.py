@@ -1,4 +1,4 @@
-"""Triton functions shared by forward and backward kernels, and the kernels that list the boxes of each tile (SPEC 4)."""
+"""Triton functions shared by both passes, and the kernels that list the boxes of each tile (SPEC 4)."""
 
 from __future__ import annotations
 
