@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.drawing.draw import draw
-from primdiffusion.drawing.scene import Look, Scene
+from primdiffusion.drawing.scene import Scene, ViewSettings
 from primdiffusion.human import framing, place
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.anchors import default_anchors
@@ -58,7 +58,7 @@ def main() -> None:
     depth_to_png(arguments.out / "march_depth.png", rendering)
     to_png(arguments.out / "march_posed.png", march(walking, framing(walking)), BACKGROUND)
     to_png(arguments.out / "march_side.png", march(walking, framing(walking, yaw=SIDE)), BACKGROUND)
-    boxes = draw(Scene(rest, chart=default_anchors().chart), front, Look("boxes"))
+    boxes = draw(Scene(rest, chart=default_anchors().chart), front, ViewSettings("boxes"))
     rgba_to_png(arguments.out / "march_boxes.png", torch.from_numpy(boxes.combined), BACKGROUND)
     share = share_on_body(rest.position)
     arguments.json.write_text(json.dumps({"seconds_march_512": seconds, "grid_share_on_body": share}))

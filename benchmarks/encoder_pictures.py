@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from primdiffusion.capture.conditioning import conditioning_views, default_betas, spread_cameras
 from primdiffusion.capture.reader import Captures, open_captures
 from primdiffusion.drawing.draw import draw
-from primdiffusion.drawing.scene import Look, Scene
+from primdiffusion.drawing.scene import Scene, ViewSettings
 from primdiffusion.encoder.model import EncoderModel, load_encoder
 from primdiffusion.evaluation.reconstruction import picture
 from primdiffusion.geometry.camera import Camera
@@ -60,7 +60,7 @@ def row(model: EncoderModel, captures: Captures, name: str, novel_frame: int) ->
 
 def drawn_view(primitives: Primitives, camera: Camera, look: str) -> Tensor:
     """The depth or the primitives, drawn over black, sRGB-encoded."""
-    drawn = draw(Scene(primitives, chart=default_anchors().chart), camera, Look(look))
+    drawn = draw(Scene(primitives, chart=default_anchors().chart), camera, ViewSettings(look))
     return encode_srgb(torch.from_numpy(drawn.combined[..., :3]).clamp(0, 1))
 
 

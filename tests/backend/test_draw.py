@@ -8,7 +8,7 @@ import pytest
 import torch
 from march_scenes import camera_at, one_box, random_boxes
 from primdiffusion.drawing.draw import FIRST_PIXELS, GROWTH, depth_span, draw, draw_in_bands
-from primdiffusion.drawing.scene import NOTHING, Look, Picture, Scene
+from primdiffusion.drawing.scene import NOTHING, Picture, Scene, ViewSettings
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import Primitives
@@ -62,8 +62,8 @@ def test_a_solid_through_people_hides_exactly_what_is_behind_it(boxes, camera, z
     behind = np.where(np.isfinite(far)[..., None], shaded.rgb, BACKGROUND)
     want = people.rgb.numpy() + (1 - people.alpha.numpy())[..., None] * behind
 
-    got = draw(Scene(boxes, solids), camera, Look(background=BACKGROUND, settings=SETTINGS))
-    free = draw(Scene(boxes), camera, Look(background=BACKGROUND, settings=SETTINGS))
+    got = draw(Scene(boxes, solids), camera, ViewSettings(background=BACKGROUND, settings=SETTINGS))
+    free = draw(Scene(boxes), camera, ViewSettings(background=BACKGROUND, settings=SETTINGS))
     assert np.abs(free.combined[..., :3] - want).max() > 0.2, "the solid matters"
     error = np.abs(got.combined[..., :3] - want).max(-1)
     assert error.max() < 0.07, "a sample on the very surface may fall to either side"
@@ -77,20 +77,20 @@ def test_clip_planes_are_at_depths_and_not_at_distances(boxes, camera):
     _, _, cosine = geometry(camera)
     start, end = 0.61, 0.65
     want = slow(boxes, camera, start / cosine, end / cosine)
-    got = draw(Scene(boxes), camera, Look(clip=(start, end), settings=SETTINGS))
+    got = draw(Scene(boxes), camera, ViewSettings(clip=(start, end), settings=SETTINGS))
     error = np.abs(got.combined[..., 3] - want.alpha.numpy())
     assert error.max() < 0.07
     assert np.quantile(error, 0.98) < 1e-3
-    assert 0.05 < want.alpha.mean() < draw(Scene(boxes), camera, Look()).combined[..., 3].mean() - 0.02
+    assert 0.05 < want.alpha.mean() < draw(Scene(boxes), camera, ViewSettings()).combined[..., 3].mean() - 0.02
     distances = slow(boxes, camera, np.full_like(cosine, start), np.full_like(cosine, end))
     assert np.abs(distances.alpha - want.alpha).max() > 0.1, "the test can tell them apart"
 
 
 def test_planes_that_cut_nothing_change_nothing(boxes, camera):
     near, far = depth_span(boxes, camera, (0, math.inf))
-    free = draw(Scene(boxes), camera, Look())
-    loose = draw(Scene(boxes), camera, Look(clip=(near - 1e-4, far + 1e-4)))
-    behind_all = draw(Scene(boxes, wall(-50.0)), camera, Look(clip=(0.1, 10)))
+    free = draw(Scene(boxes), camera, ViewSettings())
+    loose = draw(Scene(boxes), camera, ViewSettings(clip=(near - 1e-4, far + 1e-4)))
+    behind_all = draw(Scene(boxes, wall(-50.0)), camera, ViewSettings(clip=(0.1, 10)))
     for other in (loose, behind_all):
         assert np.allclose(other.combined, free.combined, atol=1e-6)
         assert np.array_equal(other.depth, free.depth)
@@ -150,7 +150,7 @@ def test_far_and_narrow_views_find_outlines_too(boxes):
 
 
 def test_without_a_background_the_picture_is_premultiplied_and_transparent(boxes, camera):
-    clear, full = draw(Scene(boxes), camera), draw(Scene(boxes), camera, Look(background=BACKGROUND))
+    clear, full = draw(Scene(boxes), camera), draw(Scene(boxes), camera, ViewSettings(background=BACKGROUND))
     alpha = clear.combined[..., 3:]
     assert alpha.min() == 0
     assert np.allclose(full.combined[..., :3], clear.combined[..., :3] + (1 - alpha) * BACKGROUND, atol=1e-6)
@@ -159,15 +159,15 @@ def test_without_a_background_the_picture_is_premultiplied_and_transparent(boxes
 
 
 def test_a_holdout_leaves_a_hole_in_all_but_what_is_before_it(boxes, camera):
-    held = draw(Scene(boxes, wall(0.0, holdout=True)), camera, Look(background=BACKGROUND))
+    held = draw(Scene(boxes, wall(0.0, holdout=True)), camera, ViewSettings(background=BACKGROUND))
     kept = draw(Scene(boxes, wall(0.0)), camera)
     solid = draw(Scene(None, wall(0.0)), camera)
     alpha = (kept.combined[..., :3] - held.combined[..., :3]) / solid.combined[..., :3]
     assert np.allclose(held.combined[..., 3], 1 - alpha.mean(-1), atol=1e-4), "what is not a person is a hole"
     assert 0.1 < held.combined[..., 3].mean() < 0.9
-    nobody = draw(Scene(None, wall(0.0, holdout=True)), camera, Look(background=BACKGROUND))
-    assert (nobody.combined == 0).all()
-    assert (nobody.depth == np.float32(NOTHING)).all()
+    no_human = draw(Scene(None, wall(0.0, holdout=True)), camera, ViewSettings(background=BACKGROUND))
+    assert (no_human.combined == 0).all()
+    assert (no_human.depth == np.float32(NOTHING)).all()
 
 
 def test_the_view_depth_shows_expected_depth_in_colours(boxes, camera):
@@ -176,32 +176,32 @@ def test_the_view_depth_shows_expected_depth_in_colours(boxes, camera):
     people = slow(boxes, camera, free, free + np.inf)
     span = depth_span(boxes, camera, (0, math.inf))
     solid = people.alpha.numpy() > 0.999
-    got = draw(Scene(boxes), camera, Look("depth", settings=SETTINGS)).combined[solid]
+    got = draw(Scene(boxes), camera, ViewSettings("depth", settings=SETTINGS)).combined[solid]
     want = depth_colours(people.depth.numpy() * cosine, *span)[solid]
     assert np.abs(encode_srgb(got[:, :3]) - want).max() < 0.01
     assert len(got) > 50
-    with_wall = draw(Scene(boxes, wall(0.5)), camera, Look("depth"))
+    with_wall = draw(Scene(boxes, wall(0.5)), camera, ViewSettings("depth"))
     assert np.allclose(encode_srgb(with_wall.combined[..., :3]), depth_colours(np.zeros(()), *span), atol=1e-5)
 
 
 def test_the_view_alpha_shows_coverage_by_people_that_solids_do_not_hide(boxes, camera):
     people = draw(Scene(boxes), camera).combined[..., 3]
-    got = draw(Scene(boxes, wall(-0.4)), camera, Look("alpha", background=BACKGROUND)).combined
+    got = draw(Scene(boxes, wall(-0.4)), camera, ViewSettings("alpha", background=BACKGROUND)).combined
     assert np.allclose(encode_srgb(got[..., :3]), people[..., None], atol=1e-5)
     assert (got[..., 3] == 1).all()
-    hidden = draw(Scene(boxes, wall(0.4)), camera, Look("alpha")).combined
+    hidden = draw(Scene(boxes, wall(0.4)), camera, ViewSettings("alpha")).combined
     assert (hidden[..., :3] == 0).all()
 
 
 def test_the_view_boxes_shows_boxes_before_solids(boxes, camera):
     drawn = draw_boxes(boxes, camera)
-    got = draw(Scene(boxes, wall(-0.4)), camera, Look("boxes"))
+    got = draw(Scene(boxes, wall(-0.4)), camera, ViewSettings("boxes"))
     seen = drawn.alpha > 0
     assert 0.1 < seen.mean() < 0.9
     assert np.array_equal(got.combined[seen, :3], drawn.rgb[seen])
     assert np.array_equal(got.depth[seen], drawn.depth[seen])
     assert np.allclose(got.combined[~seen], draw(Scene(None, wall(-0.4)), camera).combined[~seen])
-    through = draw(Scene(boxes, wall(0.0)), camera, Look("boxes"))
+    through = draw(Scene(boxes, wall(0.0)), camera, ViewSettings("boxes"))
     wall_depth = draw(Scene(None, wall(0.0)), camera).depth
     assert np.array_equal(through.depth, np.minimum(np.where(seen, drawn.depth, np.inf), wall_depth))
 
@@ -209,7 +209,7 @@ def test_the_view_boxes_shows_boxes_before_solids(boxes, camera):
 @pytest.mark.parametrize("view", ["colour", "depth", "alpha", "boxes"])
 @pytest.mark.parametrize("speed", [None, 1.0, 2000.0, 1e9])
 def test_bands_make_the_picture(boxes, camera, view, speed):
-    scene, look = Scene(boxes, wall(0.0, 0.4)), Look(view, BACKGROUND, (0.1, 10))
+    scene, look = Scene(boxes, wall(0.0, 0.4)), ViewSettings(view, BACKGROUND, (0.1, 10))
     whole, picture = draw(scene, camera, look), Picture.blank(camera.width, camera.height)
     picture.combined[:] = np.nan
     rows = [done.rows for done in draw_in_bands(picture, scene, camera, look, speed)]
@@ -226,15 +226,15 @@ def test_bands_make_the_picture(boxes, camera, view, speed):
 def test_the_first_band_of_an_unknown_machine_is_small():
     camera = camera_at((0.0, 0.0, 1.0), width=1024, height=512).to(dtype=torch.float32)
     picture = Picture.blank(1024, 512)
-    bands = draw_in_bands(picture, Scene(None), camera, Look())
+    bands = draw_in_bands(picture, Scene(None), camera, ViewSettings())
     assert next(bands).rows == FIRST_PIXELS // 1024
 
 
 def test_an_empty_scene_is_the_background(camera):
-    nobody = dataclasses.replace(one_box(), **{k: v[:0] for k, v in vars(one_box()).items()}).to(dtype=torch.float32)
-    for scene in (Scene(None), Scene(nobody)):
+    no_boxes = dataclasses.replace(one_box(), **{k: v[:0] for k, v in vars(one_box()).items()}).to(dtype=torch.float32)
+    for scene in (Scene(None), Scene(no_boxes)):
         for view in ("colour", "depth", "boxes"):
-            picture = draw(scene, camera, Look(view, BACKGROUND))
+            picture = draw(scene, camera, ViewSettings(view, BACKGROUND))
             assert np.allclose(picture.combined, (*BACKGROUND, 1), atol=1e-6)
             assert (picture.depth == np.float32(NOTHING)).all()
 
@@ -244,4 +244,4 @@ def test_an_empty_scene_is_the_background(camera):
 )
 def test_unknown_views_and_impossible_planes_are_rejected(wrong):
     with pytest.raises(ValueError, match=r"x-ray|clip"):
-        Look(**wrong)
+        ViewSettings(**wrong)

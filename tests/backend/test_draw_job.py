@@ -13,7 +13,7 @@ from primdiffusion.commands import frame_drawer
 from primdiffusion.commands.frame import FrameSpec, PosedPerson
 from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
 from primdiffusion.drawing.draw import draw
-from primdiffusion.drawing.scene import Look, Scene
+from primdiffusion.drawing.scene import Scene, ViewSettings
 from primdiffusion.failures import describe
 from primdiffusion.human import framing, generate, place, pose_body
 from primdiffusion.human_file import save_human
@@ -64,7 +64,7 @@ def drawn(params: FrameSpec, drawer: FrameDrawer | None = None, reports: list | 
 
 def test_the_frame_holds_the_picture_of_the_placed_person_from_its_bottom_row(human, pose, params):
     primitives = place(human, pose)
-    want = draw(Scene(primitives), framing(primitives, 0.4, WIDTH, HEIGHT), Look(clip=(0.0, 1e10)))
+    want = draw(Scene(primitives), framing(primitives, 0.4, WIDTH, HEIGHT), ViewSettings(clip=(0.0, 1e10)))
     assert (want.combined[..., 3] > 0.9).mean() > 0.05
     drawn(params)
     values = np.fromfile(params.frame, np.float32)
@@ -81,7 +81,7 @@ def test_other_betas_draw_the_reshaped_person_whose_boxes_have_grown(human, pose
     got = drawn(dataclasses.replace(params, people=[person])).combined
     camera = framing(place(human, pose), 0.4, WIDTH, HEIGHT)
     grown, ungrown = (
-        draw(Scene(place(one, pose)), camera, Look(clip=(0.0, 1e10))).combined
+        draw(Scene(place(one, pose)), camera, ViewSettings(clip=(0.0, 1e10))).combined
         for one in (reshaped(human, betas), dataclasses.replace(human, betas=betas))
     )
     assert np.abs(grown - ungrown).max() > 0.1
@@ -147,8 +147,8 @@ def test_several_people_stand_in_one_picture(human, pose, params):
     first = place(human, pose)
     second = dataclasses.replace(first, position=first.position + torch.tensor([0.3, 0, -0.5]))
     camera = framing(first, 0.4, WIDTH, HEIGHT)
-    want = draw(Scene(Primitives.together([first, second])), camera, Look())
-    alone = draw(Scene(first), camera, Look())
+    want = draw(Scene(Primitives.together([first, second])), camera, ViewSettings())
+    alone = draw(Scene(first), camera, ViewSettings())
     assert np.allclose(drawn(two).combined, want.combined, atol=2e-3)
     assert want.combined[..., 3].mean() > 1.2 * alone.combined[..., 3].mean()
 

@@ -11,7 +11,7 @@ from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, Unu
 from primdiffusion.people.payloads import fitted_payloads, orbit_camera
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.cpu import march_cpu
-from primdiffusion.render.inverse import InverseSettings, Target, fit_colours, fit_payload
+from primdiffusion.render.inverse import InverseSettings, TargetImage, fit_colours, fit_payload
 
 FULL = 200.0
 SIDE = 3
@@ -42,15 +42,15 @@ def cameras(count: int, turn: float = 0.0, size: int = 32) -> list[Camera]:
     ]
 
 
-def pictures(payload: Payload, views: list[Camera]) -> list[Target]:
+def pictures(payload: Payload, views: list[Camera]) -> list[TargetImage]:
     targets = []
     for camera in views:
         drawn = march_cpu(Primitives.place(sheet_frames(), payload), camera)
-        targets.append(Target(sheet_frames(), camera, torch.cat([drawn.rgb, drawn.alpha[..., None]], -1).numpy()))
+        targets.append(TargetImage(sheet_frames(), camera, torch.cat([drawn.rgb, drawn.alpha[..., None]], -1).numpy()))
     return targets
 
 
-def error(payload: Payload, targets: list[Target]) -> float:
+def error(payload: Payload, targets: list[TargetImage]) -> float:
     """Mean square error of colours over black and alpha."""
     squares = []
     for target in targets:

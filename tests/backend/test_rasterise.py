@@ -165,6 +165,14 @@ def test_triangles_behind_the_camera_are_left_out():
     assert rasterise(TexturedMesh((behind,)), camera).alpha.sum() == 0
 
 
+def test_triangles_across_the_camera_plane_are_drawn_where_they_are_in_front():
+    camera = Camera(torch.tensor([[20.0, 0, 20], [0, 20, 20], [0, 0, 1]]), torch.eye(3, 4), 40, 40)
+    floor = part([[-9, 1, -9], [9, 1, -9], [9, 1, 9], [-9, 1, 9]], [[0, 1, 2], [0, 2, 3]])  # y points down
+    alpha = rasterise(TexturedMesh((floor,)), camera).alpha
+    assert not alpha[:22].any()  # the floor ends at z = 9, row 22.2
+    assert alpha[23:].all()
+
+
 def test_a_view_along_a_direction_holds_the_whole_box():
     bounds = np.array([[-0.2, 0.1, -0.5], [0.4, 1.9, 0.3]])
     for direction in ((0, 0, -1), (0, -1, 0), (1, -0.3, 0.7)):

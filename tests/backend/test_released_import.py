@@ -18,7 +18,7 @@ from primdiffusion.diffusion.checkpoint import CheckpointError, load_checkpoint,
 from primdiffusion.diffusion.codec import ReleasedSlab
 from primdiffusion.diffusion.schedule import released_steps
 from primdiffusion.drawing.draw import draw
-from primdiffusion.drawing.scene import Look, Scene
+from primdiffusion.drawing.scene import Scene, ViewSettings
 from primdiffusion.human import framing, generate, place, place_skinned
 from primdiffusion.human_file import HumanFileError, load_human, save_human
 from primdiffusion.primitives.anchors import build_anchors
@@ -120,7 +120,7 @@ def test_the_engines_frames_and_boxes_show_people_on_the_users_body(person, tmp_
             people=[PosedPerson(tmp_path / "a.human.safetensors", still, [still] * 24)],
         )  # fmt: skip
         FrameDrawer(torch.device("cpu")).draw(params, lambda *_: None)
-        want = draw(Scene(primitives, chart=chart), camera, Look(view, clip=(0.0, 1e10)))
+        want = draw(Scene(primitives, chart=chart), camera, ViewSettings(view, clip=(0.0, 1e10)))
         found = map_frame(params.frame, 40, 56).combined
         assert (want.combined[..., 3] > 0.5).mean() > 0.2
         assert np.abs(found - want.combined).mean() < 2e-3

@@ -176,8 +176,8 @@ def _texture_coordinates(
 def _unwrapped(template: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unwrap automatically; return UV faces and coordinates."""
     try:
-        import xatlas
-    except ModuleNotFoundError as error:  # xatlas has no wheels for Python 3.14 or Linux on ARM
+        import xatlas  # optional: it has no wheels for Python 3.14 or Linux on ARM
+    except ModuleNotFoundError as error:
         raise BodyFileError(
             "the body has no texture coordinates, and this Python has no xatlas to make some: give them by a second "
             "file (uv), or install xatlas."

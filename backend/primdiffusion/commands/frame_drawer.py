@@ -16,7 +16,7 @@ from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.commands.frame import FrameSpec
 from primdiffusion.commands.request import ReportProgress
 from primdiffusion.drawing.draw import BAND_SECONDS, FIRST_PIXELS, draw_in_bands
-from primdiffusion.drawing.scene import Look, Picture, Scene
+from primdiffusion.drawing.scene import Picture, Scene, ViewSettings
 from primdiffusion.failures import PictureOutOfMemory, out_of_memory
 from primdiffusion.formats.arrays import read_arrays
 from primdiffusion.geometry.camera import Camera
@@ -120,7 +120,7 @@ class FrameDrawer:
 
     def _fill(self, picture: Picture, scene: Scene, frame: FrameSpec, report: ReportProgress) -> float:
         """Draw the scene; return the seconds spent in the marcher."""
-        look = Look(
+        look = ViewSettings(
             frame.view,
             None if frame.background is None else tuple(frame.background),
             (frame.clip[0], frame.clip[1]),

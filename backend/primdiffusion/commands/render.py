@@ -119,14 +119,14 @@ class RenderCommand:
 
         # torch is loaded late
         from primdiffusion.drawing.draw import draw
-        from primdiffusion.drawing.scene import Look, Scene
+        from primdiffusion.drawing.scene import Scene, ViewSettings
         from primdiffusion.human import body_of, framing, place
         from primdiffusion.human_file import load_human
         from primdiffusion.pose_file import read_pose
         from primdiffusion.render.image import depth_to_png, rgba_to_png
         from primdiffusion.render.march import MarchSettings, march
 
-        look = Look(self.view, settings=MarchSettings(step=self.step))
+        look = ViewSettings(self.view, settings=MarchSettings(step=self.step))
         human = load_human(self.human)
         primitives = place(human, None if self.pose is None else read_pose(self.pose, self.frame))
         width, height = (self.size if side is None else side for side in (self.width, self.height))

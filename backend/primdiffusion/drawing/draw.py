@@ -18,17 +18,17 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from primdiffusion.drawing.compositing import Backdrop, backdrop, over_background, over_solids
-from primdiffusion.drawing.scene import Look, Picture, Scene
+from primdiffusion.drawing.scene import Picture, Scene, ViewSettings
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.image import depth_colours
 from primdiffusion.render.lattice import check_camera
 from primdiffusion.render.march import Span, march
-from primdiffusion.render.solids import Layer, draw_boxes
+from primdiffusion.render.solids import ImageLayer, draw_boxes
 
 
-def draw(scene: Scene, camera: Camera, look: Look = Look()) -> Picture:  # noqa: B008
+def draw(scene: Scene, camera: Camera, look: ViewSettings = ViewSettings()) -> Picture:  # noqa: B008
     """Draw `scene`: humans over solids over the background.
 
     Depth is the nearer of a human's first hit (opacity one half) and a solid. A holdout hides humans behind it and
@@ -41,13 +41,13 @@ def draw(scene: Scene, camera: Camera, look: Look = Look()) -> Picture:  # noqa:
     return picture
 
 
-def draw_into(picture: Picture, scene: Scene, camera: Camera, look: Look) -> float:
+def draw_into(picture: Picture, scene: Scene, camera: Camera, look: ViewSettings) -> float:
     """As `draw`, into an existing picture of the camera's size; return the seconds spent in the marcher."""
     check_camera(camera)
     behind = None if scene.solids is None else backdrop(scene.solids, camera, look.clip)
     end = None if behind is None else behind.end
     if scene.primitives is None or scene.primitives.position.shape[0] == 0:
-        people = People(Layer.nothing(camera), Layer.nothing(camera).depth, 0.0)
+        people = People(ImageLayer.nothing(camera), ImageLayer.nothing(camera).depth, 0.0)
     elif look.view == "boxes":
         people = _boxes(draw_boxes(scene.primitives, camera, scene.chart, look.clip), end)
     else:
@@ -85,14 +85,14 @@ def depth_span(primitives: Primitives | None, camera: Camera, clip: tuple[float,
 class People:
     """The rendered humans, before compositing."""
 
-    layer: Layer
+    layer: ImageLayer
     expected: Float32[ndarray, "h w"]
     """Expected depth along the optical axis; inf where no human is hit."""
     seconds: float
     """Time spent in the marcher."""
 
 
-def _marched(primitives: Primitives, camera: Camera, look: Look, end: ndarray | None) -> People:
+def _marched(primitives: Primitives, camera: Camera, look: ViewSettings, end: ndarray | None) -> People:
     secant = _secants(camera)
     span = _span(primitives, camera, look.clip, end, secant)
     began = time.perf_counter()
@@ -102,16 +102,16 @@ def _marched(primitives: Primitives, camera: Camera, look: Look, end: ndarray | 
     )
     seconds = time.perf_counter() - began
     needed = end is not None or look.view == "depth"
-    return People(Layer(rgb, alpha, first_hit / secant), depth / secant if needed else depth, seconds)
+    return People(ImageLayer(rgb, alpha, first_hit / secant), depth / secant if needed else depth, seconds)
 
 
-def _boxes(boxes: Layer, end: ndarray | None) -> People:
+def _boxes(boxes: ImageLayer, end: ndarray | None) -> People:
     """The boxes that are not hidden by solids."""
     if end is None:
         return People(boxes, boxes.depth, 0.0)
     seen = boxes.depth < end
     depth = np.where(seen, boxes.depth, np.float32(np.inf))
-    return People(Layer(boxes.rgb * seen[..., None], boxes.alpha * seen, depth), depth, 0.0)
+    return People(ImageLayer(boxes.rgb * seen[..., None], boxes.alpha * seen, depth), depth, 0.0)
 
 
 def _in_depth(people: People, span: tuple[float, float]) -> People:
@@ -191,7 +191,7 @@ GROWTH = 4
 
 
 @dataclasses.dataclass(frozen=True)
-class Progress:
+class DrawProgress:
     """Progress of an image."""
 
     rows: int
@@ -204,8 +204,8 @@ class Progress:
 
 
 def draw_in_bands(
-    picture: Picture, scene: Scene, camera: Camera, look: Look, pixels_a_second: float | None = None
-) -> Iterator[Progress]:
+    picture: Picture, scene: Scene, camera: Camera, look: ViewSettings, pixels_a_second: float | None = None
+) -> Iterator[DrawProgress]:
     """As `draw`, but fill `picture` in bands from the top; `pixels_a_second` is the measured speed, if known."""
     top, rows, seconds = 0, camera.height, 0.0
     speeds: list[float] = []
@@ -217,7 +217,7 @@ def draw_in_bands(
         pixels_a_second = rows * camera.width / max(time.perf_counter() - began, 1e-6)
         speeds.append(pixels_a_second)
         top += rows
-        yield Progress(top, seconds, min(speeds[1:] or speeds))
+        yield DrawProgress(top, seconds, min(speeds[1:] or speeds))
 
 
 def _rows(width: int, pixels_a_second: float | None) -> int:

@@ -31,7 +31,7 @@ class Scene:
 
 
 @dataclasses.dataclass(frozen=True)
-class Look:
+class ViewSettings:
     """View settings."""
 
     view: View = VIEWS[0]

@@ -37,7 +37,7 @@ from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Frames, K, Payload, S
 from primdiffusion.raster.rasterise import rasterise_colourings
-from primdiffusion.render.inverse import InverseSettings, Target, fit_colours, fit_payload
+from primdiffusion.render.inverse import InverseSettings, TargetImage, fit_colours, fit_payload
 from primdiffusion.staging import written_whole
 from primdiffusion.worker_process import each
 
@@ -237,11 +237,13 @@ def orbit_camera(middle: Float[ndarray, "3"], extent: float, yaw: float, pitch: 
     return look_at(position, target, vertical_fov=fov, width=size, height=size)
 
 
-def _targets(colourings: Sequence[TexturedMesh], frames: Frames, betas: ndarray, turn: float) -> list[list[Target]]:
+def _targets(
+    colourings: Sequence[TexturedMesh], frames: Frames, betas: ndarray, turn: float
+) -> list[list[TargetImage]]:
     """Renders of each colouring, all from the same cameras."""
-    targets: list[list[Target]] = [[] for _ in colourings]
+    targets: list[list[TargetImage]] = [[] for _ in colourings]
     for camera, weight in views_of(colourings[0], betas, turn):
         for own, picture in zip(targets, rasterise_colourings(colourings, camera, SUPERSAMPLE), strict=True):
             rgba = np.concatenate([picture.rgb, picture.alpha[..., None]], axis=-1)
-            own.append(Target(frames, camera, rgba, weight))
+            own.append(TargetImage(frames, camera, rgba, weight))
     return targets

@@ -20,8 +20,8 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu_adjoint import Gradients, Upstream, adjoin_boxes, weigh_rays
 from primdiffusion.render.cpu_compiled import on_all_threads
-from primdiffusion.render.cpu_forward import Ends, Picture, march_tiles
-from primdiffusion.render.cpu_packing import Scene, heaviest_first, pack
+from primdiffusion.render.cpu_forward import Ends, ImageRows, march_tiles
+from primdiffusion.render.cpu_packing import PackedScene, heaviest_first, pack
 from primdiffusion.render.lattice import MarchSettings, Span, check_camera, check_scene, check_unbatched, strides_of
 
 LARGEST_PAYLOAD = 256
@@ -78,7 +78,7 @@ def count_samples(
 
 def draw_with_ends(
     primitives: Primitives, camera: Camera, settings: MarchSettings
-) -> tuple[Rendering, _View, Scene, Ends]:
+) -> tuple[Rendering, _View, PackedScene, Ends]:
     """Render without gradients; also return the scene with empty cells and the ends of the rays, for derivatives."""
     view = _view(primitives.map(lambda tensor: tensor.detach()), camera, settings, None)
     inputs = (primitives.rgb.float(), primitives.density.float(), view.to_local, view.offset, view.pixel_to_world)
@@ -174,7 +174,7 @@ Inputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 """rgb, density, to_local, offset, pixel_to_world."""
 
 
-def _scene(view: _View, inputs: Inputs, *, empty_cells: bool) -> Scene:
+def _scene(view: _View, inputs: Inputs, *, empty_cells: bool) -> PackedScene:
     rgb, density, to_local, offset, pixel_to_world = (tensor.detach() for tensor in inputs)
     if density.shape[-1] == 1:  # one voxel is constant, like two equal ones
         rgb, density = rgb.expand(-1, -1, 2, 2, 2), density.expand(-1, 2, 2, 2)
@@ -195,11 +195,11 @@ def _ends(rays: int) -> Ends:
 
 
 def _draw(
-    view: _View, scene: Scene, ends: Ends, counts: Int64[ndarray, "tiles 2"] | None = None
+    view: _View, scene: PackedScene, ends: Ends, counts: Int64[ndarray, "tiles 2"] | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return rgb, alpha, depth and first hit, one row per pixel. Fills `ends` and `counts` unless they are empty."""
     rays = view.width * view.height
-    picture = Picture(np.empty((rays, 3), np.float32), *(np.empty(rays, np.float32) for _ in range(3)))
+    picture = ImageRows(np.empty((rays, 3), np.float32), *(np.empty(rays, np.float32) for _ in range(3)))
     counts = np.empty((0, 2), np.int64) if counts is None else counts
     on_all_threads(
         march_tiles, picture, ends, counts, scene.boxes, scene.size, scene.rectangle, scene.row_start, scene.row_box,
@@ -252,7 +252,7 @@ def _upstream(
 
 
 def _adjoin(
-    view: _View, scene: Scene, upstream: Upstream, *, payload: bool, geometry: bool, camera: bool
+    view: _View, scene: PackedScene, upstream: Upstream, *, payload: bool, geometry: bool, camera: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Gradients of `Inputs`, empty if not required."""
     k, size = len(scene.rectangle), scene.size

@@ -38,7 +38,7 @@ COLUMNS = 7
 _BOX, _STRIDE, _REFERENCE, _LINE, _FIRST, _NEXT, _LAST = range(COLUMNS)
 
 
-class Picture(NamedTuple):
+class ImageRows(NamedTuple):
     """Output of the forward pass, one row per pixel."""
 
     rgb: Float32[ndarray, "r 3"]

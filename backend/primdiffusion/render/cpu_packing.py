@@ -25,7 +25,7 @@ from primdiffusion.render.cpu_sampling import PackedBoxes
 from primdiffusion.render.lattice import ORTHOGONAL
 
 
-class Scene(NamedTuple):
+class PackedScene(NamedTuple):
     """The packed boxes of an image, and the lists of boxes that its tiles see."""
 
     boxes: PackedBoxes
@@ -56,7 +56,7 @@ def pack(
     height: int,
     *,
     empty_cells: bool,
-) -> Scene:
+) -> PackedScene:
     """Pack one image's scene; boxes that are not `solid` are invisible.
 
     Boxes are cropped to the cells with density, except with `empty_cells`, which the gradient of density needs.
@@ -80,7 +80,7 @@ def pack(
     row_start, row_place = row_lists(rectangle[seen], down)
     tile_boxes = boxes_per_tile(rectangle, across, down)
     row_box = seen.astype(np.int32)[row_place]
-    return Scene(boxes, rectangle, row_start, row_box, tile_boxes, to_world, size, bool(suspect.any()))
+    return PackedScene(boxes, rectangle, row_start, row_box, tile_boxes, to_world, size, bool(suspect.any()))
 
 
 def heaviest_first(work: Int64[ndarray, "n"]) -> Int64[ndarray, "n"]:

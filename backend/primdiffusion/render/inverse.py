@@ -39,7 +39,7 @@ BACKGROUND = float(decode_srgb(torch.tensor(0.5)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Target:
+class TargetImage:
     """An image to fit."""
 
     frames: Frames
@@ -88,7 +88,7 @@ class InverseSettings:
 
 def fit_payload(
     start: Payload,
-    targets: Sequence[Target],
+    targets: Sequence[TargetImage],
     full_density: float,
     settings: InverseSettings = InverseSettings(),
 ) -> Payload:
@@ -128,7 +128,7 @@ def fit_payload(
 def fit_colours(
     starts: Sequence[Payload],
     density: Payload,
-    targets: Sequence[Sequence[Target]],
+    targets: Sequence[Sequence[TargetImage]],
     settings: InverseSettings = InverseSettings(),
 ) -> list[Payload]:
     """Fit the colours of several colourings of one geometry, with the densities of `density`.
@@ -180,7 +180,7 @@ class _View:
     alpha_free: Float32[ndarray, "r"]
 
     @classmethod
-    def of(cls, target: Target, payload: Payload, settings: InverseSettings) -> _View:
+    def of(cls, target: TargetImage, payload: Payload, settings: InverseSettings) -> _View:
         rendering, jacobian = linearise(Primitives.place(target.frames, payload), target.camera, BACKGROUND)
         rgb, alpha = rendering.rgb.numpy().reshape(-1, 3), rendering.alpha.numpy().reshape(-1, 1)
         wanted, wanted_alpha = _over_background(target)
@@ -216,7 +216,7 @@ class _ColourView:
     weight: Float32[ndarray, "r c"]
 
     @classmethod
-    def of(cls, targets: Sequence[Target], density: Payload, z: ndarray, settings: InverseSettings) -> _ColourView:
+    def of(cls, targets: Sequence[TargetImage], density: Payload, z: ndarray, settings: InverseSettings) -> _ColourView:
         target = targets[0]
         rendering, jacobian = linearise(Primitives.place(target.frames, density), target.camera, BACKGROUND)
         matrix, alpha = ColourMatrix.of(jacobian), rendering.alpha.numpy().reshape(-1, 1)
@@ -280,7 +280,7 @@ def laplacian(x: Float32[ndarray, "v c"]) -> Float32[ndarray, "v c"]:
     return out.reshape(x.shape)
 
 
-def _check(start: Payload, targets: Sequence[Target]) -> None:
+def _check(start: Payload, targets: Sequence[TargetImage]) -> None:
     if not targets:
         raise ValueError("there are no images to fit: give at least one target")
     start.validate()
@@ -288,7 +288,7 @@ def _check(start: Payload, targets: Sequence[Target]) -> None:
         raise ValueError(f"the start is a batch {tuple(start.density.shape[:-4])}: give one human")
 
 
-def _over_background(target: Target) -> tuple[ndarray, ndarray]:
+def _over_background(target: TargetImage) -> tuple[ndarray, ndarray]:
     """Colours over the background, and alpha; one row per pixel."""
     rgba = target.rgba.reshape(-1, 4)
     return rgba[:, :3] + (1 - rgba[:, 3:]) * BACKGROUND, rgba[:, 3:]

@@ -50,7 +50,7 @@ class Solids:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Layer:
+class ImageLayer:
     """An image to be composited."""
 
     rgb: Float32[ndarray, "h w 3"]
@@ -60,20 +60,20 @@ class Layer:
     """Metres along the optical axis; inf for background."""
 
     @classmethod
-    def nothing(cls, camera: Camera) -> Layer:
+    def nothing(cls, camera: Camera) -> ImageLayer:
         """An empty, read-only layer."""
         size = (camera.height, camera.width)
         zero, infinity = np.float32(0), np.float32(np.inf)
         return cls(np.broadcast_to(zero, (*size, 3)), np.broadcast_to(zero, size), np.broadcast_to(infinity, size))
 
 
-def shade_solids(solids: Solids, nearest: NearestTriangle, camera: Camera) -> Layer:
+def shade_solids(solids: Solids, nearest: NearestTriangle, camera: Camera) -> ImageLayer:
     """Shade the solids with a sky and a headlight, flat per triangle; holdouts are empty, with infinite depth.
 
     colour * (SKY (1 + n_up) / 2 + HEADLIGHT |n . ray|), with the normal n towards the viewer. No antialiasing.
     """
-    nothing = Layer.nothing(camera)
-    layer = Layer(nothing.rgb.copy(), nothing.alpha.copy(), nothing.depth.copy())
+    nothing = ImageLayer.nothing(camera)
+    layer = ImageLayer(nothing.rgb.copy(), nothing.alpha.copy(), nothing.depth.copy())
     _, direction = eye_of(camera)
     seen = (nearest.triangle, nearest.depth, direction)
     _shade(solids.corners, solids.colour, solids.holdout, *seen, layer.rgb, layer.alpha, layer.depth)
@@ -129,7 +129,7 @@ def draw_boxes(
     camera: Camera,
     group: Int[Tensor, "k"] | None = None,
     clip: tuple[float, float] = (0.0, np.inf),
-) -> Layer:
+) -> ImageLayer:
     """Render the boxes themselves, as in the paper's figure: a colour for each, faces lit, edges darkened.
 
     `primitives` are unbatched. Boxes of one `group` (such as a UV chart) share a hue and differ in lightness; without
@@ -145,7 +145,7 @@ def draw_boxes(
     rgb = np.zeros((camera.height, camera.width, 3), np.float32)
     pixel = 1 / float(camera.intrinsics[0, 0])
     _shade_boxes(nearest.triangle, nearest.depth, position, rotation, half_extent, colour, *eye_of(camera), pixel, rgb)
-    return Layer(rgb, (nearest.triangle >= 0).astype(np.float32), nearest.depth)
+    return ImageLayer(rgb, (nearest.triangle >= 0).astype(np.float32), nearest.depth)
 
 
 def box_colours(count: int, group: Int[Tensor, "k"] | None = None) -> Float32[ndarray, "k 3"]:
