@@ -36,7 +36,7 @@ SAME_BODY_M = 0.02
 LEAST_COVERED = 0.8
 """Fraction of the body inside the masks; dressed humans on the default body have more than 0.95."""
 _EACH = 20
-"""Every so many vertices of the body are projected."""
+"""One in this many vertices of the body is projected."""
 _NAMED = 3
 
 

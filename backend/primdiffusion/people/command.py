@@ -1,4 +1,4 @@
-"""The commands that make people from an asset folder: rigged files to render, or primitives to train on."""
+"""Commands that make humans from an asset folder: rigged files to render, or primitives to train on."""
 
 from __future__ import annotations
 
@@ -17,47 +17,47 @@ from primdiffusion.people.wardrobe import required_meshes
 
 @dataclasses.dataclass(frozen=True)
 class PeopleCommand:
-    """Make dressed, rigged people as glTF files: what captures are rendered from."""
+    """Make dressed, rigged humans as glTF files, from which captures are rendered."""
 
     out: Path
-    """Folder to write person_NNNNNN/person.glb and manifest.json into; people that are whole in it are kept."""
+    """Folder to write person_NNNNNN/person.glb and manifest.json into; complete ones are skipped."""
     assets: Path | None = None
-    """MakeHuman asset folder (CC0); without it the environment variable PRIMDIFFUSION_ASSETS is asked."""
+    """MakeHuman asset folder (CC0); the default is the environment variable PRIMDIFFUSION_ASSETS."""
     count: int = 100
-    """People to make."""
+    """Number of humans."""
     seed: int = 0
-    """Seed of the first person; the next has the next."""
+    """Seed of the first human; the others have the following seeds."""
     workers: int = os.cpu_count() or 1
-    """Processes; each takes a core and about 1 GB."""
+    """Processes; each needs a core and about 1 GB."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PayloadsCommand:
-    """Make dressed people as primitives: the training set of the diffusion model.
+    """Make dressed humans as primitives: the training set of the diffusion model.
 
-    `payloads encode` makes it of captures instead; `payloads pack` stores either in few files, which `payloads verify`
-    compares with their checksums (each with its own --help).
+    `payloads encode` makes them from captures instead; `payloads pack` stores either in few files, whose checksums
+    `payloads verify` compares (each with its own --help).
     """
 
     out: Path
-    """Folder to write person_NNNNNN.npz into; people that are whole in it are kept."""
+    """Folder to write person_NNNNNN.npz into; complete ones are skipped."""
     assets: Path | None = None
-    """MakeHuman asset folder (CC0); without it the environment variable PRIMDIFFUSION_ASSETS is asked."""
+    """MakeHuman asset folder (CC0); the default is the environment variable PRIMDIFFUSION_ASSETS."""
     count: int = 100
-    """People to make."""
+    """Number of humans."""
     variants: int = 4
-    """Colourings of each."""
+    """Colourings of each human."""
     seed: int = 0
-    """Seed of the first person; the next has the next."""
+    """Seed of the first human; the others have the following seeds."""
     making: Making = "fitted"
-    """fitted: the primitives are fitted to renders of the mesh, about 30 s a person and core; from_mesh: each voxel
+    """fitted: the primitives are fitted to renders of the mesh, about 30 s per human and core; from_mesh: each voxel
     takes the colour of the nearest surface point, 2 s, blurred."""
     workers: int = os.cpu_count() or 1
-    """Processes; each takes a core and about 1.5 GB."""
+    """Processes; each needs a core and about 1.5 GB."""
 
 
 def run_people(command: PeopleCommand) -> None:
-    """Makes the people, shows how far it is, and prints the folder."""
+    """Make the humans, show progress, and print the folder."""
     people = PeopleSet(command.out, command.seed, command.count)
     assets = open_assets(command.assets, required_meshes())
     with tqdm(total=command.count, unit="person", desc="people", disable=None) as bar:
@@ -66,15 +66,15 @@ def run_people(command: PeopleCommand) -> None:
     unknown = unknown_licences(command.out)
     if unknown:
         print(
-            f"primdiffusion: {len(unknown)} asset files state no licence ({unknown[0]}, ...): the manifest calls it "
-            "unknown; list them in a LICENSES.txt beside the asset folder",
+            f"primdiffusion: {len(unknown)} asset files state no licence ({unknown[0]}, ...), so the manifest lists it "
+            "as unknown: list them in a LICENSES.txt beside the asset folder",
             file=sys.stderr,
         )
     print(command.out)
 
 
 def run_payloads(command: PayloadsCommand) -> None:
-    """Makes the payloads and shows how far it is."""
+    """Make the payloads and show progress."""
     assets = open_assets(command.assets, required_meshes())
     with tqdm(total=command.count, unit="person", desc="payloads") as bar:
 

@@ -61,7 +61,7 @@ def make_person(assets: Assets, base: BaseMesh, seed: int) -> Person:
 
 
 def recolour(person: Person, seed: int) -> Person:
-    """Return the person with other colours of skin, hair, eyes and clothes; geometry arrays are shared."""
+    """Return the human with other colours of skin, hair, eyes and clothes; geometry arrays are shared."""
     return _coloured(person.assets, person.base, person.choice, person.mesh, seed)
 
 

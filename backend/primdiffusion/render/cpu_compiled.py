@@ -105,25 +105,25 @@ def _stamp() -> tuple[tuple[str, int, int], ...]:
 
 
 TILE = 8
-"""Pixels along a side of a tile."""
+"""Width and height of a tile, pixels."""
 NEAR = 1e-6
-"""Metres along the optical axis: boxes are cut off here, as what lies behind the camera has no place in the picture."""
+"""Depth at which boxes are clipped, metres along the optical axis."""
 MARGIN = 0.01
-"""Pixels added around a box's rectangle against rounding."""
+"""Pixels added around a box's rectangle for rounding."""
 NOTHING = (0, -1, 0, -1)
 
 
 def tiles_across(pixels: int) -> int:
-    """Tiles in a row or column of so many pixels."""
+    """Number of tiles in a row or column of `pixels` pixels."""
     return -(-pixels // TILE)
 
 
 def row_lists(
     rectangle: Int32[ndarray, "k 4"], down: int
 ) -> tuple[Int64[ndarray, "down+1"], Int32[ndarray, "entries"]]:
-    """The boxes that reach into row i of tiles are the second array from the first one's [i] to [i + 1], in order.
+    """Lists of the boxes that overlap each row of tiles: `boxes[start[i] : start[i + 1]]`, in order, for row i.
 
-    Lists per row and not per tile: memory grows with boxes x rows at worst.
+    One list per row instead of per tile, so memory is at most proportional to boxes x rows.
     """
     first, last = rectangle[:, 2].astype(np.int64), rectangle[:, 3].astype(np.int64)
     count = np.maximum(last - first + 1, 0)
@@ -136,7 +136,7 @@ def row_lists(
 
 
 def boxes_per_tile(rectangle: Int32[ndarray, "k 4"], across: int, down: int) -> Int64[ndarray, "tiles"]:
-    """How many boxes each tile can see, row by row: an estimate of its work."""
+    """Number of boxes that each tile sees, row by row; an estimate of its work."""
     seen = rectangle[(rectangle[:, 0] <= rectangle[:, 1]) & (rectangle[:, 2] <= rectangle[:, 3])]
     change = np.zeros((down + 1, across + 1), np.int64)
     np.add.at(change, (seen[:, 2], seen[:, 0]), 1)
@@ -148,10 +148,10 @@ def boxes_per_tile(rectangle: Int32[ndarray, "k 4"], across: int, down: int) -> 
 
 @part()
 def tile_rectangle(corners, across, down):
-    """First and last tile column, first and last tile row around a box with the homogeneous pixel `corners` [8, 3].
+    """First and last tile column, and first and last tile row, of a box with homogeneous pixel `corners` [8, 3].
 
-    Corner 4 i + 2 j + k lies at the low or high end of the box's three axes as i, j, k are 0 or 1. What reaches behind
-    the camera is cut off at NEAR first. last < first where nothing is in the picture.
+    Corner 4 i + 2 j + k is at the low (0) or high (1) end of the box's axes. Boxes are clipped at NEAR. last < first if
+    the box is not visible.
     """
     left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
     for i in range(8):
