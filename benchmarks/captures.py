@@ -31,8 +31,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 from capture_compare import compare, joint_error_px
-from primdiffusion.capture.dataset import CaptureDataset, SampleSettings, batches
-from primdiffusion.capture.dataset import pack
+from primdiffusion.capture.dataset import CaptureDataset, SampleSettings, batches, pack
 from primdiffusion.capture.people_files import find_people, read_person
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.reader import Captures, open_captures
