@@ -155,7 +155,7 @@ def test_a_camera_that_has_the_person_at_its_back_changes_nothing(dataset, tmp_p
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ([], "holds several subjects: name one of them (person_000000, person_000001)"),
+        ([], "contains several subjects: name one of them (person_000000, person_000001)"),
         (["--subject", "anna"], "there is no subject 'anna'"),
         (["--subject", FIRST, "--frame", "7"], "person_000000 has frames 0 to 1, not 7"),
         (["--subject", FIRST, "--views", "0"], "0 views were requested"),

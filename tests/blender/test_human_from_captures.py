@@ -166,7 +166,7 @@ def test_the_real_child_makes_a_person_of_real_captures(saved_scene, tmp_path, m
     )
     blender_primdiffusion.register()
     try:
-        with pytest.raises(RuntimeError, match=r"holds several subjects: name one of them \(person_000000"):
+        with pytest.raises(RuntimeError, match=r"contains several subjects: name one of them \(person_000000"):
             bpy.ops.primdiffusion.human_from_captures(directory=str(folder))
         asked = {"directory": str(folder), "subject": "person_000001", "views": 3}
         assert bpy.ops.primdiffusion.human_from_captures(**asked) == {"FINISHED"}
