@@ -22,7 +22,7 @@ class CodecConfig:
     channels: int = 256
     """Latent channels of a primitive."""
     people: int = 160
-    """People (geometry and colours) that the basis is fitted to, drawn at random."""
+    """Randomly chosen samples (geometry and colours) to which the basis is fitted."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,15 +32,15 @@ class PriorConfig:
     components: int = 128
     """Person components."""
     channels: int = 64
-    """Leading latent channels in which person components live; they hold what whole people differ in."""
+    """Leading latent channels that the person components span; global differences are in these."""
     groups: tuple[str, ...] = ("sex", "outfit", "pattern")
-    """Attributes that people of one covariance have in common; those that the people do not have are left out."""
+    """Attributes that define the groups, each with its own covariance; attributes missing in the data are ignored."""
     features: tuple[tuple[str, ...], ...] = (("sex", "hair", "hat"), ("shoes",))
-    """Attributes that move the mean of a group, each list on its own account; a part for each choice."""
+    """Attributes that shift the mean of a group, each list independently; one mixture part for each choice."""
     lean: float = 0.1
-    """People of the covariance of all groups, in units of the number of components, that each group's is mixed with."""
+    """Shrinkage of the groups' covariances to that of all data: its weight as samples, relative to `components`."""
     folds: int = 4
-    """Parts of the people, each left out once, to measure how much of a component's variance holds for new people."""
+    """Folds of the cross-validation that measures how much variance of each component generalises to new people."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,38 +48,38 @@ class PhaseConfig:
     """Training of one network."""
 
     steps: int
-    """Optimiser steps; the learning rate falls to a tenth along a cosine over them."""
+    """Optimiser steps; the learning rate decays to a tenth along a cosine."""
     batch: int
-    """People, with noise of random level each, in a step."""
+    """Samples per step, each at a random noise level."""
     learning_rate: float = 1e-3
-    """AdamW's, after a warm-up of 100 steps."""
+    """Learning rate of AdamW after a warm-up of 100 steps."""
     weight_decay: float = 0.01
-    """AdamW's."""
+    """Weight decay of AdamW."""
     gradient_clip: float = 1.0
-    """Largest norm of a step's gradient."""
+    """Largest norm of the gradient."""
     ema: float = 0.999
-    """Decay of the average of weights that is evaluated and shipped."""
+    """Decay of the averaged weights, which are evaluated and saved."""
     weighting: Weighting = "whitened"
-    """Of x0 errors: whitened, in units of the closed form's posterior std; plain, as the paper; min_snr, plain times
-    min(SNR of the level, gamma) (Hang et al. 2023)."""
+    """Weighting of x0 errors: whitened, in units of the posterior std of the closed form; plain, as in the paper;
+    min_snr, plain times min(SNR, gamma) (Hang et al. 2023)."""
     error_power: float = 1.0
     """Whitened errors, in units of posterior std s, are weighted by s^power: 2 is the paper's error on one level."""
     levels: Levels = "uniform"
-    """Of noise that are trained: uniform in t, as the paper; log_uniform in noise over signal; log_normal, most of them
-    about the spread of what is to be denoised (Karras et al. 2022), a fifth log_uniform."""
+    """Distribution of noise levels: uniform in t, as in the paper; log_uniform in noise over signal; log_normal around
+    the spread of the data (Karras et al. 2022), with a fifth log_uniform."""
     min_snr_gamma: float = 5.0
     """Largest weight of a level with min_snr."""
     blend: float = 0.3
-    """Share of people that are blends of the colour variants of one geometry. Default preset only."""
+    """Fraction of samples that blend the colour variants of one geometry. Default preset only."""
     unasked: float = 0.5
-    """Share of people that are learnt without any attribute; the others with some of theirs. Default preset only."""
+    """Fraction of samples trained without attributes; the others have a random subset. Default preset only."""
     evaluate_every: int = 500
     """Steps between evaluations on held-out people."""
     bfloat16: bool = False
-    """Forward and backward of the network in bfloat16, where the device multiplies it faster."""
+    """Run the network in bfloat16 if the device is faster with it."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for values out of range."""
+        """Raise ValueError for values out of range."""
         for name in ("steps", "batch", "evaluate_every"):
             _check(name, getattr(self, name), getattr(self, name) >= 1, "1 or more")
         for name in ("learning_rate", "gradient_clip", "min_snr_gamma"):
@@ -96,34 +96,33 @@ class TrainingConfig:
     """Train a diffusion model; the same command line resumes (docs/design/diffusion_training.md)."""
 
     data: Path
-    """People of `primdiffusion payloads`: a folder of files, or of the shards that `payloads pack` makes of them."""
+    """Training set of `primdiffusion payloads`: a folder of files, or of shards from `payloads pack`."""
     run: Path
-    """Folder for weights, metrics, pictures and this configuration; an unfinished run in it is resumed."""
+    """Folder of the run: weights, metrics, images and settings; an unfinished run is resumed."""
     preset: Literal["default", "paper"] = "default"
-    """default: a light network on latents; paper: the paper's U-Net on whole slabs, for graphics cards."""
+    """default: a light network on latents; paper: the paper's U-Net on whole slabs, for GPUs."""
     made_of: Literal["makehuman", "own"] = "own"
-    """What the card says of the people: makehuman, those of `payloads` from MakeHuman's CC0 assets, with their licence
-    and limits; own, nothing."""
+    """Data in the model card: makehuman, licence and limits of `payloads` from MakeHuman's CC0 assets; own, none."""
     minutes: float | None = None
-    """Stop after this time, to be resumed; None trains to the end."""
+    """Time limit, after which the run can be resumed."""
     seed: int = 0
     """Seed of all random numbers."""
     schedule: Literal["linear", "sqrt_linear", "fine_linear"] | None = None
-    """Noise schedule over 1000 steps: linear (the paper's; None in the paper preset), fine_linear (the same from less
-    noise on; None in the default preset) or sqrt_linear (the released code's)."""
+    """Noise schedule over 1000 steps: linear (the paper's; default of the paper preset), fine_linear (the same with less
+    noise at the start; default of the default preset) or sqrt_linear (the released code's)."""
     chain: Literal["trailing", "dense"] | None = None
-    """Steps that the model is sampled in: trailing (evenly spaced; None in the paper preset) or dense (closer where
-    there is little noise; None in the default preset)."""
+    """Timesteps in sampling: trailing (evenly spaced; default of the paper preset) or dense (denser at low noise; default
+    of the default preset)."""
     holdout: float = 0.05
-    """Share of geometries, with all their colour variants, that is evaluated on and never trained on."""
+    """Fraction of geometries, with all their colour variants, held out for evaluation."""
     save_every: float = 60.0
-    """Seconds between saved states: the most that a kill can lose. 0 saves after every step."""
+    """Seconds between checkpoints; 0 saves after every step."""
     threads: int | None = None
-    """Processor threads; None leaves torch's choice."""
+    """CPU threads; the default is torch's."""
     log_every: int = 50
-    """Steps between lines of metrics.jsonl; what they hold are running means."""
+    """Steps between lines of metrics.jsonl, which are running means."""
     pictures_every: int = 1000
-    """Steps between pictures of a few people that the averaged weights generate."""
+    """Steps between images of samples from the averaged weights."""
     codec: CodecConfig = dataclasses.field(default_factory=CodecConfig)
     prior: PriorConfig = dataclasses.field(default_factory=PriorConfig)
     model: DenoiserConfig = dataclasses.field(default_factory=DenoiserConfig)
@@ -145,10 +144,10 @@ class TrainingConfig:
             evaluate_every=5000, bfloat16=True,
         )
     )  # fmt: skip
-    """The paper preset's only phase; the batch is that of each process."""
+    """The only phase of the paper preset; the batch is that of each process."""
 
     def __post_init__(self) -> None:
-        """Fills in what follows from the preset; raises ValueError for values out of range."""
+        """Fill in the defaults of the preset; raise ValueError for values out of range."""
         usual = {"default": ("fine_linear", "dense"), "paper": ("linear", "trailing")}[self.preset]
         for name, value in zip(("schedule", "chain"), usual, strict=True):
             if getattr(self, name) is None:
@@ -205,7 +204,7 @@ class RunConfig(Protocol):
 
 
 def check_resumable(saved: str, config: RunConfig) -> None:
-    """ValueError that names the settings in which a saved run differs from `config`, except when to stop."""
+    """Raise ValueError, naming the settings in which a saved run differs from `config`, except those allowed to."""
     try:
         before = _comparable(json.loads(saved))
     except (ValueError, AttributeError) as error:

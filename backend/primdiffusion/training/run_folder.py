@@ -1,9 +1,9 @@
 """The folder of a run, of either stage: starting, resuming and recording runs.
 
 config.json      the settings
-run.json         the people; of every start its step, processes, versions and commit
-metrics.jsonl    a line now and then
-pictures/        what it looks like as it goes
+run.json         the training set; step, processes, versions and commit of every start
+metrics.jsonl    metrics at intervals
+pictures/        images at intervals
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ def begin(
 ) -> None:
     """Save settings, versions and names of the training set; when resuming, check that these are unchanged.
 
-    `about` is noted beside the people; `start` says of this start where it begins and on how many "processes". Lines
-    of metrics.jsonl for which `is_kept` is false belong to steps that a kill undid: they will be written again.
+    `about` is saved with the names; `start` describes this start: its step and number of "processes". Lines of
+    metrics.jsonl for which `is_kept` is false belong to steps lost in a kill and are removed.
 
     Raises:
-        ValueError: other settings or other people than those with which the run began, or damaged files.
+        ValueError: settings or training set differ from those of the run, or files are damaged.
         OSError: the folder cannot be written to.
     """
     saved, noted = config.run / CONFIG, config.run / RUN
@@ -59,7 +59,7 @@ def begin(
 
 
 def append_metrics(run: Path, row: Mapping[str, Any]) -> None:
-    """One line of metrics.jsonl. Raises OSError, which names the file."""
+    """Append a line to metrics.jsonl. Raises OSError, naming the file."""
     path = run / METRICS
     try:
         with path.open("a", encoding="utf-8") as file:
@@ -85,7 +85,7 @@ def versions() -> dict[str, str]:
 
 
 def _earlier(config: RunConfig, people: Sequence[str], saved: str, processes: int) -> list[Mapping[str, Any]]:
-    """Earlier starts of the run, which must have been with the same people."""
+    """Return the earlier starts of the run. Raises ValueError for another training set."""
     try:
         before = json.loads(saved)
         known, starts = before["people"], before.get("starts", [])
