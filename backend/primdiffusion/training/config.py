@@ -108,11 +108,11 @@ class TrainingConfig:
     seed: int = 0
     """Seed of all random numbers."""
     schedule: Literal["linear", "sqrt_linear", "fine_linear"] | None = None
-    """Noise schedule over 1000 steps: linear (the paper's; default of the paper preset), fine_linear (the same with less
-    noise at the start; default of the default preset) or sqrt_linear (the released code's)."""
+    """Noise schedule over 1000 steps: linear (the paper's; for the paper preset), fine_linear (the same with less noise
+    at the start; for the default preset) or sqrt_linear (the released code's)."""
     chain: Literal["trailing", "dense"] | None = None
-    """Timesteps in sampling: trailing (evenly spaced; default of the paper preset) or dense (denser at low noise; default
-    of the default preset)."""
+    """Timesteps in sampling: trailing (evenly spaced; for the paper preset) or dense (denser at low noise; for the
+    default preset)."""
     holdout: float = 0.05
     """Fraction of geometries, with all their colour variants, held out for evaluation."""
     save_every: float = 60.0
