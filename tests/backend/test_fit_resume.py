@@ -207,7 +207,7 @@ def test_other_settings_in_the_same_folder_are_named_and_limits_may_change(captu
 
 def test_other_people_in_the_same_folder_are_refused(begun, tmp_path):
     others = captured(tmp_path / "others", people=3, frames=1, passes=("img", "mask"))
-    with pytest.raises(ValueError, match=r"other people .*\(2 and 3 of them\)"):
+    with pytest.raises(ValueError, match=r"another training set .*\(2 and 3 people\)"):
         fit(settings(others, begun.run))
 
 
