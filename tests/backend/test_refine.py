@@ -158,7 +158,7 @@ def spoiled(human: Human, name: str) -> Human:
         (lambda human, views: (human, [dataclasses.replace(views, rgba=views.rgba[..., :3])]), "uint8"),
         (lambda human, views: (human, [dataclasses.replace(views, rgba=views.rgba / 255)]), "uint8"),
         (lambda human, views: (human, [dataclasses.replace(views, pose=BodyPose.rest(3))]), "one pose a record"),
-        (lambda human, views: (human, [dataclasses.replace(views, rgba=views.rgba * 0)]), "views 0 shows a person"),
+        (lambda human, views: (human, [dataclasses.replace(views, rgba=views.rgba * 0)]), "views 0 covers the subject"),
         (lambda human, views: (spoiled(human, "rgb"), [views]), "'rgb' holds NaN"),
         (lambda human, views: (spoiled(human, "density"), [views]), "'density' holds NaN"),
         (lambda human, views: (dataclasses.replace(human, betas=torch.zeros(300)), [views]), "another body"),
