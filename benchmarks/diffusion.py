@@ -45,13 +45,13 @@ from primdiffusion.evaluation.generation import (
 )
 from primdiffusion.evaluation.neighbours import nearest_stored
 from primdiffusion.evaluation.pretrained_networks import load_clip_vision, load_inception
-from primdiffusion.evaluation.voxel_baseline import load_voxel_model
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person
 from record import report
 from torch import Tensor
+from voxel_baseline import load_voxel_model
 
 Figures = dict[str, float | int | str | None]
 SPEED_FIGURES = (

@@ -27,7 +27,6 @@ from primdiffusion.evaluation.gallery import made_gallery, payload_of, payload_s
 from primdiffusion.evaluation.generation import ReferenceSet, open_reference_set
 from primdiffusion.evaluation.neighbours import nearest_stored
 from primdiffusion.evaluation.portraits import PORTRAITS, Portrait, camera_of
-from primdiffusion.evaluation.voxel_baseline import load_voxel_model
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import place
 from primdiffusion.people.payloads import rest_frames
@@ -37,6 +36,7 @@ from primdiffusion.render.march import march
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person
 from torch import Tensor
+from voxel_baseline import load_voxel_model
 
 BACKGROUND = (0.72, 0.72, 0.72)
 CELL = 192

@@ -11,8 +11,6 @@ from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, seeded
 from primdiffusion.evaluation.gallery import payload_of
 from primdiffusion.evaluation.portraits import PORTRAITS, camera_of
-from primdiffusion.evaluation.voxel_baseline import VoxelModel
-from primdiffusion.evaluation.voxel_grid import primitives_of, voxelise_payload
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, generate_batch, place
 from primdiffusion.people.assets import Assets
@@ -24,6 +22,8 @@ from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.march import march
 from primdiffusion.training.stored_people import read_person
 from torch import Tensor
+from voxel_baseline import VoxelModel
+from voxel_grid import primitives_of, voxelise_payload
 
 TOGETHER = 8
 """People that are sampled at once."""

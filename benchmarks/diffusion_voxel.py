@@ -23,15 +23,6 @@ import torch
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
-from primdiffusion.evaluation.voxel_baseline import (
-    SCHEDULE,
-    VoxelCodec,
-    VoxelModel,
-    fit_voxel_codec,
-    save_voxel_model,
-    voxel_denoiser,
-)
-from primdiffusion.evaluation.voxel_grid import voxelise
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.staging import written_whole
@@ -43,6 +34,15 @@ from primdiffusion.training.state import TrainingState
 from primdiffusion.training.stored_people import find_people, read_outline, read_person
 from safetensors.torch import load_file, save
 from torch import Tensor
+from voxel_baseline import (
+    SCHEDULE,
+    VoxelCodec,
+    VoxelModel,
+    fit_voxel_codec,
+    save_voxel_model,
+    voxel_denoiser,
+)
+from voxel_grid import voxelise
 
 CHANNELS = 64
 """Numbers of a cell, as many as a primitive has in our codec."""

@@ -1,10 +1,19 @@
 """People as grids of voxels, and the baseline that diffuses them."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from primdiffusion.diffusion.gaussian import PersonPrior
-from primdiffusion.evaluation.voxel_baseline import (
+from primdiffusion.geometry.camera import look_at
+from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.render.march import MarchSettings, march
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from voxel_baseline import (
     BLOCKS,
     VALUES,
     VoxelCodec,
@@ -15,11 +24,7 @@ from primdiffusion.evaluation.voxel_baseline import (
     save_voxel_model,
     voxel_denoiser,
 )
-from primdiffusion.evaluation.voxel_grid import BOUNDS, SIDE, primitives_of, voxelise, voxelise_payload
-from primdiffusion.geometry.camera import look_at
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
-from primdiffusion.primitives.primitives import Frames, Payload, Primitives
-from primdiffusion.render.march import MarchSettings, march
+from voxel_grid import BOUNDS, SIDE, primitives_of, voxelise, voxelise_payload
 
 FULL = 100.0
 

@@ -14,11 +14,6 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int, UInt8
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-from torch import Tensor, nn
-from torch.nn import functional
-
 from primdiffusion.diffusion.codec import DEAD_ZONE, SLAB_UNIT
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
@@ -26,10 +21,14 @@ from primdiffusion.diffusion.local_unet import PersonNetworkConfig
 from primdiffusion.diffusion.samplers import SAMPLERS
 from primdiffusion.diffusion.schedule import SCHEDULES, trailing_steps
 from primdiffusion.diffusion.unet import TimeEmbedding, zeroed
-from primdiffusion.evaluation.voxel_grid import SIDE, primitives_of
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.staging import written_whole
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+from torch.nn import functional
+from voxel_grid import SIDE, primitives_of
 
 BLOCK = 4
 """Side of a cell, voxels."""

@@ -11,10 +11,9 @@ import numba
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from torch import Tensor
-
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Frames, Payload, Primitives
+from torch import Tensor
 
 SIDE = 64
 """Voxels along each axis (paper Table 2)."""
