@@ -160,7 +160,7 @@ def test_fewer_betas_are_filled_up(tmp_path):
 
 def test_masks_beside_the_body_are_a_warning_and_masks_around_it_are_none(dataset, tmp_path):
     (warning,) = captured_person(dataset, FIRST).warnings
-    assert "of the body of person_000000 lies inside the masks" in warning
+    assert "of the body of person_000000 is inside the masks" in warning
     job = small_job(tmp_path, people=1, frames=1, passes=("img", "mask"))
     for path in job.people.values():
         save_person(path, TexturedMesh((box(half=1.0),)))
@@ -181,4 +181,4 @@ def test_cameras_that_look_past_the_body_are_rejected(folder):
 def test_one_view_works_and_warns(dataset):
     person = captured_person(dataset, FIRST, views=1)
     assert len(person.cameras) == 1
-    assert person.warnings[0] == "one view only: sides that it does not see are guessed"
+    assert person.warnings[0] == "only one view: the sides that it does not show are guessed"

@@ -96,8 +96,8 @@ def test_training_goes_on_where_it_stopped_across_epochs(captures):
 def test_packs_hold_the_same_samples_and_are_used(captures, monkeypatch):
     settings = dataclasses.replace(SETTINGS, framing="crop")
     before = [CaptureDataset(captures, settings)[0, i] for i in range(9)]
-    assert [packing.kept for packing in pack(captures)] == [False] * 3
-    assert [packing.kept for packing in pack(captures)] == [True] * 3
+    assert [packing.found for packing in pack(captures)] == [False] * 3
+    assert [packing.found for packing in pack(captures)] == [True] * 3
     monkeypatch.setattr("primdiffusion.capture.reader.read_picture", None)  # nothing is decoded any more
     after = [CaptureDataset(captures, settings)[0, i] for i in range(9)]
     assert all(same(one, other) for one, other in zip(before, after, strict=True))

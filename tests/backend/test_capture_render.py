@@ -235,7 +235,7 @@ def test_one_that_fails_leaves_the_others_alone_and_is_reported(tmp_path):
     job = small_job(tmp_path)
     job.people[NAMES[0]].write_bytes(b"glTF but no more")
     outcomes = {outcome.subject: outcome for outcome in render(job)}
-    assert (outcomes[NAMES[0]].what, outcomes[NAMES[1]].what) == ("failed", "done")
+    assert (outcomes[NAMES[0]].status, outcomes[NAMES[1]].status) == ("failed", "done")
     report = json.loads((job.out / "report.json").read_text())
     assert report["done"] == [NAMES[1]]
     assert "person.glb" in report["failed"][0]["why"]

@@ -231,7 +231,7 @@ def test_the_command_line_evaluates_a_checkpoint(captures, tmp_path, capsys):
 
 def test_command_tells_wrong_folders_and_numbers(captures, tmp_path, capsys):
     for arguments, sentence in (
-        (["--captures", str(tmp_path / "none")], "there is no folder of captures"),
+        (["--captures", str(tmp_path / "none")], "the folder of captures"),
         (["--captures", str(captures.root), "--people", "-1"], "people is -1"),
         (["--captures", str(captures.root), "--checkpoint", str(tmp_path / "no.safetensors")], "no.safetensors"),
         (["--captures", str(captures.root), "--lpips", str(tmp_path / "w.pth")], "w.pth"),

@@ -125,5 +125,5 @@ def test_voxels_that_cannot_be_are_rejected_with_what_to_do(voxel, message):
 
 def test_a_batch_is_rejected():
     primitives = boxes()
-    with pytest.raises(ValueError, match="one person at a time"):
+    with pytest.raises(ValueError, match="one human at a time"):
         merge(Primitives(**{name: value[None] for name, value in vars(primitives).items()}))

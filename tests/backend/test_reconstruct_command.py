@@ -124,7 +124,7 @@ def test_a_dataset_in_the_released_layout_gives_the_same_person(dataset, line, t
 
 def test_one_view_works_and_the_user_is_told_that_the_rest_is_guessed(dataset, line, tmp_path, capsys):
     cli.main([*line, "--capture", str(dataset / FIRST), "--views", "1"])
-    told = "primdiffusion: warning: one view only: sides that it does not see are guessed\n"
+    told = "primdiffusion: warning: only one view: the sides that it does not show are guessed\n"
     assert capsys.readouterr().err == told
     assert (tmp_path / "out" / "human.npz").exists()
 
@@ -167,7 +167,7 @@ def test_impossible_wishes_are_one_sentence_and_leave_nothing(dataset, line, cap
 
 
 def test_a_missing_folder_picture_or_dataset_is_named(dataset, line, tmp_path, capsys):
-    assert "there is no folder of captures" in failure(capsys, line, "--capture", tmp_path / "nowhere")
+    assert "the folder of captures" in failure(capsys, line, "--capture", tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     assert "no finished captures" in failure(capsys, line, "--capture", tmp_path / "empty")
     damaged = shutil.copytree(dataset / FIRST, tmp_path / "damaged" / FIRST)
@@ -212,7 +212,7 @@ def test_the_request_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypa
     assert [report[:2] for report in reports] == stages
     assert result["subject"] == FIRST
     assert result["views"] == [0, 1, 2, 3]
-    assert "lies inside the masks" in result["warnings"][0]
+    assert "is inside the masks" in result["warnings"][0]
     shutil.rmtree(tmp_path / "out")
     for end in range(len(reports)):
         count = itertools.count()

@@ -122,7 +122,7 @@ def test_the_panels_job_runs_from_a_cold_start_to_its_files(start):
     assert {"Reading the pictures", "Reconstructing", "Writing the person"} <= set(messages)
     assert request.fraction == 1.0
     assert Path(request.result["human"]).exists()
-    assert request.result["warnings"][0] == "one view only: sides that it does not see are guessed"
+    assert request.result["warnings"][0] == "only one view: the sides that it does not show are guessed"
 
 
 def test_a_refusal_of_the_backend_becomes_the_requests_error(start):

@@ -120,7 +120,7 @@ def reconstruct(id: int, params: dict, cancelled: threading.Event) -> None:
     shutil.copyfile(os.environ["FAKE_HUMAN"], out / "human.npz")
     (out / "person.human.safetensors").write_bytes(json.dumps(params).encode())
     files = {"human": str(out / "human.npz"), "person": str(out / "person.human.safetensors")}
-    warnings = ["one view only"] if params["views"] == 1 else []
+    warnings = ["only one view"] if params["views"] == 1 else []
     say(id=id, result={**files, "warnings": warnings, "seconds": 0.1})
 
 
