@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,6 +15,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from primdiffusion.evaluation.portraits import PORTRAITS, SIDE, mesh_portraits, portraits
+from primdiffusion.formats.arrays import read_arrays
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
@@ -136,9 +136,9 @@ def open_gallery(sources: Sequence[Source], folder: Path, report: Report = silen
 def _cached(path: Path) -> tuple[Tensor, list[dict[str, Any]]] | None:
     """Pictures and attributes from an earlier run; None if they are damaged or of other views."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            pictures, attributes = torch.from_numpy(file["pictures"]), json.loads(str(file["attributes"]))
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
+        arrays = read_arrays(path, ("pictures", "attributes"))
+        pictures, attributes = torch.from_numpy(arrays["pictures"]), json.loads(str(arrays["attributes"]))
+    except ValueError:
         return None
     fits = tuple(pictures.shape[1:]) == (len(PORTRAITS), SIDE, SIDE, 4) and len(attributes) == len(pictures)
     return (pictures, attributes) if fits else None
@@ -146,23 +146,17 @@ def _cached(path: Path) -> tuple[Tensor, list[dict[str, Any]]] | None:
 
 def read_attributes(path: Path) -> list[dict[str, Any]]:
     """Read the attributes of each colouring in a payload file. Raises ValueError if they are unreadable."""
+    arrays = read_arrays(path, ("attributes", "voxels"))
     try:
-        with np.load(path, allow_pickle=False) as file:
-            stored, colourings = json.loads(str(file["attributes"])), len(file["voxels"])
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(
-            f"{path} is not a payload file ({error}): make it again with `primdiffusion payloads`"
-        ) from error
-    return list(stored.get("variants", [stored] * colourings))
+        stored = json.loads(str(arrays["attributes"]))
+    except ValueError as error:
+        raise ValueError(f"{path}: its attributes are not JSON ({error}): make it again") from error
+    return list(stored.get("variants", [stored] * len(arrays["voxels"])))
 
 
 def read_seed(path: Path) -> int:
     """Seed of the MakeHuman sample in a payload file. Raises ValueError for other samples and unreadable files."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return int(file["seed"])
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} was not made from MakeHuman's assets ({error}): compare without them") from error
+    return int(read_arrays(path, ("seed",))["seed"])
 
 
 def made_gallery(samples: Iterable[Primitives]) -> UInt8[Tensor, "n v h w 4"]:

@@ -27,6 +27,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from primdiffusion.body.model import default_body
+from primdiffusion.formats.arrays import read_arrays
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
@@ -144,18 +145,12 @@ def voxels_from_payload(payload: Payload) -> UInt8[np.ndarray, "K 8 8 8 4"]:
 
 def is_complete(path: Path, variants: int, seed: int, making: Making) -> bool:
     """Whether a file contains this sample, made by this method; False for damaged files, which are made again."""
-    if not path.is_file():
-        return False
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return (
-                set(KEYS) <= {*file}
-                and file["voxels"].shape == (variants, K, S, S, S, 4)
-                and int(file["seed"]) == seed
-                and str(file["making"]) == VERSIONS[making]
-            )
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        arrays = read_arrays(path, KEYS)
+        known = int(arrays["seed"]), str(arrays["making"])
+    except (OSError, ValueError):
         return False
+    return known == (seed, VERSIONS[making]) and arrays["voxels"].shape == (variants, K, S, S, S, 4)
 
 
 BODY_VIEWS, BODY_SIZE, BODY_FOV = 28, 176, math.radians(30)
