@@ -1,4 +1,4 @@
-"""Where the detail of people is lost between mesh and sample.
+"""Where detail of humans is lost between mesh and sample.
 
 `python benchmarks/chain.py --assets DIR --held DIR --json F --sheet F.png` compares pictures of held-out people with
 renders of their meshes (16 samples a pixel), all over grey, sRGB-encoded. Stages, each the prefix of its figures:
@@ -78,9 +78,9 @@ from torch import Tensor
 
 Figures = dict[str, float | int | bool | str | None]
 PAYLOAD_PEOPLE = 3
-"""People whose fits are repeated, timed and posed."""
+"""Number of humans whose fits are repeated, timed and posed."""
 COLOURINGS = 2
-"""Further ones, for their time."""
+"""Number of further colourings that are timed."""
 SHEET_PEOPLE = 6
 SHEET_STAGES = ("true", "from_mesh", "payload", "codec", "step300", "step700")
 NOISE_SEED = 1000
@@ -130,17 +130,17 @@ def parsed() -> argparse.Namespace:
 
 
 class Chain:
-    """What the stages make of held-out people, added one after the other."""
+    """Results of each stage for held-out humans, added one by one."""
 
     def __init__(self) -> None:
         self.rows: dict[tuple[str, str], list[Measures]] = {}
         self.latents: list[Tensor] = []
         self.codec_head_energy: list[float] = []
         self.pictures: list[dict[str, tuple[Tensor, Tensor]]] = []
-        """Head and front of the first people at SHEET_STAGES."""
+        """Head and front of the first humans at SHEET_STAGES."""
 
     def add(self, model: DiffusionModel, assets: Assets, held: Path | None, number: int) -> None:
-        """Draw and measure one person at all stages; `held` holds the fitted payloads, None: without that stage."""
+        """Render and measure one human at all stages; `held` is the folder of fitted payloads, None skips that stage."""
         person = held_out(assets, number)
         scene = rest_scene(person)
         start = stored(start_of(person, scene.frames), person.betas)
@@ -168,7 +168,7 @@ class Chain:
             self.pictures.append({n: (over_grey(shown["head"][n]), over_grey(shown["front"][n])) for n in names})
 
     def figures(self) -> Figures:
-        """Means by stage and view."""
+        """Mean figures by stage and view."""
         figures: Figures = {}
         for (stage, view), rows in self.rows.items():
             for measure, value in means(rows).items():
@@ -180,7 +180,7 @@ class Chain:
 
 
 def payload_figures(assets: Assets, held: Path, count: int) -> Figures:
-    """How repeatable fits are, what they cost, and what they gain in other poses."""
+    """Repeatability and cost of fits, and their gain in other poses."""
     cosines, seconds, gains = [], [], {"front": [], "head": []}
     colouring = None
     for number in range(count):
@@ -211,7 +211,7 @@ def payload_figures(assets: Assets, held: Path, count: int) -> Figures:
 
 
 def sample_figures(model: DiffusionModel, assets: Assets, chain: Chain, count: int, skins: int) -> Figures:
-    """How sharp, how varied and how even in skin generated people are beside held-out ones."""
+    """Sharpness, variety and skin consistency of generated humans relative to held-out ones."""
     skins_held = []
     for number in range(skins):
         person = held_out(assets, number)

@@ -1,7 +1,7 @@
-"""A sheet of people generated from successive seeds, nobody picked: what the default checkpoint makes.
+"""A sheet of humans generated from consecutive seeds by the default checkpoint, not hand-picked.
 
-Everybody from the front with lowered arms; then, of the first seeds, depth pictures, whole people at 512 x 512 pixels
-in T pose, and heads. `--json` keeps the median seconds a person.
+All from the front with lowered arms; then, of the first seeds, depth, full bodies at 512 x 512 pixels in T pose, and
+heads. `--json` saves the median seconds per human.
 """
 
 from __future__ import annotations

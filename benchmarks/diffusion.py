@@ -1,12 +1,12 @@
-"""How good, how new and how fast generated people are: ours beside a Gaussian and the paper's voxel baseline.
+"""Quality, novelty and speed of generated humans, beside one Gaussian and the paper's voxel baseline.
 
-`python benchmarks/diffusion.py --assets DIR --people DIR --judge DIR --old OLD.safetensors --json F --table F` compares
---count samples of each set with renders of held-out meshes. The --judge folder caches portraits and the feature
-network, which take some minutes to make. Distances are Frechet distances of features; `distance_floor` is that of
-other meshes, the best any model can be expected to reach; `from_mesh`, `payload` and `codec` are what stored people
-lose before any network. `attribute_hit_*` is how often the feature network reads what was asked for, by attribute, and
-`attribute_read_*` how often it reads it right on renders of held-out meshes. Figures that need an option that is not
-given are null. Times are of two threads. --quick takes few samples of each.
+`python benchmarks/diffusion.py --assets DIR --people DIR --reference DIR --old F --json F --table F` compares --count
+samples of each set with renders of held-out meshes. The --reference folder caches portraits and the feature network,
+which take some minutes to compute. Distances are Frechet distances of features; `distance_floor` is that of other
+meshes, the best that a model can reach; `from_mesh`, `payload` and `codec` are what stored humans lose before any
+network. `attribute_hit_*` is how often the feature network recognises the requested value of an attribute,
+`attribute_read_*` its accuracy on renders of held-out meshes. Figures that need an omitted option are null. Times are
+of two threads. --quick takes few samples of each.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ SPEED_FIGURES = (
     "generate_first_seconds_cpu", "generate_processor_seconds", "generate_seconds_a_person_of_8", "peak_gb",
 )  # fmt: skip
 NEED_MORE = ("nearest_neighbour_ratio_latent", "fid_ours", "kid_100_ours", "fid_clip_ours")
-"""Figures that stay null without people or weights."""
+"""Figures that are null without people or weights."""
 TITLES = {
     "ours": "ours",
     "old": "ours, the checkpoint before",
@@ -105,7 +105,7 @@ def main() -> None:
         reference = open_reference_set(
             mesh_sources(assets, seeds_of(arguments.meshes, REAL_SEED), COLOURINGS),
             mesh_sources(assets, seeds_of(arguments.meshes // 2, HELD_SEED), COLOURINGS),
-            arguments.judge, progress("portraits"), epoch,
+            arguments.reference, progress("portraits"), epoch,
         )  # fmt: skip
         rows = comparisons(reference, model, assets, arguments)
         figures |= attribute_hits(reference, model, 1 if arguments.quick else 6)
@@ -126,16 +126,18 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--assets", type=Path, help="MakeHuman's assets: meshes to compare with")
     parser.add_argument("--meshes", type=int, default=300, help="geometries of the reference; half as many held out")
     parser.add_argument("--old", type=Path, help="another checkpoint, to compare ours with")
-    parser.add_argument("--people", type=Path, help="folder of the payloads that the model was trained on")
-    parser.add_argument("--holdout", type=float, default=0.08, help="share of them that was held out")
-    parser.add_argument("--seed", type=int, default=0, help="of the training run")
-    parser.add_argument("--judge", type=Path, default=Path("runs/judge"), help="folder for portraits and features")
-    parser.add_argument("--checkpoint", type=Path, help="without it the package's default")
+    parser.add_argument("--people", type=Path, help="folder of payloads that the model was trained on")
+    parser.add_argument("--holdout", type=float, default=0.08, help="share that was held out")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the training run")
+    parser.add_argument(
+        "--reference", type=Path, default=Path("runs/reference"), help="folder for portraits and feature network"
+    )
+    parser.add_argument("--checkpoint", type=Path, help="model to measure; the default one if omitted")
     parser.add_argument("--voxel", type=Path, help="baseline of diffusion_voxel.py")
     parser.add_argument("--inception", type=Path, help="weights for FID: pt_inception-2015-12-05-6726825d.pth")
     parser.add_argument("--clip", type=Path, help="weights for FID_CLIP: ViT-B/32 as .safetensors")
-    parser.add_argument("--count", type=int, default=256, help="people of each set")
-    parser.add_argument("--quick", action="store_true", help="16 people of each set, no search among latents")
+    parser.add_argument("--count", type=int, default=256, help="samples of each set")
+    parser.add_argument("--quick", action="store_true", help="16 samples of each set, no search among latents")
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--table", type=Path, help="markdown file for the table")
     return parser.parse_args()
@@ -144,7 +146,7 @@ def parsed() -> argparse.Namespace:
 def comparisons(
     reference: ReferenceSet, model: DiffusionModel, assets: Assets, arguments: argparse.Namespace
 ) -> dict[str, Comparison]:
-    """Compare every available set with the held-out meshes."""
+    """Compare each available set with the held-out meshes."""
     count = 16 if arguments.quick else arguments.count
     seeds = seeds_of(count)
     sets: dict[str, Callable[[], Iterable[Primitives]]] = {
@@ -179,7 +181,7 @@ def comparisons(
 
 
 def attribute_hits(reference: ReferenceSet, model: DiffusionModel, each: int) -> Figures:
-    """Shares of people in whom the feature network reads the value that was asked for, `each` of every value."""
+    """How often the feature network recognises the requested value, over `each` samples of every value."""
     network, figures = reference.network, {}
     for name in ASKED:
         values = model.vocabulary.categories.get(name, ())

@@ -1,9 +1,9 @@
-"""The documentation's pictures of generated people: beside their nearest training people, and beside baselines.
+"""Pictures of generated humans beside their nearest training samples, and beside baselines.
 
-`python benchmarks/diffusion_pictures.py --people DIR --judge DIR --voxel voxel.safetensors --neighbours
-docs/pictures/neighbours.png --comparison docs/pictures/generated_comparison.png` draws people of successive seeds,
-not cherry-picked, each beside the nearest training samples by features and by latents with the distances (1 is the
-median of the held-out set); and rows of held-out samples, ours, the Gaussian's and the voxel baseline's. --judge is the
+`python benchmarks/diffusion_pictures.py --people DIR --reference DIR --voxel voxel.safetensors --neighbours
+docs/pictures/neighbours.png --comparison docs/pictures/generated_comparison.png` renders humans from consecutive seeds,
+not hand-picked: each beside the nearest training samples by features and by latents, with distances (1 is the median of
+the held-out set); and rows of held-out samples, ours, the Gaussian's and the voxel baseline's. --reference is the
 folder of benchmarks/diffusion.py.
 """
 
@@ -53,7 +53,7 @@ def main() -> None:
     parser.add_argument("--people", type=Path, required=True, help="folder of the payloads that were trained on")
     parser.add_argument("--holdout", type=float, default=0.08)
     parser.add_argument("--seed", type=int, default=0, help="of the training run")
-    parser.add_argument("--judge", type=Path, default=Path("runs/judge"))
+    parser.add_argument("--reference", type=Path, default=Path("runs/reference"))
     parser.add_argument("--checkpoint", type=Path)
     parser.add_argument("--voxel", type=Path)
     parser.add_argument("--count", type=int, default=8, help="people in a picture")
@@ -66,7 +66,7 @@ def main() -> None:
         reference = open_reference_set(
             payload_sources(train, read_person),
             payload_sources(held, read_person),
-            arguments.judge,
+            arguments.reference,
             progress("portraits"),
             epoch,
         )
@@ -126,7 +126,7 @@ def comparison(model: DiffusionModel, held: Sequence[Path], voxel: Path | None, 
     if voxel is not None:
         sets["voxel diffusion"] = voxels(load_voxel_model(voxel), seeds)
     rows = [(name, [(one, "") for one in islice(made, count)]) for name, made in sets.items()]
-    return sheet(rows, "In T pose, from the front, and heads; successive seeds, every so many held out; nobody picked")
+    return sheet(rows, "In T pose, from the front, and heads; consecutive seeds, evenly spaced held-out samples")
 
 
 def sheet(rows: Sequence[tuple[str, Sequence[tuple[Primitives, str]]]], heading: str) -> Image.Image:

@@ -1,4 +1,4 @@
-"""The sets of people that benchmarks/diffusion.py compares: all in T pose, made one after the other."""
+"""The sets that benchmarks/diffusion.py compares: all in T pose, produced one by one."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from voxel_baseline import VoxelModel
 from voxel_grid import primitives_of, voxelise_payload
 
 TOGETHER = 8
-"""People that are sampled at once."""
+"""Batch size of sampling."""
 
 
 def generated(model: DiffusionModel, seeds: Sequence[int]) -> Iterator[Human]:
-    """Ours, by the default sampler and steps."""
+    """Ours, with the default sampler and steps."""
     for first in range(0, len(seeds), TOGETHER):
         yield from generate_batch(model, seeds[first : first + TOGETHER])
 
@@ -73,7 +73,7 @@ def voxels(model: VoxelModel, seeds: Sequence[int]) -> Iterator[Primitives]:
 
 
 def decoded(model: DiffusionModel, paths: Sequence[Path], colourings: int | None = None) -> Iterator[Primitives]:
-    """Stored people after the codec alone: what a perfect denoiser could at best make."""
+    """Stored humans after the codec alone: the best that a perfect denoiser could generate."""
     for path in paths:
         person = read_person(path)
         frames = rest_frames(person.betas.numpy())
@@ -82,12 +82,12 @@ def decoded(model: DiffusionModel, paths: Sequence[Path], colourings: int | None
 
 
 def plain(payload: Payload) -> Payload:
-    """On the CPU, fit for the marcher."""
+    """A copy on the CPU that the marcher accepts."""
     return payload.to("cpu").map(lambda tensor: tensor.clone())
 
 
 def stored(paths: Sequence[Path], colourings: int | None = None) -> Iterator[Primitives]:
-    """People on disk, in all colourings or the first ones."""
+    """Stored humans, in all colourings or the first ones."""
     for path in paths:
         person = read_person(path)
         frames = rest_frames(person.betas.numpy())
@@ -98,7 +98,7 @@ def stored(paths: Sequence[Path], colourings: int | None = None) -> Iterator[Pri
 def stored_voxels(
     paths: Sequence[Path], model: VoxelModel | None = None, colourings: int | None = None
 ) -> Iterator[Primitives]:
-    """Stored people as grids of 64^3 voxels: what that representation can at best show; of a model after its codec."""
+    """Stored humans as grids of 64^3 voxels, the limit of that representation; with a model, after its codec."""
     for path in paths:
         person = read_person(path)
         frames = rest_frames(person.betas.numpy())
@@ -115,5 +115,5 @@ def front(primitives: Primitives) -> Tensor:
 
 
 def seeds_of(count: int, first: int = 0) -> list[int]:
-    """Successive seeds; nobody is picked."""
+    """Consecutive seeds, not hand-picked."""
     return torch.arange(first, first + count).tolist()

@@ -23,7 +23,7 @@ SOURCES = {
     ),
     "diffusion": (
         "Generated people",
-        "benchmarks/diffusion.py --people DIR --judge DIR --voxel FILE --json docs/results/diffusion.json "
+        "benchmarks/diffusion.py --people DIR --reference DIR --voxel FILE --json docs/results/diffusion.json "
         "--table docs/results/diffusion_table.md",
     ),
     "layout": ("The grid on the default body", "scripts/bake_layout"),

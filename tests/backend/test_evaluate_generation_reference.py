@@ -175,7 +175,7 @@ def stage_two():
 
 
 def test_command_compares_generated_people_and_writes_figures(people, reference, reference_folder, tmp_path, capsys):
-    line = ["generation", "--people", str(people), "--judge", str(reference_folder), "--holdout", "0.34"]
+    line = ["generation", "--people", str(people), "--reference", str(reference_folder), "--holdout", "0.34"]
     line += ["--count", "5", "--steps", "2", "--json", str(tmp_path / "new" / "figures.json")]
     command.run(line, lambda path: None, stage_two)
     assert "| generated | 5 |" in capsys.readouterr().out
@@ -186,7 +186,7 @@ def test_command_compares_generated_people_and_writes_figures(people, reference,
 
 
 def test_command_refuses_too_few_people_before_it_works(people, tmp_path):
-    line = ["generation", "--people", str(people), "--judge", str(tmp_path / "judge"), "--count", "3"]
+    line = ["generation", "--people", str(people), "--reference", str(tmp_path / "judge"), "--count", "3"]
     with pytest.raises(ValueError, match="more than 3"):
         command.run(line, lambda path: None, stage_two)
     assert not (tmp_path / "judge").exists()

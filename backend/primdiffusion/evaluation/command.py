@@ -1,4 +1,4 @@
-"""The command `primdiffusion evaluate`: how good trained models are."""
+"""The command `primdiffusion evaluate`: quality of trained models."""
 
 from __future__ import annotations
 
@@ -6,49 +6,63 @@ import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import tyro
 from tqdm import tqdm
 
 from primdiffusion import __version__
-from primdiffusion.evaluation.reconstruction import Reconstructor
+from primdiffusion.capture.reader import open_captures
+from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.evaluation import generation, reconstruction
+from primdiffusion.evaluation.attribute_network import features_of
+from primdiffusion.evaluation.distances import NEIGHBOURS
+from primdiffusion.evaluation.gallery import (
+    COLOURINGS,
+    ReadPerson,
+    made_gallery,
+    mesh_sources,
+    payload_sources,
+    read_seed,
+)
+from primdiffusion.evaluation.generation import compare, open_reference_set, real_vs_real
+from primdiffusion.evaluation.image_metrics import load_lpips
+from primdiffusion.evaluation.reconstruction import EvaluationSettings, Reconstructor, evaluate, summary
+from primdiffusion.human import generate, place
+from primdiffusion.people.assets import open_assets
+from primdiffusion.staging import written_whole
 
-if TYPE_CHECKING:
-    from primdiffusion.diffusion.model import DiffusionModel
-    from primdiffusion.evaluation.gallery import ReadPerson
-
-DESCRIPTION = "How good trained models are."
+DESCRIPTION = "Measure the quality of trained models."
 
 
 class TrainedReconstructor(Reconstructor, Protocol):
-    """One from a checkpoint."""
+    """A reconstructor loaded from a checkpoint."""
 
     @property
     def card(self) -> Mapping[str, Any]:
-        """What it is."""
+        """Its model card."""
         ...
 
 
 LoadEncoder = Callable[[Path | None], TrainedReconstructor]
-"""Reads a checkpoint, None: the package's own. Its caller gives it: evaluation imports nothing of training."""
+"""Loads a checkpoint; None is the default one. Passed in, as evaluation imports no training."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateReconstruction:
-    """Compare an encoder's people with captures of them: PSNR, SSIM, overlap of masks, LPIPS if weights are given.
+    """Compare encoded humans with their captures: PSNR, SSIM, mask overlap, and LPIPS if weights are given.
 
-    Everybody is encoded once, from some views of one pose, then drawn from all cameras in all poses.
+    Each human is encoded once, from some views of one pose, and rendered from all cameras in all poses.
     """
 
     captures: Path
     """Folder of captures."""
     checkpoint: Path | None = None
-    """Trained encoder (.safetensors); without it the one that comes with the package."""
+    """Trained encoder (.safetensors); the default one if omitted."""
     people: int = 0
-    """How many, in the order of their names; 0: all."""
+    """Number of humans, in the order of their names; 0: all."""
     views: int = 8
-    """How many cameras the encoder is given, spread around the person."""
+    """Number of cameras given to the encoder, spread around the human."""
     frame: int = 0
     """The pose in which."""
     size: int = 512
@@ -64,9 +78,6 @@ class EvaluateReconstruction:
         Raises:
             ValueError, FileNotFoundError: captures, checkpoint or weights are missing, damaged or do not fit.
         """
-        from primdiffusion.capture.reader import open_captures
-        from primdiffusion.evaluation.image_metrics import load_lpips
-        from primdiffusion.evaluation.reconstruction import EvaluationSettings, evaluate, summary, table
 
         if self.people < 0:
             raise ValueError(f"people is {self.people}: ask for one or more, or 0 for everybody")
@@ -90,15 +101,15 @@ class EvaluateReconstruction:
                 "pictures": [dataclasses.asdict(score) for score in scores],
             }
             _write(self.json, record)
-        print(table(means))
+        print(reconstruction.table(means))
 
 
 @dataclasses.dataclass(frozen=True)
 class StageTwo:
-    """What of training the evaluation of generated people needs; given by its caller, as `LoadEncoder` is."""
+    """Functions of training that the evaluation of generated humans needs; passed in like `LoadEncoder`."""
 
     load_model: Callable[[Path | None], DiffusionModel]
-    """Reads a checkpoint, None: the package's own."""
+    """Loads a checkpoint; None is the default one."""
     find_people: Callable[[Path], Sequence[Path]]
     split_people: Callable[[Sequence[Path], float, int], tuple[list[Path], list[Path]]]
     """By the share that is held out and a seed."""
@@ -107,28 +118,28 @@ class StageTwo:
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateGeneration:
-    """Compare generated people with people the model was not trained on, in a feature space of their attributes.
+    """Compare generated humans with ones held out from training, in a feature space of human attributes.
 
-    Also tells whether they are copies: how far they are from training people, beside how far new people are.
+    Also reports whether they are copies: their distance to the training set, relative to that of held-out humans.
     """
 
     people: Path
     """Folder of the payloads that the model was trained on, those held out among them."""
-    judge: Path
-    """Folder for portraits and feature network; what is not there is made, which takes minutes."""
+    reference: Path
+    """Folder for portraits and feature network; what is missing is computed, which takes minutes."""
     assets: Path | None = None
-    """MakeHuman's assets, if the people were made from them: they are compared as renders of their meshes, so that what
-    payloads lack counts too. Without it, as renders of their payloads."""
+    """MakeHuman's assets, if the training set was made from them: the reference is then renders of the meshes, so that
+    detail which payloads lack counts too. Without them it is renders of the payloads."""
     checkpoint: Path | None = None
-    """Model (.safetensors); without it the one that comes with the package."""
+    """Model (.safetensors); the default one if omitted."""
     count: int = 256
-    """People to generate, of successive seeds."""
+    """Number of humans to generate, from successive seeds."""
     first_seed: int = 0
-    """The first of them."""
+    """The first seed."""
     steps: int = 30
     """Sampling steps."""
     holdout: float = 0.05
-    """Share of people that was held out in training."""
+    """Share that was held out in training."""
     seed: int = 0
     """Seed of the training run."""
     json: Path | None = None
@@ -140,12 +151,6 @@ class EvaluateGeneration:
         Raises:
             ValueError, FileNotFoundError: people or checkpoint are missing, damaged or too few.
         """
-        from primdiffusion.evaluation.attribute_network import features_of
-        from primdiffusion.evaluation.distances import NEIGHBOURS
-        from primdiffusion.evaluation.gallery import COLOURINGS, made_gallery, mesh_sources, payload_sources, read_seed
-        from primdiffusion.evaluation.generation import compare, open_reference_set, real_vs_real, table
-        from primdiffusion.human import generate, place
-        from primdiffusion.people.assets import open_assets
 
         if self.count <= NEIGHBOURS:
             raise ValueError(
@@ -163,7 +168,7 @@ class EvaluateGeneration:
             def report(done: int, total: int) -> None:
                 bar.update(1)
 
-            reference = open_reference_set(*real, self.judge, report)
+            reference = open_reference_set(*real, self.reference, report)
         with tqdm(range(self.first_seed, self.first_seed + self.count), unit="person", disable=None) as seeds:
             made = made_gallery(place(generate(model, seed, self.steps)) for seed in seeds)
         rows = {
@@ -178,19 +183,17 @@ class EvaluateGeneration:
                 "feature_accuracy": reference.held_accuracies,
             }
             _write(self.json, record)
-        print(table(rows))
+        print(generation.table(rows))
 
 
 def _write(path: Path, record: Mapping[str, Any]) -> None:
-    from primdiffusion.staging import written_whole
-
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as unfinished:
         unfinished.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
 
 def run(arguments: Sequence[str], load_encoder: LoadEncoder, stage_two: Callable[[], StageTwo] | None = None) -> None:
-    """Parses and runs one line; without `stage_two` only reconstructions can be evaluated."""
+    """Parse and run a command line; without `stage_two` only reconstructions can be evaluated."""
     commands: dict[str, Any] = {"reconstruction": EvaluateReconstruction}
     if stage_two is not None:
         commands["generation"] = EvaluateGeneration
