@@ -25,7 +25,7 @@ import record
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "blender_primdiffusion"))
 from backend.client import BackendClient, Died  # noqa: E402
-from backend.requests import Backend, Request  # noqa: E402
+from backend.requests import Backend, ChildRequest  # noqa: E402
 
 TICK_S = 0.1
 """The interval of Blender's timer in seconds."""
@@ -47,7 +47,7 @@ class Timer:
     def __init__(self) -> None:
         self.longest_s = 0.0
 
-    def until(self, job: Request, reached: Callable[[], bool]) -> float:
+    def until(self, job: ChildRequest, reached: Callable[[], bool]) -> float:
         """Seconds until `reached` is true; raises TimeoutError."""
         began = time.monotonic()
         while not reached():
@@ -81,7 +81,7 @@ def main() -> None:
     record.report(figures, arguments.json)
 
 
-def cancel_seconds(timer: Timer, folder: Path, when: Callable[[Request], bool], send: int = 0) -> float:
+def cancel_seconds(timer: Timer, folder: Path, when: Callable[[ChildRequest], bool], send: int = 0) -> float:
     """Seconds from the cancel to the end of a job.
 
     The cancel comes when `when` holds for the job and, if `send` is given, after this signal was sent to its child.
@@ -149,8 +149,8 @@ def heartbeat_interval_s() -> float:
     return max(after - before for before, after in pairwise(times))
 
 
-def generate(backend: Backend, folder: Path) -> Request:
-    return Request(backend, "generate", {"seed": 1, "steps": STEPS, "size": 16, "out_dir": str(folder / "out")})
+def generate(backend: Backend, folder: Path) -> ChildRequest:
+    return ChildRequest(backend, "generate", {"seed": 1, "steps": STEPS, "size": 16, "out_dir": str(folder / "out")})
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 """The streams of a child process, read and written without a thread and without waiting.
 
-A child writes its output into a temporary file, which we read on a timer. Of what works without a thread on Linux,
-Windows and macOS alike this is the one that never holds up either side: a pipe cannot be read without waiting by the
-same calls on all three, and a full one stops the child while Blender is busy; a socket would need a child that knows of
-it, and asks some firewalls. The file grows by 0.4 MB an hour of heartbeats. Its input is a pipe, whose end tells the
-child that Blender is gone; what the pipe does not take at once is written at the next tick.
+A child writes its output into a temporary file, which we read on a timer. Of the ways that need no thread on Linux,
+Windows and macOS, only this one never blocks either side: the three have no common call to read a pipe without
+waiting, and a full pipe stops the child while Blender is busy; a socket needs support in the child and can trigger a
+firewall prompt. The file grows by 0.4 MB per hour of heartbeats. The child's input is a pipe that closes when Blender
+ends; what the pipe does not take at once is written at the next tick.
 """
 
 from __future__ import annotations
@@ -66,11 +66,11 @@ class Output:
         return rest
 
     def has_more(self) -> bool:
-        """There is something that has not been read."""
+        """Some output has not been read yet."""
         return not self._source.closed and os.fstat(self._source.fileno()).st_size > self._source.tell()
 
     def log(self) -> list[str]:
-        """The last lines of all that was written; reads them anew, apart from `lines`."""
+        """The last lines of the whole output, read independently of `lines`."""
         if self._source.closed:
             return []
         place = self._source.tell()

@@ -67,7 +67,7 @@ class Died:
 
 @dataclasses.dataclass(frozen=True)
 class Silent:
-    """The child lives but has said nothing for `seconds`; sent once per silence."""
+    """The child lives but has sent nothing for `seconds`; sent once per silence."""
 
     seconds: float
 
@@ -82,12 +82,12 @@ def child_environment(module_path: Path | None, cache_dir: Path | None, extra: M
     anything installed. `cache_dir` takes byte code and compiled kernels, so that the extension's folder stays as it is.
     """
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONHOME", "PYTHONSTARTUP")}
-    environment.update(PYTHONSAFEPATH="1")  # no modules from the current folder, which may be anybody's
+    environment.update(PYTHONSAFEPATH="1")  # never import from the current folder
     environment.update(PYTHONUTF8="1", PYTHONUNBUFFERED="1", PYTHONFAULTHANDLER="1")
     if module_path is not None:
         environment["PYTHONPATH"] = str(module_path)
     if cache_dir is not None:
-        environment.pop("PYTHONDONTWRITEBYTECODE", None)  # torch would be compiled anew at every start
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)  # torch would be recompiled at every start
         environment.update(PYTHONPYCACHEPREFIX=str(cache_dir / "bytecode"), NUMBA_CACHE_DIR=str(cache_dir / "numba"))
     environment.update(extra)
     return environment
@@ -123,7 +123,7 @@ class BackendClient:
         self._polled_at = time.monotonic()
         self._abandoned: set[int] = set()
         self.info: dict[str, Any] = {}
-        """What the child said of itself: version, python, memory, and device once torch is loaded (`ready`)."""
+        """What the child reported about itself: version, python, memory, and device once torch is loaded (`ready`)."""
 
     def start(self) -> None:
         """Starts the child and asks it who it is; `info` fills as it answers. Raises OSError without such a Python."""
@@ -186,7 +186,7 @@ class BackendClient:
 
     @property
     def occupied(self) -> bool:
-        """The child has still to end a request that was abandoned; another one would be refused as busy."""
+        """The child is still ending an abandoned request and would reject another one as busy."""
         return bool(self._abandoned)
 
     def poll(self) -> list[Event]:
@@ -296,7 +296,7 @@ class BackendClient:
         return Response(id, result)
 
     def _end(self, exit_code: int) -> Iterator[Event]:
-        """The end of the child, once, after everything it still said."""
+        """The end of the child, once, after its last messages."""
         self._ended = True
         last = _parse(self._output.rest()) if self._output is not None else None
         if last is not None:

@@ -1,8 +1,8 @@
-"""Pictures from the child: asked for by any thread, drawn one after the other, followed by whoever asked.
+"""Pictures drawn by the child process, one after another, at the request of any thread.
 
-There is no thread of its own: whoever waits for a picture, Blender's render thread or a timer of its window, also
-speaks with the child, one of them at a time (`DrawingChild.advance`). The child is started by the first picture, kept
-warm, and ended when none has been asked for in a while.
+There is no thread for it: the caller that waits for a picture (Blender's render thread or a timer of its window) also
+exchanges messages with the child, one caller at a time (`DrawingChild.advance`). The first picture starts the child,
+which stays warm until no picture has been requested for a while.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ State = Literal["waiting", "starting", "drawing", "done", "failed", "cancelled"]
 
 
 class Drawing:
-    """One picture: wanted, under way, and at last done, failed or cancelled. Read and waited for by any thread."""
+    """One requested picture, which ends as done, failed or cancelled. Any thread may read it or wait for it."""
 
     def __init__(self, params: Mapping[str, Any], advance: Callable[[], None] = lambda: None):
-        """`advance` speaks with the child that draws this picture; it never waits."""
+        """`advance` exchanges messages with the child that draws this picture; it never waits."""
         self.params = dict(params)
         self.state: State = "waiting"
         self.rows = 0
         """Finished rows, from the top."""
         self.eta_s: float | None = None
-        """Seconds that are left, None while unknown."""
+        """Seconds left, None while unknown."""
         self.result: dict[str, Any] = {}
-        """When done: seconds, and what they were spent on."""
+        """Once done: the seconds it took, by stage."""
         self.error: RequestError | None = None
         self.cancel_asked_at: float | None = None
         self._advance = advance
@@ -44,11 +44,11 @@ class Drawing:
 
     @property
     def finished(self) -> bool:
-        """Nothing more will happen."""
+        """The state will not change again."""
         return self.state in ("done", "failed", "cancelled")
 
     def wait(self, timeout_s: float) -> bool:
-        """Sleeps until there is news since the last call, at most `timeout_s`; whether there is."""
+        """Wait until something has changed since the last call, at most `timeout_s`; returns whether it has."""
         end = time.monotonic() + timeout_s
         while True:
             self._advance()
@@ -61,13 +61,13 @@ class Drawing:
             time.sleep(min(left, LISTEN_S))
 
     def cancel(self) -> None:
-        """Asks for an end, which comes within a band of the picture; before the first, nothing is drawn at all."""
+        """Cancel the picture. Takes effect at the end of a band; before the first band nothing is drawn."""
         if self.cancel_asked_at is None:
             self.cancel_asked_at = time.monotonic()
             self._advance()
 
     def become(self, state: State, **facts: Any) -> None:
-        """Moves on. For whoever speaks with the child."""
+        """Change the state. Only the thread that holds the turn may call this."""
         for name, value in facts.items():
             setattr(self, name, value)
         self.state = state
@@ -75,7 +75,7 @@ class Drawing:
 
 
 class DrawingChild:
-    """A child process that draws. Pictures are drawn in the order in which they were asked for."""
+    """A child process that draws pictures in the order they were requested."""
 
     def __init__(self, backend: Backend, idle_s: float = IDLE_S):
         self._backend = backend
@@ -84,16 +84,16 @@ class DrawingChild:
         self._current: Drawing | None = None
         self._connecting: Generator[None, None, BackendClient] | None = None
         self._client: BackendClient | None = None
-        """The child that `_current` was asked of."""
+        """The child that draws `_current`."""
         self._request = 0
-        self._told_to_cancel = False
+        self._cancel_sent = False
         self._idle_since = time.monotonic()
         self._closed = False
         self._turn: collections.deque[None] = collections.deque([None])
-        """Whoever has taken the one element speaks with the child: taking it is atomic and never waits."""
+        """The thread that has taken the one element may exchange messages with the child; taking it is atomic."""
 
     def draw(self, params: Mapping[str, Any]) -> Drawing:
-        """Asks for a picture (`params` of the request `draw`, docs/design/protocol.md) and returns at once.
+        """Request a picture (`params` of the request `draw`, docs/design/protocol.md) and returns at once.
 
         Raises RuntimeError after `close`.
         """
@@ -106,26 +106,26 @@ class DrawingChild:
 
     @property
     def info(self) -> dict[str, Any]:
-        """What the child says of itself; empty while there is none."""
+        """What the child reports about itself; empty while there is no child."""
         client = self._backend.client
         return client.info if client is not None else {}
 
     @property
     def pid(self) -> int | None:
-        """The process at work or kept warm, None while there is none."""
+        """Process id of the child, busy or warm; None while there is no child."""
         client = self._backend.client
         return client.pid if client is not None else None
 
     def close(self) -> None:
-        """Ends the child for good; drawings under way become cancelled."""
+        """End the child for good and cancel its drawings."""
         self._closed = True
         self.advance()
         self._backend.shutdown()
 
     def advance(self) -> None:
-        """Take in what the child has said, ask for the next picture, end an idle child. Never waits.
+        """Read the child's messages, request the next picture, end an idle child. Never waits.
 
-        For any thread; does nothing while another is at it.
+        For any thread; does nothing while another thread holds the turn.
         """
         try:
             self._turn.popleft()
@@ -142,16 +142,16 @@ class DrawingChild:
         finally:
             self._turn.append(None)
 
-    # whoever has the turn
+    # only for the thread that holds the turn
 
     def _next(self) -> Drawing | None:
-        """The one at work, or else the next one wanted."""
+        """The current drawing, or else the next one requested."""
         if self._current is None and self._wanted:
-            self._current, self._client, self._told_to_cancel = self._wanted.popleft(), None, False
+            self._current, self._client, self._cancel_sent = self._wanted.popleft(), None, False
         return self._current
 
     def _rest(self) -> None:
-        """Between pictures: end a child that has been idle for long."""
+        """End a child that has been idle for too long."""
         if self._backend.client is not None and time.monotonic() - self._idle_since > self._idle_s:
             self._backend.release()
 
@@ -184,9 +184,9 @@ class DrawingChild:
 
     def _listen(self, client: BackendClient, drawing: Drawing) -> None:
         if drawing.cancel_asked_at is not None:
-            if not self._told_to_cancel:
+            if not self._cancel_sent:
                 client.cancel(self._request)
-                self._told_to_cancel = True
+                self._cancel_sent = True
             if time.monotonic() - drawing.cancel_asked_at > CANCEL_PATIENCE_S:
                 client.kill(0.0)
                 drawing.become("cancelled")
@@ -211,5 +211,5 @@ def _take(event: Event, client: BackendClient, request: int, drawing: Drawing) -
         drawing.become("failed", error=RequestError(event.message, remedy, "died", event.stderr))
     elif isinstance(event, Silent):
         client.kill(0.0)
-        sentence = f"the backend hung: it said nothing for {event.seconds:.0f} s and was ended"
+        sentence = f"the backend hung: it sent nothing for {event.seconds:.0f} s and was ended"
         drawing.become("failed", error=RequestError(sentence, "render again", "hung", client.stderr))

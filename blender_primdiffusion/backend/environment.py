@@ -81,7 +81,7 @@ class SetUpFolder:
 
     @property
     def log(self) -> Path:
-        """What venv and pip said."""
+        """The output of venv and pip."""
         return self.root / "set_up.log"
 
 

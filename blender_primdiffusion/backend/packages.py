@@ -58,7 +58,7 @@ class Lock:
 
     @property
     def installed_bytes(self) -> int:
-        """Of the environment, about."""
+        """Approximate size of the environment."""
         return sum(package.installed for package in self.packages)
 
 
@@ -89,7 +89,7 @@ def locks_for(folder: Path, platform: str, python: tuple[int, int]) -> dict[str,
 
 @dataclasses.dataclass(frozen=True)
 class Machine:
-    """As far as the choice of packages depends on it."""
+    """The facts that the choice of packages depends on."""
 
     platform: str
     """linux_x86_64, linux_arm64, windows_x86_64, macos_arm64, or one without locks such as macos_x86_64."""
@@ -98,11 +98,11 @@ class Machine:
     nvidia: bool
     """There is an NVIDIA driver."""
     driver: int | None
-    """Its major version where the system tells without being asked by a program."""
+    """The driver's major version, where a file of the system states it."""
 
     @property
     def described(self) -> str:
-        """What was found, for people."""
+        """The machine in a few words, for the panel."""
         owner, _, chip = self.platform.partition("_")
         chip = NAMES["apple"] if self.platform == "macos_arm64" else f"{owner.title()} {chip}"
         card = f", NVIDIA driver{f' {self.driver}' if self.driver else ''}" if self.nvidia else ""
@@ -127,10 +127,10 @@ def _nvidia() -> tuple[bool, int | None]:
     if os.name == "nt":
         return Path(os.environ.get("SYSTEMROOT", r"C:\Windows"), "System32", "nvcuda.dll").exists(), None
     try:
-        told = Path("/proc/driver/nvidia/version").read_text(encoding="utf-8", errors="replace")
+        version = Path("/proc/driver/nvidia/version").read_text(encoding="utf-8", errors="replace")
     except OSError:
         return False, None
-    found = re.search(r"\b(\d{3,})\.\d+", told)
+    found = re.search(r"\b(\d{3,})\.\d+", version)
     return True, int(found[1]) if found else None
 
 
@@ -220,7 +220,7 @@ def clean_environment(temporary: Path, pip_cache: Path) -> dict[str, str]:
 def followed(
     command: Sequence[str], log: Path, environment: Mapping[str, str], explain: Callable[[str, int], str]
 ) -> Generator[str, None, None]:
-    """Run a command whose output is added to the log, and yield what it has said so far while it runs; closing ends it.
+    """Run a command whose output is added to the log, and yield its output so far while it runs; closing ends it.
 
     Raises SetUpFailed with what `explain` makes of the output and the exit code of a command that fails.
     """
@@ -242,25 +242,27 @@ def followed(
             raise SetUpFailed(f"{command[0]} cannot be run: {error.strerror}") from error
     try:
         while (exit_code := process.poll()) is None:
-            yield _said(log, start)
+            yield _output_since(log, start)
     finally:
         if process.poll() is None:
             process.kill()
             process.wait()
     if exit_code != 0:
-        raise SetUpFailed(explain(_said(log, start), exit_code))
+        raise SetUpFailed(explain(_output_since(log, start), exit_code))
 
 
-def _said(log: Path, start: int) -> str:
+def _output_since(log: Path, start: int) -> str:
     with log.open("rb") as file:
         file.seek(start)
         return file.read().decode("utf-8", "replace")
 
 
-def what_went_wrong(said: str, exit_code: int) -> str:
+def what_went_wrong(output: str, exit_code: int) -> str:
     """pip's failure in a sentence: a known cause with what to do, otherwise its own last error."""
     for pattern, sentence in _WHAT_WENT_WRONG:
-        if found := re.search(pattern, said, re.DOTALL):
+        if found := re.search(pattern, output, re.DOTALL):
             return sentence.format(*(group.split("==")[0] for group in found.groups() or ("",)))
-    errors = re.findall(r"^ERROR: (.+)$", said, re.MULTILINE) or [line for line in said.splitlines() if line.strip()]
+    errors = re.findall(r"^ERROR: (.+)$", output, re.MULTILINE) or [
+        line for line in output.splitlines() if line.strip()
+    ]
     return f"pip failed: {errors[-1].strip() if errors else f'exit code {exit_code}'}"

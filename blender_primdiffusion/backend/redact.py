@@ -1,4 +1,4 @@
-"""Texts for bug reports without what tells who somebody is: folders, names of users and of the machine."""
+"""Remove folders and the names of the user and the machine from the text of a bug report."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _KNOWN = re.compile(
     r"[/\\].*",
     re.DOTALL,
 )
-"""Folders from which on a path is that of a program, and not somebody's."""
+"""From these folders on, a path belongs to a program and is not private."""
 _SLASH = r"(?:/|\\{1,8}|%2[Ff]|%5[Cc])"
 _DRIVE = rf"(?:file:/{{2,3}})?[A-Za-z](?::|%3[Aa]){_SLASH}"
 _SHARE = r"(?:file:/*)?(?:\\{2,8}|(?:%5[Cc]){2,8})(?=[^\s\\])"

@@ -36,11 +36,11 @@ def run_to_end(work: Generator[object, None, Result]) -> Result:
 
 
 END_S = 2.0
-"""What a child that was asked to end may take for it."""
+"""How long a child may take to end."""
 
 
 class Backend:
-    """The child that requests share: started at first use, kept warm, started anew after it died.
+    """The child that requests share: started at first use, kept warm, restarted after it died.
 
     Blender may be closed between any two calls, so what takes long is a generator that yields while it waits.
     """
@@ -50,12 +50,12 @@ class Backend:
         self._make_client = make_client
         self._client: BackendClient | None = None
         self._leaving: list[tuple[BackendClient, float, Callable[[], None]]] = []
-        """Each with the time at which it is killed, and what is to be done after it has gone."""
+        """Children that are ending: the time at which each is killed, and what to do once it has gone."""
         self._closed = False
-        self._request: Request | None = None
+        self._request: ChildRequest | None = None
 
-    def admit(self, request: Request) -> bool:
-        """Takes `request` as the one at work; False while another is."""
+    def admit(self, request: ChildRequest) -> bool:
+        """Make `request` the current one; False while another is running."""
         if self._request is not None and not self._request.finished:
             return False
         self._request = request
@@ -94,18 +94,18 @@ class Backend:
         return self._client.poll() if self._client is not None else []
 
     def release(self) -> None:
-        """Ends the child that is kept warm, without waiting for it; the next request starts another."""
+        """End the warm child without waiting for it; the next request starts another."""
         client, self._client = self._client, None
         if client is not None:
             client.end()
             self.part_with(client)
 
     def part_with(self, client: BackendClient, afterwards: Callable[[], None] = lambda: None) -> None:
-        """Do `afterwards` when a child that was asked to end has gone; see to it that it goes."""
+        """Call `afterwards` once a child that was asked to end has gone; kill it if it stays too long."""
         self._leaving.append((client, time.monotonic() + END_S, afterwards))
 
     def see_off(self) -> None:
-        """Look after children that are about to end. Takes no time."""
+        """Kill children that take too long to end; clean up after those that have gone. Never waits."""
         leaving, self._leaving = self._leaving, []
         for client, killed_at, afterwards in leaving:
             if client.gone_within(0.0):
@@ -116,7 +116,7 @@ class Backend:
             self._leaving.append((client, killed_at, afterwards))
 
     def shutdown(self) -> None:
-        """Ends the child for good, also one that is just being started. Waits for its end some seconds at most."""
+        """End the child for good, also one that is still starting. Waits a few seconds at most."""
         self._closed = True
         if self._client is not None:
             self._client.shutdown()
@@ -161,7 +161,7 @@ STAGES = {
     "merge": "Merging the volumes",
     "fit": "Fitting",
 }
-"""What the child calls its stages, for people."""
+"""The child's stages, as the panel names them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,8 +177,8 @@ class RequestError:
         return " ".join(sentence(part) for part in (self.message, self.remedy) if part)
 
 
-class Request:
-    """Asks the child for one thing. Call `tick` from a timer until `finished`; then read `result` or `error`.
+class ChildRequest:
+    """One request to the child. Call `tick` from a timer until `finished`; then read `result` or `error`.
 
     starting -> running -> done | failed;  cancel: -> cancelling -> cancelled.
 
@@ -186,7 +186,7 @@ class Request:
     """
 
     def __init__(self, backend: Backend, method: str, params: Mapping[str, Any]):
-        """The child's half-written files are looked for in the parameter `out_dir`, where the method has one."""
+        """Half-written files are cleared from the parameter `out_dir`, if the method has one."""
         self.method = method
         self._params = dict(params)
         self._backend = backend
@@ -199,12 +199,12 @@ class Request:
         self.step = 0
         self.total = int(params.get("steps", 1))
         self.eta_s: float | None = None
-        """Seconds that are left, None while unknown."""
+        """Seconds left, None while unknown."""
         self.message = "Starting the backend"
         self.picture: Path | None = None
-        """A PNG of what is there so far."""
+        """A PNG of the human so far."""
         self.pictures: dict[int, Path] = {}
-        """PNGs by index, of a method that makes several people."""
+        """PNGs by index, of a method that generates several humans."""
         self.result: dict[str, Any] | None = None
         """The child's."""
         self.error: RequestError | None = None
@@ -214,7 +214,7 @@ class Request:
 
     @property
     def finished(self) -> bool:
-        """Nothing more will happen."""
+        """The state will not change again."""
         return self.state in FINAL
 
     @property
@@ -224,11 +224,11 @@ class Request:
 
     @property
     def info(self) -> dict[str, Any]:
-        """What the backend says of itself (version, device, memory); empty until it answers."""
+        """What the backend reports about itself (version, device, memory); empty until it answers."""
         return self._client.info if self._client is not None else {}
 
     def tick(self) -> bool:
-        """Takes in what has happened; True if something visible changed. Never waits."""
+        """Read the child's messages; returns whether something visible changed. Never waits."""
         if self.finished:
             return False
         self._backend.see_off()
@@ -248,7 +248,7 @@ class Request:
         )  # fmt: skip
 
     def cancel(self) -> None:
-        """Asks for an end; `tick` goes on until the state is cancelled, which it is within a second."""
+        """Cancel the request; call `tick` until the state is cancelled, which takes a second at most."""
         if self.finished or self._cancel_asked_at is not None:
             return
         self._cancel_asked_at = time.monotonic()
@@ -269,11 +269,11 @@ class Request:
             self._client = client = connected.value
             if not client.info.get("ready"):
                 self.message = "Loading PyTorch"
-        except Exception as error:  # whatever it is, the user is to read it
+        except Exception as error:  # any error must reach the user
             self._fail(RequestError(str(error) or type(error).__name__, "", "environment"))
 
     def _ask(self, client: BackendClient) -> None:
-        """Sends the request, unless the child has still to find out that an earlier one is not wanted any more."""
+        """Send the request, once the child has ended an abandoned one."""
         if self._cancel_asked_at is not None:
             self._end("cancelled", "Cancelled")
         elif not client.occupied:
@@ -303,8 +303,8 @@ class Request:
                 self._fail(RequestError(event.message, remedy, "died", event.stderr))
         elif isinstance(event, Silent):
             self._kill()
-            said = f"the backend hung: it said nothing for {event.seconds:.0f} s and was ended"
-            self._fail(RequestError(said, "Try again", "hung", self._log()))
+            message = f"the backend hung: it sent nothing for {event.seconds:.0f} s and was ended"
+            self._fail(RequestError(message, "Try again", "hung", self._log()))
 
     def _take_progress(self, params: dict[str, Any]) -> None:
         if self._cancel_asked_at is not None:
@@ -336,7 +336,7 @@ class Request:
         self._end("cancelled", "Cancelled")
 
     def _kill(self) -> None:
-        """Blender does not stand still while the system takes a large child away: what is left is cleared after it."""
+        """Kill the child. Blender must not wait while the system frees a large process: leftovers go afterwards."""
         client = self._client
         if client is None or client.kill(_KILL_PATIENCE_S):
             self._clear_leftovers()
@@ -344,11 +344,11 @@ class Request:
             self._backend.part_with(client, self._clear_leftovers)
 
     def _clear_leftovers(self) -> None:
-        """Half-written files of a killed child lie in a folder of its own (the backend's staging.py names it so)."""
+        """Remove the folder of half-written files of a killed child (named by the backend's staging.py)."""
         if self._client is not None and self._out_dir is not None:
             shutil.rmtree(self._out_dir / f".primdiffusion-partial-{self._client.pid}", ignore_errors=True)
             if self._out_dir_is_new:
-                with contextlib.suppress(OSError):  # holds other things, or never came to be
+                with contextlib.suppress(OSError):  # holds other files, or was never created
                     self._out_dir.rmdir()
 
     def _log(self) -> tuple[str, ...]:

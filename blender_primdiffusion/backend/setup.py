@@ -25,7 +25,7 @@ from typing import Any, Literal
 from .client import BackendClient
 from .environment import MARK, BackendPython, SetUpFolder, search
 from .packages import Lock, SetUpFailed, clean_environment, followed, what_went_wrong
-from .requests import Backend, Request
+from .requests import Backend, ChildRequest
 
 State = Literal["absent", "broken", "ready"]
 OFFLINE = (
@@ -76,8 +76,8 @@ def state_of(folder: SetUpFolder) -> tuple[State, dict[str, Any]]:
 def set_up(
     folder: SetUpFolder, lock: Lock, compute: str, module_path: Path, cache: Path, wheels: Path | None = None
 ) -> Steps:
-    """Make the environment anew from the package index, or from a folder of `wheels`; it is ready when it has made a
-    person. `compute` (cpu, cuda or apple) is for its mark."""
+    """Rebuild the environment from the package index, or from a folder of `wheels`; it is ready once it has generated
+    a human. `compute` (cpu, cuda or apple) is for its mark."""
     python, host = folder.python, sys.executable
     folder.root.mkdir(parents=True, exist_ok=True)
     (folder.environment / MARK).unlink(missing_ok=True)
@@ -148,7 +148,7 @@ def _trial(python: Path, module_path: Path, cache: Path, temporary: Path) -> Gen
     backend, began = Backend(make_client), time.monotonic()
     person = temporary / "person"
     try:
-        request = Request(backend, "generate", {**_TRIAL, "out_dir": str(person)})
+        request = ChildRequest(backend, "generate", {**_TRIAL, "out_dir": str(person)})
         while not request.finished:
             yield Step(f"Testing the backend: {request.message}", _INSTALLED)
             request.tick()

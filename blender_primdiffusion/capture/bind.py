@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from ..scene.armature import build_armature
 from ..scene.convention import points_to_backend, points_to_blender
-from .body import Body, blend
-from .fit import fit_surface, vertex_normals
+from .body import Body, blend, fit_surface, vertex_normals
 from .registration import Registration, axis_name, register, scale_note
 from .scan_files import Parameters, ScanError, ScanFile, read_parameters
 from .skinned_surface import mesh_points

@@ -25,7 +25,7 @@ from .scan import Scan, ScanFile, load_scan
 from .settings import CaptureSettings
 from .skinned_surface import cameras_inside
 from .stage import Stage, shoot_centres, shoot_colours
-from .subject import Sitting, begin, is_drawn, is_finished, list_subjects, name_reference
+from .subject import CapturePlan, begin, is_drawn, is_finished, list_subjects, name_reference
 from .surfaces import mark_parts, prepare_materials
 
 
@@ -166,7 +166,7 @@ def _capture(context, settings, scan_file, poses, body, load, clock: _Clock) -> 
             prepare_materials(scan.objects, unlit=settings.light == "uniform")
             views = list(settings.cameras) or _views_around(scan, settings, poses)
             joints = np.stack([scan.pose(*pose) for pose in zip(poses.rotations, poses.translations, strict=True)])
-        begin(folder, Sitting(scan.betas, poses, joints, views), settings.layouts)
+        begin(folder, CapturePlan(scan.betas, poses, joints, views), settings.layouts)
         for frame in range(len(poses)):
             missing = [camera for camera in range(len(views)) if not is_drawn(folder, settings.kinds, frame, camera)]
             if missing:

@@ -14,8 +14,7 @@ from ..motion.rigs import BoneMap, facing, map_bones, rig_from_smpl
 from ..motion.rotation import to_axis_angle
 from ..scene.convention import matrix_to_quaternion, points_to_blender
 from .bind import bind_static
-from .body import Body
-from .fit import ShapeFit, fit_joints
+from .body import Body, ShapeFit, fit_joints
 from .registration import stand_up
 from .rigged import (
     RigSkeleton,

@@ -36,7 +36,7 @@ from ..motion.motion import Motion
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Sitting:
+class CapturePlan:
     """A human, its poses and the cameras around it."""
 
     betas: NDArray[np.float64]
@@ -46,25 +46,25 @@ class Sitting:
     views: list[View]
 
 
-def begin(folder: Path, sitting: Sitting, layouts: tuple[str, ...]) -> None:
+def begin(folder: Path, plan: CapturePlan, layouts: tuple[str, ...]) -> None:
     """Write all files but the pictures and the completion mark.
 
     Raises CaptureFolderError where the folder holds another human, or other poses.
     """
-    poses = sitting.poses
+    poses = plan.poses
     theta = poses.axis_angle().reshape(len(poses), 72)
-    smpl = (theta[:, :3], theta[:, 3:], sitting.betas, poses.translations)
+    smpl = (theta[:, :3], theta[:, 3:], plan.betas, poses.translations)
     _check_same(folder, smpl)
     write_smpl(folder, *smpl)
-    write_joints(folder, sitting.views, sitting.joints)
-    write_cameras(folder, sitting.views)
+    write_joints(folder, plan.views, plan.joints)
+    write_cameras(folder, plan.views)
     if "opencv" in layouts:
-        write_opencv(folder, sitting.views)
+        write_opencv(folder, plan.views)
     for frame in range(len(poses)):
         if "nerf" in layouts:
-            write_nerf(folder, sitting.views, frame)
+            write_nerf(folder, plan.views, frame)
         if "colmap" in layouts:
-            write_colmap(folder, sitting.views, frame)
+            write_colmap(folder, plan.views, frame)
 
 
 def is_finished(folder: Path) -> bool:

@@ -226,12 +226,6 @@ def make_unlit(material: bpy.types.Material) -> None:
     tree.links.new(mix.outputs[0], output.inputs["Surface"])
 
 
-def has_picture(material: bpy.types.Material | None) -> bool:
-    """Whether a material shows an image that is there."""
-    tree = material.node_tree if material is not None else None
-    return tree is not None and any(node.type == "TEX_IMAGE" and node.image is not None for node in tree.nodes)
-
-
 def _colour(node: bpy.types.Node) -> bpy.types.NodeSocket | None:
     if node.type == "BSDF_TRANSPARENT":
         return None

@@ -34,7 +34,7 @@ _MOST_FILES = 8
 
 
 @dataclasses.dataclass(frozen=True)
-class Solids:
+class SceneSolids:
     """Opaque triangles in the world; backend axes, metres."""
 
     corners: NDArray[np.float32]
@@ -47,7 +47,7 @@ class Solids:
 
 def scene_solids(
     depsgraph: bpy.types.Depsgraph, everything_holdout: bool, space: bpy.types.SpaceView3D | None = None
-) -> Solids:
+) -> SceneSolids:
     """Visible meshes, curves, surfaces, texts, metaballs and their instances, except the bodies of humans.
 
     A triangle has its material's base colour (see `base_colour`), or without a material the object's. Curves and the
@@ -56,9 +56,9 @@ def scene_solids(
     """
     parts = list(_parts(depsgraph, space))
     if not parts:
-        return Solids(np.zeros((0, 3, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, bool))
+        return SceneSolids(np.zeros((0, 3, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, bool))
     corners, colour, holdout = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Solids(corners, colour, holdout | everything_holdout)
+    return SceneSolids(corners, colour, holdout | everything_holdout)
 
 
 def visible_instances(
@@ -88,7 +88,7 @@ def _concerns_solids(changed: bpy.types.ID) -> bool:
     return isinstance(changed, _SOLID_DATA)
 
 
-def stored(solids: Solids, folder: Path) -> Path | None:
+def stored(solids: SceneSolids, folder: Path) -> Path | None:
     """Write solids to a file for the child, named by its content, and remove old files; None where there are none."""
     if len(solids.corners) == 0:
         return None

@@ -19,11 +19,9 @@ from ..scene.human_npz import Destination, read_human, write_now
 from ..scene.volumes import free_unused_grids
 from .follow import building
 from .missing_files import look
-from .queue import Job, chosen_checkpoint
+from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .target import HumanTarget
 
-_PICTURE_PX = 16
-"""Of the child's previews, which are not used here."""
 _STEP_PICTURE_PX = 256
 """Of the picture after each step, for the panel."""
 
@@ -68,7 +66,7 @@ class EditJob(Job):
             np.savez(folder / "region.npz", weights=np.asarray(asked["region"]["painted"], np.float32))
             asked["region"] = {"weights": str(folder / "region.npz")}
         checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
-        params = {**asked, "person": self.target.file_now(), "steps": self.steps, "size": _PICTURE_PX}
+        params = {**asked, "person": self.target.file_now(), "steps": self.steps, "size": PREVIEW_PX}
         params["picture_px"] = _STEP_PICTURE_PX
         return {**params, **checkpoint, "out_dir": str(folder)}
 
@@ -130,7 +128,7 @@ class RestoreJob(Job):
         return f"Restore Volumes of {self.target.name}"
 
     def params(self, folder: Path) -> dict[str, Any]:
-        return {"person": self.file, "out_dir": str(folder), "size": _PICTURE_PX}
+        return {"person": self.file, "out_dir": str(folder), "size": PREVIEW_PX}
 
     def place(self) -> Destination:
         return restore_destination(self.target.found())
@@ -163,7 +161,7 @@ class RegenerateJob(Job):
     def params(self, folder: Path) -> dict[str, Any]:
         asked = {name: self.made[name] for name in ("steps", "sampler", "attributes", "guidance") if name in self.made}
         checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
-        return {"seed": self.made["seed"], **asked, **checkpoint, "size": _PICTURE_PX, "out_dir": str(folder)}
+        return {"seed": self.made["seed"], **asked, **checkpoint, "size": PREVIEW_PX, "out_dir": str(folder)}
 
     def place(self) -> Destination:
         return edit_destination(self.target.found())

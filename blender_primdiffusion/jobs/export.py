@@ -24,7 +24,7 @@ from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remov
 from ..scene.shape import BODY_FILE, betas_of, generated_betas, has_custom_shape, shape_model_of
 from ..scene.surface import carrier_of, primitives_of
 from .generate import build_person
-from .queue import Job
+from .queue import PREVIEW_PX, Job
 from .target import HumanTarget
 
 
@@ -192,10 +192,6 @@ def _motion(context: bpy.types.Context, person: bpy.types.Collection, frames: Fr
     )
 
 
-_PICTURE_PX = 16
-"""Of the child's previews, which are not used here."""
-
-
 @dataclasses.dataclass(frozen=True)
 class ExportGaussiansJob(Job):
     """Write a human in a pose as 3D Gaussians."""
@@ -282,7 +278,7 @@ class ImportHumanJob(Job):
         return name_of(self.path)
 
     def params(self, folder: Path) -> dict[str, Any]:
-        return {"person": self.path, "out_dir": str(folder), "size": _PICTURE_PX}
+        return {"person": self.path, "out_dir": str(folder), "size": PREVIEW_PX}
 
     def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         motion = motion_in(read_tensors(Path(self.path)))

@@ -15,7 +15,7 @@ from ..scene.build import build_written, next_folder, stand_beside_others
 from ..scene.cycles import overlap_warning_in
 from ..scene.human_npz import Destination, write_now
 from .follow import building
-from .queue import Job, chosen_checkpoint
+from .queue import PREVIEW_PX, Job, chosen_checkpoint
 
 
 def build_person(
@@ -37,8 +37,6 @@ def build_person(
     return collection, " ".join([sentence(notice), *map(sentence, warnings)])
 
 
-_PICTURE_PX = 16
-"""Of the child's previews, which are not used here."""
 _STEP_PICTURE_PX = 256
 """Of the picture after each step, for the panel."""
 
@@ -66,7 +64,7 @@ class GenerateJob(Job):
 
     def params(self, folder: Path) -> dict[str, Any]:
         params = {"seed": self.seed, "steps": self.steps, "sampler": self.sampler, **self.asked}
-        params |= {"size": _PICTURE_PX, "picture_px": _STEP_PICTURE_PX}
+        params |= {"size": PREVIEW_PX, "picture_px": _STEP_PICTURE_PX}
         checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
         return {**params, **checkpoint, "out_dir": str(folder)}
 

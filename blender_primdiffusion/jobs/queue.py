@@ -16,13 +16,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import bpy
 
 from ..backend.client import Died, Silent
-from ..backend.requests import Request
+from ..backend.requests import Backend, ChildRequest, RequestError
 from ..places import new_backend, preference
 from .remedies import defect_in_the_scene, error_in_the_scene
 
 if TYPE_CHECKING:
-    from ..backend.requests import Backend, Request, RequestError
     from ..scene.human_npz import Destination
+
+
+PREVIEW_PX = 16
+"""Of the child's previews, which most jobs do not use."""
 
 
 class Job(abc.ABC):
@@ -126,7 +129,7 @@ class Queue:
         self.waiting: collections.deque[Entry] = collections.deque()
         self.current: Entry | None = None
         """The running one, None between jobs."""
-        self.request: Request | None = None
+        self.request: ChildRequest | None = None
         """The request of `current`."""
         self.advancing = False
         """`current` has more to do before its result may enter the scene."""
@@ -277,7 +280,7 @@ class Queue:
         except (ValueError, OSError) as error:
             self._end(JobOutcome(entry, error=error_in_the_scene(error)))
             return
-        self.request = Request(self._backend_for(preference("backend_python")), entry.job.method, params)
+        self.request = ChildRequest(self._backend_for(preference("backend_python")), entry.job.method, params)
 
     def _end(self, outcome: JobOutcome) -> JobOutcome:
         self.outcomes[outcome.entry.job.kind] = self.last = outcome

@@ -6,14 +6,10 @@ import dataclasses
 import errno
 import re
 import traceback
-from typing import TYPE_CHECKING
 
 import bpy
 
 from ..backend.requests import RequestError, sentence
-
-if TYPE_CHECKING:
-    from ..backend.requests import RequestError
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
 

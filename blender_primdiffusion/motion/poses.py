@@ -122,7 +122,6 @@ def _turn(axis: int, degrees: float | NDArray) -> NDArray[np.float64]:
 
 
 _HANGING = Arm(down=76, elbow=14, forearm=-10)
-_STRAIGHT = Leg()
 
 BUILT_IN: dict[str, Pose] = {
     "near T": Pose(Arm(down=8, elbow=4), Arm(down=8, elbow=4), Leg(out=4), Leg(out=4)),

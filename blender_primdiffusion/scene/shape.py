@@ -145,7 +145,7 @@ def faulty_field(model: ShapeModel) -> str | None:
     return "barycentric" if weights.min() < -1e-3 or np.abs(weights.sum(-1) - 1).max() > 1e-3 else None
 
 
-class Measures(NamedTuple):
+class BodyMeasures(NamedTuple):
     """Of a bare body at rest."""
 
     height: float
@@ -154,7 +154,7 @@ class Measures(NamedTuple):
     """Kilograms: the volume within the skin times DENSITY."""
 
 
-def measure(model: ShapeModel, betas: NDArray) -> Measures:
+def measure(model: ShapeModel, betas: NDArray) -> BodyMeasures:
     """Height and weight at these betas [10]."""
     return _measured(model, tuple(np.asarray(betas, np.float64)))
 
@@ -194,12 +194,12 @@ def slider_names(model: ShapeModel) -> list[str]:
 
 
 @functools.lru_cache(maxsize=64)
-def _measured(model: ShapeModel, betas: tuple[float, ...]) -> Measures:
+def _measured(model: ShapeModel, betas: tuple[float, ...]) -> BodyMeasures:
     vertices = model.surface(np.array(betas))
     upright = vertices[:, 1]
     a, b, c = (vertices[model.faces[:, corner]] for corner in range(3))
     volume = float(np.einsum("fx,fx->", a, np.cross(b, c))) / 6  # signed tetrahedra to the origin
-    return Measures(float(upright.max() - upright.min()), abs(volume) * DENSITY)
+    return BodyMeasures(float(upright.max() - upright.min()), abs(volume) * DENSITY)
 
 
 def _slope(model: ShapeModel, betas: NDArray) -> NDArray[np.float64]:

@@ -21,7 +21,6 @@ from . import (
     batch,
     captures_panel,
     captures_settings,
-    edit_operators,
     edit_panel,
     export_operators,
     export_panel,
@@ -38,15 +37,14 @@ from . import (
     shape_panel,
     shape_settings,
     translations,
-    variations_operators,
     variations_panel,
 )
 from .setup import operators as setup_operators
 from .setup import preferences
 
 MODULES = (
-    translations, setup_operators, preferences, follow, jobs_panel, attributes, generate_panel, variations_operators,
-    variations_panel, human_panel, shape_settings, edit_operators, shape_panel, edit_panel, missing_files,
+    translations, setup_operators, preferences, follow, jobs_panel, attributes, generate_panel,
+    variations_panel, human_panel, shape_settings, edit_panel, shape_panel, missing_files,
     import_motion, motion_panel, pose_panel, assets_panel, render_operators, render_panel, captures_settings,
     captures_panel, reconstruct_panel, export_operators, export_panel, batch, manual,
 )  # fmt: skip

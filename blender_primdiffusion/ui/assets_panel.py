@@ -11,7 +11,7 @@ from ..jobs.follow import submit
 from ..jobs.target import HumanTarget, selected_person
 from ..scene.human import humans
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
-from .on_person import SKIP, OnPerson
+from .on_person import SKIP, OnPerson, Reporting
 from .translations import CONTEXT
 
 _PICTURE = "Image file for the preview; empty: one is drawn"
@@ -22,7 +22,6 @@ class PRIMDIFFUSION_OT_mark_human_as_asset(OnPerson, bpy.types.Operator):
 
     bl_idname = "primdiffusion.mark_human_as_asset"
     bl_label = "Mark Human as Asset"
-    bl_options: set[str] = set()  # the result makes the undo step
 
     picture: bpy.props.StringProperty(name="Picture", description=_PICTURE, subtype="FILE_PATH", options=SKIP)
 
@@ -42,7 +41,6 @@ class PRIMDIFFUSION_OT_mark_pose_as_asset(OnPerson, bpy.types.Operator):
 
     bl_idname = "primdiffusion.mark_pose_as_asset"
     bl_label = "Mark Pose as Asset"
-    bl_options: set[str] = set()  # the result makes the undo step
 
     name: bpy.props.StringProperty(name="Name", description="Of the pose", default="Pose", options=SKIP)
     picture: bpy.props.StringProperty(name="Picture", description=_PICTURE, subtype="FILE_PATH", options=SKIP)
@@ -74,26 +72,21 @@ class PRIMDIFFUSION_OT_unmark_human_asset(OnPerson, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_make_pose_assets(bpy.types.Operator):
+class PRIMDIFFUSION_OT_make_pose_assets(Reporting, bpy.types.Operator):
     """Write the built-in poses as assets to a folder, and add it to the asset libraries"""
 
     bl_idname = "primdiffusion.make_pose_assets"
     bl_label = "Make Pose Assets"
-    bl_options: set[str] = set()  # the open file stays as it is
 
     directory: bpy.props.StringProperty(
         name="Folder", description="Empty: in the extension's own folder", subtype="DIR_PATH", options=SKIP
     )
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> set[str]:
         from ..jobs.assets import write_pose_library  # needs numpy
 
         folder = Path(bpy.path.abspath(self.directory)) if self.directory else None
-        try:
-            path, count = write_pose_library(context, folder)
-        except (ValueError, OSError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        path, count = write_pose_library(context, folder)
         self.report({"INFO"}, f"{count} poses are in {path}, and in the Asset Browser")
         return {"FINISHED"}
 

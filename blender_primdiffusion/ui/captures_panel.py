@@ -15,6 +15,7 @@ from ..jobs.follow import redraw
 from .captures_session import Busy, captures
 from .captures_settings import words_of
 from .drawing import SidebarPanel, draw_lines, property_columns
+from .on_person import Reporting
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,7 +55,7 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
                 return self._render_here(context, words)
             settings_of(parse(words))  # report impossible settings at once
             captures.start(words)
-        except (Busy, OSError, ValueError, RuntimeError) as error:
+        except (OSError, ValueError, RuntimeError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         bpy.app.timers.register(follow, first_interval=_TICK_S, persistent=True)
@@ -103,65 +104,55 @@ class PRIMDIFFUSION_OT_cancel_captures(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_verify_captures(bpy.types.Operator):
+class PRIMDIFFUSION_OT_verify_captures(Reporting, bpy.types.Operator):
     """Read every file of the captures and report what is missing, truncated or altered"""
 
     bl_idname = "primdiffusion.verify_captures"
     bl_label = "Verify"
-    bl_options: set[str] = set()
 
     out: bpy.props.StringProperty(name="Captures", description="Empty: the panel's")
     repair: bpy.props.BoolProperty(
         name="Repair", description="Remove damaged files, so that the next run renders only those again"
     )
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> set[str]:
         """With a window another Blender verifies; in background mode this one, failing on damage."""
         # needs numpy
         from ..capture.options import parse
         from ..capture.subject import repair, verify
 
         out = bpy.path.abspath(self.out or context.scene.primdiffusion_captures.out)
-        try:
-            if not out:
-                raise ValueError("choose the folder of captures first")
-            words = ["--out", out, "--verify", *(["--repair"] if self.repair else [])]
-            if not bpy.app.background:
-                captures.start(words)
-                bpy.app.timers.register(follow, first_interval=_TICK_S, persistent=True)
-                return {"FINISHED"}
-            root = parse(words).out
-            wrong = repair(root) if self.repair else verify(root)
-        except (Busy, OSError, ValueError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        if not out:
+            raise ValueError("choose the folder of captures first")
+        words = ["--out", out, "--verify", *(["--repair"] if self.repair else [])]
+        if not bpy.app.background:
+            captures.start(words)
+            bpy.app.timers.register(follow, first_interval=_TICK_S, persistent=True)
+            return {"FINISHED"}
+        root = parse(words).out
+        wrong = repair(root) if self.repair else verify(root)
         for sentence in wrong:
             print(f"PrimDiffusion: {sentence}")
         if wrong and not self.repair:
-            self.report({"ERROR"}, f"{len(wrong)} problems; the first: {wrong[0]}")
-            return {"CANCELLED"}
+            raise ValueError(f"{len(wrong)} problems; the first: {wrong[0]}")
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_preview_rig(bpy.types.Operator):
+class PRIMDIFFUSION_OT_preview_rig(Reporting, bpy.types.Operator):
     """Show the cameras around the active object, or hide them again"""
 
     bl_idname = "primdiffusion.preview_rig"
     bl_label = "Preview Cameras"
     bl_options = {"UNDO"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> set[str]:
         from ..capture.blender_camera import aim  # needs numpy
 
         collection = context.scene.collection.children.get(RIG)
         if collection is not None:
             remove_rig(collection)
             return {"FINISHED"}
-        try:
-            rig = context.scene.primdiffusion_captures.rig()
-        except ValueError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        rig = context.scene.primdiffusion_captures.rig()
         collection = bpy.data.collections.new(RIG)
         context.scene.collection.children.link(collection)
         for number, view in enumerate(rig.views(*_sphere_around(context))):

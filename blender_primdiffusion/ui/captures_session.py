@@ -24,7 +24,7 @@ PATIENCE_S = 0.7
 _MOST_LINES = 200
 
 
-class Busy(RuntimeError):
+class Busy(ValueError):
     """A capture runs already."""
 
 

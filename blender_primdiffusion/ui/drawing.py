@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import re
 import textwrap
-from typing import TYPE_CHECKING
 
 import bpy
 
+from ..backend.requests import RequestError
 from ..jobs.follow import building, in_the_way
 from ..jobs.pictures import so_far
 from ..jobs.queue import JobOutcome, queue
 from ..jobs.remedies import remedy_for
 from ..places import EXTENSION
 from .manual import draw_manual_button
-
-if TYPE_CHECKING:
-    from ..backend.requests import RequestError
 
 _LINE = 34
 """Characters that fit a sidebar of default width, beside an icon."""
@@ -69,17 +66,17 @@ def draw_job(
     return props
 
 
-def draw_lines(layout: bpy.types.UILayout, text: str, icon: str) -> None:
+def draw_lines(layout: bpy.types.UILayout, text: str, icon: str, width: int = _LINE) -> None:
     """A sentence on as many lines as it needs."""
     column = layout.column(align=True)
-    for number, line in enumerate(_wrapped(text)):
+    for number, line in enumerate(_wrapped(text, width)):
         column.label(text=line, icon=icon if number == 0 else "BLANK1", translate=False)
 
 
-def _wrapped(text: str) -> list[str]:
+def _wrapped(text: str, width: int = _LINE) -> list[str]:
     """Lines that fit; numbers keep their units."""
     together = _QUANTITY.sub(lambda match: match[0].replace(" ", _NO_BREAK), text)
-    return [line.replace(_NO_BREAK, " ") for line in textwrap.wrap(together, _LINE)]
+    return [line.replace(_NO_BREAK, " ") for line in textwrap.wrap(together, width)]
 
 
 def _draw_progress(layout: bpy.types.UILayout) -> None:

@@ -1,17 +1,290 @@
-"""Edits of the selected person: sub-panels of Human."""
+"""Edits of the selected human in place (Vary, Re-dress Region, Transfer Texture, Blend): sub-panels of Human."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import bpy
 
-from ..formats.requests import SIDED_PARTS, WHOLE_PARTS
-from ..jobs.target import selected_person
-from ..scene.human import body_of, humans
-from .attributes import draw_attributes
+from ..formats.requests import AMOUNT, FRACTION, PARTS, SIDED_PARTS, STEPS, TRANSFERS, WHOLE_PARTS
+from ..jobs.follow import submit
+from ..jobs.target import named_person, selected_person
+from ..scene.human import BODY_MARK, MARK, body_of, humans, person_file
+from .attributes import PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed, title
 from .drawing import SidebarPanel, draw_job, property_columns
-from .edit_operators import painting
+from .on_person import PANELS, SKIP, OnPerson, Reporting
+from .translations import CONTEXT
+
+PAINTED_GROUP = "PrimDiffusion Region"
+"""Vertex group of the body mesh that Paint Region makes."""
+
+_TRANSFERS = {
+    "texture": ("Texture", "Colours only, on the person's own shape"),
+    "garment": ("Garment", "Colours and shape: what the other person wears there"),
+}
+TRANSFER_ITEMS = [(name, *_TRANSFERS[name]) for name in TRANSFERS]
+
+
+def parts_property():
+    """A choice of several body parts."""
+    return bpy.props.EnumProperty(
+        name="Parts",
+        translation_context=CONTEXT,
+        description="Parts to change: Shift-click for several. Left and right are the person's",
+        items=[(name, title(name), "", 1 << i) for i, name in enumerate(PARTS)],
+        options={"ENUM_FLAG", "SKIP_SAVE"},
+        default={"top"},
+    )
+
+
+def _may_be_other(_self: PRIMDIFFUSION_PG_edit, collection: bpy.types.Collection) -> bool:
+    return MARK in collection and collection in humans(bpy.context.scene)
+
+
+class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
+    """`scene.primdiffusion_edit`."""
+
+    seed: bpy.props.IntProperty(
+        name="Seed",
+        description="Another seed gives another result; the same seed gives the same result",
+        default=1,
+        min=0,
+    )
+    amount: bpy.props.FloatProperty(
+        name="Amount",
+        description="How much the new person may differ from this one: 0 not at all, 1 completely",
+        default=AMOUNT,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+    )
+    region: bpy.props.EnumProperty(
+        name="Region",
+        description="Where to change the person; everything else stays exactly as it is",
+        items=[
+            ("PARTS", "Parts", "Parts of the body, by name"),
+            ("PAINTED", "Painted", "A vertex group of the body mesh: where its weight is one half or more"),
+        ],
+    )
+    parts: parts_property()
+    vertex_group: bpy.props.StringProperty(
+        name="Vertex Group", description="Vertex group of the person's body mesh", default=PAINTED_GROUP
+    )
+    attributes: bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_attributes)
+    other: bpy.props.PointerProperty(
+        name="Other Person", description="The other person", type=bpy.types.Collection, poll=_may_be_other
+    )
+    what: bpy.props.EnumProperty(name="Transfer", description="What the person gets", items=TRANSFER_ITEMS)
+    harmonise: bpy.props.FloatProperty(
+        name="Harmonise",
+        description="How much the region is denoised again to match the rest of the person: 0 copies it exactly",
+        default=0.0,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+    )
+    fraction: bpy.props.FloatProperty(
+        name="Fraction",
+        translation_context=CONTEXT,
+        description="Share of the other person: 0 is this person, 1 the other",
+        default=FRACTION,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+    )
+
+
+class PRIMDIFFUSION_OT_paint_region(Reporting, bpy.types.Operator):
+    """Show the body mesh of the selected person and paint the region to change"""
+
+    bl_idname = "primdiffusion.paint_region"
+    bl_label = "Paint Region"
+    bl_options = {"UNDO"}
+
+    def act(self, context: bpy.types.Context) -> set[str]:
+        from ..scene.edit import start_painting  # needs numpy
+
+        settings = context.scene.primdiffusion_edit
+        person = selected_person(context)
+        body = body_of(person)
+        if body is None:
+            raise ValueError(f"the body mesh of {person.name!r} was deleted: choose parts by name instead")
+        start_painting(context, body, settings.vertex_group)
+        settings.region = "PAINTED"
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_finish_painting(bpy.types.Operator):
+    """Return to Object mode and hide the body mesh; its vertex group stays"""
+
+    bl_idname = "primdiffusion.finish_painting"
+    bl_label = "Finish Painting"
+    bl_options = {"UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("No region is being painted: press Paint Region first")
+        return painting(context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        from ..scene.edit import end_painting  # needs numpy
+
+        end_painting(context, context.view_layer.objects.active)
+        return {"FINISHED"}
+
+
+def painting(context: bpy.types.Context) -> bool:
+    """Whether a body mesh is being weight painted."""
+    active = context.view_layer.objects.active
+    return active is not None and active.mode == "WEIGHT_PAINT" and BODY_MARK in active
+
+
+class _Edit(OnPerson):
+    """Base of the edits; properties that are not given are the panel's."""
+
+    job: str
+    """Class of `jobs.edit`."""
+    seed: bpy.props.IntProperty(name="Seed", min=0, description=PANELS, options=SKIP)
+    steps: bpy.props.IntProperty(name="Steps", min=1, max=1000, default=STEPS, description=PANELS, options=SKIP)
+
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        from ..jobs import edit  # needs numpy
+
+        steps = self.chosen("steps", context.scene.primdiffusion)
+        return submit(self, context, getattr(edit, self.job).of(person, steps, self.params(context, person)))
+
+    def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
+        """The edit's parameters of the child's method: see `EditJob.asked`."""
+        raise NotImplementedError
+
+    def chosen(self, name: str, settings: bpy.types.PropertyGroup) -> Any:
+        """The operator's property if set, else the panel's."""
+        return getattr(self if self.properties.is_property_set(name) else settings, name)
+
+
+class _Region:
+    """Operators with a region."""
+
+    parts: parts_property()
+    vertex_group: bpy.props.StringProperty(
+        name="Vertex Group", description="Vertex group with a painted region, instead of parts", options=SKIP
+    )
+
+    def region(
+        self, settings: bpy.types.PropertyGroup, person: bpy.types.Collection
+    ) -> list[str] | dict[str, list[float]]:
+        """Names of parts, or painted weights [V]."""
+        from ..scene.edit import painted_weights  # needs numpy
+
+        given = self.properties.is_property_set
+        if given("vertex_group") or (not given("parts") and settings.region == "PAINTED"):
+            body = body_of(person)
+            if body is None:
+                raise ValueError(f"the body mesh of {person.name!r} was deleted: choose parts by name instead")
+            return {"painted": painted_weights(body, self.chosen("vertex_group", settings)).tolist()}
+        parts = sorted(self.chosen("parts", settings))
+        if not parts:
+            raise ValueError("no part of the body is chosen: choose one or more in the panel")
+        return parts
+
+
+class PRIMDIFFUSION_OT_vary(_Edit, bpy.types.Operator):
+    """Turn the selected person into a similar one; the smaller the amount, the more similar"""
+
+    bl_idname = "primdiffusion.vary"
+    bl_label = "Vary"
+    job = "VaryJob"
+
+    amount: bpy.props.FloatProperty(name="Amount", min=0.0, max=1.0, description=PANELS, options=SKIP)
+    attributes: bpy.props.StringProperty(
+        name="Attributes", description="For example sex=female, height=1.7; empty: no restriction", options=SKIP
+    )
+    guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=PANELS, options=SKIP)
+
+    def params(self, context: bpy.types.Context, _person: bpy.types.Collection) -> dict[str, Any]:
+        settings = context.scene.primdiffusion_edit
+        params = {"amount": self.chosen("amount", settings), "seed": self.chosen("seed", settings)}
+        wanted = parsed(self.attributes)
+        if wanted:
+            params |= {"attributes": wanted, "guidance": self.chosen("guidance", context.scene.primdiffusion)}
+        return params
+
+
+class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
+    """Generate a region of the selected person again; everything else stays exactly as it is"""
+
+    bl_idname = "primdiffusion.redress"
+    bl_label = "Re-dress Region"
+    job = "RedressJob"
+
+    attributes: bpy.props.StringProperty(
+        name="Attributes", description=f"For example outfit=suit. {PANELS}", options=SKIP
+    )
+    guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=PANELS, options=SKIP)
+
+    def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
+        settings = context.scene.primdiffusion_edit
+        params: dict[str, Any] = {"region": self.region(settings, person), "seed": self.chosen("seed", settings)}
+        given = self.properties.is_property_set("attributes")
+        wanted = parsed(self.attributes) if given else asked(settings.attributes)
+        if wanted:
+            params |= {"attributes": wanted, "guidance": self.chosen("guidance", context.scene.primdiffusion)}
+        return params
+
+
+class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
+    """Transfer the texture, or the garment, of another person to a region of the selected person"""
+
+    bl_idname = "primdiffusion.transfer_texture"
+    bl_label = "Transfer Texture"
+    job = "TransferJob"
+
+    source: bpy.props.StringProperty(name="Source", description=f"Name of the other person. {PANELS}", options=SKIP)
+    what: bpy.props.EnumProperty(name="Transfer", items=TRANSFER_ITEMS, description=PANELS, options=SKIP)
+    harmonise: bpy.props.FloatProperty(name="Harmonise", min=0.0, max=1.0, description=PANELS, options=SKIP)
+
+    def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
+        settings = context.scene.primdiffusion_edit
+        return {
+            "source": _other(context, person, self.source),
+            "region": self.region(settings, person),
+            "what": self.chosen("what", settings),
+            "harmonise": self.chosen("harmonise", settings),
+            "seed": self.chosen("seed", settings),
+        }
+
+
+class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
+    """Change the selected person towards another one, who stays unchanged"""
+
+    bl_idname = "primdiffusion.blend"
+    bl_label = "Blend"
+    job = "BlendJob"
+
+    other: bpy.props.StringProperty(name="Other", description=f"Name of the other person. {PANELS}", options=SKIP)
+    fraction: bpy.props.FloatProperty(
+        name="Fraction", translation_context=CONTEXT, min=0.0, max=1.0, description=PANELS, options=SKIP
+    )
+
+    def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
+        settings = context.scene.primdiffusion_edit
+        other = _other(context, person, self.other)
+        return {"other": other, "fraction": self.chosen("fraction", settings)}
+
+
+def _other(context: bpy.types.Context, person: bpy.types.Collection, name: str) -> str:
+    """The backend's file of the other person, named by a script or picked in the panel."""
+    picked = context.scene.primdiffusion_edit.other
+    if not name and picked is None:
+        raise ValueError("choose the other person in the panel first")
+    other = named_person(context, name or picked.name)
+    if other == person:
+        raise ValueError(f"{person.name!r} cannot be the other person too: choose another one")
+    return str(person_file(other))
+
+
+PROPERTIES = ((bpy.types.Scene, "primdiffusion_edit", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_edit)),)
 
 
 def _sub_panel(name: str, label: str, order: int, content: Callable) -> type:
@@ -62,14 +335,14 @@ def _draw_transfer(layout: bpy.types.UILayout, settings, context) -> None:
 
 
 def _draw_blend(layout: bpy.types.UILayout, settings, _context) -> None:
-    """With whom, how far, and the button."""
+    """The other human, the fraction and the button."""
     layout.prop(settings, "other")
     layout.prop(settings, "fraction")
     draw_job(layout, "interpolate", "primdiffusion.blend", "ARROW_LEFTRIGHT", settings.other is not None)
 
 
 def _draw_files(layout: bpy.types.UILayout, _settings, _context) -> None:
-    """People's files on disk: beside the .blend, and those that edits have left."""
+    """Human files on disk: beside the .blend, and those left by edits."""
     layout.operator("primdiffusion.collect_files", icon="PACKAGE")
     layout.operator("primdiffusion.find_volumes_in_folder", icon="VIEWZOOM")
     layout.operator("primdiffusion.remove_unused_files", icon="TRASH")

@@ -12,7 +12,7 @@ from ..formats import requests
 from ..jobs.follow import submit
 from ..jobs.target import HumanTarget
 from ..scene.human import armature_of
-from .on_person import PANELS, SKIP, OnPerson
+from .on_person import PANELS, SKIP, OnPerson, Reporting
 from .translations import CONTEXT
 
 
@@ -109,8 +109,6 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
 
 class _Export(OnPerson):
     """Base of the exports; not redoable, since a redo slider must not start the job again."""
-
-    bl_options: set[str] = set()  # no UNDO either: those that change the scene make a step
 
     def chosen(self, context: bpy.types.Context, name: str):
         """The operator's property if set, else the panel's."""
@@ -310,12 +308,11 @@ class PRIMDIFFUSION_OT_export_human(_ToFile, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
+class PRIMDIFFUSION_OT_import_human(Reporting, bpy.types.Operator):
     """Add the person of a .human file to the scene"""
 
     bl_idname = "primdiffusion.import_human"
     bl_label = "Import Human File"
-    bl_options: set[str] = set()  # neither REGISTER (redo) nor UNDO (the result has one)
 
     filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH", options=SKIP)
     filter_glob: bpy.props.StringProperty(
@@ -335,19 +332,15 @@ class PRIMDIFFUSION_OT_import_human(bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> set[str]:
         # needs numpy
         from ..jobs.export import ImportHumanJob
         from ..scene.human_file import motion_in, read_tensors
 
         path = Path(bpy.path.abspath(self.filepath))
-        try:
-            if not self.filepath or not path.is_file():
-                raise FileNotFoundError(f"there is no file {str(path)!r}: choose a .human file")
-            motion_in(read_tensors(path))
-        except (ValueError, OSError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        if not self.filepath or not path.is_file():
+            raise FileNotFoundError(f"there is no file {str(path)!r}: choose a .human file")
+        motion_in(read_tensors(path))
         at = tuple(self.location) if self.properties.is_property_set("location") else None
         return submit(self, context, ImportHumanJob(str(path), at))
 

@@ -17,6 +17,7 @@ from ..jobs.queue import queue
 from .attributes import CATEGORIES, SCALARS, PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
 from .manual import draw_manual_button
+from .on_person import Reporting
 from .setup.preferences import draw_set_up
 from .translations import CONTEXT
 
@@ -129,10 +130,8 @@ _PANELS = "Not given: the panel's"
 _SKIP = {"SKIP_SAVE"}
 
 
-class GenerateOptions:
+class GenerateOptions(Reporting):
     """Properties of operators that generate. None is redoable: a redo slider must not start an expensive job again."""
-
-    bl_options: set[str] = set()  # neither REGISTER (redo) nor UNDO (the result has one)
 
     seed: bpy.props.IntProperty(
         name="Seed", default=-1, min=-1, max=LARGEST_SEED, description="-1: the panel's", options=_SKIP
@@ -234,7 +233,7 @@ class PRIMDIFFUSION_OT_generate(GenerateOptions, bpy.types.Operator):
         name="Count", default=0, min=0, max=1000, description="How many people; 0: the panel's", options={"SKIP_SAVE"}
     )
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> set[str]:
         from ..jobs.generate import GenerateJob  # needs numpy
 
         settings = context.scene.primdiffusion
@@ -244,12 +243,8 @@ class PRIMDIFFUSION_OT_generate(GenerateOptions, bpy.types.Operator):
         if from_panel and not settings.keep_seed and settings.seed in _queued_seeds():
             settings.seed = random_seed()
         seed = settings.seed if from_panel else self.seed
-        try:
-            last = last_seed(seed, count)
-            sampling = self.sampling(settings)
-        except ValueError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        last = last_seed(seed, count)
+        sampling = self.sampling(settings)
         for each in range(seed, last + 1):
             renew_seed = from_panel and not settings.keep_seed and each == last
             next_seed = random_seed() if renew_seed else None

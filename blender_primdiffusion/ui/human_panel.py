@@ -12,7 +12,7 @@ from ..jobs.missing_files import look, state
 from ..jobs.target import HumanTarget, selected_person
 from ..scene.human import armature_of, check_editable, humans, humans_folder, person_file, remove_human
 from .drawing import SidebarPanel, draw_job, draw_lines
-from .on_person import OnPerson
+from .on_person import OnPerson, Reporting
 
 
 class _Find:
@@ -107,7 +107,6 @@ class PRIMDIFFUSION_OT_generate_again(OnPerson, bpy.types.Operator):
 
     bl_idname = "primdiffusion.generate_again"
     bl_label = "Generate Again"
-    bl_options: set[str] = set()  # neither REGISTER (redo) nor UNDO (the result has one)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         from ..jobs.edit import RegenerateJob, made_from_seed  # needs numpy
@@ -119,21 +118,17 @@ class PRIMDIFFUSION_OT_generate_again(OnPerson, bpy.types.Operator):
         raise ValueError(f"the file of {person.name!r} is there, {there.name!r}: press Find Missing Volumes")
 
 
-class PRIMDIFFUSION_OT_collect_files(bpy.types.Operator):
+class PRIMDIFFUSION_OT_collect_files(Reporting, bpy.types.Operator):
     """Copy the files of all people next to this .blend, so that it can be moved or sent with one folder"""
 
     bl_idname = "primdiffusion.collect_files"
     bl_label = "Collect Files"
     bl_options = {"UNDO"}
 
-    def execute(self, _context: bpy.types.Context) -> set[str]:
+    def act(self, _context: bpy.types.Context) -> set[str]:
         from ..scene.collect import collect_files  # needs numpy
 
-        try:
-            done = collect_files()
-        except (OSError, ValueError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        done = collect_files()
         look()
         where = humans_folder().name
         if done.volumes:

@@ -18,6 +18,7 @@ from ..jobs.pictures import so_far
 from ..jobs.queue import queue
 from ..places import EXTENSION, backend_module_path, preference
 from .drawing import SidebarPanel, draw_ended, draw_lines, draw_queue
+from .on_person import Reporting
 
 TEXT = "PrimDiffusion Diagnostics"
 _LOG_LINES = 60
@@ -106,12 +107,11 @@ class PRIMDIFFUSION_OT_copy_diagnostics(bpy.types.Operator):
 _SKIP = {"SKIP_SAVE"}
 
 
-class PRIMDIFFUSION_OT_cancel(bpy.types.Operator):
+class PRIMDIFFUSION_OT_cancel(Reporting, bpy.types.Operator):
     """Stop this job, or remove it from the queue; nothing is added to the scene"""
 
     bl_idname = "primdiffusion.cancel"
     bl_label = "Cancel"
-    bl_options: set[str] = set()
 
     number: bpy.props.IntProperty(
         name="Number", description="Number of the queued job; 0 is the running one", min=0, options=_SKIP
@@ -122,21 +122,19 @@ class PRIMDIFFUSION_OT_cancel(bpy.types.Operator):
         cls.poll_message_set("No job is queued")
         return queue.busy
 
-    def execute(self, _context: bpy.types.Context) -> set[str]:
+    def act(self, _context: bpy.types.Context) -> set[str]:
         if not queue.cancel(self.number):
             which = f"job {self.number} is no longer queued" if self.number else "no job is running yet"
-            self.report({"ERROR"}, which)
-            return {"CANCELLED"}
+            raise ValueError(which)
         redraw()
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_try_again(bpy.types.Operator):
+class PRIMDIFFUSION_OT_try_again(Reporting, bpy.types.Operator):
     """Queue the failed job again"""
 
     bl_idname = "primdiffusion.try_again"
     bl_label = "Try Again"
-    bl_options: set[str] = set()
 
     kind: bpy.props.StringProperty(
         name="Kind", description="Kind of job, such as generate; empty: the last one that ended", options=_SKIP
@@ -147,12 +145,11 @@ class PRIMDIFFUSION_OT_try_again(bpy.types.Operator):
         cls.poll_message_set("No job has failed")
         return any(outcome.error is not None for outcome in queue.outcomes.values())
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> set[str]:
         outcome = queue.outcomes.get(self.kind) if self.kind else queue.last
         if outcome is None or outcome.error is None:
             why = f"no job {self.kind!r} has failed" if self.kind else "the last job did not fail"
-            self.report({"ERROR"}, why)
-            return {"CANCELLED"}
+            raise ValueError(why)
         return submit(self, context, outcome.entry.job)
 
 

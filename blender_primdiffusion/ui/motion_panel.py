@@ -12,7 +12,7 @@ from ..backend.requests import sentence
 from ..scene.actions import action_curves, end_repeat, loops, repeat
 from .drawing import SidebarPanel, draw_lines, property_columns
 from .export_operators import destination
-from .on_person import FACTS, OnArmature, WhereTo, scene_fps, target_armature
+from .on_person import FACTS, OnArmature, Reporting, WhereTo, scene_fps, target_armature
 from .translations import CONTEXT
 
 _BUILT_IN = [
@@ -23,7 +23,7 @@ _BUILT_IN = [
 ]
 
 
-class PRIMDIFFUSION_OT_use_action(bpy.types.Operator):
+class PRIMDIFFUSION_OT_use_action(Reporting, bpy.types.Operator):
     """Use another action of this file for the person"""
 
     bl_idname = "primdiffusion.use_action"
@@ -32,20 +32,16 @@ class PRIMDIFFUSION_OT_use_action(bpy.types.Operator):
 
     action: bpy.props.StringProperty(name="Action", description="Name of the action", options={"SKIP_SAVE"})
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> set[str]:
         from ..motion.pose_library import check_posable  # needs numpy
 
         action = bpy.data.actions.get(self.action)
-        try:
-            armature = target_armature(context)
-            check_posable(armature)
-            if action is None:
-                raise ValueError(f"there is no action {self.action!r} in this file")
-            if not moves_bones(action):
-                raise ValueError(f"the action {self.action!r} does not animate the bones of a person")
-        except ValueError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        armature = target_armature(context)
+        check_posable(armature)
+        if action is None:
+            raise ValueError(f"there is no action {self.action!r} in this file")
+        if not moves_bones(action):
+            raise ValueError(f"the action {self.action!r} does not animate the bones of a person")
         animation = armature.animation_data_create()
         animation.action = action
         if action_curves(armature) is None:
@@ -135,7 +131,6 @@ class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operato
 
     bl_idname = "primdiffusion.export_motion"
     bl_label = "Export Motion"
-    bl_options: set[str] = set()  # changes nothing
 
     filename_ext = ".npz"
     filter_glob: bpy.props.StringProperty(default="*.npz", options={"HIDDEN"})
@@ -161,7 +156,7 @@ class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operato
 
 
 class PRIMDIFFUSION_PT_motion(SidebarPanel, bpy.types.Panel):
-    """Motion from files and of our own, what it is, and out again."""
+    """Import and built-in motions, the current motion, and export."""
 
     bl_label = "Motion"
     bl_order = 3

@@ -12,8 +12,28 @@ SKIP = {"SKIP_SAVE"}
 PANELS = "Not given: the panel's"
 
 
-class OnPerson:
-    """Base of operators on one human: finds it and turns errors into reports; subclasses define `run`."""
+class Reporting:
+    """Base of operators whose errors become reports; subclasses define `act`.
+
+    No options: with REGISTER a redo slider would start an expensive job again, and results make their own UNDO step.
+    """
+
+    bl_options: set[str] = set()
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            return self.act(context)
+        except (ValueError, OSError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+
+    def act(self, context: bpy.types.Context) -> set[str]:
+        """The operator itself; ValueError and OSError become reports."""
+        raise NotImplementedError
+
+
+class OnPerson(Reporting):
+    """Base of operators on one human, which it finds; subclasses define `run`."""
 
     human: bpy.props.StringProperty(
         name="Person", description="Name of the person's collection; empty: the selected person", options=SKIP
@@ -24,19 +44,15 @@ class OnPerson:
         cls.poll_message_set("There is no person in the scene: generate one first")
         return bool(humans(context.scene))
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        try:
-            return self.run(context, self.person(context))
-        except (ValueError, OSError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+    def act(self, context: bpy.types.Context) -> set[str]:
+        return self.run(context, self.person(context))
 
     def person(self, context: bpy.types.Context) -> bpy.types.Collection:
         """The human named, else the selected one. Raises ValueError."""
         return named_person(context, self.human) if self.human else selected_person(context)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """The operator itself; ValueError and OSError become reports."""
+        """The operator itself."""
         raise NotImplementedError
 
 
@@ -72,8 +88,8 @@ def scene_fps(scene: bpy.types.Scene) -> float:
     return scene.render.fps / scene.render.fps_base
 
 
-class OnArmature:
-    """Base of operators on one armature: finds it and turns errors into reports; subclasses define `on`."""
+class OnArmature(Reporting):
+    """Base of operators on one armature, which it finds; subclasses define `on`."""
 
     person: bpy.props.StringProperty(
         name="Person",
@@ -87,15 +103,11 @@ class OnArmature:
         cls.poll_message_set("There is no person in the scene: generate one, or select an armature with SMPL's joints")
         return bool(humans(context.scene)) or (active is not None and active.type == "ARMATURE")
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        try:
-            return self.on(context, target_armature(context, self.person))
-        except (ValueError, OSError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+    def act(self, context: bpy.types.Context) -> set[str]:
+        return self.on(context, target_armature(context, self.person))
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        """The operator itself; ValueError and OSError become reports."""
+        """The operator itself."""
         raise NotImplementedError
 
 

@@ -253,7 +253,6 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
 
     bl_idname = "primdiffusion.save_pose"
     bl_label = "Save Pose"
-    bl_options: set[str] = set()  # a file cannot be undone
 
     pose_name: bpy.props.StringProperty(
         name="Name", description="Name of the new pose", default="My Pose", options=_SKIP

@@ -10,6 +10,7 @@ import bpy
 from ..formats.requests import CAPTURE_VIEWS
 from ..jobs.follow import submit
 from .drawing import SidebarPanel, draw_job, property_columns
+from .on_person import Reporting
 
 _CAMERAS_FILE = "cameras.json"
 
@@ -62,12 +63,11 @@ class PRIMDIFFUSION_PG_reconstruct(bpy.types.PropertyGroup):
     )
 
 
-class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
+class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
     """Reconstruct a person from pictures taken from several sides, and add it to the scene with an armature"""
 
     bl_idname = "primdiffusion.human_from_captures"
     bl_label = "Human from Captures"
-    bl_options: set[str] = set()  # neither REGISTER (redo) nor UNDO: the result has one
 
     directory: bpy.props.StringProperty(
         name="Captures", description="Empty: the panel's", subtype="DIR_PATH", options={"SKIP_SAVE"}
@@ -84,21 +84,20 @@ class PRIMDIFFUSION_OT_human_from_captures(bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> set[str]:
         from ..jobs.generate import ReconstructJob  # needs numpy
 
         asked = context.scene.primdiffusion_reconstruct
         folder = bpy.path.abspath(self.directory or asked.capture)
         subject = self.subject or ("" if self.directory else asked.subject)  # the panel's belongs to its own folder
         if not folder:
-            self.report({"ERROR"}, "choose the folder of captures first")
-            return {"CANCELLED"}
+            raise ValueError("choose the folder of captures first")
         frame, views = self.frame if self.frame >= 0 else asked.frame, self.views or asked.views
         return submit(self, context, ReconstructJob(folder, subject, frame, views))
 
 
 class PRIMDIFFUSION_PT_human_from_captures(SidebarPanel, bpy.types.Panel):
-    """From which pictures, of whom, the button; progress and errors."""
+    """Capture, subject, frame, views and the button; progress and errors."""
 
     bl_label = "Human from Captures"
     bl_parent_id = "PRIMDIFFUSION_PT_captures"

@@ -45,8 +45,6 @@ class PRIMDIFFUSION_OT_set_attachment(OnPerson, bpy.types.Operator):
 
 
 class _Merging(OnPerson):
-    bl_options: set[str] = set()  # neither REGISTER (redo) nor UNDO (the result has one)
-
     voxel: bpy.props.FloatProperty(
         name="Voxel Size",
         description="Metres. Not given: the panel's",
@@ -119,7 +117,6 @@ class PRIMDIFFUSION_OT_fit_density_gain(OnPerson, bpy.types.Operator):
 
     bl_idname = "primdiffusion.fit_density_gain"
     bl_label = "Fit Density Gain"
-    bl_options: set[str] = set()  # the result has an undo step
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         from ..jobs.merge import FitGainJob  # needs numpy

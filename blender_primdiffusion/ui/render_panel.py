@@ -16,6 +16,7 @@ from ..scene.attachment import MODES, attachment_of
 from ..scene.human import human_of, humans
 from ..scene.material import density_gain, set_density_gain
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
+from .on_person import Reporting
 from .render_operators import ATTACHMENT_ITEMS
 
 _FROM_EEVEE = frozenset(
@@ -164,21 +165,20 @@ class PRIMDIFFUSION_OT_set_up_engine(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_set_up_cycles(bpy.types.Operator):
+class PRIMDIFFUSION_OT_set_up_cycles(Reporting, bpy.types.Operator):
     """Render with Cycles: people are approximate; shadows and light on other objects are correct"""
 
     bl_idname = "primdiffusion.set_up_cycles"
     bl_label = "Cycles (Approximate)"
     bl_options = {"UNDO"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> set[str]:
         """Camera, world, film and bounces of light between other objects stay as they are."""
         from ..scene.cycles import fit_cycles_to_volumes  # needs numpy
 
         scene = context.scene
         if not hasattr(scene, "cycles"):
-            self.report({"ERROR"}, "Cycles is disabled: enable the add-on Cycles Render Engine in the preferences")
-            return {"CANCELLED"}
+            raise ValueError("Cycles is disabled: enable the add-on Cycles Render Engine in the preferences")
         scene.render.engine = "CYCLES"
         bounces = scene.cycles.max_bounces
         fit_cycles_to_volumes(scene, _SAMPLES)
@@ -187,23 +187,19 @@ class PRIMDIFFUSION_OT_set_up_cycles(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_add_camera(bpy.types.Operator):
+class PRIMDIFFUSION_OT_add_camera(Reporting, bpy.types.Operator):
     """Add a camera that frames the selected person, or all people, and a sun for other objects"""
 
     bl_idname = "primdiffusion.add_camera"
     bl_label = "Add Camera and Light"
     bl_options = {"UNDO"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> set[str]:
         from ..scene.cycles import frame_box, humans_extent, new_camera, posed_extent  # needs numpy
 
         scene = context.scene
         person = human_of(context.view_layer.objects.active, scene)
-        try:
-            extent = humans_extent(scene) if person is None else posed_extent(person)
-        except ValueError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        extent = humans_extent(scene) if person is None else posed_extent(person)
         camera = new_camera(scene)
         camera.name = camera.data.name = "Human Camera"
         frame_box(camera, extent, _YAW, (scene.render.resolution_x, scene.render.resolution_y))

@@ -10,7 +10,7 @@ import bpy
 from ..scene.human import BETA_COUNT, LARGEST_BETA, MARK
 
 if TYPE_CHECKING:
-    from ..scene.shape import Measures
+    from ..scene.shape import BodyMeasures
 
 _NOT_ANIMATED: set[str] = set()
 """Options: an animation would move the rest bones in each frame; the custom property can be animated instead."""
@@ -24,7 +24,7 @@ def person_of(armature: bpy.types.Object) -> bpy.types.Collection:
     raise ValueError(f"the object {armature.name!r} is not the armature of a person: select one")
 
 
-def measures_of(armature: bpy.types.Object) -> Measures:
+def measures_of(armature: bpy.types.Object) -> BodyMeasures:
     """Height and weight as set by the sliders. Raises ValueError or FileNotFoundError where they are unknown."""
     from ..scene.shape import betas_of, measure, shape_model_of  # needs numpy
 
@@ -62,13 +62,13 @@ def _set_betas(self: PRIMDIFFUSION_PG_human, betas: Sequence[float]) -> None:
     _printed(lambda: reshape(person_of(self.id_data), np.clip(list(betas), -LARGEST_BETA, LARGEST_BETA)))
 
 
-def _measure(self: PRIMDIFFUSION_PG_human) -> Measures:
-    from ..scene.shape import Measures  # needs numpy
+def _measure(self: PRIMDIFFUSION_PG_human) -> BodyMeasures:
+    from ..scene.shape import BodyMeasures  # needs numpy
 
     try:
         return measures_of(self.id_data)
     except (OSError, ValueError):
-        return Measures(0.0, 0.0)
+        return BodyMeasures(0.0, 0.0)
 
 
 def _height(self: PRIMDIFFUSION_PG_human) -> float:

@@ -31,6 +31,6 @@ def test_every_operator_and_setting_has_its_place(addon):
     assert "### take_result" not in text
 
 
-def test_the_page_says_when_an_operator_is_disabled(addon):
+def test_the_page_states_when_an_operator_is_disabled(addon):
     vary = page.page().split("\n### vary\n")[1].split("\n### ")[0]
     assert "tooltip says: There is no" in vary

@@ -48,7 +48,7 @@ def rendered(tmp_path) -> dict:
     return json.loads((tmp_path / "rendered.json").read_text())
 
 
-def test_a_person_becomes_an_asset_with_words_and_a_drawn_picture(person, tmp_path):
+def test_a_human_becomes_an_asset_with_tags_and_a_preview(person, tmp_path):
     assert ops.mark_human_as_asset() == {"FINISHED"}
     about = person.asset_data
     assert about.description == "Generated human, seed 0, sex female, height 1.7"
@@ -60,7 +60,7 @@ def test_a_person_becomes_an_asset_with_words_and_a_drawn_picture(person, tmp_pa
     assert (len(asked["pose"]), asked["pose"][16 * 3 + 2]) == (72, -1.15)
 
 
-def test_a_picture_of_ones_own_needs_no_backend(person, tmp_path):
+def test_a_given_preview_needs_no_backend(person, tmp_path):
     assert ops.mark_human_as_asset(picture=str(PICTURE)) == {"FINISHED"}
     assert preview(person).max() > 0
     assert not (tmp_path / "rendered.json").exists()
@@ -126,7 +126,7 @@ def test_a_pose_becomes_an_action_that_gives_it_to_any_human(person, tmp_path):
     np.testing.assert_allclose(current_pose(other)[0], waving(), atol=1e-4)
 
 
-def test_marking_a_pose_leaves_the_action_at_work(person):
+def test_marking_a_pose_leaves_the_active_action(person):
     armature = armature_of(person)
     armature.keyframe_insert("location", frame=3)
     action, slot = armature.animation_data.action, armature.animation_data.action_slot

@@ -261,7 +261,7 @@ def _asked(monkeypatch, folder: Path) -> None:
 
 @pytest.mark.parametrize("situation", SITUATIONS, ids=lambda one: one.__name__)
 @pytest.mark.usefixtures("outside")
-def test_every_operator_works_or_says_what_is_wrong(anna, situation, monkeypatch):
+def test_every_operator_works_or_reports_what_is_wrong(anna, situation, monkeypatch):
     if situation is not backend_missing:
         _asked(monkeypatch, anna / "for the child")
     faults = []
@@ -291,7 +291,7 @@ def _varied(person) -> Job:
 
 @pytest.mark.parametrize("ask", [_generated, _varied], ids=["generated", "varied"])
 @pytest.mark.parametrize("situation", SITUATIONS, ids=lambda one: one.__name__)
-def test_a_result_that_waits_enters_the_scene_or_says_why_not(anna, situation, ask, capfd):
+def test_a_waiting_result_enters_the_scene_or_reports_why_not(anna, situation, ask, capfd):
     (person,) = humans(bpy.context.scene)
     queue.add(bpy.context, ask(person))
     while not queue.ready:
@@ -327,7 +327,7 @@ class _Drawn:
 
 
 @pytest.mark.parametrize("situation", SITUATIONS, ids=lambda one: one.__name__)
-def test_every_panel_is_drawn(anna, situation):
+def test_every_panel_draws(anna, situation):
     situation(humans(bpy.context.scene)[0])
     drawn, faults = 0, []
     for cls in bpy.types.Panel.__subclasses__():

@@ -110,7 +110,7 @@ def test_a_blend_holds_the_person_moved_and_finds_its_files_where_the_folder_is(
     assert bone.rotation_quaternion.angle == pytest.approx(0.5, abs=1e-3)
 
 
-def test_a_blend_that_is_asked_for_later_is_made_without_another_generation(out):
+def test_a_blend_requested_later_needs_no_second_generation(out):
     assert generate(out, "--seed", 7) == DONE
     made = (out / "person_000007" / "person.human.safetensors").stat().st_mtime_ns
     assert generate(out, "--seed", 7, "--blend", "anna") == DONE
@@ -148,7 +148,7 @@ def test_people_who_are_there_and_how_they_were_made_stay_without_a_backend(out,
     assert report(out)["skipped"] == ["person_000007"]
 
 
-def test_a_backend_lost_on_the_way_leaves_who_was_made_and_says_who(out, monkeypatch):
+def test_a_lost_backend_leaves_the_finished_humans_and_names_them(out, monkeypatch):
     def lost(backend, method, params, *more):
         return _no_backend() if params["seed"] == 8 else ask(backend, method, params, *more)
 

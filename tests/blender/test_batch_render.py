@@ -54,7 +54,7 @@ def test_a_folder_of_people_becomes_a_picture_of_each(people, out):
     assert report(out)["done"] == ["person_000007", "person_000008"]
 
 
-def test_what_is_there_is_not_drawn_again(people, out):
+def test_existing_pictures_are_not_rendered_again(people, out):
     assert render(people / "person_000007", out, *SMALL) == DONE
     before = (out / "person_000007.png").stat().st_mtime_ns
     assert render(people, out, *SMALL) == DONE
@@ -86,13 +86,13 @@ def test_a_turntable_keeps_its_distance_and_shows_everything(people):
     np.testing.assert_allclose(distances, distances[0], rtol=1e-5)
 
 
-def test_a_motion_is_drawn_frame_by_frame(people, out, tmp_path):
+def test_a_motion_is_rendered_frame_by_frame(people, out, tmp_path):
     np.save(tmp_path / "still.npy", np.zeros((4, 72)))
     assert render(people / "person_000007", out, *SMALL, "--motion", tmp_path / "still.npy", "--frames", "2..3") == DONE
     assert pictures(out) == ["person_000007/0002.png", "person_000007/0003.png"]
 
 
-def test_a_blend_is_drawn_as_it_is_and_stays_so(people, out):
+def test_a_blend_is_rendered_as_it_is_and_stays_unchanged(people, out):
     blend = people / "person_000007" / "person.blend"
     before = blend.read_bytes()
     bpy.ops.wm.open_mainfile(filepath=str(blend))
@@ -129,7 +129,7 @@ def test_missing_volumes_are_reported_before_cycles_renders(people, out):
     assert "1 of 8 volumes have lost their files" in report(out)["failed"][0]["why"]
 
 
-def test_without_a_backend_it_says_so_at_once(people, out, monkeypatch, capfd):
+def test_a_missing_backend_is_reported_at_once(people, out, monkeypatch, capfd):
     def nowhere(*_, **__):
         raise BackendNotFound("No Python for the backend: /nowhere does not exist")
 

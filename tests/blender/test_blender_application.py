@@ -117,7 +117,7 @@ def test_the_same_command_continues_with_the_python_that_preferences_name(instal
     assert installed("-b", "--python-expr", f"{forget}; bpy.ops.wm.save_userpref()").returncode == 0
 
 
-def test_people_and_their_blends_are_drawn_alike(command, people, tmp_path):
+def test_human_files_and_their_blends_render_alike(command, people, tmp_path):
     blend = people / "person_000007" / "person.blend"
     for source, out in ((people / "person_000007", tmp_path / "person"), (blend, tmp_path / "blend")):
         done = command("render", source, "--out", out, "--size", "128x128")
@@ -147,7 +147,7 @@ def test_a_rigged_mesh_is_captured(command, tmp_path, empty_scene):
     assert "nothing can be written to" in done.stderr
 
 
-def test_one_who_cannot_be_drawn_is_reported_and_the_exit_code_says_so(command, tmp_path):
+def test_a_human_that_cannot_be_rendered_is_reported_and_fails_the_command(command, tmp_path):
     (tmp_path / "anna.human").write_bytes(b"no person at all")
     done = command("render", tmp_path, "--out", tmp_path / "out")
     assert done.returncode == FAILED
@@ -180,7 +180,7 @@ def test_a_folder_that_cannot_be_written_to_ends_with_a_sentence(command, people
         assert "nothing can be written to" in done.stderr
 
 
-def test_without_a_backend_nothing_is_left_and_the_sentence_says_what_to_do(installed, tmp_path):
+def test_without_a_backend_no_file_is_left_and_the_error_names_the_remedy(installed, tmp_path):
     words = ["-c", "primdiffusion", "generate", "--out", tmp_path / "people", "--python", "/nowhere/python"]
     done = installed(*words)
     assert done.returncode == NO_BACKEND

@@ -139,7 +139,7 @@ def test_what_is_done_is_skipped(copy, empty_scene, monkeypatch):
     assert report.skipped == ["anna", "bert"]
 
 
-def test_damage_is_named_repaired_and_only_it_rendered_anew(copy, whole, empty_scene):
+def test_damage_is_named_repaired_and_only_it_rendered_again(copy, whole, empty_scene):
     paths = [picture_path(copy / "anna", kind, 1, frame) for kind, frame in (("img", 0), ("depth", 1))]
     paths.append(copy / "bert/joints.npz")
     paths[0].write_bytes(paths[0].read_bytes()[:-20])
@@ -164,7 +164,7 @@ def test_damage_is_named_repaired_and_only_it_rendered_anew(copy, whole, empty_s
     assert ours == undisturbed
 
 
-def test_files_cut_short_are_made_anew_even_without_repair(copy, whole, empty_scene):
+def test_truncated_files_are_rendered_again_even_without_repair(copy, whole, empty_scene):
     path = picture_path(copy / "anna", "mask", 0, 1)
     path.write_bytes(b"")
     capture(empty_scene, small(copy))
@@ -245,7 +245,7 @@ def test_shards_share_people_without_gap_or_overlap(empty_scene, tmp_path):
     assert verify(tmp_path) == []
 
 
-def test_the_released_codes_reference_is_there_when_asked_for(empty_scene, tmp_path):
+def test_the_released_codes_reference_is_written_on_request(empty_scene, tmp_path):
     capture(empty_scene, small(tmp_path, released_reference=True), poses=POSES.frames([0]))
     reference = tmp_path / RELEASED_REFERENCE
     assert files_of(reference) == files_of(tmp_path / "anna")
@@ -305,7 +305,7 @@ def test_the_noise_is_the_same_in_whatever_order_views_are_rendered(empty_scene,
     assert seeds[0] != seeds[1]  # the same person under two names: only the noise differs
 
 
-def test_without_room_the_batch_ends_and_says_so(empty_scene, tmp_path, monkeypatch):
+def test_a_full_disk_ends_the_batch_with_an_error(empty_scene, tmp_path, monkeypatch):
     calls = []
 
     def full(path, pixels):

@@ -125,7 +125,7 @@ def test_the_operator_renders_in_background_mode_and_leaves_the_scene_alone(exte
     assert bpy.ops.primdiffusion.verify_captures(out=str(out)) == {"FINISHED"}
 
 
-def test_the_operator_fails_in_one_sentence(extension, people, tmp_path):
+def test_the_operator_reports_an_error_in_one_sentence(extension, people, tmp_path):
     render = bpy.ops.primdiffusion.render_captures
     with pytest.raises(RuntimeError, match="choose a folder of people first"):
         render()
@@ -167,7 +167,7 @@ def test_a_batch_continues_past_a_broken_scan_reports_it_and_exits_with_1(people
     assert picture.read_bytes() == whole
 
 
-def test_a_wrong_line_exits_with_2_and_says_what_is_wrong(tmp_path):
+def test_a_wrong_command_line_exits_with_2_and_an_error(tmp_path):
     for words, said in (
         (["--people", str(tmp_path)], "--out"),
         (["--out", str(tmp_path), "--cameras", "none"], "--cameras"),

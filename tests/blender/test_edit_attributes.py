@@ -13,7 +13,7 @@ import pytest
 from blender_primdiffusion.formats.requests import PARTS
 
 from blender_primdiffusion.scene.human import humans, person_file
-from blender_primdiffusion.ui import attributes, edit_operators
+from blender_primdiffusion.ui import attributes, edit_panel
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_attributes
 
 VOCABULARY = {
@@ -51,7 +51,7 @@ def test_menus_hold_what_the_checkpoint_knows_and_any(known):
         known.outfit = "dress"
 
 
-def test_nothing_is_asked_for_unless_it_is_chosen(addon, known):
+def test_unchosen_attributes_are_not_requested(addon, known):
     bpy.ops.primdiffusion.generate(seed=7, steps=1)
     assert {"attributes", "guidance"}.isdisjoint(sent(addon))
     known.sex, known.use_height, known.height, known.use_weight = "female", True, 1.82, True
@@ -126,4 +126,4 @@ def test_every_part_of_the_body_can_be_chosen(addon):
     panel = addon.scene.primdiffusion_edit
     panel.parts = set(PARTS)
     assert panel.parts == set(PARTS)
-    assert edit_operators.PRIMDIFFUSION_PG_edit.bl_rna.properties["parts"].default_flag == {"top"}
+    assert edit_panel.PRIMDIFFUSION_PG_edit.bl_rna.properties["parts"].default_flag == {"top"}

@@ -15,7 +15,7 @@ from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.edit import painted_weights
 from blender_primdiffusion.scene.human import armature_of, body_of, humans, person_file, remove_human
-from blender_primdiffusion.ui import edit_operators, edit_panel
+from blender_primdiffusion.ui import edit_panel
 
 DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
 """Seeds that the fake child takes as orders."""
@@ -301,7 +301,7 @@ def test_a_panel_shows_only_its_own_job_and_cancels_it(person):
 
 
 def test_no_edit_can_be_redone_with_a_slider():
-    edits = edit_operators._Edit.__subclasses__()
+    edits = edit_panel._Edit.__subclasses__()
     assert len(edits) >= 3
     for operator in edits:
         assert not {"REGISTER", "UNDO"} & operator.bl_options

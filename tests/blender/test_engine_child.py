@@ -172,7 +172,7 @@ def find_nothing(*_: object, **__: object) -> BackendPython:
 
 
 @pytest.mark.parametrize("kind", ["PANO", "LIGHT"])
-def test_a_camera_that_cannot_be_drawn_is_one_clear_error(stage, kind):
+def test_an_unsupported_camera_is_one_clear_error(stage, kind):
     if kind == "PANO":
         stage.scene.camera.data.type = "PANO"
     else:
@@ -272,7 +272,7 @@ if sys.argv[2] == "killed":
 
 
 @pytest.mark.parametrize("how", ["quit", "killed"])
-def test_blender_that_ends_while_a_picture_is_drawn_leaves_no_process_and_no_memory(how):
+def test_ending_blender_during_a_picture_leaves_no_process_and_no_memory(how):
     command = [sys.executable, "-c", EXIT_WHILE_DRAWING, str(FAKE), how]
     root, environment = Path(__file__).parents[2], {**os.environ, "FAKE_BAND_S": "1.0"}
     done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=60, check=False)

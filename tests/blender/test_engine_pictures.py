@@ -179,7 +179,7 @@ def test_depth_is_the_backends_first_hit_along_the_optical_axis(stage, backend):
 
 
 @pytest.mark.parametrize(("seed", "scale", "step"), [(0, 0.8, STEP), (1, 0.6, STEP / 2)])
-def test_a_posed_scaled_and_turned_armature_is_drawn_as_posed(stage, backend, seed, scale, step):
+def test_a_posed_scaled_and_rotated_armature_renders_as_posed(stage, backend, seed, scale, step):
     rotations, translation = strong_pose(seed)
     pose_from_joint_rotations(stage.armature, rotations, translation)
     turn = Euler((0.3, -0.2, 0.8)).to_matrix().to_4x4()
@@ -248,7 +248,7 @@ def test_two_people_share_one_picture_and_the_hidden_are_left_out(stage, backend
     assert_same(render_png(stage.out), alone)
 
 
-def test_an_instanced_person_is_drawn_where_the_instance_is(stage, backend):
+def test_an_instanced_human_renders_at_the_instance(stage, backend):
     instance = bpy.data.objects.new("again", None)
     stage.scene.collection.objects.link(instance)
     instance.instance_type, instance.instance_collection = "COLLECTION", stage.person
@@ -259,7 +259,7 @@ def test_an_instanced_person_is_drawn_where_the_instance_is(stage, backend):
     assert_same(render_png(stage.out), eight_bit(expected(stage, backend, [here, there])[0]))
 
 
-def test_a_person_linked_from_another_file_is_drawn_from_there(stage, backend, tmp_path):
+def test_a_linked_human_renders_from_the_library_file(stage, backend, tmp_path):
     wanted = eight_bit(expected(stage, backend)[0])
     bpy.ops.wm.save_mainfile()
     (tmp_path / "other").mkdir()
@@ -354,7 +354,7 @@ def test_a_person_scaled_to_nothing_is_not_there_and_nan_is_an_error(stage):
         render_png(stage.out)
 
 
-def test_one_percent_and_the_smallest_picture_are_drawn(stage, backend):
+def test_one_percent_and_the_smallest_picture_render(stage, backend):
     render = stage.scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = 1200, 900, 1
     assert_same(render_png(stage.out), eight_bit(expected(stage, backend, size=(12, 9))[0]))

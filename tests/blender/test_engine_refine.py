@@ -57,7 +57,7 @@ def test_at_rest_pictures_become_finer_until_they_are_whole(bench):
     assert len(bench.asked) == 3
 
 
-def test_while_wishes_change_only_coarse_pictures_are_asked_for_one_at_a_time(bench):
+def test_while_the_view_changes_only_coarse_pictures_are_requested_one_at_a_time(bench):
     for step in range(10):
         bench.refinement.want(wish(step))
         bench.refinement.advance()
@@ -92,7 +92,7 @@ def test_a_new_wish_cancels_a_fine_picture_and_not_a_coarse_one(bench):
     assert bench.asked[-1].params["width"] == -(-SIZE[0] // COARSENESS[0])
 
 
-def test_the_frame_on_show_is_never_drawn_into(bench):
+def test_the_displayed_frame_is_never_written_to(bench):
     bench.refinement.want(wish("a"))
     for step in range(12):
         bench.refinement.advance()

@@ -120,7 +120,7 @@ def test_a_persons_own_body_is_left_out_even_when_shown(stage, folder):
     assert len(solids_now().corners) == 0
 
 
-def test_what_is_hidden_in_renders_or_from_the_camera_is_not_drawn(stage):
+def test_objects_hidden_in_renders_or_from_the_camera_are_not_rendered(stage):
     thing = cube()
     assert render_png(stage.out)[..., 3].any()
     thing.hide_render = True
@@ -129,7 +129,7 @@ def test_what_is_hidden_in_renders_or_from_the_camera_is_not_drawn(stage):
     assert not render_png(stage.out).any()
 
 
-def test_only_what_may_concern_solids_makes_them_read_anew(stage, folder):
+def test_only_changes_that_affect_solids_make_them_read_again(stage, folder):
     thing = cube()
     seen = []
     handler = lambda _scene, depsgraph: seen.append(changed_by(depsgraph))  # noqa: E731

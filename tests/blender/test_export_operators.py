@@ -106,7 +106,7 @@ def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
         ("import_human", {"filepath": "OUT/none.human"}, "there is no file"),
     ],
 )
-def test_what_cannot_be_done_is_reported_in_a_sentence(anna, out, operator, properties, sentence):
+def test_an_impossible_export_is_reported_in_a_sentence(anna, out, operator, properties, sentence):
     given = {name: v.replace("OUT", str(out)) if isinstance(v, str) else v for name, v in properties.items()}
     refused(sentence, getattr(OPERATORS, operator), **given)
     assert not list(out.iterdir())
@@ -149,7 +149,7 @@ def test_adding_a_proxy_again_replaces_it_and_removing_takes_all_of_it(anna):
     assert not primitives_of(anna).hide_viewport
 
 
-def test_gaussians_are_asked_for_in_the_pose_of_now(anna, out):
+def test_gaussians_are_requested_in_the_current_pose(anna, out):
     turns = moving(anna)
     bpy.context.scene.frame_set(2)
     armature_of(anna).location.x = 3.0
@@ -217,7 +217,7 @@ def test_a_file_that_holds_no_person_is_rejected_before_any_work(store, out, dam
     assert not humans(bpy.context.scene)
 
 
-def test_the_panels_are_drawn_in_the_sidebar_and_files_can_be_dropped(store):
+def test_the_panels_draw_in_the_sidebar_and_files_can_be_dropped(store):
     types = bpy.types
     assert types.PRIMDIFFUSION_PT_export.bl_order == 6
     assert types.PRIMDIFFUSION_PT_export.bl_category == "PrimDiffusion"

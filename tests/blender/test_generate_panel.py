@@ -30,7 +30,7 @@ def panel_settings(addon):
 
 
 @pytest.fixture
-def in_line(monkeypatch):
+def queued_jobs(monkeypatch):
     """Works as with a window: submit returns at once, and `drive` is the timer."""
     monkeypatch.setattr(
         generate_panel, "submit", lambda _operator, context, job: queue.add(context, job) and {"FINISHED"}
@@ -72,7 +72,7 @@ def test_a_seed_from_a_script_leaves_the_panels_and_is_one_person(addon, panel_s
     assert (seeds(addon), panel_settings.seed) == ([31], 7)
 
 
-def test_pressing_twice_asks_for_two_different_people(addon, panel_settings, in_line):
+def test_pressing_twice_generates_two_different_humans(addon, panel_settings, queued_jobs):
     bpy.ops.primdiffusion.generate(steps=1)
     bpy.ops.primdiffusion.generate(steps=1)
     drive()
@@ -81,7 +81,7 @@ def test_pressing_twice_asks_for_two_different_people(addon, panel_settings, in_
     assert second != 7
 
 
-def test_a_count_queues_as_many_jobs_with_consecutive_seeds(addon, panel_settings, in_line):
+def test_a_count_queues_as_many_jobs_with_consecutive_seeds(addon, panel_settings, queued_jobs):
     panel_settings.count = 3
     bpy.ops.primdiffusion.generate(steps=1)
     assert [entry.job.label for entry in queue.waiting] == [f"Human, seed {seed}" for seed in (7, 8, 9)]

@@ -42,7 +42,7 @@ def asked_of_the_child(person: bpy.types.Collection) -> dict:
     return json.loads((folder_of(person) / "person.human.safetensors").read_bytes())
 
 
-def test_the_operator_builds_a_person_of_what_was_asked_for(addon, captures):
+def test_the_operator_builds_a_human_from_the_chosen_captures(addon, captures):
     asked = {"directory": f"{captures}/", "subject": "anna", "frame": 2, "views": 5}
     assert bpy.ops.primdiffusion.human_from_captures(**asked) == {"FINISHED"}
     (person,) = humans(addon.scene)

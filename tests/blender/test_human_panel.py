@@ -69,7 +69,7 @@ def test_a_slider_moves_the_person(person):
     assert height(person) == pytest.approx(np.ptp(wanted[:, 1]), abs=1e-5)
 
 
-def test_height_and_weight_are_what_is_asked_for(person):
+def test_height_and_weight_match_the_sliders(person):
     settings(person).height = 1.65
     assert height(person) == pytest.approx(1.65, abs=2e-4)
     before = measure(shape_model_of(person), betas_of(person)).weight
@@ -103,7 +103,7 @@ def test_one_undo_takes_a_slider_back_and_redo_brings_it_again(person):
     np.testing.assert_allclose(betas_of(person), TALL)
 
 
-def test_sliders_of_a_person_who_cannot_follow_do_nothing_and_the_panel_says_why(person, addon):
+def test_sliders_of_a_human_without_a_shape_do_nothing_and_the_panel_explains_why(person, addon):
     addon.view_layer.objects.active = armature_of(person)
     bpy.ops.object.mode_set(mode="EDIT")
     before = list(armature_of(person)[BETAS])

@@ -165,7 +165,7 @@ def test_diagnostics_can_be_copied_before_anything_was_done(addon):
     assert "not started yet" in jobs_panel.diagnostics()
 
 
-def test_release_ends_the_child_says_what_was_freed_and_the_next_person_starts_another(addon):
+def test_release_ends_the_child_reports_the_freed_memory_and_the_next_job_starts_another(addon):
     pid = started_and_idle()
     said = memory.release()
     assert said.startswith("1 process ended, 0.")

@@ -97,7 +97,7 @@ def test_unmerging_goes_back_to_the_surface_where_that_was_shown(person):
     assert attachment_of(person) == "SURFACE"
 
 
-def test_the_panel_says_when_the_pose_is_another_one(person):
+def test_the_panel_reports_a_changed_pose(person):
     raise_left_arm(person, 0.3)
     ops.merge()
     assert not render_panel.outdated(person, bpy.context.scene)

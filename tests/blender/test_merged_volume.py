@@ -223,7 +223,7 @@ def test_a_material_without_the_factor_is_rejected(person):
         set_density_gain(person, 1.5)
 
 
-def test_memory_is_what_openvdb_says_of_the_loaded_grids(person):
+def test_memory_is_what_openvdb_reports_for_the_loaded_grids(person):
     files = sorted(folder_of(person).glob("prim_*.vdb"))
     memory = person_memory(person)
     assert memory.files == sum(path.stat().st_size for path in files)

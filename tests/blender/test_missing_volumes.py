@@ -61,7 +61,7 @@ def whole(person) -> bool:
     return all(volume.grids.load() for volume in volumes) and person_file(person).is_file() and not missing_files()
 
 
-def test_nothing_is_drawn_when_no_file_is_missing(person, addon):
+def test_the_panel_is_empty_when_no_file_is_missing(person, addon):
     look()
     assert state.summary == ""
     assert "primdiffusion.find_missing_volumes" not in shown(PRIMDIFFUSION_PT_human, addon)

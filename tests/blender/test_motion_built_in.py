@@ -82,7 +82,7 @@ def test_turning_is_a_quarter_to_the_left_each_round():
     np.testing.assert_allclose(half, [1, 0, 0], atol=0.06)
 
 
-def test_legs_reach_the_feet_asked_for_and_stretch_after_those_too_far():
+def test_legs_reach_the_target_feet_and_stretch_towards_those_too_far():
     rest = np.tile(np.eye(3), (2, 24, 1, 1))
     still = np.zeros(2)
     near = joint("left_ankle") + np.array([0.05, 0.2, 0.1])

@@ -350,7 +350,7 @@ def test_the_panel_shows_what_was_found(addon, armature, tmp_path):
     assert "SMPL-H" not in texts(PRIMDIFFUSION_PT_motion, addon)
 
 
-def test_facts_are_kept_with_the_action(addon, armature, tmp_path):
+def test_facts_are_stored_with_the_action(addon, armature, tmp_path):
     ops.import_motion(filepath=amass(tmp_path / "m.npz"))
     assert json.loads(armature.animation_data.action["primdiffusion_motion"])["Frame Rate"] == "120"
 

@@ -36,7 +36,7 @@ def seeds() -> list[int]:
     return [json.loads(person_file(person).read_bytes())["seed"] for person in humans(bpy.context.scene)]
 
 
-def test_works_are_done_one_at_a_time_in_the_order_in_which_they_were_asked_for(addon):
+def test_jobs_run_one_at_a_time_in_the_order_queued(addon):
     for seed in (11, 12, 13):
         ask(seed)
     pids = set()
@@ -160,7 +160,7 @@ def test_undo_and_redo_during_a_job_are_harmless(addon):
     assert "two" not in bpy.data.objects
 
 
-def test_a_result_enters_the_scene_it_was_asked_for_and_the_window_stays(addon):
+def test_a_result_enters_the_scene_it_was_requested_in_and_the_window_stays(addon):
     first, second = bpy.context.scene, bpy.data.scenes.new("Second")
     window = bpy.context.window_manager.windows[0]
     bpy.ops.ed.undo_push(message="two scenes")

@@ -108,7 +108,7 @@ def test_one_material_serves_all_people(person, saved_scene, tmp_path):
     assert len(humans(bpy.context.scene)) == 2
 
 
-def test_provenance_and_overlaps_are_kept_on_the_collection(person):
+def test_provenance_and_overlaps_are_stored_on_the_collection(person):
     collection, arrays = person
     stored = json.loads(collection[MARK])
     assert stored["seed"] == 0

@@ -35,7 +35,7 @@ def test_a_good_file_gives_back_its_arrays(tmp_path):
 
 
 @pytest.mark.parametrize("sentence", SPOILED)
-def test_a_spoiled_field_is_named_in_one_sentence(tmp_path, sentence):
+def test_a_broken_field_is_named_in_one_sentence(tmp_path, sentence):
     path = synthetic.write(tmp_path / "human.npz", 4, **SPOILED[sentence])
     with pytest.raises(HumanNpzError, match=sentence) as caught:
         read_human(path)

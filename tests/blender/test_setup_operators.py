@@ -133,7 +133,7 @@ def test_set_up_backend_downloads_when_blender_may_use_the_network(online, monke
     assert list(places.set_up_folder().environment.rglob("tiny.py"))
 
 
-def test_without_online_access_set_up_is_rejected_and_says_how_to_allow_it(wheels):
+def test_without_online_access_set_up_is_rejected_with_the_remedy(wheels):
     with pytest.raises(RuntimeError, match=r"Preferences > System > Network > Allow Online Access"):
         press.set_up_backend()
     layout = Layout()
@@ -168,7 +168,7 @@ def test_a_folder_may_bring_its_own_list_of_packages(wheels, tmp_path, monkeypat
     assert known.known().about["lock_name"] == "requirements.txt"
 
 
-def test_an_environment_of_other_packages_than_todays_says_so(wheels, monkeypatch):
+def test_an_environment_with_outdated_packages_is_reported(wheels, monkeypatch):
     assert press.install_from_folder(directory=str(wheels)) == {"FINISHED"}
     (path,) = known.available().values()
     monkeypatch.setattr(known, "LOCKS", path.parent)

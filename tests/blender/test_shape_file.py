@@ -44,7 +44,7 @@ def test_the_shape_model_gives_the_persons_own_surface_joints_and_frames(tmp_pat
 
 
 @pytest.mark.parametrize("sentence", SPOILED)
-def test_a_spoiled_field_is_named_in_one_sentence(tmp_path, sentence):
+def test_a_broken_field_is_named_in_one_sentence(tmp_path, sentence):
     path = synthetic_shape.write(tmp_path / "human.npz", **SPOILED[sentence])
     with pytest.raises(HumanNpzError, match=sentence) as caught:
         read_human(path)

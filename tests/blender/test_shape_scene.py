@@ -223,7 +223,7 @@ def edited_file(tmp_path, betas):
     return tmp_path / "edited.npz", tmp_path / "first" / "person.human.safetensors"
 
 
-def test_a_shape_of_ones_own_outlives_an_edit_that_changes_the_shape(person, tmp_path):
+def test_a_custom_shape_survives_an_edit_that_changes_the_shape(person, tmp_path):
     reshape(person, SHAPE)
     done = replace(person, *edited_file(tmp_path, np.ones(10)))
     assert not done.reshaped

@@ -31,7 +31,7 @@ def composed() -> set[str]:
     from blender_primdiffusion.motion.poses import LIBRARY
     from blender_primdiffusion.ui.attributes import CATEGORIES, menu
     from blender_primdiffusion.ui.shape_panel import _SHOWN
-    from blender_primdiffusion.ui.variations_operators import _BUILD_ALL
+    from blender_primdiffusion.ui.variations_panel import _BUILD_ALL
 
     sliders = {f"Shape {index + 1}" for index in range(BETA_COUNT)} | {"Stature", "Shoulders", "Waist", "Girth"}
     facts = {"Rig", "Up Axis", "Frames", "Frame Rate", "Units", "Bones", "Stride"}

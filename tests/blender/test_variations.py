@@ -13,7 +13,7 @@ from blender_primdiffusion.jobs.pictures import icons
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.jobs.variations import VariationsJob, sheet
 from blender_primdiffusion.scene.human import armature_of, humans, person_file
-from blender_primdiffusion.ui import variations_operators, variations_panel
+from blender_primdiffusion.ui import variations_panel
 
 FAILS, TAKES_LONG = 2, 4
 """Seeds that the fake child takes as orders."""
@@ -39,7 +39,7 @@ def files_left() -> list[Path]:
     return list(Path(bpy.app.tempdir).glob("variation*"))
 
 
-def test_people_are_kept_in_files_and_nothing_enters_the_scene(addon, shown_people):
+def test_variations_are_files_and_nothing_enters_the_scene(addon, shown_people):
     assert seeds() == [11, 12, 13, 14]
     assert not humans(addon.scene)
     for variation in sheet.variations:
@@ -49,7 +49,7 @@ def test_people_are_kept_in_files_and_nothing_enters_the_scene(addon, shown_peop
     assert [path.name.split("_")[1] for path in files_left()] == ["sheet"], "the child's folder is gone"
 
 
-def test_the_panels_settings_are_asked_for_and_random_seeds_differ_each_time(addon):
+def test_the_panels_settings_are_requested_and_random_seeds_differ_each_time(addon):
     addon.scene.primdiffusion.quality = "HIGH"
     ops.variations(count=4)
     first = seeds()
@@ -116,7 +116,7 @@ def test_nothing_selected_a_wrong_number_and_no_sheet_are_rejected(addon):
         ops.variations(seed=2**31 - 1, count=2)
 
 
-def test_more_like_this_asks_for_variants_of_the_kept_person(addon, shown_people):
+def test_more_like_this_requests_variants_of_the_chosen_human(addon, shown_people):
     ops.select_variation(index=1)
     kept = sheet.variations[1].person
     assert ops.more_like_variation(count=3, seed=20, amount=0.25, steps=4) == {"FINISHED"}
@@ -224,7 +224,7 @@ def test_a_disk_that_is_full_keeps_the_former_sheet(addon, shown_people, monkeyp
 
 def test_none_can_be_redone_with_a_slider():
     for operator in (
-        variations_operators.PRIMDIFFUSION_OT_variations,
-        variations_operators.PRIMDIFFUSION_OT_more_like_variation,
+        variations_panel.PRIMDIFFUSION_OT_variations,
+        variations_panel.PRIMDIFFUSION_OT_more_like_variation,
     ):
         assert not {"REGISTER", "UNDO"} & operator.bl_options

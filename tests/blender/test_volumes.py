@@ -64,7 +64,7 @@ def test_files_hold_the_windowed_payload_at_half_precision_with_x_along_t(human,
         )
 
 
-def test_one_empty_voxel_lies_round_what_is_not_empty_and_nothing_more_is_drawn(human, tmp_path):
+def test_one_empty_voxel_surrounds_the_dense_ones_and_no_more_is_stored(human, tmp_path):
     density = np.zeros((3, 8, 8, 8), np.float32)
     density[0, 3:5, 2, 1:6] = 50  # D, H, W
     density[1] = 1e4  # reaches the rim in spite of the window

@@ -7,7 +7,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 from backend.client import BackendClient
-from backend.requests import Backend, Request
+from backend.requests import Backend, ChildRequest
 
 _PICTURE_PX = 16
 
@@ -22,21 +22,23 @@ def this_pythons_backend(**settings) -> Backend:
     return Backend(make_client)
 
 
-def _request(backend: Backend, method: str, out_dir: Path, checkpoint: Path | None, **params) -> Request:
+def _request(backend: Backend, method: str, out_dir: Path, checkpoint: Path | None, **params) -> ChildRequest:
     chosen = {} if checkpoint is None else {"checkpoint": str(checkpoint)}
-    return Request(backend, method, {**params, **chosen, "out_dir": str(out_dir)})
+    return ChildRequest(backend, method, {**params, **chosen, "out_dir": str(out_dir)})
 
 
-def generate_request(backend: Backend, *, out_dir: Path, checkpoint: Path | None = None, **params) -> Request:
+def generate_request(backend: Backend, *, out_dir: Path, checkpoint: Path | None = None, **params) -> ChildRequest:
     """A person from noise."""
     return _request(backend, "generate", out_dir, checkpoint, size=_PICTURE_PX, **params)
 
 
-def edit_request(backend: Backend, method: str, person: Path, *, out_dir: Path, checkpoint: Path, **params) -> Request:
+def edit_request(
+    backend: Backend, method: str, person: Path, *, out_dir: Path, checkpoint: Path, **params
+) -> ChildRequest:
     """A person of one that exists."""
     return _request(backend, method, out_dir, checkpoint, person=str(person), size=_PICTURE_PX, **params)
 
 
-def reconstruct_request(backend: Backend, *, capture: Path, out_dir: Path, checkpoint: Path, **params) -> Request:
+def reconstruct_request(backend: Backend, *, capture: Path, out_dir: Path, checkpoint: Path, **params) -> ChildRequest:
     """A person from captures."""
     return _request(backend, "reconstruct", out_dir, checkpoint, capture=str(capture), **params)

@@ -7,7 +7,7 @@ import sys
 import time
 
 import pytest
-from backend.requests import Request
+from backend.requests import ChildRequest
 from child_requests import generate_request, this_pythons_backend
 
 TICK_S = 0.1
@@ -40,7 +40,7 @@ sys.meta_path.insert(0, LongSteps())
 """
 
 
-def tick(request: Request, until, timeout_s: float = 90.0) -> None:
+def tick(request: ChildRequest, until, timeout_s: float = 90.0) -> None:
     """As Blender's timer does."""
     end = time.monotonic() + timeout_s
     while not until():

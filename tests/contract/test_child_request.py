@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 from backend.client import BackendClient
 from backend.environment import BackendNotFound
-from backend.requests import Backend, Request
+from backend.requests import Backend, ChildRequest
 from child_requests import generate_request, this_pythons_backend
 from conversation import BUSY_STEPS
 
 PYTHON = Path(sys.executable)
 
 
-def follow(request: Request, until=lambda request: request.finished, timeout_s: float = 180) -> list[str]:
+def follow(request: ChildRequest, until=lambda request: request.finished, timeout_s: float = 180) -> list[str]:
     """Ticks as Blender's timer does; returns the states passed through."""
     states = [request.state]
     end = time.monotonic() + timeout_s
@@ -38,7 +38,7 @@ def backend():
 
 @pytest.fixture
 def start(backend, checkpoint, tmp_path):
-    def start(steps: int, name: str = "out", **settings) -> Request:
+    def start(steps: int, name: str = "out", **settings) -> ChildRequest:
         return generate_request(
             backend, seed=4, steps=steps, out_dir=tmp_path / name, **{"checkpoint": checkpoint, **settings}
         )
@@ -158,6 +158,7 @@ def test_a_child_that_hangs_is_ended_and_fails_the_request(checkpoint, tmp_path)
     assert follow(request)[-1] == "failed"
     assert request.error.kind == "hung"
     assert backend.client is None
+    backend.shutdown()  # clears what the child left, once it has gone
     assert not (tmp_path / "out").exists()
 
 

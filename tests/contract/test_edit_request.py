@@ -4,7 +4,7 @@ import time
 from pathlib import Path
 
 import pytest
-from backend.requests import Request
+from backend.requests import ChildRequest
 from child_requests import edit_request, generate_request, this_pythons_backend
 from conversation import BUSY_STEPS
 from primdiffusion.human_file import load_human
@@ -18,7 +18,7 @@ PARAMS = {
 }
 
 
-def follow(request: Request, until=lambda request: request.finished, timeout_s: float = 120) -> Request:
+def follow(request: ChildRequest, until=lambda request: request.finished, timeout_s: float = 120) -> ChildRequest:
     """Ticks as Blender's timer does."""
     end = time.monotonic() + timeout_s
     while not until(request):
@@ -44,7 +44,7 @@ def people(backend, checkpoint, tmp_path_factory) -> list[Path]:
     return [folder / "person.human.safetensors" for folder in folders]
 
 
-def edit(backend, people, checkpoint, method, out, steps=3, **changes) -> Request:
+def edit(backend, people, checkpoint, method, out, steps=3, **changes) -> ChildRequest:
     others = {"transfer": {"source": str(people[1])}, "interpolate": {"other": str(people[1])}}
     asked = {**PARAMS[method], **others.get(method, {}), **changes}
     return edit_request(backend, method, people[0], **asked, out_dir=out, steps=steps, checkpoint=checkpoint)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from backend.requests import Request
+from backend.requests import ChildRequest
 from capture_scenes import captured
 from child_requests import reconstruct_request, this_pythons_backend
 from conversation import Conversation
@@ -86,7 +86,7 @@ def test_a_cancel_ends_the_job_and_leaves_nothing(child, asked):
     assert not Path(asked["out_dir"]).parent.exists()
 
 
-def follow(request: Request, timeout_s: float = 180) -> list[str]:
+def follow(request: ChildRequest, timeout_s: float = 180) -> list[str]:
     """Ticks as Blender's timer does; returns the messages passed through."""
     messages, end = [request.message], time.monotonic() + timeout_s
     while not request.finished:
@@ -107,7 +107,7 @@ def backend():
 
 @pytest.fixture
 def start(backend, captures, encoder, tmp_path):
-    def start(**more) -> Request:
+    def start(**more) -> ChildRequest:
         settings = {"capture": captures, "subject": FIRST, "checkpoint": encoder, "out_dir": tmp_path / "out", **more}
         return reconstruct_request(backend, **settings)
 

@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from ...backend.requests import Backend, Request
+from ...backend.requests import Backend, ChildRequest
 from ...capture.report import Report
 from ...console import Stop, duration
 from ...places import preference
@@ -93,11 +93,11 @@ class _Person:
                 person_blend(source / NPZ_FILE, source / PERSON_FILE, made / self._blend, self.name, self._movement)
             publish(made, self._folder, last=self._blend or PERSON_FILE)
 
-    def _print_progress(self, job: Request) -> None:
-        if not job.finished and time.monotonic() - self._printed > _PRINT_S:
+    def _print_progress(self, request: ChildRequest) -> None:
+        if not request.finished and time.monotonic() - self._printed > _PRINT_S:
             self._printed = time.monotonic()
-            left = f" ({duration(job.eta_s)} left)" if job.eta_s else ""
-            self.say(f"{self.which} {self.name}: {job.message}{left}")
+            left = f" ({duration(request.eta_s)} left)" if request.eta_s else ""
+            self.say(f"{self.which} {self.name}: {request.message}{left}")
 
 
 def _try(person: _Person, backend: Backend, report: Report, clock: Clock) -> None:

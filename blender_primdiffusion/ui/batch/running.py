@@ -16,7 +16,7 @@ from typing import Any
 import bpy
 
 from ...backend.environment import VARIABLE
-from ...backend.requests import Backend, Request
+from ...backend.requests import Backend, ChildRequest
 from ...capture.report import Report, report_path
 from ...console import (
     CANCELLED,
@@ -94,13 +94,13 @@ def ask(
     method: str,
     params: Mapping[str, Any],
     stop: Stop,
-    on_progress: Callable[[Request], None] = lambda _request: None,
+    on_progress: Callable[[ChildRequest], None] = lambda _request: None,
 ) -> dict[str, Any]:
     """The child's result; `on_progress` is called with the request whenever it changes.
 
     Raises NoBackend, ChildFailed, and Stopped once `stop` is set, within a second; then no file is left.
     """
-    request = Request(backend, method, params)
+    request = ChildRequest(backend, method, params)
     while not request.finished:
         if stop.is_set():
             request.cancel()

@@ -7,17 +7,14 @@ import functools
 import importlib.util
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import bpy
 
 from ...backend.environment import VARIABLE
-from ...backend.packages import chosen_compute, locks_for, read_lock, this_machine
+from ...backend.packages import Lock, Machine, chosen_compute, locks_for, read_lock, this_machine
 from ...backend.setup import state_of
 from ...places import EXTENSION, preference, set_up_folder
-
-if TYPE_CHECKING:
-    from ...backend.packages import Lock, Machine
 
 LOCKS = Path(__file__).resolve().parents[2] / "requirements"
 _LINE_BYTES_PER_S = 50e6 / 8

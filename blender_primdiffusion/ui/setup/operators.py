@@ -6,18 +6,15 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
 
 from ...backend import environment, setup
 from ...backend.requests import sentence
+from ...backend.setup import Steps
 from ...jobs.queue import queue
 from ...places import CACHE_VARIABLE, backend_module_path, cache_folder, preference, set_up_folder
 from . import known
-
-if TYPE_CHECKING:
-    from ...backend.setup import Steps
 
 TICK_S = 0.2
 _PRINT_S = 2.0
@@ -187,7 +184,7 @@ class PRIMDIFFUSION_OT_set_up_backend(bpy.types.Operator):
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
         if there:
-            self.report({"INFO"}, f"{now.line}; press Repair to install it anew")
+            self.report({"INFO"}, f"{now.line}; press Repair to reinstall it")
             return {"FINISHED"}
         return _begin(self, installing)
 

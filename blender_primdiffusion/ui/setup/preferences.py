@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import textwrap
-
 import bpy
 
 from ...backend.requests import sentence
 from ...places import EXTENSION, set_up_folder
+from ..drawing import draw_lines
 from .known import chosen, cost, gigabytes, known, machine
 from .operators import redraw, session
 
@@ -28,7 +27,7 @@ def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
     if now.usable:
         return True
     box = layout.box()
-    draw_text(box, now.line, "ERROR", width)
+    draw_lines(box, now.line, "ERROR", width)
     if not draw_cost(box, width):
         props = box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES")
         props.module = EXTENSION
@@ -43,7 +42,7 @@ def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
 def draw_progress(layout: bpy.types.UILayout, width: int) -> None:
     """The bar, the current step below it (a bar cuts long texts), and Cancel."""
     layout.progress(factor=session.fraction, text=f"{session.fraction:.0%}")
-    draw_text(layout, session.message, "BLANK1", width)
+    draw_lines(layout, session.message, "BLANK1", width)
     layout.operator("primdiffusion.cancel_set_up", icon="CANCEL")
 
 
@@ -52,29 +51,22 @@ def draw_cost(layout: bpy.types.UILayout, width: int) -> bool:
     try:
         _, lock, note = chosen()
     except (ValueError, OSError) as error:
-        draw_text(layout, sentence(error), "ERROR", width)
+        draw_lines(layout, sentence(error), "ERROR", width)
         return False
-    draw_text(layout, cost(lock), "BLANK1", width)
+    draw_lines(layout, cost(lock), "BLANK1", width)
     if note:
-        draw_text(layout, note, "INFO", width)
+        draw_lines(layout, note, "INFO", width)
     if not bpy.app.online_access:
-        draw_text(layout, ONLINE, "INTERNET_OFFLINE", width)
+        draw_lines(layout, ONLINE, "INTERNET_OFFLINE", width)
     return True
 
 
 def draw_result(layout: bpy.types.UILayout, width: int) -> None:
     """How the last set-up ended."""
     if session.error:
-        draw_text(layout, session.error, "ERROR", width)
+        draw_lines(layout, session.error, "ERROR", width)
     elif session.notice:
-        draw_text(layout, session.notice, "INFO", width)
-
-
-def draw_text(layout: bpy.types.UILayout, text: str, icon: str, width: int) -> None:
-    """A sentence over as many lines as it needs."""
-    column = layout.column(align=True)
-    for number, line in enumerate(textwrap.wrap(text, width)):
-        column.label(text=line, icon=icon if number == 0 else "BLANK1", translate=False)
+        draw_lines(layout, session.notice, "INFO", width)
 
 
 _WIDTH = 90
@@ -139,10 +131,10 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
             draw_progress(box, _WIDTH)
             return
         now, folder = known(), set_up_folder()
-        draw_text(box, now.line, "CHECKMARK" if now.usable else "ERROR", _WIDTH)
+        draw_lines(box, now.line, "CHECKMARK" if now.usable else "ERROR", _WIDTH)
         if folder.environment.is_dir():
             size = f"{gigabytes(now.about['bytes'])} in " if "bytes" in now.about else ""
-            draw_text(box, f"{size}{folder.environment}", "FILE_FOLDER", _WIDTH)
+            draw_lines(box, f"{size}{folder.environment}", "FILE_FOLDER", _WIDTH)
         if now.state != "named":
             _draw_private(self, box)
         self._draw_buttons(box, now.state, folder.environment.is_dir())
@@ -162,7 +154,7 @@ def _draw_private(preferences: PRIMDIFFUSION_AP_preferences, box: bpy.types.UILa
     """The private environment: device, cost, buttons."""
     row = box.row()
     row.prop(preferences, "compute", expand=True)
-    draw_text(box, f"Found: {machine().described}", "SYSTEM", _WIDTH)
+    draw_lines(box, f"Found: {machine().described}", "SYSTEM", _WIDTH)
     here = draw_cost(box, _WIDTH)
     row = box.row()
     row.enabled = here
