@@ -140,7 +140,7 @@ class Chain:
         """Head and front of the first humans at SHEET_STAGES."""
 
     def add(self, model: DiffusionModel, assets: Assets, held: Path | None, number: int) -> None:
-        """Render and measure one human at all stages; `held` is the folder of fitted payloads, None skips that stage."""
+        """Measure one human at all stages; `held` is the folder of fitted payloads; None skips that stage."""
         person = held_out(assets, number)
         scene = rest_scene(person)
         start = stored(start_of(person, scene.frames), person.betas)
