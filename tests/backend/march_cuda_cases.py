@@ -1,4 +1,4 @@
-"""What march_cuda must do; test_march_cuda.py runs it in Triton's interpreter, and on a CUDA device."""
+"""What march_cuda must do; render/test_cuda.py runs it in Triton's interpreter, and on a CUDA device."""
 
 import dataclasses
 import os

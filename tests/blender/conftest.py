@@ -21,7 +21,6 @@ os.environ.setdefault("BLENDER_USER_RESOURCES", str(_OWN / "user"))
 os.environ["TMPDIR"] = str(_OWN / "tmp")
 _TESTS = Path(__file__).parents[1]
 os.environ.setdefault("PRIMDIFFUSION_CACHE", str(_TESTS.parent / ".pytest_cache" / "children"))  # compile once
-sys.path[:0] = [str(folder) for folder in (_TESTS.parent, _TESTS, Path(__file__).parent, _TESTS / "backend")]
 
 bpy = pytest.importorskip("bpy", reason="bpy is not installed: pip install -e .[blender]")
 

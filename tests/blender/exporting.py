@@ -28,13 +28,13 @@ def write_store(folder: Path) -> None:
     write_person(folder / "person.human.safetensors")
 
 
-def write_person(path: Path, **metadata: str) -> None:
+def write_person(path: Path, betas: np.ndarray | None = None, **metadata: str) -> None:
     """A small safetensors file with a person's metadata."""
-    betas = synthetic.arrays(8)["betas"].astype("<f4").tobytes()
+    raw = np.asarray(synthetic.arrays(8)["betas"] if betas is None else betas, "<f4").tobytes()
     about = {"format": "primdiffusion.human", "format_version": "1", "provenance": json.dumps({"seed": 5}), **metadata}
-    header = {"__metadata__": about, "betas": {"dtype": "F32", "shape": [10], "data_offsets": [0, len(betas)]}}
+    header = {"__metadata__": about, "betas": {"dtype": "F32", "shape": [10], "data_offsets": [0, len(raw)]}}
     text = json.dumps(header).encode()
-    path.write_bytes(len(text).to_bytes(8, "little") + text + betas)
+    path.write_bytes(len(text).to_bytes(8, "little") + text + raw)
 
 
 def add_person(store: Path, name: str = "Anna") -> bpy.types.Collection:

@@ -7,7 +7,56 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
-from test_tooltips import labels, ours, properties, tooltips
+
+_WITHIN_A_ROW = {"PRIMDIFFUSION_PG_captures.shards"}
+"""Labels that are words between two numbers: 0 of 4."""
+_BLENDERS = frozenset(bpy.types.Operator.bl_rna.properties.keys()) | {"name", "rna_type"}
+_FROM_BLENDER = {"filepath", "directory", "files", "check_existing", "filter_glob", "remove_active", "remove_name"}
+"""Properties that Blender's own mix-ins bring along, in Blender's words."""
+
+
+def classes(kind: type) -> list[type]:
+    found = [cls for cls in kind.__subclasses__() if cls.__name__.startswith("PRIMDIFFUSION_")]
+    return sorted({cls for cls in found if cls.is_registered}, key=lambda cls: cls.__name__)
+
+
+def rna(cls: type):
+    if issubclass(cls, bpy.types.Operator):
+        return getattr(bpy.ops.primdiffusion, cls.bl_idname.partition(".")[2]).get_rna_type()
+    return cls.bl_rna
+
+
+def ours(prop: bpy.types.Property) -> bool:
+    return not prop.is_hidden and prop.identifier not in _BLENDERS | _FROM_BLENDER
+
+
+def properties() -> Iterator[tuple[str, bpy.types.Property]]:
+    for kind in (bpy.types.Operator, bpy.types.PropertyGroup, bpy.types.AddonPreferences):
+        for cls in classes(kind):
+            for prop in filter(ours, rna(cls).properties):
+                yield f"{cls.__name__}.{prop.identifier}", prop
+
+
+def labels() -> Iterator[tuple[str, str]]:
+    for kind in (bpy.types.Operator, bpy.types.Panel, bpy.types.Menu):
+        for cls in classes(kind):
+            yield cls.__name__, cls.bl_label
+    for where, prop in properties():
+        if prop.type in ("POINTER", "COLLECTION") or where in _WITHIN_A_ROW:
+            continue
+        yield where, prop.name
+        for item in getattr(prop, "enum_items_static", ()):
+            yield f"{where}.{item.identifier}", item.name
+
+
+def tooltips() -> Iterator[tuple[str, str]]:
+    for cls in classes(bpy.types.Operator):
+        if "INTERNAL" not in cls.bl_options:
+            yield cls.__name__, rna(cls).description
+    for where, prop in properties():
+        if prop.type not in ("POINTER", "COLLECTION"):
+            yield where, prop.description
+
 
 ROOT = Path(__file__).resolve().parents[2] / "blender_primdiffusion"
 FOR_CONSOLES = ("ui/batch", "capture/command.py", "console.py")

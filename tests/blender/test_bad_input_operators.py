@@ -16,8 +16,8 @@ import bpy
 import pytest
 import synthetic
 import synthetic_shape
+from exporting import write_person
 from jobs_driven import drive
-from test_missing_volumes import write_person
 
 from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.generate import GenerateJob

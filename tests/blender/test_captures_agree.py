@@ -9,11 +9,11 @@ pytest.importorskip("torch", reason="the backend has another Python than this Bl
 
 import torch
 from blender_primdiffusion.formats.camera_rig import Rig, bounding_sphere
+from loaded_scans import load, own_person
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.render import set_up_capture
 from primdiffusion.formats import camera_rig as backend_rig
-from test_scan_rigs import load, own_person
 
 from blender_primdiffusion.motion.poses import built_in_poses
 

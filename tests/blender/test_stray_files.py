@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 def test_a_run_that_passes_leaves_no_files(tmp_path):
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
     here = Path(__file__).parent
-    chosen = [str(here / "test_volumes.py"), "--confcutdir", str(here)]  # Blender 5.2's Python has no torch
+    chosen = [str(here / "scene/test_volumes.py"), "--confcutdir", str(here)]  # Blender 5.2's Python has no torch
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST_", "BLENDER_"))}
     environment["TMPDIR"] = str(tmp_path)
     done = subprocess.run(

@@ -7,7 +7,6 @@ import pytest
 from tiny_model import save_tiny_checkpoint
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "blender_primdiffusion"))
-sys.path.append(str(Path(__file__).parents[1] / "backend"))
 
 
 @pytest.fixture(scope="session")

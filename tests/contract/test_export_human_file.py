@@ -1,14 +1,8 @@
 """.human files: the extension writes them with numpy alone, the backend reads them."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
-
-sys.path.append(str(Path(__file__).parents[1] / "backend"))
-
 from export_people import person
 from primdiffusion.human_file import export_for_blender, load_human, save_human
 from primdiffusion.reshaping import reshaped as reshape_in_backend

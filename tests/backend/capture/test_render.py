@@ -1,0 +1,286 @@
+"""People's files to captures on disk: the layout, going on after a kill, failures that stay alone."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from capture_scenes import box_person, captured, save_person, small_job
+from primdiffusion import cli
+from primdiffusion.capture.people_files import GlbError, find_people, read_glb, read_person
+from primdiffusion.capture.render import render
+from primdiffusion.capture.verify import verify
+from primdiffusion.commands.captures import parse_shard
+from primdiffusion.formats import capture_layout
+
+NAMES = ["person_000000", "person_000001"]
+
+
+def everything(root: Path) -> dict[str, bytes]:
+    """All files but zip archives, which hold the time."""
+    files = sorted(path for path in root.rglob("*") if path.is_file() and path.suffix not in (".npz", ".json"))
+    return {str(path.relative_to(root)): path.read_bytes() for path in files}
+
+
+def test_a_persons_file_is_read_as_it_was_written(tmp_path):
+    mesh = box_person()
+    person = read_person(save_person(tmp_path / "a.glb", mesh))
+    assert person.betas.tolist() == [0.0] * 10
+    for was, now in zip(mesh.parts, person.mesh.parts, strict=True):
+        assert now.name == was.name
+        np.testing.assert_allclose(now.vertices[now.faces], was.vertices[was.faces], atol=1e-6)
+        np.testing.assert_allclose(now.corner_uv, was.corner_uv, atol=1e-6)
+        assert np.array_equal(now.texture, was.texture)
+        assert (now.skin_index[:, 0] == was.skin_index[0, 0]).all()
+
+
+@pytest.mark.parametrize("cut", [0, 11, 300, -400, -1])
+def test_a_file_cut_short_is_rejected_by_name(tmp_path, cut):
+    path = save_person(tmp_path / "a.glb")
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(GlbError, match=r"a\.glb"):
+        read_person(path)
+
+
+def change(path: Path, edit) -> None:
+    """Edit a .glb's JSON."""
+    glb = read_glb(path)
+    edit(glb.content)
+    text = json.dumps(glb.content).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = len(text).to_bytes(4, "little") + b"JSON" + text
+    chunks += len(glb.binary).to_bytes(4, "little") + b"BIN\0" + glb.binary
+    path.write_bytes(b"glTF" + (2).to_bytes(4, "little") + (12 + len(chunks)).to_bytes(4, "little") + chunks)
+
+
+@pytest.mark.parametrize(
+    ("edit", "why"),
+    [
+        (lambda c: c["accessors"][1].update(count=10**9), "accessor"),
+        (lambda c: c["accessors"][1].update(bufferView=99), "accessor"),
+        (lambda c: c["bufferViews"][1].update(byteOffset=-8), "accessor"),
+        (lambda c: c["nodes"][0].update(name="Hips"), "joints Hips"),
+        (lambda c: c["images"][0].update(uri="../../secret.png", bufferView=10**6), "image"),
+        (lambda c: (c["asset"].pop("extras"), c["scenes"][0].pop("extras")), "betas"),
+        (lambda c: c["asset"]["extras"]["primdiffusion"].update(body="smplx"), "smplx"),
+        (lambda c: c["asset"]["extras"]["primdiffusion"].update(betas=[1e6] * 10), "betas"),
+        (lambda c: c["asset"]["extras"]["primdiffusion"].update(betas=[0.0] * 5000), "betas"),
+        (lambda c: c["nodes"][24].update(skin=-7), "not a human"),
+        (lambda c: c.pop("nodes"), "not a human"),
+        (lambda c: c["nodes"].__setitem__(slice(24, None), []), "no mesh"),
+        (lambda c: c["nodes"][24].pop("skin"), "has no skin"),
+    ],
+)
+def test_files_without_a_human_are_rejected(tmp_path, edit, why):
+    path = save_person(tmp_path / "a.glb")
+    change(path, edit)
+    with pytest.raises(GlbError, match=why):
+        read_person(path)
+
+
+def test_people_are_found_in_folders_of_their_own_and_as_files(tmp_path):
+    for path in ("people/b/person.glb", "people/a/person.glb", "c.glb", ".hidden/person.glb"):
+        save_person(tmp_path / path)
+    assert list(find_people(tmp_path)) == ["a", "b", "c"]
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        find_people(tmp_path / "nowhere")
+
+
+def test_captures_have_the_layouts_files_and_are_whole(tmp_path):
+    root = captured(tmp_path)
+    assert (root / capture_layout.LIST_FILE).read_text().split() == NAMES
+    about = capture_layout.read_about(root)
+    assert (about["renderer"], about["light"], about["frames"], about["rig"]["count"]) == (
+        "rasteriser",
+        "uniform",
+        3,
+        4,
+    )
+    for name in NAMES:
+        subject = root / name
+        assert capture_layout.damaged(subject) == []
+        for kind in ("img", "mask", "depth", "normal", "part"):
+            pictures = [
+                capture_layout.picture_path(subject, kind, camera, frame) for camera in range(4) for frame in range(3)
+            ]
+            assert all(path.is_file() for path in pictures)
+            assert sum(path.is_file() for path in (subject / kind).rglob("*")) == 12
+        frames = {p.name for p in (subject / "nerf").iterdir()} & {p.name for p in (subject / "colmap").iterdir()}
+        assert frames == {"0000", "0001", "0002"}
+        with np.load(subject / "joints.npz") as joints:
+            assert joints["pixel"].shape == (4, 3, 24, 2)
+    assert json.loads((root / "report.json").read_text()) == {"done": NAMES, "failed": [], "skipped": []}
+
+
+def test_two_workers_make_the_same_files_as_one(tmp_path):
+    one, two = captured(tmp_path / "one"), small_job(tmp_path / "two")
+    assert sorted(outcome.subject for outcome in render(two, workers=2)) == NAMES
+    assert everything(one) == everything(two.out)
+
+
+def test_few_people_are_shared_out_to_many_workers(tmp_path):
+    one, many = captured(tmp_path / "one", people=1), small_job(tmp_path / "many", people=1)
+    assert [(outcome.status, outcome.views) for outcome in render(many, workers=2)] == [("done", 12)]
+    assert everything(one) == everything(many.out)
+
+
+def test_what_is_there_is_kept_and_what_is_missing_is_made(tmp_path):
+    root = captured(tmp_path)
+    before = everything(root)
+    lost = capture_layout.picture_path(root / NAMES[1], "depth", 2, 1)
+    lost.unlink()
+    kept = capture_layout.picture_path(root / NAMES[1], "depth", 2, 2)
+    kept_at = kept.stat().st_mtime_ns
+    assert {outcome.subject: outcome.status for outcome in render(small_job(tmp_path))} == {
+        NAMES[0]: "skipped",
+        NAMES[1]: "done",
+    }
+    assert kept.stat().st_mtime_ns == kept_at
+    assert everything(root) == before
+
+
+def test_a_killed_run_is_gone_on_with_and_leaves_the_same_files(tmp_path):
+    expected = everything(captured(tmp_path / "expected", frames=12))
+    job = small_job(tmp_path, frames=12)
+    program = f"""
+import sys; sys.path.insert(0, {str(Path(__file__).parents[1])!r})
+from pathlib import Path
+from capture_scenes import small_job
+from primdiffusion.capture.render import render
+from primdiffusion.capture.verify import verify
+list(render(small_job(Path({str(tmp_path)!r}), frames=12)))
+"""
+    child = subprocess.Popen([sys.executable, "-c", program])
+    began = time.monotonic()
+    while not list(job.out.glob("*/img/*/0003.jpg")):
+        assert time.monotonic() - began < 120
+        assert child.poll() is None
+        time.sleep(0.002)
+    os.kill(child.pid, signal.SIGKILL)
+    child.wait()
+    assert not (job.out / NAMES[1] / capture_layout.COMPLETE_FILE).exists()
+    assert {outcome.status for outcome in render(job)} <= {"done", "skipped"}
+    assert everything(job.out) == expected
+    assert verify(job.out) == []
+
+
+def test_what_a_killed_process_left_half_written_goes(tmp_path):
+    job = small_job(tmp_path)
+    left = job.out / NAMES[0] / "img/camera0000/.0000.4242.partial.jpg"
+    capture_layout.claim(job.out, job.about)
+    left.parent.mkdir(parents=True)
+    left.write_bytes(b"half")
+    list(render(job))
+    assert not left.exists()
+    assert verify(job.out) == []
+
+
+def test_workers_end_when_the_command_is_killed(tmp_path):
+    save_person(tmp_path / "people" / "p0" / "person.glb")
+    save_person(tmp_path / "people" / "p1" / "person.glb")
+    line = [
+        "captures",
+        "render",
+        "--people",
+        str(tmp_path / "people"),
+        "--out",
+        str(tmp_path / "out"),
+        "--workers",
+        "2",
+    ]
+    process = subprocess.Popen([sys.executable, "-m", "primdiffusion.cli", *line], stdout=subprocess.DEVNULL)
+    try:
+        assert within(90, lambda: list((tmp_path / "out").glob("*/img/*/*.jpg")))
+        workers = psutil.Process(process.pid).children(recursive=True)
+        assert len(workers) >= 2
+    finally:
+        process.kill()
+        process.wait()
+    assert within(10, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))
+
+
+def within(seconds: float, reached) -> bool:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline and not reached():
+        time.sleep(0.1)
+    return bool(reached())
+
+
+def test_files_of_poses_that_cannot_be_read_are_left_out_and_reported(tmp_path, capsys):
+    save_person(tmp_path / "people" / "p0" / "person.glb")
+    np.save(tmp_path / "good.npy", np.random.default_rng(0).normal(0, 0.3, (3, 72)))
+    np.save(tmp_path / "nan.npy", np.full((3, 72), np.nan))
+    line = ["captures", "render", "--people", str(tmp_path / "people"), "--out", str(tmp_path / "out"), "--size", "24",
+            "--cameras", "1", "--pose-count", "2", "--poses", str(tmp_path / "nan.npy")]  # fmt: skip
+    with pytest.raises(SystemExit):
+        cli.main(line)
+    assert "none of the 1 pose files" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as end:
+        cli.main([*line, str(tmp_path / "good.npy")])
+    assert end.value.code == 1
+    assert "0 of 1 people and 1 of 2 pose files failed" in capsys.readouterr().err
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["done"] == ["p0"]
+    assert "nan.npy" in report["failed"][0]["why"]
+
+
+def test_one_that_fails_leaves_the_others_alone_and_is_reported(tmp_path):
+    job = small_job(tmp_path)
+    job.people[NAMES[0]].write_bytes(b"glTF but no more")
+    outcomes = {outcome.subject: outcome for outcome in render(job)}
+    assert (outcomes[NAMES[0]].status, outcomes[NAMES[1]].status) == ("failed", "done")
+    report = json.loads((job.out / "report.json").read_text())
+    assert report["done"] == [NAMES[1]]
+    assert "person.glb" in report["failed"][0]["why"]
+    assert (job.out / capture_layout.LIST_FILE).read_text().split() == [NAMES[1]]
+
+
+def test_another_person_or_pose_in_the_same_folder_is_rejected(tmp_path):
+    captured(tmp_path, people=1)
+    job = small_job(tmp_path, people=1)
+    (job.out / NAMES[0] / capture_layout.COMPLETE_FILE).unlink()
+    turned = job.poses.map(lambda values: values.flip(0))
+    (outcome,) = render(dataclasses.replace(job, poses=turned))
+    assert outcome.status == "failed"
+    assert "other poses" in outcome.error
+
+
+def test_other_settings_in_the_same_folder_are_rejected(tmp_path):
+    captured(tmp_path, people=1)
+    with pytest.raises(capture_layout.CaptureFolderError, match="samples is 9, wanted is 25"):
+        list(render(small_job(tmp_path, people=1, samples=5)))
+
+
+def test_the_command_renders_a_shard_and_exits_with_1_on_failure(tmp_path, capsys):
+    for number in range(3):
+        save_person(tmp_path / "people" / f"p{number}" / "person.glb")
+    line = ["captures", "render", "--people", str(tmp_path / "people"), "--out", str(tmp_path / "out"), "--size", "24",
+            "--cameras", "2", "--pose-count", "2", "--released-reference"]  # fmt: skip
+    cli.main([*line, "--shard", "0/2"])
+    assert sorted(path.parent.name for path in (tmp_path / "out").glob("*/complete.json")) == ["p0", "p2"]
+    (tmp_path / "people" / "p1" / "person.glb").write_bytes(b"")
+    with pytest.raises(SystemExit) as end:
+        cli.main([*line, "--shard", "1/2"])
+    assert end.value.code == 1
+    assert "1 of 2 people failed" in capsys.readouterr().err
+    assert (tmp_path / "out" / capture_layout.RELEASED_REFERENCE / "complete.json").exists()
+    assert {path.name for path in (tmp_path / "out").glob("report*")} == {"report-0-of-2.json", "report-1-of-2.json"}
+
+
+@pytest.mark.parametrize("text", ["2/2", "-1/2", "1", "a/b", "0/0", "1/2/3"])
+def test_shards_that_are_none_are_rejected(text):
+    with pytest.raises(ValueError, match="shard"):
+        parse_shard(text)
+
+
+@pytest.mark.parametrize(("more", "why"), [({"passes": ("img", "rgba")}, "rgba"), ({"passes": ()}, "passes")])
+def test_passes_that_cannot_be_drawn_are_rejected(tmp_path, more, why):
+    with pytest.raises(ValueError, match=why):
+        list(render(small_job(tmp_path, **more)))

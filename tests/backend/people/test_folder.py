@@ -1,0 +1,193 @@
+"""People folders: whole or not at all, the same everywhere, licences of all assets. Need a MakeHuman asset folder."""
+
+import errno
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from primdiffusion.people import assets as assets_module
+from primdiffusion.people import folder as folder_module
+from primdiffusion.people import load_base_mesh, make_person, open_assets
+from primdiffusion.people.assets import ENVIRONMENT_VARIABLE, licence_of
+from primdiffusion.people.fitting import cover
+from primdiffusion.people.folder import OtherPeopleError, PeopleSet, is_whole, make_people
+from primdiffusion.people.wardrobe import SKIRTS, required_meshes
+
+NEARBY = Path(__file__).resolve().parents[4] / "shared" / "data" / "makehuman"
+OTHER_PROCESSOR = {
+    "OPENBLAS_CORETYPE": "Prescott",
+    "NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3 AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL",
+    "ATEN_CPU_CAPABILITY": "default",
+}
+"""Makes the libraries compute as on a machine without vector instructions newer than SSE."""
+
+
+@pytest.fixture(scope="module")
+def assets():
+    folder = os.environ.get(ENVIRONMENT_VARIABLE, NEARBY if NEARBY.is_dir() else None)
+    if folder is None:
+        pytest.skip(f"needs a MakeHuman asset folder: set {ENVIRONMENT_VARIABLE}")
+    return open_assets(folder, required_meshes())
+
+
+@pytest.fixture(scope="module")
+def two(assets, tmp_path_factory):
+    root = tmp_path_factory.mktemp("people")
+    assert list(make_people(assets, PeopleSet(root, 3, 2), 1)) == [0, 1, 2]
+    return root
+
+
+def command(assets, out, *more):
+    return [sys.executable, "-m", "primdiffusion.cli", "people", "--assets", str(assets.root), "--out", str(out), *more]
+
+
+def digests(root):
+    return {path.relative_to(root): hashlib.sha256(path.read_bytes()).hexdigest() for path in root.rglob("*.*")}
+
+
+def test_manifest_lists_people_and_the_licence_of_every_asset(two):
+    manifest = json.loads((two / "manifest.json").read_text())
+    assert (manifest["format"], manifest["version"]) == ("primdiffusion-people", 1)
+    assert (manifest["seed"], manifest["count"]) == (3, 2)
+    assert manifest["people"] == ["person_000003", "person_000004"]
+    cards = [json.loads((two / name / "person.json").read_text()) for name in manifest["people"]]
+    used = {source["path"] for card in cards for source in card["sources"]}
+    assert {asset["path"] for asset in manifest["assets"]} == used
+    assert all(len(card["betas"]) == 10 and card["body"] == "default" for card in cards)
+    assert any(path.endswith(".mhclo") for path in used)
+    assert any(path.endswith((".png", ".jpg")) for path in used)
+
+
+def test_damaged_people_are_made_anew_and_whole_ones_kept(assets, two):
+    before = digests(two)
+    kept, damaged = two / "person_000003/person.glb", two / "person_000004/person.glb"
+    moment = kept.stat().st_mtime_ns
+    damaged.write_bytes(damaged.read_bytes()[:-7])
+    assert not is_whole(two / "person_000004", 4)
+    assert list(make_people(assets, PeopleSet(two, 3, 2), 1)) == [1, 2]
+    assert digests(two) == before
+    assert kept.stat().st_mtime_ns == moment
+
+
+def test_other_sets_of_people_are_rejected(assets, two):
+    with pytest.raises(OtherPeopleError, match="2 samples from seed 3, but 2 from seed 4"):
+        list(make_people(assets, PeopleSet(two, 4, 2), 1))
+    with pytest.raises(OtherPeopleError, match="person_000004"):
+        list(make_people(assets, PeopleSet(two, 3, 1), 1))
+
+
+@pytest.mark.parametrize(("seed", "count", "word"), [(0, 0, "count is 0"), (-1, 2, "seed is -1")])
+def test_sets_without_people_are_rejected(tmp_path, seed, count, word):
+    with pytest.raises(ValueError, match=word):
+        PeopleSet(tmp_path, seed, count)
+
+
+def test_full_disk_is_named_and_leaves_nothing(assets, tmp_path, monkeypatch):
+    def full(self, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="person_000005") as caught:
+        folder_module.write_person(assets, tmp_path / "person_000005", 5)
+    assert caught.value.errno == errno.ENOSPC
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_killed_processes_left_is_removed(assets, two):
+    child = subprocess.Popen([sys.executable, "-c", ""])
+    child.wait()
+    left = two / f".person_000009.{child.pid}.partial"
+    left.mkdir()
+    (left / "person.glb").write_bytes(b"half")
+    list(make_people(assets, PeopleSet(two, 3, 2), 1))
+    assert not left.exists()
+
+
+def test_licences_are_read_from_headers_lists_and_materials(tmp_path):
+    (tmp_path / "pack/hat").mkdir(parents=True)
+    root = tmp_path / "pack"
+    (root / "hat/a.obj").write_text("# This asset was explicitly released as CC0 in september 2020.\nv 0 0 0\n")
+    (root / "hat/b.mhclo").write_text("# license CC-BY-SA 4.0\n")
+    (root / "hat/c.obj").write_text("v 0 0 0\n# CC0\n")
+    (root / "hat/d.mhmat").write_text("# released as CC0\ndiffuseTexture d_diffuse.png\n")
+    for name in ("d_diffuse.png", "e.png", "f.png"):
+        (root / "hat" / name).write_bytes(b"")
+    (tmp_path / "LICENSES.txt").write_text("Notes\npath | source | license\npack/hat/e.png | x | CC-BY-4.0 | y\n")
+    found = {name: licence_of(root, f"hat/{name}") for name in ("a.obj", "b.mhclo", "d_diffuse.png", "e.png", "f.png")}
+    assert found == {
+        "a.obj": "CC0-1.0",
+        "b.mhclo": "CC-BY-SA 4.0",
+        "d_diffuse.png": "CC0-1.0",
+        "e.png": "CC-BY-4.0",
+        "f.png": "unknown",
+    }
+
+
+def test_damaged_pictures_are_named(assets, tmp_path):
+    for room in assets_module.SUBFOLDERS:
+        (tmp_path / room).mkdir()
+    source = next((assets.root / "skins/textures").glob("*.jpg"))
+    (tmp_path / "skins/half.jpg").write_bytes(source.read_bytes()[:5000])
+    with pytest.raises(ValueError, match=r"half\.jpg.*fetch it again"):
+        open_assets(tmp_path).picture("skins/half", 64)
+
+
+def test_faces_differ_between_people_of_one_body(assets):
+    base = load_base_mesh()
+    first, second = (make_person(assets, base, seed).mesh.parts[0] for seed in (3, 4))
+    assert len(first.vertices) != len(second.vertices) or not np.allclose(first.vertices, second.vertices)
+
+
+def test_skin_far_under_cloth_is_left_out_and_its_rim_sunk(assets):
+    base = load_base_mesh()
+    (path, _), *_ = SKIRTS.items()
+    garment = cover(assets, base, path)
+    assert 1000 < garment.hidden.sum() < len(np.unique(base.faces))
+    assert garment.sink.max() < 0.02
+    head = np.unique(base.faces)[base.template[np.unique(base.faces), 1] > 0.42]
+    assert not garment.hidden[head].any()
+    assert (garment.sink[head] == 0).all()
+
+
+@pytest.mark.slow
+def test_any_processor_and_number_of_workers_gives_the_same_bytes(assets, tmp_path):
+    environments = {"one": ("1", {}), "two": ("2", OTHER_PROCESSOR)}
+    for name, (workers, more) in environments.items():
+        options = ("--count", "3", "--seed", "40", "--workers", workers)
+        subprocess.run(command(assets, tmp_path / name, *options), check=True, env={**os.environ, **more})
+    assert digests(tmp_path / "one") == digests(tmp_path / "two")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("blow", [signal.SIGINT, signal.SIGKILL])
+def test_stopped_runs_leave_whole_people_and_no_workers(assets, tmp_path, blow):
+    options = ("--count", "60", "--workers", "2")
+    process = subprocess.Popen(command(assets, tmp_path, *options), stderr=subprocess.DEVNULL)
+    try:
+        assert _within(120, lambda: len(list(tmp_path.glob("person_*"))) >= 2)
+        workers = psutil.Process(process.pid).children(recursive=True)
+        assert len(workers) >= 2
+        process.send_signal(blow)
+        assert process.wait(30) in (130, -signal.SIGKILL)
+    finally:
+        process.kill()
+        process.wait()
+    assert _within(15, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))
+    for folder in tmp_path.glob("person_*"):
+        assert is_whole(folder, int(folder.name[-6:]))
+    assert not (tmp_path / "manifest.json").exists()
+
+
+def _within(seconds, reached):
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline and not reached():
+        time.sleep(0.2)
+    return reached()

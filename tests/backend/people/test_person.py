@@ -1,0 +1,326 @@
+"""Whole people: these need a MakeHuman asset folder and skip without one."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+import torch
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.people import assets as assets_module
+from primdiffusion.people import load_base_mesh, make_person, open_assets, recolour
+from primdiffusion.people import payloads as payloads_module
+from primdiffusion.people import person as person_module
+from primdiffusion.people.appearance import SkinColours, skin_texture
+from primdiffusion.people.assets import ENVIRONMENT_VARIABLE, AssetsMissingError
+from primdiffusion.people.fitting import shown_faces, under_hat, under_hem
+from primdiffusion.people.mhclo import parse_mhclo
+from primdiffusion.people.payloads import fitted_payloads, is_complete, make_payloads, orbit_camera, rest_frames
+from primdiffusion.people.wardrobe import HAIR, HATS, OUTFITS, choose, draw_body, required_meshes
+from primdiffusion.primitives.from_mesh import FULL_DENSITY, from_mesh
+from primdiffusion.primitives.primitives import Payload, Primitives
+from primdiffusion.raster.rasterise import rasterise
+from primdiffusion.render.march import march
+
+NEARBY = Path(__file__).resolve().parents[4] / "shared" / "data" / "makehuman"
+SEEDS = range(6)
+
+
+@pytest.fixture(scope="module")
+def base():
+    return load_base_mesh()
+
+
+@pytest.fixture(scope="module")
+def assets():
+    folder = os.environ.get(ENVIRONMENT_VARIABLE, NEARBY if NEARBY.is_dir() else None)
+    if folder is None:
+        pytest.skip(f"needs a MakeHuman asset folder: set {ENVIRONMENT_VARIABLE}")
+    return open_assets(folder, required_meshes())
+
+
+@pytest.fixture(scope="module")
+def people(assets, base):
+    return [make_person(assets, base, seed) for seed in SEEDS]
+
+
+def same_pictures(first, second):
+    return all(np.array_equal(a.texture, b.texture) for a, b in zip(first.mesh.parts, second.mesh.parts, strict=True))
+
+
+def test_no_folder_says_how_to_name_one(monkeypatch):
+    monkeypatch.delenv(ENVIRONMENT_VARIABLE, raising=False)
+    with pytest.raises(AssetsMissingError, match=rf"--assets.*{ENVIRONMENT_VARIABLE}"):
+        open_assets()
+
+
+def test_absent_folder_is_named(tmp_path):
+    with pytest.raises(AssetsMissingError, match="nowhere"):
+        open_assets(tmp_path / "nowhere")
+
+
+def test_incomplete_folder_says_what_it_lacks(tmp_path):
+    for name in assets_module.SUBFOLDERS:
+        (tmp_path / name).mkdir()
+    assert open_assets(tmp_path).root == tmp_path.resolve()
+    with pytest.raises(AssetsMissingError, match=r": eyes/low-poly/low-poly\.mhclo"):
+        open_assets(tmp_path, ("eyes/low-poly/low-poly",))
+    (tmp_path / "skins").rmdir()
+    with pytest.raises(AssetsMissingError, match=": skins;"):
+        open_assets(tmp_path)
+
+
+def test_environment_names_the_folder(tmp_path, monkeypatch):
+    for name in assets_module.SUBFOLDERS:
+        (tmp_path / name).mkdir()
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, str(tmp_path))
+    assert open_assets().root == tmp_path.resolve()
+
+
+def test_pointers_left_by_git_lfs_are_not_pictures(tmp_path):
+    for name in assets_module.SUBFOLDERS:
+        (tmp_path / name).mkdir()
+    (tmp_path / "eyes" / "iris.png").write_text("version https://git-lfs.github.com/spec/v1\n")
+    assert not open_assets(tmp_path).has_picture("eyes/iris")
+
+
+def test_outer_clothes_hide_the_body_and_what_lies_deeper(base):
+    triangle = base.faces[0]
+    line = "{} {} {} 1 0 0 0 0 0\n".format(*triangle)
+    listed = " ".join(str(vertex) for vertex in triangle)
+    outer = parse_mhclo(f"name outer\nz_depth 50\nverts 0\n{line * 3}delete_verts\n{listed}\n")
+    inner = parse_mhclo(f"name inner\nz_depth 5\nverts 0\n{line * 3}")
+    proxies = {"inner": (inner, np.array([[0, 1, 2]])), "outer": (outer, np.array([[0, 1, 2]]))}
+    shown = shown_faces(base, proxies, np.zeros(len(base.template), bool))
+    assert not shown["body"][0]
+    assert shown["body"].sum() == len(base.faces) - 1
+    assert not shown["inner"].any()
+    assert shown["outer"].all()
+
+
+def test_hat_covers_hair_above_its_tilted_brim():
+    angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    brim = np.stack([0.2 * np.cos(angle), 1 + 0.1 * np.cos(angle), 0.2 * np.sin(angle)], -1)
+    crown = np.stack([0.1 * np.cos(angle), 1.2 + 0 * angle, 0.1 * np.sin(angle)], -1)
+    hair = np.array([[0.15, 1.1, 0.0], [0.15, 1.05, 0.0], [-0.15, 0.95, 0.0], [-0.15, 0.9, 0.0]])
+    covered = under_hat(np.concatenate([brim, crown]), hair, np.repeat(np.arange(4)[:, None], 3, axis=1))
+    assert covered.tolist() == [True, False, True, False]
+
+
+def test_socks_end_under_trousers_but_not_under_skirts():
+    sock, face = np.array([[0.0, 0.1, 0], [0, 0.2, 0]]), np.array([[0, 0, 0], [1, 1, 1]])
+    assert under_hem(np.array([[0.0, 0.12, 0], [0, 1, 0]]), sock, face).tolist() == [False, True]
+    assert under_hem(np.array([[0.0, 0.6, 0], [0, 1, 0]]), sock, face).tolist() == [False, False]
+
+
+def test_femininity_separates_the_bodies_the_shape_space_was_made_from(base):
+    axis = person_module.femininity(base)
+    gender = base.sample_phenotypes[:, base.phenotype_names.index("gender")]
+    assert np.corrcoef(base.sample_betas @ axis, gender)[0, 1] > 0.95
+    # Women's hips are wide for their shoulders: the sign of the axis is right.
+    ratio = []
+    for sign in (1, -1):
+        body = base.vertices(sign * 2 * axis / np.linalg.norm(axis))[np.unique(base.faces)]
+        crotch = -0.25
+        hips = body[np.abs(body[:, 1] - (crotch + 0.1)) < 0.03][:, 0]
+        waist = body[np.abs(body[:, 1] - (crotch + 0.35)) < 0.03][:, 0]
+        ratio.append(np.ptp(hips) / np.ptp(waist))
+    assert ratio[0] > ratio[1] + 0.05
+
+
+def test_outfits_are_worn_evenly_within_a_sex_and_betas_stay_in_range(base):
+    axis = person_module.femininity(base)
+    choices = [choose(seed, axis) for seed in range(1200)]
+    for sex, outfits in OUTFITS.items():
+        worn = [choice.outfit.name for choice in choices if choice.sex == sex]
+        assert len(worn) == pytest.approx(600, abs=80)
+        for outfit in outfits:
+            expected = len(worn) / len(outfits)
+            assert worn.count(outfit.name) == pytest.approx(expected, abs=4 * np.sqrt(expected))
+    betas = np.stack([choice.betas for choice in choices])
+    assert np.abs(betas).max() <= 2
+    assert betas.std() == pytest.approx(0.9, abs=0.1)
+    assert {choice.hair for choice in choices} == {None, *HAIR["female"], *HAIR["male"]}
+    assert {choice.hat for choice in choices} == {None, *HATS}
+
+
+def test_sex_is_the_side_of_the_femininity_axis(base):
+    axis = person_module.femininity(base)
+    for seed in range(50):
+        betas, sex = draw_body(seed, axis)
+        assert (betas @ axis > 0) == (sex == "female")
+
+
+def test_same_seed_gives_the_same_person(assets, base, people):
+    again = make_person(assets, base, SEEDS[1])
+    assert again.attributes == people[1].attributes
+    assert all(
+        np.array_equal(a.vertices, b.vertices) for a, b in zip(again.mesh.parts, people[1].mesh.parts, strict=True)
+    )
+    assert same_pictures(again, people[1])
+
+
+def test_recolouring_shares_geometry_and_changes_colours(people):
+    other = recolour(people[0], 99)
+    for before, after in zip(people[0].mesh.parts, other.mesh.parts, strict=True):
+        assert after.name == before.name
+        for field in ("vertices", "faces", "corner_uv", "skin_index", "skin_weight"):
+            assert getattr(after, field) is getattr(before, field)
+    assert not same_pictures(people[0], other)
+    assert same_pictures(recolour(other, SEEDS[0]), people[0])
+
+
+def test_everybody_wears_an_outfit_and_shoes_and_has_a_face(people):
+    for person in people:
+        names = [part.name for part in person.mesh.parts]
+        assert len(set(names)) == len(names)
+        assert {"body", "outfit", "shoes", "eyes", "eyebrows", "eyelashes"} <= set(names)
+        for part in person.mesh.parts:
+            assert len(part.faces) > 0
+            assert np.isfinite(part.vertices).all()
+            assert part.skin_weight.min() >= 0
+            assert np.abs(part.skin_weight.sum(1) - 1).max() < 1e-6
+            assert max(part.texture.shape) <= 1024
+            assert part.faces.max() < len(part.vertices)
+
+
+def test_people_stand_upright_at_adult_size(people):
+    for person in people:
+        assert 1.5 < person.attributes["height"] < 2.0
+        low, high = person.mesh.bounds
+        assert high[0] - low[0] == pytest.approx(high[1] - low[1], rel=0.25)  # arms level
+
+
+def test_rigid_skinning_moves_people_as_a_whole(people):
+    skinning = np.tile(np.eye(4), (24, 1, 1))
+    skinning[:, :3, :3] = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    skinning[:, :3, 3] = [1, 2, 3]
+    for before, after in zip(people[0].mesh.parts, people[0].mesh.posed(skinning).parts, strict=True):
+        expected = before.vertices @ skinning[0, :3, :3].T + [1, 2, 3]
+        assert np.abs(after.vertices - expected).max() < 1e-9
+
+
+def test_clothes_hide_most_of_the_body_under_them(people, base):
+    for person in people:
+        body = next(part for part in person.mesh.parts if part.name == "body")
+        assert len(body.faces) < 0.8 * len(base.faces)
+
+
+def test_skins_darken_steadily_with_tone_for_both_sexes(assets):
+    for sex, light in (("female", "young_lightskinned_female_diffuse2"), ("male", "young_lightskinned_male_diffuse")):
+        skins = [
+            SkinColours(f"skins/textures/{light}", "skins/textures/young_darkskinned_male_diffuse", tone, (0, 0, 0))
+            for tone in (0, 0.25, 0.5, 0.75, 1)
+        ]
+        brightness = [skin_texture(assets, skin)[200:400, 150:450, :3].mean() for skin in skins]
+        assert np.diff(brightness).max() < -10, sex
+
+
+def test_payloads_are_stored_whole_and_mended(assets, tmp_path):
+    reports = []
+    (path,) = make_payloads(
+        assets, tmp_path, 1, 2, 3, 1, "from_mesh", lambda done, total: reports.append((done, total))
+    )
+    assert reports == [(0, 1), (1, 1)]
+    with np.load(path, allow_pickle=False) as file:
+        voxels, attributes = file["voxels"], json.loads(str(file["attributes"]))
+        assert float(file["full_density"]) == FULL_DENSITY
+    assert voxels.shape == (2, 1024, 8, 8, 8, 4)
+    assert np.array_equal(voxels[0, ..., 3], voxels[1, ..., 3])
+    assert not np.array_equal(voxels[0], voxels[1])
+    assert 0.1 < (voxels[0, ..., 3] > 0).mean() < 0.9
+    assert len(attributes["variants"]) == 2
+    assert is_complete(path, 2, 3, "from_mesh")
+    assert not is_complete(path, 3, 3, "from_mesh")
+    assert not is_complete(path, 2, 3, "fitted")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    assert not is_complete(path, 2, 3, "from_mesh")
+    make_payloads(assets, tmp_path, 1, 2, 3, 1, "from_mesh")
+    with np.load(path, allow_pickle=False) as file:
+        assert np.array_equal(file["voxels"], voxels)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["person_000003.npz"]
+
+
+def test_fitted_payloads_look_more_like_the_mesh_in_each_colouring_from_sides_that_were_not_shown(
+    assets, people, monkeypatch
+):
+    monkeypatch.setattr(payloads_module, "BODY_VIEWS", 8)
+    monkeypatch.setattr(payloads_module, "HEAD_VIEWS", 6)
+    colourings = [people[0].mesh, recolour(people[0], 77).mesh]
+    frames = rest_frames(people[0].betas)
+    low, high = people[0].mesh.bounds
+    views = {
+        "body": orbit_camera((low + high) / 2, 1.1 * float((high - low).max()), 33, 3, 0.5, 256),
+        "head": orbit_camera(payloads_module.head_centre(people[0].betas), 0.42, 21, 5, 0.2, 128),
+    }
+
+    def psnr(payload: Payload, mesh, view: str) -> float:
+        drawn, true = march(Primitives.place(frames, payload), views[view]), rasterise(mesh, views[view], 3)
+        over_grey = [
+            encode_srgb(np.clip(rgb + (1 - alpha[..., None]) * 0.2, 0, 1))
+            for rgb, alpha in ((drawn.rgb.numpy(), drawn.alpha.numpy()), (true.rgb, true.alpha))
+        ]
+        return float(-10 * np.log10(np.square(over_grey[0] - over_grey[1]).mean()))
+
+    payloads = fitted_payloads(colourings, frames, people[0].betas)
+    assert torch.equal(payloads[0].density, payloads[1].density)
+    for payload, mesh in zip(payloads, colourings, strict=True):
+        for view, gain in (("body", 1.5), ("head", 1.0)):
+            assert psnr(payload, mesh, view) > psnr(from_mesh(mesh, frames), mesh, view) + gain, view
+
+
+def test_counts_that_make_nothing_are_rejected(tmp_path):
+    with pytest.raises(ValueError, match="variants is 0"):
+        make_payloads(assets_module.Assets(tmp_path), tmp_path, 1, 0, 0, 1)
+
+
+def test_person_is_frozen(people):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        people[0].betas = None
+
+
+@pytest.mark.slow
+def test_processes_make_the_same_files_as_one(assets, tmp_path):
+    environment = dict(os.environ)
+    alone = make_payloads(assets, tmp_path / "one", 3, 1, 11, 1, "from_mesh")
+    reports = []
+    together = make_payloads(
+        assets, tmp_path / "two", 3, 1, 11, 2, "from_mesh", lambda done, total: reports.append(done)
+    )
+    assert [path.name for path in together] == [path.name for path in alone]
+    assert reports[0] == 0
+    assert reports[-1] == 3
+    assert dict(os.environ) == environment
+    for first, second in zip(alone, together, strict=True):
+        with np.load(first) as a, np.load(second) as b:
+            assert np.array_equal(a["voxels"], b["voxels"])
+
+
+@pytest.mark.slow
+def test_workers_end_when_the_command_is_killed(assets, tmp_path):
+    command = [sys.executable, "-m", "primdiffusion.cli", "payloads", "--assets", str(assets.root)]
+    options = ["--out", str(tmp_path), "--count", "50", "--workers", "2", "--making", "from_mesh"]
+    process = subprocess.Popen([*command, *options], stdout=subprocess.DEVNULL)
+    try:
+        assert _within(60, lambda: any(tmp_path.glob("*.npz")))
+        workers = psutil.Process(process.pid).children(recursive=True)
+        assert len(workers) >= 2
+    finally:
+        process.kill()
+        process.wait()
+    assert _within(10, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))
+
+
+def _within(seconds: float, reached: Callable[[], bool]) -> bool:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline and not reached():
+        time.sleep(0.2)
+    return reached()

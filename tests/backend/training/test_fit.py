@@ -1,0 +1,269 @@
+"""A run of stage 1: what it leaves, when it stops, and what it says of bad input."""
+
+import json
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from accelerate import Accelerator
+from capture_scenes import captured
+from fit_scenes import WHOLE, files, flags, make_small, rows, sentence, settings
+from PIL import Image
+from primdiffusion.capture.dataset import FIRST, SINGLE_PROCESS
+from primdiffusion.capture.reader import open_captures
+from primdiffusion.encoder.config import PRESETS
+from primdiffusion.encoder.model import load_encoder
+from primdiffusion.encoder.network import Encoder
+from primdiffusion.render.march import MarchSettings
+from primdiffusion.training import fit as fit_module
+from primdiffusion.training import recorder as recorder_module
+from primdiffusion.training import run_folder
+from primdiffusion.training.fit import fit, run
+from primdiffusion.training.fit_config import FitConfig, LossConfig
+from primdiffusion.training.fit_data import fit_batches, fit_dataset
+from primdiffusion.training.fit_losses import volume_loss
+from primdiffusion.training.fit_run import MODEL, STATE, FitState
+from primdiffusion.training.run_folder import METRICS, PICTURES
+from safetensors.torch import load_file
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    return captured(tmp_path_factory.mktemp("captures"), people=2, frames=2, passes=("img", "mask"))
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    make_small(monkeypatch)
+
+
+@pytest.fixture
+def own(captures, tmp_path):
+    """Captures that a test may damage."""
+    shutil.copytree(captures, tmp_path / "captures")
+    return tmp_path / "captures"
+
+
+def test_a_run_leaves_settings_versions_metrics_pictures_state_and_encoder(captures, tmp_path):
+    config = settings(captures, tmp_path / "run", steps=4, evaluate_every=2, held=captures)
+    model = fit(config)
+    assert files(config.run) == WHOLE
+    assert json.loads((config.run / "config.json").read_text())["learning_rate"] == 1e-4
+    about = json.loads((config.run / "run.json").read_text())
+    assert about["people"] == ["person_000000", "person_000001"]
+    assert about["starts"][0].keys() >= {"torch", "accelerate", "python", "primdiffusion", "processes"}
+    assert not (ROOT / ".git").exists() or about["starts"][0]["commit"]
+    (picture,) = (config.run / PICTURES).iterdir()
+    assert Image.open(picture).size == (5 * 24, 2 * 24)
+    told = [row for row in rows(config.run) if "rgb" in row]
+    assert [row["step"] for row in told] == [1, 2, 3, 4]
+    terms = {"rgb", "silhouette", "volume", "gradient"}
+    times = {"seconds_data", "seconds_forward", "seconds_march", "seconds_backward", "seconds"}
+    assert told[0].keys() == {"step"} | terms | times
+    measured = [row for row in rows(config.run) if "psnr_train" in row]
+    assert [row["step"] for row in measured] == [2, 4]
+    assert all(np.isfinite([row["psnr_train"], row["psnr_held"]]).all() for row in measured)
+    kept = load_encoder(config.run / MODEL)
+    assert kept.card["steps"] == model.card["steps"] == 4
+    assert all(
+        torch.allclose(a, b, atol=1e-3)
+        for a, b in zip(kept.encoder.parameters(), model.encoder.parameters(), strict=True)
+    )
+
+
+def test_weights_change_and_the_average_is_what_is_kept(captures, tmp_path):
+    config = settings(captures, tmp_path / "run", steps=3)
+    fit(config)
+    state, kept = load_file(config.run / STATE), load_file(config.run / MODEL)
+    for key, value in kept.items():
+        assert torch.equal(state[f"average.{key}"].half(), value)
+    assert any(not torch.equal(state[f"average.{key}"], state[f"network.{key}"]) for key in kept)
+
+
+def test_ctrl_c_stops_after_the_step_and_saves(captures, tmp_path, monkeypatch):
+    def press(self, progress):
+        if progress.step == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(recorder_module.Recorder, "__call__", press)
+    model = fit(settings(captures, tmp_path / "run"))
+    assert model.card["steps"] == 2
+    assert load_encoder(tmp_path / "run" / MODEL).card["steps"] == 2
+
+
+def test_minutes_stop_a_run_after_the_step_that_passes_them(captures, tmp_path):
+    assert fit(settings(captures, tmp_path / "run", minutes=0.0)).card["steps"] == 1
+    assert fit(settings(captures, tmp_path / "run", minutes=0.0)).card["steps"] == 2
+
+
+def test_bfloat16_trains_float32_weights_on_the_processor(captures, tmp_path):
+    seen = set()
+
+    def note(module, inputs, output):
+        if isinstance(module, torch.nn.Linear):
+            seen.add(output.dtype)
+
+    hook = torch.nn.modules.module.register_module_forward_hook(note)
+    with hook:
+        config = settings(captures, tmp_path / "run", steps=2, mixed_precision="bf16")
+        model = fit(config)
+    assert torch.bfloat16 in seen
+    assert {parameter.dtype for parameter in model.encoder.parameters()} == {torch.float32}
+    assert all(np.isfinite(row["rgb"]) for row in rows(config.run) if "rgb" in row)
+
+
+def test_the_perceptual_loss_is_read_from_its_file_and_counted(captures, tmp_path, monkeypatch):
+    read = []
+
+    class Brightness(torch.nn.Module):
+        def forward(self, image, target):
+            return (image.mean() - target.mean()).abs()
+
+    monkeypatch.setattr(fit_module, "load_perceptual", lambda path: read.append(path) or Brightness())
+    loss = LossConfig(perceptual=1.0, perceptual_weights=tmp_path / "vgg19.pth")
+    fit(settings(captures, tmp_path / "run", steps=1, loss=loss))
+    assert read == [tmp_path / "vgg19.pth"]
+    assert rows(tmp_path / "run")[0]["perceptual"] > 0
+
+
+def test_a_perceptual_weight_without_a_file_is_refused_and_a_missing_file_named(captures, tmp_path):
+    with pytest.raises(ValueError, match=r"--loss.perceptual-weights"):
+        settings(captures, tmp_path / "run", loss=LossConfig(perceptual=1.0))
+    loss = LossConfig(perceptual=1.0, perceptual_weights=tmp_path / "nowhere.pth")
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.pth"):
+        fit(settings(captures, tmp_path / "run", loss=loss))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"batch": 0}, {"steps": 0}, {"learning_rate": float("nan")}, {"ema": 1.0}, {"workers": -1}, {"minutes": -1.0},
+     {"gradient_clip": 0.0}, {"encoder": "huge"}, {"threads": 0}],
+)  # fmt: skip
+def test_settings_that_cannot_be_are_named(captures, tmp_path, change):
+    (name,) = change
+    with pytest.raises(ValueError, match=name):
+        settings(captures, tmp_path / "run", **change)
+
+
+def test_losses_without_colour_are_refused():
+    with pytest.raises(ValueError, match="colours"):
+        LossConfig(rgb=0.0)
+    with pytest.raises(ValueError, match=r"loss\.volume"):
+        LossConfig(volume=-1.0)
+
+
+def test_captures_without_people_are_refused(tmp_path):
+    (tmp_path / "captures").mkdir()
+    with pytest.raises(FileNotFoundError, match="no finished captures"):
+        fit(settings(tmp_path / "captures", tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_person_with_one_view_trains_on_it_again_and_again(own, tmp_path):
+    for person in own.glob("person_*"):
+        cameras = json.loads((person / "cameras.json").read_text())
+        (person / "cameras.json").write_text(json.dumps({"camera0000": cameras["camera0000"]}))
+    assert fit(settings(own, tmp_path / "run", steps=1, views=3, targets=2)).card["steps"] == 1
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_picture_that_goes_missing_is_named(own, tmp_path, workers):
+    for path in own.glob("person_000001/img/*/0001.*"):
+        path.unlink()
+    with pytest.raises(FileNotFoundError) as error:
+        fit(settings(own, tmp_path / "run", workers=workers))
+    assert sentence(error.value).endswith("is missing: render the subject again")
+    assert sentence(error.value).startswith(str(own / "person_000001" / "img"))
+
+
+def test_a_mask_of_another_size_is_named(own, tmp_path):
+    for path in own.glob("person_000000/mask/*/*.png"):
+        Image.new("L", (30, 30)).save(path)
+    with pytest.raises(ValueError, match=r"mask.*30 x 30 pixels, its camera 32 x 32"):
+        fit(settings(own, tmp_path / "run"))
+
+
+def test_somebody_of_another_body_is_named_before_training_begins(own, tmp_path):
+    path = own / "person_000001" / "outputs_re_fitting"
+    (plain,) = path.glob("*plain*.npz")
+    with np.load(plain) as arrays:
+        changed = {**arrays, "betas": np.zeros((1, 16))}
+    np.savez(plain, **changed)
+    with pytest.raises(ValueError, match=r"person_000001 has 16 betas"):
+        fit(settings(own, tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(ValueError, match=r"person_000001 has 16 betas"):
+        fit(settings(own, tmp_path / "run", held=own))
+
+
+@pytest.mark.parametrize(("batch", "remedy"), [(4, "--batch 2"), (1, "fewer --targets")])
+def test_too_little_memory_says_what_to_try(captures, tmp_path, monkeypatch, batch, remedy):
+    def full(*_):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")
+
+    monkeypatch.setattr(fit_module, "objective", full)
+    with pytest.raises(ValueError) as error:
+        fit(settings(captures, tmp_path / "run", batch=batch))
+    assert remedy in sentence(error.value)
+
+
+def test_a_loss_that_is_not_finite_is_named_and_nothing_is_saved(captures, tmp_path, monkeypatch):
+    fit(settings(captures, tmp_path / "run", steps=2))
+    before = {name: (tmp_path / "run" / name).read_bytes() for name in (STATE, MODEL)}
+    monkeypatch.setattr(
+        fit_module, "loss_terms", lambda *_: {"rgb": torch.tensor(1.0), "volume": torch.tensor(float("nan"))}
+    )
+    with pytest.raises(FloatingPointError) as error:
+        fit(settings(captures, tmp_path / "run", steps=3))
+    assert "(volume) at step 2 is not finite" in sentence(error.value)
+    assert all((tmp_path / "run" / name).read_bytes() == content for name, content in before.items())
+
+
+def test_metrics_that_find_no_room_name_their_file(captures, tmp_path):
+    config = settings(captures, tmp_path / "run")
+    (config.run / METRICS).mkdir(parents=True)
+    with pytest.raises(OSError) as error:
+        run_folder.append_metrics(config.run, {"step": 1})
+    assert str(config.run / METRICS) in sentence(error.value)
+
+
+def test_the_command_says_where_the_encoder_is(captures, tmp_path, capsys):
+    run([*flags(settings(captures, tmp_path / "run", steps=1)), "--loss.silhouette", "0.01"])
+    assert capsys.readouterr().out == f"{tmp_path / 'run' / MODEL}  1 of 1 steps\n"
+
+
+def test_held_boxes_are_drawn_as_large_as_they_start_and_then_learn(captures, tmp_path):
+    terms = {}
+    for hold_scale in (1, 0):
+        config = settings(captures, tmp_path / "run", hold_scale=hold_scale)
+        state, dataset = first_state(config), fit_dataset(open_captures(captures), config)
+        sample, _ = next(fit_batches(dataset, config, FIRST, SINGLE_PROCESS))
+        with torch.no_grad():
+            state.network.scale_out.bias.fill_(30.0)  # as if boxes had learned to be larger
+        clock = recorder_module.StepTimer(torch.device("cpu"))
+        terms[hold_scale] = fit_module.objective(config, state, sample, MarchSettings(step=0.02), clock)
+        start = sample.frames.half_extent * torch.tensor(PRESETS["default"].extent)
+    assert torch.allclose(terms[1]["volume"], config.loss.volume * volume_loss(start))
+    assert terms[0]["volume"] > 1.2 * terms[1]["volume"]
+
+
+def test_biases_of_places_learn_so_many_times_as_fast_as_weights(captures, tmp_path):
+    config = settings(captures, tmp_path / "run", place_rate=50.0)
+    state = first_state(config)
+    before = {name: value.detach().clone() for name, value in state.network.named_parameters()}
+    state.update(sum(value.sum() for value in state.network.parameters()))
+    after = {name: value.detach() for name, value in state.network.named_parameters()}
+    moved = {name: float((value - before[name]).abs().max()) for name, value in after.items()}
+    weight, place = (moved[f"scale_out.{part}"] for part in ("convolution.parametrizations.weight.original1", "bias"))
+    assert place / weight == pytest.approx(50, rel=0.01)
+    assert moved["colour.up.0.bias"] == pytest.approx(place, rel=0.01)
+
+
+def first_state(config: FitConfig) -> FitState:
+    return FitState(Encoder(PRESETS["default"]), config, Accelerator(cpu=True))

@@ -1,0 +1,144 @@
+"""Losses, noise levels and blends of the training of the diffusion model."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
+from primdiffusion.diffusion.schedule import fine_linear, linear, sqrt_linear
+from primdiffusion.training.cells import CellTrainee
+from primdiffusion.training.config import PhaseConfig
+from primdiffusion.training.latents import LatentSet
+from primdiffusion.training.losses import (
+    blend_conditions,
+    blends,
+    closed_form,
+    level_weight,
+    mixed,
+    objective,
+    random_steps,
+    weighted_error,
+    x0_errors,
+)
+
+
+def test_a_network_that_knows_more_has_less_error(prepared_once):
+    from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
+
+    _, prepared = prepared_once
+    denoiser = PersonDenoiser(DenoiserConfig(None, None), prepared.prior, linear())
+    guesses = {
+        "nothing": lambda x, t: prepared.prior.mean.expand_as(x),
+        "gaussian": closed_form(denoiser, single=True),
+        "truth": lambda x, t: prepared.held.latents.float(),
+    }
+    errors = x0_errors(guesses, denoiser.schedule, prepared.held.latents[:16], levels=(300, 900))
+    for level in (300, 900):
+        assert errors["gaussian"][level] < errors["nothing"][level]
+    assert errors["gaussian"][300] < errors["gaussian"][900]
+
+
+def test_log_uniform_levels_are_even_in_the_logarithm_of_noise_over_signal():
+    schedule = fine_linear()
+    t = random_steps(schedule, 20_000, torch.Generator().manual_seed(0), "log_uniform")
+    ratio = (schedule.half_log_snr(0) - torch.tensor([schedule.half_log_snr(int(one)) for one in t])) / (
+        schedule.half_log_snr(0) - schedule.half_log_snr(999)
+    )
+    assert torch.histc(ratio.float(), 8, 0, 1).min() > 0.1 * len(t)
+    even = random_steps(schedule, 20_000, torch.Generator().manual_seed(0))
+    assert (t < 50).float().mean() > 6 * (even < 50).float().mean()
+
+
+def test_log_normal_levels_surround_the_spread_and_leave_no_level_untrained():
+    schedule = fine_linear()
+    t = random_steps(schedule, 20_000, torch.Generator().manual_seed(0), "log_normal", spread=0.05)
+    clean, noise = schedule.levels(t, torch.empty(0, 1))
+    ratio = (noise / clean).flatten().log()
+    assert abs(float(ratio.median()) - math.log(2 * 0.05)) < 0.3
+    assert ((ratio > math.log(0.01)) & (ratio < math.log(1.0))).float().mean() > 0.75
+    assert (ratio > math.log(10.0)).float().mean() > 0.02
+
+
+def test_blends_stay_within_a_geometry_and_keep_the_variance():
+    geometry = torch.tensor([0, 0, 0, 1, 1, 2])
+    weight, place = blends(geometry, 40_000, 1.0, torch.Generator().manual_seed(0))
+    assert torch.equal(geometry[place[:, 0]], geometry[place[:, 1]])
+    assert torch.allclose(weight.sum(1), torch.ones(40_000), atol=1e-6)
+    assert weight.square().sum(1).mean().item() == pytest.approx(1.0, abs=0.02)
+    alone, _ = blends(geometry, 100, 0.0, torch.Generator().manual_seed(0))
+    assert torch.equal(alone[:, 1], torch.zeros(100))
+
+
+def test_mixtures_are_weighted_sums_of_two():
+    generator = torch.Generator().manual_seed(0)
+    samples = torch.randn(5, 3, 4, generator=generator).half()
+    weights = torch.tensor([[1.0, 0.0], [0.3, 0.7], [1.4, -0.4]])
+    indices = torch.tensor([[0, 4], [1, 2], [3, 3]])
+    expected = torch.einsum("bk,bkcd->bcd", weights, samples[indices].float())
+    torch.testing.assert_close(mixed(samples, weights, indices), expected)
+
+
+def test_error_weights_have_mean_one_at_every_level():
+    error, std = torch.ones(2, 5), torch.rand(2, 5) + 0.1
+    for power in (0.0, 1.0, 2.0):
+        assert weighted_error(error, std, power).item() == pytest.approx(1.0, abs=1e-5)
+    wide = torch.tensor([[1.0, 3.0]])
+    assert weighted_error(torch.tensor([[0.0, 1.0]]), wide, 2.0).item() == pytest.approx(0.9, abs=1e-6)
+
+
+@pytest.mark.parametrize("schedule", [linear(), sqrt_linear()])
+def test_min_snr_weights_are_those_of_the_paper(schedule):
+    # Hang et al. 2023, table 1: min(SNR, gamma) for a network that predicts x0
+    config = PhaseConfig(steps=1, batch=1, weighting="min_snr", min_snr_gamma=5.0)
+    signal, noise = schedule.levels(torch.tensor([0, 300, 999]), torch.zeros(3, 1))
+    weight = level_weight(signal, noise, config)[:, 0]
+    snr = schedule.alpha_bar / (1 - schedule.alpha_bar)
+    assert weight.tolist() == pytest.approx([min(float(snr[t]), 5.0) for t in (0, 300, 999)], rel=1e-5)
+    assert weight[0] == 5
+    assert torch.equal(level_weight(signal, noise, PhaseConfig(steps=1, batch=1, weighting="plain")), torch.ones(3, 1))
+
+
+def test_weightings_weight_what_they_say():
+    error, std = torch.tensor([[1.0, 2.0], [3.0, 0.0]]), torch.tensor([[1.0, 2.0], [0.5, 1.0]])
+    signal, noise = torch.tensor([[0.8], [0.1]]), torch.tensor([[0.6], [0.995]])
+    losses = {
+        name: objective(
+            error, std, signal, noise, PhaseConfig(steps=1, batch=1, weighting=name, error_power=0.0)
+        ).item()
+        for name in ("whitened", "plain", "min_snr")
+    }
+    assert losses["whitened"] == pytest.approx((1 + 1 + 36 + 0) / 4)
+    assert losses["plain"] == pytest.approx((1 + 4 + 9) / 4)
+    assert losses["min_snr"] == pytest.approx(((0.8 / 0.6) ** 2 * 5 + (0.1 / 0.995) ** 2 * 9) / 4)
+
+
+@pytest.mark.parametrize("name", ["person", "local"])
+def test_every_weighting_trains_both_networks(prepared_once, name):
+    config, prepared = prepared_once
+    losses = []
+    for weighting in ("whitened", "plain", "min_snr"):
+        phases = {key: dataclasses.replace(getattr(config, key), weighting=weighting) for key in ("person", "local")}
+        trainee = CellTrainee(dataclasses.replace(config, **phases), prepared, torch.device("cpu"))
+        trainee.network(name).requires_grad_(True)
+        loss = trainee.loss(name, torch.Generator().manual_seed(0))
+        loss.backward()
+        losses.append(loss.item())
+        assert trainee.network(name).outer.weight.grad.abs().max() > 0
+    assert len(set(losses)) == 3
+    assert np.isfinite(losses).all()
+
+
+def test_blends_are_asked_for_by_what_both_people_have():
+    condition = torch.tensor([[1.0, 0, 1, 0], [1.0, 0, 0, 1]])
+    words = AttributeVocabulary({"sex": ("female", "male"), "pattern": ("patterned", "plain")}, {})
+    people = LatentSet(torch.zeros(2, 1, 32, 32), torch.zeros(2, dtype=torch.int64), torch.zeros(1, 10), condition)
+    indices, weights = torch.tensor([[0, 1], [0, 1]]), torch.tensor([[0.6, 0.4], [1.0, 0.0]])
+    asked = [
+        blend_conditions(people, indices, weights, words, 0.0, torch.Generator().manual_seed(s)) for s in range(200)
+    ]
+    most = torch.stack(asked).amax(0)
+    assert torch.equal(most, torch.tensor([[1.0, 0, 0, 0], [1.0, 0, 1, 0]]))

@@ -1,0 +1,54 @@
+"""The prior fitted to latents."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from primdiffusion.diffusion.codec import mirror_cells
+from primdiffusion.primitives.primitives import GRID
+from primdiffusion.training.prior import fit_prior
+
+
+def test_the_prior_s_components_are_even_or_odd_in_the_mirror(prepared_once):
+    _, prepared = prepared_once
+    prior, codec = prepared.prior, prepared.codec
+    pictures = prior.basis.unflatten(1, prior.mean.shape)
+    assert torch.allclose(codec.mirror(pictures), pictures * prior.parity[:, None, None, None], atol=1e-3)
+    assert torch.allclose(prior.basis @ prior.basis.T, torch.eye(6), atol=1e-4)
+    assert torch.allclose(codec.mirror(prior.mean), prior.mean, atol=1e-3)
+    assert torch.allclose(mirror_cells(codec.mean), codec.mean, atol=1e-3)
+
+
+def test_the_prior_describes_the_people_it_was_fitted_to(prepared_once):
+    _, prepared = prepared_once
+    z = prepared.train.latents.float()
+    energy = (z - prepared.prior.mean).square().sum((1, 2, 3)).mean()
+    described = prepared.prior.marginal_variance().sum() + prepared.prior.rest_variance.sum()
+    assert described.item() == pytest.approx(energy.item(), rel=0.15)
+    assert prepared.prior.log_weight.shape == (2, 1)
+
+
+def test_shapes_learn_what_the_person_shows(prepared_once):
+    # the first beta of these people sets their density, so it can be read off them; the others are constant
+    _, prepared = prepared_once
+    held, prior = prepared.held, prepared.prior
+    first = torch.searchsorted(held.geometry, torch.arange(len(held.betas)))
+    features = prior.split(held.latents[first].float())[0] / prior.marginal_variance().sqrt()
+    left = prepared.shapes.scale @ prepared.shapes.scale.T
+    assert features.shape[1] == prepared.shapes.weight.shape[1]
+    assert left[0, 0] < 0.8 * prepared.train.betas[:, 0].var()
+
+
+def test_person_components_live_in_the_leading_channels_alone(prepared_once):
+    config, prepared = prepared_once
+    z = prepared.train.latents[:8].float()
+    prior = fit_prior(
+        prepared.train, prepared.codec, prepared.vocabulary, dataclasses.replace(config.prior, channels=2)
+    )
+    assert prior.basis.shape[1] == 2 * GRID * GRID
+    coefficients, rest = prior.split(z)
+    assert torch.equal(rest[:, 2:], z[:, 2:] - prior.mean[2:])
+    assert torch.allclose(prior.join(coefficients, rest), z, atol=1e-4)
+    assert (prior.split(prior.join(coefficients, torch.zeros_like(rest)))[0] - coefficients).abs().max() < 1e-3

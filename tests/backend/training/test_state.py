@@ -1,0 +1,70 @@
+"""The state of a training run: what is saved, restored and rejected."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from primdiffusion.training.config import PhaseConfig
+from primdiffusion.training.state import TrainingState, learning_rate_factor
+
+
+def state_of_a_line(seed=0):
+    torch.manual_seed(3)
+    network = torch.nn.Sequential(torch.nn.Linear(3, 8), torch.nn.Dropout(0.5), torch.nn.Linear(8, 1))
+    return TrainingState(network, PhaseConfig(steps=50, batch=4), seed)
+
+
+def advance(state, steps):
+    for _ in range(steps):
+        state.network.train()
+        x = torch.randn(4, 3, generator=state.generator)
+        state.update((state.network(x) - x.sum(1, keepdim=True)).square().mean())
+
+
+def test_a_state_saved_in_the_middle_goes_on_bit_for_bit(tmp_path):
+    whole, part = state_of_a_line(), state_of_a_line()
+    torch.manual_seed(11)
+    advance(whole, 20)
+    torch.manual_seed(11)
+    advance(part, 7)
+    part.save(tmp_path / "state")
+    torch.randn(100)  # anything else drawn in between must not matter
+    resumed = state_of_a_line(seed=99)
+    resumed.load(tmp_path / "state")
+    advance(resumed, 13)
+    assert resumed.step == 20
+    for a, b in zip(whole.network.parameters(), resumed.network.parameters(), strict=True):
+        assert torch.equal(a, b)
+    for a, b in zip(whole.average.parameters(), resumed.average.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_the_average_lags_behind_the_weights():
+    state = state_of_a_line()
+    start = [p.clone() for p in state.network.parameters()]
+    advance(state, 15)
+    moved = sum((p - q).abs().sum() for p, q in zip(state.network.parameters(), start, strict=True))
+    lagged = sum((p - q).abs().sum() for p, q in zip(state.average.parameters(), start, strict=True))
+    assert 0 < lagged < moved
+
+
+def test_a_damaged_or_foreign_state_is_refused(tmp_path):
+    state, other = state_of_a_line(), TrainingState(torch.nn.Linear(2, 2), PhaseConfig(steps=1, batch=1), 0)
+    state.save(tmp_path / "state")
+    with pytest.raises(ValueError, match="does not fit"):
+        other.load(tmp_path / "state")
+    (tmp_path / "state").write_bytes((tmp_path / "state").read_bytes()[:100])
+    with pytest.raises(ValueError, match="damaged"):
+        state_of_a_line().load(tmp_path / "state")
+
+
+def test_a_gradient_that_is_not_finite_stops_the_run():
+    state = state_of_a_line()
+    with pytest.raises(FloatingPointError, match="step 0"):
+        state.update(state.network(torch.full((1, 3), float("nan"))).sum())
+
+
+def test_learning_rate_warms_up_and_falls_to_a_tenth():
+    assert learning_rate_factor(0, 1000) == pytest.approx(0.01)
+    assert learning_rate_factor(99, 10**9) == pytest.approx(1.0)
+    assert learning_rate_factor(1000, 1000) == pytest.approx(0.1)

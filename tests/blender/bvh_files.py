@@ -1,0 +1,58 @@
+"""BVH files of other rigs, written for tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from blender_primdiffusion.formats.joints import JOINT_NAMES, PARENTS
+
+from blender_primdiffusion.motion.rotation import from_axis_angle
+
+Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
+FRAMES = 6
+ORDERS = ["ZXY", "XYZ", "YZX", "ZYX", "XZY", "YXZ"]
+
+
+def motion_of(spread: float = 0.35, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return from_axis_angle(rng.normal(0, spread, (FRAMES, 24, 3))), rng.normal(0, 0.5, (FRAMES, 3))
+
+
+def write_bvh(
+    path: Path,
+    rest: np.ndarray,
+    rotations: np.ndarray,
+    root: np.ndarray,
+    names: dict[str, str],
+    left_out: tuple[str, ...] = (),
+    frame_time: str = "0.0083333",
+) -> Path:
+    """A BVH file of joints at rest [24, 3] that turn by [F, 24, 3, 3]; each joint with an Euler order of its own."""
+    lines, columns = ["HIERARCHY"], []
+    children = {j: [c for c, p in enumerate(PARENTS) if p == j and JOINT_NAMES[c] not in left_out] for j in range(24)}
+
+    def joint(j: int, depth: int) -> None:
+        pad, order = "\t" * depth, ORDERS[j % len(ORDERS)]
+        offset = rest[j] - (rest[PARENTS[j]] if j else 0)
+        lines.append(f"{pad}{'JOINT' if j else 'ROOT'} {names[JOINT_NAMES[j]]}")
+        lines.append(f"{pad}{{\n{pad}\tOFFSET {offset[0]:.8f} {offset[1]:.8f} {offset[2]:.8f}")
+        channels = [f"{axis}rotation" for axis in order]
+        if j == 0:
+            columns.append(root)
+            channels = ["Xposition", "Yposition", "Zposition", *channels]
+        columns.append(Rotation.from_matrix(rotations[:, j]).as_euler(order, degrees=True))
+        lines.append(f"{pad}\tCHANNELS {len(channels)} {' '.join(channels)}")
+        for child in children[j]:
+            joint(child, depth + 1)
+        if not children[j]:
+            end = (rest[j] - rest[PARENTS[j]]) * 0.5
+            lines.append(f"{pad}\tEnd Site\n{pad}\t{{\n{pad}\t\tOFFSET {end[0]} {end[1]} {end[2]}\n{pad}\t}}")
+        lines.append(f"{pad}}}")
+
+    joint(0, 0)
+    lines += ["MOTION", f"Frames: {len(rotations)}", f"Frame Time: {frame_time}"]
+    lines += [" ".join(f"{number:.7f}" for number in row) for row in np.concatenate(columns, -1)]
+    path.write_text("\n".join(lines) + "\n")
+    return path

@@ -1,0 +1,359 @@
+"""A capture goes on after a kill, finds damage, and leaves nothing behind in Blender."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from blender_primdiffusion.formats.camera_rig import Rig, look_at
+from blender_primdiffusion.formats.capture_layout import (
+    COMPLETE_FILE,
+    LIST_FILE,
+    RELEASED_REFERENCE,
+    CaptureFolderError,
+    picture_path,
+)
+from capture_child import PEOPLE, small
+from capture_person import NamedPerson, files_of, load_painted, plain, two_poses
+
+from blender_primdiffusion.capture import passes
+from blender_primdiffusion.capture.job import CaptureError, run
+from blender_primdiffusion.capture.report import Report
+from blender_primdiffusion.capture.settings import CaptureSettings
+from blender_primdiffusion.capture.stage import data_blocks
+from blender_primdiffusion.capture.subject import repair, verify
+from blender_primdiffusion.motion.motion import Motion
+
+pytestmark = pytest.mark.any_blender
+
+POSES = two_poses()
+VIEWS = 2 * 2
+
+
+def capture(context, settings: CaptureSettings, people=PEOPLE, load=load_painted, poses=POSES) -> Report:
+    report = Report()
+    for _ in run(context, settings, people, report, poses=poses, load=load):
+        pass
+    return report
+
+
+def start_child(out: Path) -> subprocess.Popen:
+    command = [sys.executable, str(Path(__file__).parents[1] / "capture_child.py"), str(out)]
+    here = Path(__file__).parents[1]
+    path = [str(here), str(here.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """A capture that nothing disturbed."""
+    out = tmp_path_factory.mktemp("whole") / "captures"
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    report = capture(bpy.context, small(out))
+    assert report.done == ["anna", "bert"]
+    assert report.failed == []
+    return out
+
+
+@pytest.fixture
+def copy(whole, tmp_path) -> Path:
+    out = tmp_path / "copy"
+    for name, content in files_of(whole).items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_bytes(content)
+    return out
+
+
+def test_the_layout_is_complete_and_verified(whole):
+    assert verify(whole) == []
+    assert (whole / LIST_FILE).read_text().split() == ["anna", "bert"]
+    names = set(files_of(whole / "anna"))
+    pictures = {
+        picture_path(Path(), kind, camera, frame).as_posix()
+        for kind in ("img", "mask", "depth", "normal", "part")
+        for camera in range(2)
+        for frame in range(2)
+    }
+    others = {"cameras.json", "joints.npz", "opencv/cameras.npz", COMPLETE_FILE}
+    others |= {f"nerf/{frame:04d}/transforms.json" for frame in range(2)}
+    others |= {f"colmap/{frame:04d}/{name}.txt" for frame in range(2) for name in ("cameras", "images", "points3D")}
+    others |= {f"outputs_re_fitting/refit_smpl_2nd{plain}.npz" for plain in ("", "_plain")}
+    assert names == pictures | others
+    report = json.loads((whole / "report.json").read_text())
+    assert (report["done"], report["failed"], report["skipped"]) == (["anna", "bert"], [], [])
+
+
+def test_joints_are_those_of_the_body_in_every_picture(whole):
+    with np.load(whole / "anna/joints.npz") as joints:
+        assert joints["world"].shape == (2, 24, 3)
+        assert joints["pixel"].shape == (2, 2, 24, 2)
+        cameras = json.loads((whole / "anna/cameras.json").read_text())
+        k, r, t = (np.array(cameras["camera0001"][key]) for key in "KRT")
+        in_camera = joints["world"][1] @ r.T + t
+        pixel = in_camera @ k.T
+        assert np.allclose(pixel[:, :2] / pixel[:, 2:], joints["pixel"][1, 1], atol=1e-3)
+        assert np.allclose(in_camera[:, 2], joints["depth"][1, 1], atol=1e-5)
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_killed_capture_continues_and_ends_in_the_same_files(whole, empty_scene, tmp_path, seed):
+    out, dice = tmp_path / "captures", random.Random(seed)
+    child = start_child(out)
+    assert child.stderr is not None
+    wanted = f"view {dice.randrange(1, 2 * VIEWS)}"
+    for line in child.stderr:
+        if line.strip() == wanted:
+            break
+    else:
+        pytest.fail(f"the child never came so far: {line}")
+    time.sleep(dice.uniform(0, 0.1))  # in the midst of a view
+    os.kill(child.pid, signal.SIGKILL)
+    child.wait()
+    child.stderr.close()
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("camera*/[!.]*.jpg")}
+    capture(empty_scene, small(out))
+    for path, written in before.items():
+        assert path.stat().st_mtime_ns == written  # what was whole is not rendered again
+    ours, undisturbed = files_of(out), files_of(whole)
+    for name in ("report.json",):
+        ours.pop(name), undisturbed.pop(name)
+    assert ours == undisturbed
+
+
+def test_what_is_done_is_skipped(copy, empty_scene, monkeypatch):
+    monkeypatch.setattr("blender_primdiffusion.capture.job.load_scan", None)
+    report = capture(empty_scene, small(copy), load=lambda *_: pytest.fail("somebody was loaded"))
+    assert report.skipped == ["anna", "bert"]
+
+
+def test_damage_is_named_repaired_and_only_it_rendered_again(copy, whole, empty_scene):
+    paths = [picture_path(copy / "anna", kind, 1, frame) for kind, frame in (("img", 0), ("depth", 1))]
+    paths.append(copy / "bert/joints.npz")
+    paths[0].write_bytes(paths[0].read_bytes()[:-20])
+    altered = bytearray(paths[1].read_bytes())
+    altered[60] ^= 255
+    paths[1].write_bytes(altered)
+    paths[2].unlink()
+    size = picture_path(whole / "anna", "img", 1, 0).stat().st_size
+    expected = [f"{paths[0]}: {size - 20} bytes instead of {size}", f"{paths[1]}: altered", f"{paths[2]}: missing"]
+    assert sorted(verify(copy)) == sorted(expected)
+    assert sorted(repair(copy)) == sorted(expected)
+    assert not any(path.exists() for path in paths)
+    assert (copy / LIST_FILE).read_text() == ""
+    untouched = picture_path(copy / "anna", "img", 0, 0)
+    before = untouched.stat().st_mtime_ns
+    report = capture(empty_scene, small(copy))
+    assert report.done == ["anna", "bert"]
+    assert untouched.stat().st_mtime_ns == before
+    assert verify(copy) == []
+    ours, undisturbed = files_of(copy), files_of(whole)
+    ours.pop("report.json"), undisturbed.pop("report.json")
+    assert ours == undisturbed
+
+
+def test_truncated_files_are_rendered_again_even_without_repair(copy, whole, empty_scene):
+    path = picture_path(copy / "anna", "mask", 0, 1)
+    path.write_bytes(b"")
+    capture(empty_scene, small(copy))
+    assert path.read_bytes() == picture_path(whole / "anna", "mask", 0, 1).read_bytes()
+    assert verify(copy) == []
+
+
+def test_an_unfinished_subject_is_reported(copy):
+    (copy / "bert" / COMPLETE_FILE).unlink()
+    picture_path(copy / "bert", "part", 0, 0).unlink()
+    assert verify(copy)[0] == f"{copy / 'bert'}: not finished: 19 of 20 pictures are there"
+
+
+def test_a_picture_that_the_mark_does_not_name_is_missed(copy):
+    mark = copy / "anna" / COMPLETE_FILE
+    files = json.loads(mark.read_text())
+    name = "img/camera0000/0000.jpg"
+    del files[name]
+    mark.write_text(json.dumps(files))
+    (copy / "anna" / name).unlink()
+    assert verify(copy) == [f"{copy / 'anna' / name}: missing"]
+
+
+def test_nothing_stays_in_the_file(empty_scene, tmp_path):
+    mine = bpy.data.meshes.new("mine")
+    before = {(block.id_type, block.name) for block in data_blocks()}
+    steps = run(empty_scene, small(tmp_path / "a"), PEOPLE, poses=POSES, load=load_painted)
+    next(steps)
+    assert bpy.context.scene.name == "Scene"
+    plain((1, 0, 0)).name = "made by the user meanwhile"
+    next(steps)
+    steps.close()  # that is: cancelled
+    after = {(block.id_type, block.name) for block in data_blocks()}
+    assert after - before == {("MATERIAL", "made by the user meanwhile")}
+    assert before <= after
+    assert mine.name == "mine"
+    assert not list(Path(bpy.app.tempdir).glob("primdiffusion_capture_*"))
+
+
+def test_a_failing_subject_does_not_affect_the_others(empty_scene, tmp_path):
+    def load(context, scan_file, body):
+        if scan_file.name == "anna":
+            raise ValueError("anna.glb holds no person: export it again")
+        return load_painted(context, scan_file, body)
+
+    before = {(block.id_type, block.name) for block in data_blocks()}
+    report = capture(empty_scene, small(tmp_path / "a"), load=load)
+    assert report.failed == [{"subject": "anna", "what": "capture", "why": "anna.glb holds no person: export it again"}]
+    assert report.done == ["bert"]
+    assert json.loads((tmp_path / "a/report.json").read_text())["failed"] == report.failed
+    assert (tmp_path / "a" / LIST_FILE).read_text().split() == ["bert"]
+    assert {(block.id_type, block.name) for block in data_blocks()} == before
+
+
+def test_progress_counts_all_subjects(empty_scene, tmp_path):
+    def load(context, scan_file, body):
+        if scan_file.name == "anna":
+            raise ValueError("no person")
+        return load_painted(context, scan_file, body)
+
+    steps = list(run(empty_scene, small(tmp_path), PEOPLE, poses=POSES, load=load))
+    assert steps[0].news[-1] == "anna: no person"
+    assert (steps[0].done, steps[0].eta_s) == (VIEWS, None)
+    assert [step.done for step in steps[1:5]] == [5, 6, 7, 8]
+    assert all(step.total == 2 * VIEWS for step in steps)
+    assert steps[1].eta_s > steps[4].eta_s == 0
+
+
+def test_shards_share_people_without_gap_or_overlap(empty_scene, tmp_path):
+    people = [NamedPerson(name) for name in ("c", "a", "b")]
+    poses = POSES.frames([0])
+    first = capture(empty_scene, small(tmp_path, shard=(0, 2)), people, poses=poses)
+    second = capture(empty_scene, small(tmp_path, shard=(1, 2)), people, poses=poses)
+    assert (first.done, second.done) == (["a", "c"], ["b"])
+    assert (tmp_path / LIST_FILE).read_text().split() == ["a", "b", "c"]
+    assert (tmp_path / "report-0-of-2.json").is_file()
+    assert (tmp_path / "report-1-of-2.json").is_file()
+    assert verify(tmp_path) == []
+
+
+def test_the_released_codes_reference_is_written_on_request(empty_scene, tmp_path):
+    capture(empty_scene, small(tmp_path, released_reference=True), poses=POSES.frames([0]))
+    reference = tmp_path / RELEASED_REFERENCE
+    assert files_of(reference) == files_of(tmp_path / "anna")
+    assert (tmp_path / LIST_FILE).read_text().split() == ["anna", "bert"]
+    assert verify(tmp_path) == []
+
+
+@pytest.mark.parametrize("change", [{"seed": 5}, {"samples": 3}, {"light": "dome"}, {"passes": ("img",)}])
+def test_a_folder_with_other_captures_is_rejected(copy, empty_scene, change):
+    before = files_of(copy)
+    with pytest.raises(CaptureFolderError, match="another folder"):
+        capture(empty_scene, small(copy, **change))
+    assert files_of(copy) == before
+
+
+def test_other_poses_are_rejected_before_anything_is_overwritten(copy, empty_scene):
+    (copy / "anna" / COMPLETE_FILE).unlink()
+    report = capture(empty_scene, small(copy), poses=POSES.frames([1, 0]))
+    assert "other poses" in report.failed[0]["why"]
+    assert report.skipped == ["bert"]
+
+
+def test_poses_that_are_not_finite_are_rejected(empty_scene, tmp_path):
+    rotations = POSES.rotations.copy()
+    rotations[1, 3] = np.nan
+    with pytest.raises(CaptureError, match="not finite"):
+        capture(empty_scene, small(tmp_path / "a"), poses=Motion(rotations, POSES.translations, 1.0, "walk.npz"))
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_camera_inside_of_a_human_fails_that_subject(empty_scene, tmp_path):
+    inside = look_at(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, 5.0]), 0.5, 64, 64)
+    outside = look_at(np.array([0.0, 0.0, 4.0]), np.zeros(3), 0.5, 64, 64)
+    report = capture(empty_scene, small(tmp_path, cameras=(outside, inside)), PEOPLE[:1])
+    assert report.failed[0]["why"].startswith("camera 1 is inside the human in frame 0")
+
+
+def test_fixed_cameras_are_used_for_all_subjects(empty_scene, tmp_path):
+    views = Rig(count=2, width=64, height=64).views(np.array([0.0, 0.1, 0.0]), 1.3)
+    capture(empty_scene, small(tmp_path, cameras=tuple(views)), poses=POSES.frames([0]))
+    for name in ("anna", "bert"):
+        cameras = json.loads((tmp_path / name / "cameras.json").read_text())
+        assert np.allclose(cameras["camera0001"]["T"], views[1].translation)
+    assert verify(tmp_path) == []
+
+
+def test_the_noise_is_the_same_in_whatever_order_views_are_rendered(empty_scene, tmp_path):
+    changes = {"light": "dome", "samples": 1}
+    capture(empty_scene, small(tmp_path / "both", **changes))
+    capture(empty_scene, small(tmp_path / "bert", **changes), PEOPLE[1:])
+    for frame, camera in ((0, 0), (1, 1)):
+        pictures = [
+            picture_path(tmp_path / run / "bert", "img", camera, frame).read_bytes() for run in ("both", "bert")
+        ]
+        assert pictures[0] == pictures[1]
+    seeds = [picture_path(tmp_path / "both" / who, "img", 0, 0).read_bytes() for who in ("anna", "bert")]
+    assert seeds[0] != seeds[1]  # the same person under two names: only the noise differs
+
+
+def test_a_full_disk_ends_the_batch_with_an_error(empty_scene, tmp_path, monkeypatch):
+    calls = []
+
+    def full(path, pixels):
+        calls.append(path)
+        if len(calls) > 5:
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        write(path, pixels)
+
+    write = passes.write_png
+    monkeypatch.setattr(passes, "write_png", full)
+    report = Report()
+    steps = run(empty_scene, small(tmp_path), PEOPLE, report, poses=POSES, load=load_painted)
+    with pytest.raises(OSError, match="No space left"):
+        list(steps)
+    assert [failure["subject"] for failure in report.failed] == ["anna"]
+    monkeypatch.undo()
+    assert capture(empty_scene, small(tmp_path)).done == ["anna", "bert"]
+    assert verify(tmp_path) == []
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="a file system of a few kilobytes needs root")
+def test_a_disk_that_is_full_is_reported(empty_scene, tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", str(disk)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode != 0:
+        pytest.skip("no right to mount")
+    try:
+        report = Report()
+        with pytest.raises(OSError) as caught:
+            list(run(empty_scene, small(disk / "captures"), PEOPLE, report, poses=POSES, load=load_painted))
+        assert caught.value.errno == errno.ENOSPC
+        assert "." not in {path.name[0] for path in disk.rglob("*.p*")}  # nothing half written stays
+    finally:
+        with contextlib.suppress(OSError):
+            subprocess.run(["umount", str(disk)], check=False)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_memory_stays_flat_over_200_views(empty_scene, tmp_path):
+    rig = Rig(count=20, width=256, height=256)
+    people = [NamedPerson(f"p{i}") for i in range(6)]
+    sizes = [resident_mb() for _ in run(empty_scene, small(tmp_path, rig=rig), people, poses=POSES, load=load_painted)]
+    assert len(sizes) >= 240
+    assert np.mean(sizes[-10:]) - np.mean(sizes[35:45]) < 30
+
+
+def resident_mb() -> float:
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmRSS:")[1].split()[0]) / 1024

@@ -1,0 +1,224 @@
+"""Skinned people of other rigs, rests, units and axes: posed as the body is, whatever they came with."""
+
+from __future__ import annotations
+
+import json
+import struct
+
+import bpy
+import numpy as np
+import pytest
+import scan_fixtures
+import synthetic
+from blender_primdiffusion.formats.camera_rig import bounding_sphere
+from blender_primdiffusion.formats.joints import JOINT_NAMES
+from loaded_scans import BETAS, BODY, MOVE, ROTATIONS, distance_m, load, own_person
+
+from blender_primdiffusion.capture.scan import Scan, ScanError
+from blender_primdiffusion.motion.rigs import RIGS, UnknownBonesError, map_bones
+from blender_primdiffusion.motion.rotation import about_axis
+
+HANDS = np.isin(BODY.skin_weights.argmax(1), [JOINT_NAMES.index("left_hand"), JOINT_NAMES.index("right_hand")])
+
+
+def bone_heads(scan: Scan) -> np.ndarray:
+    """Heads of the posed bones as Blender has them [24, 3], y up; NaN for joints without a bone."""
+    heads = np.full((24, 3), np.nan)
+    for name, joint in zip(scan.skeleton.names, scan.skeleton.joint, strict=True):
+        if joint >= 0:
+            heads[joint] = scan.armature.matrix_world @ scan.armature.pose.bones[name].head
+    return heads @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+
+
+def quarter(axis: int) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = about_axis(axis, np.pi / 2)
+    return matrix
+
+
+CASES = {
+    "Mixamo, T, glb": ("MIXAMO", ".glb", False, np.eye(4)),
+    "RenderPeople, A, centimetres, fbx": ("RENDERPEOPLE", ".fbx", True, np.diag([100.0, 100, 100, 1])),
+    "Unreal, A, lying, fbx": ("UNREAL", ".fbx", True, quarter(0)),
+    "Rigify, A, tenfold too small, glb": ("RIGIFY", ".glb", True, np.diag([0.1, 0.1, 0.1, 1])),
+    "SMPL's names, A, facing left, millimetres, fbx": ("OWN", ".fbx", True, quarter(2) @ np.diag([1e3, 1e3, 1e3, 1])),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_rig_is_posed_as_the_body_is(tmp_path, empty_scene, case):
+    names, ending, has_a_rest, placed = CASES[case]
+    rest = scan_fixtures.a_pose() if has_a_rest else None
+    _, armature = scan_fixtures.person(BODY, BETAS, rest, getattr(scan_fixtures, names))
+    scan_fixtures.move([armature], placed)
+    scan = load(scan_fixtures.save(tmp_path / f"anna{ending}"))
+    joints = scan.pose(ROTATIONS, MOVE)
+    vertices, expected, _ = BODY.pose(BETAS, ROTATIONS, MOVE)
+    assert np.linalg.norm(joints - expected, axis=-1).max() < 0.005
+    heads = bone_heads(scan)
+    assert np.nanmax(np.abs(heads - joints)) < 1e-4
+    assert np.isfinite(heads).all(1).sum() >= 22
+    off = distance_m(scan, vertices)
+    assert off.mean() < 0.006  # the hands, which other rigs do not bend at the knuckles, are off by more
+    fitted = BODY.pose(scan.betas, ROTATIONS, MOVE)[1]
+    assert np.linalg.norm(fitted - expected, axis=-1).max() < 0.01
+    assert any("mm off on average" in note for note in scan.notes) or any("file tells" in note for note in scan.notes)
+
+
+def test_units_and_axes_that_were_corrected_are_reported(tmp_path, empty_scene):
+    _, armature = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
+    scan_fixtures.move([armature], quarter(0) @ np.diag([10.0, 10, 10, 1]))
+    scan = load(scan_fixtures.save(tmp_path / "anna.glb"))
+    told = "; ".join(scan.notes)
+    assert "scaled by 0.1: it is ten times too large" in told
+    assert "-y was up after import: turned upright" in told
+    assert "bones as Mixamo names them" in told
+
+
+def test_bounds_are_those_of_what_blender_draws(tmp_path, empty_scene):
+    scan_fixtures.person(BODY, BETAS, scan_fixtures.a_pose(), scan_fixtures.UNREAL)
+    scan = load(scan_fixtures.save(tmp_path / "anna.fbx"))
+    outermost = scan.bounds(ROTATIONS[None], MOVE[None])
+    scan.pose(ROTATIONS, MOVE)
+    seen = scan_fixtures.evaluated(scan.objects)
+    np.testing.assert_allclose(outermost.min(0), seen.min(0), atol=2e-5)
+    np.testing.assert_allclose(outermost.max(0), seen.max(0), atol=2e-5)
+    np.testing.assert_allclose(bounding_sphere(outermost)[1], bounding_sphere(seen)[1], atol=2e-5)
+
+
+def test_our_own_people_are_posed_exactly(tmp_path, empty_scene):
+    scan = load(own_person(tmp_path / "person_000003" / "person.glb"))
+    assert scan.name == "person_000003"
+    np.testing.assert_array_equal(scan.betas, BETAS)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        rotations, move = synthetic.random_rotations(rng, 24), rng.normal(0, 1, 3)
+        joints = scan.pose(rotations, move)
+        vertices, expected, _ = BODY.pose(BETAS, rotations, move)
+        np.testing.assert_allclose(joints, expected, atol=5e-5)
+        np.testing.assert_allclose(bone_heads(scan), expected, atol=5e-5)
+        assert distance_m(scan, vertices).max() < 5e-5
+
+
+def test_removing_a_scan_leaves_nothing_and_keeps_what_was_there(tmp_path, empty_scene):
+    path = own_person(tmp_path / "p.glb")
+    kept = bpy.data.objects.new("kept", bpy.data.meshes.new("kept"))
+    scan = load(path)
+    assert len(bpy.data.objects) > 1
+    scan.remove()
+    assert list(bpy.data.objects) == [kept]
+    assert [len(getattr(bpy.data, kind)) for kind in ("meshes", "armatures", "materials", "images")] == [1, 0, 0, 0]
+
+
+def test_groups_of_fingers_belong_to_the_wrist(tmp_path, empty_scene):
+    scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
+    scan = load(scan_fixtures.save(tmp_path / "anna.glb"))
+    assert scan.joint_of_group("mixamorig:LeftHandMiddle1") == JOINT_NAMES.index("left_wrist")
+    assert scan.joint_of_group("mixamorig:Hips") == 0
+    assert scan.joint_of_group("nothing") is None
+
+
+def test_an_animated_person_with_a_bone_glued_to_its_parent_is_still_posed(tmp_path, empty_scene):
+    _, armature = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.UNREAL)
+    bpy.context.view_layer.objects.active = armature
+    bpy.ops.object.mode_set(mode="EDIT")
+    root = armature.data.edit_bones.new("root")
+    root.head, root.tail = (0, 0, -1.2), armature.data.edit_bones["pelvis"].head
+    armature.data.edit_bones["pelvis"].parent = root
+    armature.data.edit_bones["pelvis"].use_connect = True
+    bpy.ops.object.mode_set(mode="OBJECT")
+    armature.pose.bones["calf_l"].rotation_quaternion = (0.7, 0.7, 0, 0)
+    armature.pose.bones["calf_l"].keyframe_insert("rotation_quaternion", frame=1)
+    scan = load(scan_fixtures.save(tmp_path / "anna.glb"))
+    joints = scan.pose(ROTATIONS, MOVE)
+    assert np.linalg.norm(joints - BODY.pose(BETAS, ROTATIONS, MOVE)[1], axis=-1).max() < 0.005
+    assert np.nanmax(np.abs(bone_heads(scan) - joints)) < 1e-4
+
+
+def test_a_lamp_and_a_mesh_that_nothing_moves_are_left_out_and_reported(tmp_path, empty_scene):
+    scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
+    bpy.ops.mesh.primitive_cube_add()
+    bpy.ops.object.light_add(type="POINT")
+    scan = load(scan_fixtures.save(tmp_path / "anna.glb"))
+    assert len(scan.objects) == 1
+    assert "left out, as no bone moves it: Cube" in scan.notes
+    assert not any(thing.type == "LIGHT" for thing in bpy.data.objects)
+
+
+def test_unknown_bones_are_named(tmp_path, empty_scene):
+    names = {name: f"Bone.{number:03d}" for number, name in enumerate(JOINT_NAMES)}
+    scan_fixtures.person(BODY, BETAS, None, names)
+    path = scan_fixtures.save(tmp_path / "anna.glb")
+    with pytest.raises(ScanError, match=r"no bone is known to be 'pelvis', 'left_hip'.*the bones are 'Bone\.") as e:
+        load(path)
+    assert str(path) in str(e.value)
+    assert len(bpy.data.objects) == 0
+
+
+def test_a_size_that_no_unit_explains_is_named(tmp_path, empty_scene):
+    _, armature = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
+    scan_fixtures.move([armature], np.diag([0.2, 0.2, 0.2, 1]))
+    path = scan_fixtures.save(tmp_path / "anna.glb")
+    with pytest.raises(ScanError, match=r"is 0\.3\d* m tall, and no change of units"):
+        load(path)
+
+
+def test_two_people_in_a_file_are_named(tmp_path, empty_scene):
+    for _ in range(2):
+        scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
+    with pytest.raises(ScanError, match="holds 2 skeletons"):
+        load(scan_fixtures.save(tmp_path / "two.glb"))
+
+
+@pytest.mark.parametrize("ending", [".glb", ".fbx", ".gltf"])
+def test_a_damaged_file_is_named_and_leaves_nothing(tmp_path, empty_scene, ending):
+    path = tmp_path / f"bad{ending}"
+    path.write_bytes(b"glTF\x02\x00\x00\x00 nonsense" * 20)
+    with pytest.raises(ScanError, match="cannot be imported"):
+        load(path)
+    assert len(bpy.data.objects) == 0
+
+
+def test_a_skeleton_without_a_surface_is_named(tmp_path, empty_scene):
+    mesh, _ = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
+    bpy.data.objects.remove(mesh)
+    with pytest.raises(ScanError, match="holds no surface"):
+        load(scan_fixtures.save(tmp_path / "bones.fbx"))
+
+
+@pytest.mark.parametrize("rig", sorted(set(RIGS) - {"Daz", "Biovision"}))
+def test_every_rigs_own_names_are_known_with_any_prefix(rig):
+    bones = [
+        f"pre_{name.split('|')[0].format(l=side[0], left=side)}"
+        for part, name in RIGS[rig].items()
+        for side in (("left", "right") if "{" in name else ("left",))
+    ]
+    found = map_bones(["twist_01", *bones, "jaw"])
+    assert found.rig == rig
+    assert len(found.joints) >= 22
+
+
+def test_names_that_are_no_rigs_are_rejected():
+    with pytest.raises(UnknownBonesError, match="no bone is known to be 'pelvis'"):
+        map_bones(["a", "b"])
+    with pytest.raises(UnknownBonesError, match="'left_knee'"):
+        map_bones([name for name in JOINT_NAMES if name != "left_knee"])
+
+
+def test_a_lost_vertex_is_named(tmp_path, empty_scene):
+    mesh, _ = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
+    mesh.data.vertices[0].co.x = 1e6
+    with pytest.raises(ScanError, match="remove what is not the person"):
+        load(scan_fixtures.save(tmp_path / "anna.glb"))
+
+
+def test_an_importers_failure_is_reported_by_its_exception_not_its_place(tmp_path, empty_scene):
+    (tmp_path / "anna.glb").write_bytes(glb_of({"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [7]}]}))
+    with pytest.raises(ScanError, match=r"cannot be imported: KeyError"):
+        load(tmp_path / "anna.glb")
+
+
+def glb_of(content: dict) -> bytes:
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text

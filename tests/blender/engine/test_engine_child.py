@@ -1,0 +1,343 @@
+"""The engine and its child: progress, cancelling, deaths and missing backends, with a child that misbehaves at will."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+from backend_python import found
+from engine_stage import pixels
+
+import blender_primdiffusion
+from blender_primdiffusion import places
+from blender_primdiffusion.backend.environment import BackendPython
+from blender_primdiffusion.engine import final, studio
+from blender_primdiffusion.engine.frames import CHANNELS, SharedFrames
+
+pytestmark = pytest.mark.any_blender
+
+FAKE = Path(__file__).parents[1] / "fake_backend"
+SIZE = (40, 32)
+COLOUR = np.round(255 * np.array([0.5372549, 0.7372549, 0.88235295, 1.0]))
+"""(.25, .5, .75) as sRGB: what the fake child fills frames with."""
+
+
+@pytest.fixture
+def stage(saved_scene, tmp_path, monkeypatch):
+    """The engine on the fake child, with a camera."""
+    python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", found(python))
+    monkeypatch.setattr(places, "backend_module_path", lambda: FAKE)
+    blender_primdiffusion.register()
+    scene = saved_scene.scene
+    scene.render.engine = "PRIMDIFFUSION"
+    scene.render.resolution_x, scene.render.resolution_y = SIZE
+    scene.render.dither_intensity = 0
+    scene.view_settings.view_transform = "Standard"
+    scene.render.filepath = str(tmp_path / "picture.png")
+    scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(scene.camera)
+    yield SimpleNamespace(scene=scene, out=tmp_path / "picture.png")
+    blender_primdiffusion.unregister()
+
+
+class Engine:
+    """Stands in for Blender's side of a render: counts what it is told, and stops when asked to."""
+
+    camera_override = None
+    resolution_x, resolution_y = SIZE
+
+    def __init__(self, stop_after_s: float = 1e9):
+        self.stats, self.progress, self.ended = [], [], []
+        self._stop_at = time.monotonic() + stop_after_s
+
+    def begin_result(self, *_: object, **__: object) -> SimpleNamespace:
+        return SimpleNamespace(layers=[SimpleNamespace(passes=[])])
+
+    def end_result(self, _result: object, **how: bool) -> None:
+        self.ended.append(how)
+
+    def update_stats(self, _: str, text: str) -> None:
+        self.stats.append(text)
+
+    def update_progress(self, fraction: float) -> None:
+        self.progress.append(fraction)
+
+    def test_break(self) -> bool:
+        return time.monotonic() > self._stop_at
+
+
+def render() -> set[str]:
+    return bpy.ops.render.render(write_still=True)
+
+
+def test_the_frame_reaches_the_picture(stage):
+    assert render() == {"FINISHED"}
+    assert np.abs(255 * pixels(stage.out) - COLOUR).max() <= 1
+
+
+def test_a_second_picture_uses_the_same_child_and_the_same_file(stage):
+    render()
+    pid, files = studio.drawing_child().pid, sorted(studio.frames.folder.iterdir())
+    render()
+    assert studio.drawing_child().pid == pid
+    assert sorted(studio.frames.folder.iterdir()) == files
+
+
+def test_progress_and_seconds_left_are_reported_band_by_band(stage, monkeypatch):
+    monkeypatch.setenv("FAKE_BAND_S", "0.15")
+    engine = Engine()
+    drawing = final.render_layer(engine, bpy.context.evaluated_depsgraph_get())
+    assert drawing.state == "done"
+    assert engine.progress[-1] >= 0.75
+    assert engine.progress == sorted(engine.progress)
+    assert any("of 32, 1.0 s left" in text for text in engine.stats)
+    assert engine.ended == [{"cancel": False, "do_merge_results": True}]
+
+
+def test_a_cancel_ends_the_picture_within_a_band(stage, monkeypatch):
+    monkeypatch.setenv("FAKE_BAND_S", "0.3")
+    render()
+    engine = Engine(stop_after_s=0.1)
+    drawing = final.render_layer(engine, bpy.context.evaluated_depsgraph_get())
+    assert drawing.state == "cancelled"
+    assert max(engine.progress, default=0.0) < 1.0
+
+
+def test_a_cancel_does_not_wait_for_a_child_that_is_still_being_started(stage, monkeypatch):
+    def forever(*_: object, **__: object):
+        while True:
+            yield
+
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", forever)
+    drawing = final.render_layer(Engine(stop_after_s=0.0), bpy.context.evaluated_depsgraph_get())
+    assert drawing.state in ("starting", "cancelled")
+
+
+def test_waiting_leaves_other_threads_their_time(stage, monkeypatch):
+    monkeypatch.setenv("FAKE_BAND_S", "0.2")
+    render()
+    began, busy = time.monotonic(), time.thread_time()
+    final.render_layer(Engine(), bpy.context.evaluated_depsgraph_get())
+    assert time.thread_time() - busy < 0.5 * (time.monotonic() - began)
+
+
+def test_a_child_that_dies_is_one_error_and_the_next_render_works(stage, monkeypatch):
+    monkeypatch.setenv("FAKE_DRAW", "dies")
+    with pytest.raises(RuntimeError, match=r"ended by itself.*Render again") as caught:
+        render()
+    assert str(caught.value).count("Error:") == 1
+    assert not stage.out.exists()
+    monkeypatch.delenv("FAKE_DRAW")
+    assert render() == {"FINISHED"}
+
+
+def test_a_child_killed_between_pictures_is_replaced_silently(stage):
+    render()
+    pid = studio.drawing_child().pid
+    os.kill(pid, signal.SIGKILL)
+    time.sleep(0.2)
+    assert render() == {"FINISHED"}
+    assert studio.drawing_child().pid != pid
+
+
+def test_an_error_of_the_child_keeps_its_remedy_and_ends_an_animation(stage, monkeypatch, tmp_path):
+    monkeypatch.setenv("FAKE_DRAW", "no memory")
+    stage.scene.frame_end = 3
+    stage.scene.render.filepath = str(tmp_path / "frame_")
+    with pytest.raises(RuntimeError, match=r"There is not enough memory\. Draw fewer pixels\."):
+        bpy.ops.render.render(animation=True)
+    assert not list(tmp_path.glob("frame_*"))
+
+
+def test_without_a_backend_the_error_names_what_was_tried(stage, monkeypatch):
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", find_nothing)
+    with pytest.raises(RuntimeError, match="extension's preferences"):
+        render()
+
+
+def find_nothing(*_: object, **__: object) -> BackendPython:
+    from blender_primdiffusion.backend.environment import BackendNotFound
+
+    raise BackendNotFound("No Python for the backend; name one in the extension's preferences.")
+
+
+@pytest.mark.parametrize("kind", ["PANO", "LIGHT"])
+def test_an_unsupported_camera_is_one_clear_error(stage, kind):
+    if kind == "PANO":
+        stage.scene.camera.data.type = "PANO"
+    else:
+        stage.scene.camera = bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "SPOT"))
+        stage.scene.collection.objects.link(stage.scene.camera)
+    with pytest.raises(RuntimeError, match=f"of type {kind.lower()}.*perspective and orthographic"):
+        render()
+
+
+def test_a_camera_that_shows_nothing_is_one_clear_error(stage):
+    camera = stage.scene.camera
+    camera.data.clip_start, camera.data.clip_end = 5.0, 1.0
+    with pytest.raises(RuntimeError, match="clips everything, from 5 m to 1 m"):
+        render()
+    camera.data.clip_end, camera.scale = 100.0, (0, 0, 0)
+    with pytest.raises(RuntimeError, match="scaled to zero: give it a scale"):
+        render()
+
+
+def test_blender_itself_rejects_a_picture_without_camera_or_pixels_and_the_next_one_works(stage):
+    camera, settings = stage.scene.camera, stage.scene.render
+    stage.scene.camera = None
+    with pytest.raises(RuntimeError, match="no camera"):
+        render()
+    stage.scene.camera, settings.use_border = camera, True
+    for edges in ((0.5, 0.5), (0.5, 0.501), (0.7, 0.3)):
+        settings.border_min_x, settings.border_max_x = edges
+        with pytest.raises(RuntimeError, match="too small"):
+            render()
+    settings.use_border, settings.resolution_percentage = False, 1
+    with pytest.raises(RuntimeError, match="too small"):
+        render()
+    settings.resolution_percentage = 100
+    assert render() == {"FINISHED"}
+
+
+def test_unregistering_ends_the_child_removes_the_frames_and_leaves_the_scene_a_usable_engine(stage):
+    render()
+    folder, pid = studio.frames.folder, studio.drawing_child().pid
+    blender_primdiffusion.unregister()
+    try:
+        assert not folder.exists()
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+        assert stage.scene.render.engine.startswith("BLENDER_EEVEE")
+    finally:
+        blender_primdiffusion.register()
+
+
+def test_an_idle_child_ends_by_itself_and_the_next_picture_starts_another(stage, monkeypatch):
+    monkeypatch.setattr(studio, "IDLE_S", 0.3)
+    render()
+    pid = studio.drawing_child().pid
+    end = time.monotonic() + 5
+    while studio.drawing_child().pid is not None and time.monotonic() < end:
+        studio.advance()  # a timer does
+        time.sleep(0.05)
+    assert studio.drawing_child().pid is None
+    assert render() == {"FINISHED"}
+    assert studio.drawing_child().pid not in (None, pid)
+
+
+def test_blender_exits_while_the_engine_is_the_active_one():
+    program = (
+        "import bpy, blender_primdiffusion as b; b.register(); scene = bpy.context.scene;"
+        "scene.render.engine = 'PRIMDIFFUSION'; from blender_primdiffusion.engine import studio;"
+        "print(studio.frames.folder)"
+    )
+    root = Path(__file__).parents[3]
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=60, check=True)
+    assert not Path(done.stdout.strip().splitlines()[-1]).exists()
+
+
+EXIT_WHILE_DRAWING = """
+import sys, os, threading, time
+from pathlib import Path
+import bpy, blender_primdiffusion as b
+from blender_primdiffusion import places
+from blender_primdiffusion.backend import environment
+from blender_primdiffusion.backend.environment import BackendPython
+def search(*_, **__):
+    yield
+    return BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
+environment.search = search
+places.backend_module_path = lambda: Path(sys.argv[1])
+b.register()
+from blender_primdiffusion.engine import studio
+frame = studio.frames.take("view", 8, 8)
+drawing = studio.drawing_child().draw({"frame": str(frame.path), "region": None, "width": 8, "height": 8})
+while drawing.rows == 0:
+    drawing.wait(0.01)
+print(studio.drawing_child().pid, studio.frames.folder, flush=True)
+if sys.argv[2] == "killed":
+    os.kill(os.getpid(), 9)
+"""
+
+
+@pytest.mark.parametrize("how", ["quit", "killed"])
+def test_ending_blender_during_a_picture_leaves_no_process_and_no_memory(how):
+    command = [sys.executable, "-c", EXIT_WHILE_DRAWING, str(FAKE), how]
+    root, environment = Path(__file__).parents[3], {**os.environ, "FAKE_BAND_S": "1.0"}
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    pid, folder = done.stdout.strip().splitlines()[-1].split()
+    end = time.monotonic() + 8
+    while Path(f"/proc/{pid}").exists() and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{pid}").exists()
+    if how == "killed":
+        frames = SharedFrames()  # nobody could: the next Blender does
+        assert frames.folder.exists()
+        frames.close()
+    assert not Path(folder).exists()
+
+
+def test_a_frame_is_reused_for_its_size_and_replaced_for_another():
+    frames = SharedFrames()
+    try:
+        first = frames.take("a", 8, 4)
+        assert first.path.stat().st_size == 8 * 4 * CHANNELS * 4
+        first.combined[:], first.depth[:] = 1.0, 2.0
+        assert frames.take("a", 8, 4) is first
+        second = frames.take("a", 4, 4)
+        assert not first.path.exists()
+        assert second.path.exists()
+        assert not second.combined.any()
+        assert (first.depth == 2.0).all()  # still mapped
+    finally:
+        frames.close()
+    assert not second.path.parent.exists()
+
+
+def test_threads_share_one_folder():
+    frames, folders = SharedFrames(), set()
+    threads = [threading.Thread(target=lambda: folders.add(frames.folder)) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(folders) == 1
+    frames.close()
+
+
+def test_what_a_killed_blender_left_in_memory_is_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr("blender_primdiffusion.engine.frames.SHARED_MEMORY", tmp_path)
+    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
+    left, ours = tmp_path / f"primdiffusion_{int(dead.stdout)}_x", tmp_path / f"primdiffusion_{os.getpid()}_x"
+    for folder in (left, ours):
+        folder.mkdir()
+    frames = SharedFrames()
+    assert frames.folder.parent == tmp_path
+    assert not left.exists()
+    assert ours.exists()
+    frames.close()
+
+
+def test_a_full_memory_file_system_gives_way_to_the_disk(tmp_path, monkeypatch):
+    monkeypatch.setattr("blender_primdiffusion.engine.frames.SHARED_MEMORY", tmp_path)
+
+    def fallocate(descriptor: int, _start: int, _size: int) -> None:
+        if str(tmp_path) in os.readlink(f"/proc/self/fd/{descriptor}"):
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", fallocate)
+    frames = SharedFrames()
+    monkeypatch.setattr("numpy.memmap", lambda *_, **__: np.zeros(8 * 4 * CHANNELS, np.float32))
+    assert tmp_path not in frames.take("a", 8, 4).path.parents
+    frames.close()

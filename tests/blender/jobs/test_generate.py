@@ -1,0 +1,144 @@
+"""Generate and Cancel as the user meets them, with the real client and a child that can be told to misbehave."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import bpy
+import pytest
+from jobs_driven import drive, error_of, notice_of, shown, until_running
+
+import blender_primdiffusion
+from blender_primdiffusion.jobs import queue as queue_module
+from blender_primdiffusion.jobs.follow import follow
+from blender_primdiffusion.jobs.generate import GenerateJob
+from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.scene.human import folder_of, humans
+from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_OT_generate, PRIMDIFFUSION_PT_generate
+
+DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
+"""Seeds that the fake child takes as orders."""
+FAKE = Path(__file__).parents[1] / "fake_backend"
+
+
+def ask(context, seed: int, steps: int) -> None:
+    queue.add(context, GenerateJob(seed, steps))
+
+
+def panel_texts(context) -> list[str]:
+    return shown(PRIMDIFFUSION_PT_generate, context)
+
+
+def test_generate_builds_a_person_and_keeps_the_backends_file_beside_its_volumes(addon):
+    assert bpy.ops.primdiffusion.generate(seed=7, steps=3) == {"FINISHED"}
+    (person,) = humans(addon.scene)
+    assert sum(o.type == "VOLUME" for o in person.all_objects) == 8
+    sent = json.loads((folder_of(person) / "person.human.safetensors").read_bytes())
+    assert Path(sent.pop("out_dir")).name.startswith("generate_")
+    assert sent == {"seed": 7, "steps": 3, "sampler": "ddim", "size": 16, "picture_px": 256}
+    assert not queue.busy
+    assert error_of("generate") == ""
+    assert queue.info["device_name"] == "fake device"
+    assert set(queue.last.seconds) == {"work", "finish"}
+
+
+def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_job(addon):
+    bpy.ops.ed.undo_push(message="before")
+    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    assert len(bpy.data.volumes) == 8
+    bpy.ops.ed.undo()
+    assert not humans(bpy.context.scene)
+    assert not bpy.data.volumes
+    bpy.ops.ed.redo()
+    assert len(humans(bpy.context.scene)) == 1
+    assert all(volume.grids.load() for volume in bpy.data.volumes)
+    assert not queue.busy
+
+
+def test_generate_cannot_be_redone_with_a_slider():
+    assert not {"REGISTER", "UNDO"} & PRIMDIFFUSION_OT_generate.bl_options
+
+
+@pytest.mark.parametrize(
+    ("seed", "sentence"), [(DIES, "ended by itself"), (FAILS, "checkpoint is damaged"), (GIVES_GARBAGE, "is damaged")]
+)
+def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, tmp_path, seed, sentence):
+    objects = len(bpy.data.objects)
+    with pytest.raises(RuntimeError, match=sentence) as caught:
+        bpy.ops.primdiffusion.generate(seed=seed, steps=1)
+    assert str(caught.value).count("Error:") == 1
+    assert len(bpy.data.objects) == objects
+    assert not (tmp_path / "shot_humans").exists()
+    assert not list(Path(bpy.app.tempdir).glob("generate_*"))
+    assert any(sentence in text for text in (" ".join(panel_texts(addon)),))
+
+
+def test_after_a_death_the_next_generation_works(addon):
+    with pytest.raises(RuntimeError):
+        bpy.ops.primdiffusion.generate(seed=DIES, steps=1)
+    assert bpy.ops.primdiffusion.generate(seed=7, steps=1) == {"FINISHED"}
+    assert error_of("generate") == ""
+
+
+def test_a_killed_child_is_reported(addon):
+    ask(addon, TAKES_LONG, 50)
+    until_running()
+    os.kill(queue.child_pid, signal.SIGKILL)
+    drive()
+    assert "killed by the system" in error_of("generate")
+    assert not humans(addon.scene)
+
+
+def test_a_second_click_is_queued_and_does_not_disturb_the_first(addon):
+    ask(addon, 7, 2)
+    assert bpy.ops.primdiffusion.generate(seed=8, steps=1) == {"FINISHED"}
+    assert len(humans(addon.scene)) == 2
+
+
+def test_the_timer_builds_the_person_and_the_panel_shows_progress_then_the_result(addon):
+    assert "primdiffusion.generate" in panel_texts(addon)
+    ask(addon, TAKES_LONG, 2)
+    until_running()
+    seen = panel_texts(addon)
+    assert "primdiffusion.cancel" in seen
+    assert any("step" in text for text in seen)
+    bpy.ops.primdiffusion.cancel()
+    drive()
+    ask(addon, 7, 2)
+    drive()
+    assert len(humans(addon.scene)) == 1
+    assert any("built in" in text for text in panel_texts(addon))
+
+
+def test_cancel_ends_the_job_and_adds_nothing(addon):
+    assert not bpy.ops.primdiffusion.cancel.poll()
+    ask(addon, TAKES_LONG, 50)
+    for _ in range(20):
+        follow()
+        time.sleep(0.01)
+    assert bpy.ops.primdiffusion.cancel() == {"FINISHED"}
+    drive()
+    assert (error_of("generate"), notice_of("generate")) == ("", "Cancelled")
+    assert not humans(addon.scene)
+
+
+def test_loading_another_file_drops_the_job(addon):
+    ask(addon, TAKES_LONG, 50)
+    follow()
+    bpy.ops.wm.read_homefile(use_empty=True)
+    assert not queue.busy
+    assert follow() is None
+
+
+def test_an_interpreter_that_does_not_exist_is_named(saved_scene, monkeypatch):
+    monkeypatch.setattr(queue_module, "preference", lambda name: "/nowhere/python" if name == "backend_python" else "")
+    blender_primdiffusion.register()
+    try:
+        with pytest.raises(RuntimeError, match=r"/nowhere/python.*does not exist"):
+            bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    finally:
+        blender_primdiffusion.unregister()

@@ -1,0 +1,53 @@
+"""Scans on the default body, loaded, and how far their vertices are from it."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import bpy
+import numpy as np
+import scan_fixtures
+
+from blender_primdiffusion.capture.body import read_body
+from blender_primdiffusion.capture.scan import Scan, find_scans, load_scan
+from blender_primdiffusion.motion.rotation import from_axis_angle
+
+BODY = read_body()
+RNG = np.random.default_rng(0)
+BETAS = RNG.normal(0, 1, 10)
+ROTATIONS = from_axis_angle(RNG.normal(0, 0.4, (24, 3)))
+MOVE = np.array([0.3, 0.2, -0.1])
+
+
+def load(path: Path) -> Scan:
+    return load_scan(bpy.context, find_scans(path)[0], BODY)
+
+
+def distance_m(scan: Scan, vertices: np.ndarray) -> np.ndarray:
+    """From every seventh evaluated vertex of the scan to the nearest of `vertices` [V, 3]."""
+    from mathutils.kdtree import KDTree
+
+    tree = KDTree(len(vertices))
+    for number, point in enumerate(vertices):
+        tree.insert(point, number)
+    tree.balance()
+    return np.array([tree.find(point)[2] for point in scan_fixtures.evaluated(scan.objects)[::7]])
+
+
+def own_person(path: Path) -> Path:
+    """A .glb as the backend writes people: SMPL's joints at rest, betas in the extras."""
+    scan_fixtures.person(BODY, BETAS)
+    scan_fixtures.save(path)
+    content = path.read_bytes()
+    length = struct.unpack("<I", content[12:16])[0]
+    about = json.loads(content[20 : 20 + length])
+    about["asset"]["extras"] = {"primdiffusion": {"betas": BETAS.tolist(), "body": "default", "seed": 3}}
+    written = json.dumps(about).encode()
+    written += b" " * (-len(written) % 4)
+    rest = content[20 + length :]
+    path.write_bytes(
+        struct.pack("<4sIII4s", b"glTF", 2, 20 + len(written) + len(rest), len(written), b"JSON") + written + rest
+    )
+    return path

@@ -1,0 +1,122 @@
+"""Motion cut, resampled, grounded and scaled; the up axis and the bones of a file chosen by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scan_fixtures
+from blender_primdiffusion.formats.joints import JOINT_NAMES
+from bvh_files import motion_of, write_bvh
+
+from blender_primdiffusion.motion.adjust import cut, from_origin, in_place, leg_ratio, on_floor, resample
+from blender_primdiffusion.motion.files import MotionFileError, read_motion
+from blender_primdiffusion.motion.motion import Motion
+from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, slerp, to_axis_angle
+from blender_primdiffusion.motion.skeleton import REST_JOINTS
+
+pytestmark = pytest.mark.any_blender
+
+REST = np.tile(np.eye(3), (24, 1, 1))
+
+
+def spin(frames: int, fps: float, degrees_a_second: float = 400.0) -> Motion:
+    """Every joint about its own axis at one speed, the body along +x at one metre a second."""
+    axes = np.random.default_rng(0).normal(size=(24, 3))
+    axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
+    time = np.arange(frames) / fps
+    turns = from_axis_angle(axes * np.radians(degrees_a_second) * time[:, None, None])
+    return Motion(turns, time[:, None] * [1.0, 0.0, 0.0], fps, "spin")
+
+
+@pytest.mark.parametrize("fps", [24.0, 24000 / 1001, 60.0, 120.0])
+def test_an_even_turn_stays_even_at_any_rate(fps):
+    made = resample(spin(61, 60.0), fps)
+    wanted = spin(len(made), fps)
+    assert len(made) == int(np.floor(fps * 1.0 + 1e-6)) + 1
+    np.testing.assert_allclose(made.rotations, wanted.rotations, atol=1e-9)
+    np.testing.assert_allclose(made.translations, wanted.translations, atol=1e-12)
+
+
+def test_half_way_between_two_quaternions_is_half_the_turn_the_short_way():
+    a, b = np.array([1.0, 0, 0, 0]), -np.array([np.cos(0.5), np.sin(0.5), 0, 0])
+    np.testing.assert_allclose(slerp(a, b, 0.5), [np.cos(0.25), np.sin(0.25), 0, 0], atol=1e-12)
+    np.testing.assert_allclose(slerp(a, a, 0.3), a, atol=1e-12)
+
+
+def test_one_pose_has_no_time_to_resample():
+    assert len(resample(spin(1, 30.0), 24.0)) == 1
+
+
+def test_cutting_counts_from_one_and_keeps_the_speed():
+    motion = spin(10, 30.0)
+    part = cut(motion, 3, 9, 3)
+    np.testing.assert_array_equal(part.translations, motion.translations[[2, 5, 8]])
+    assert part.fps == 10.0
+    for wrong in ((11, 0, 1), (5, 4, 1), (1, 0, 0)):
+        with pytest.raises(ValueError, match=r"frames|stride"):
+            cut(motion, *wrong)
+
+
+def test_the_floor_is_where_feet_are_most_of_the_time_and_jumps_stay():
+    heights = np.full(40, 1.3)
+    heights[20:25] = 1.8
+    motion = Motion(np.tile(REST, (40, 1, 1, 1)), np.stack([heights * 0, heights, heights * 0], -1), 30.0, "jump")
+    grounded = on_floor(motion)
+    np.testing.assert_allclose(grounded.translations[:, 1], heights - 1.3, atol=1e-12)
+
+
+def test_paths_begin_at_the_person_or_go_nowhere():
+    motion = Motion(np.tile(REST, (2, 1, 1, 1)), np.array([[3.0, 1, 5], [4, 2, 7]]), 30.0, "m")
+    np.testing.assert_array_equal(from_origin(motion).translations, [[0, 1, 0], [1, 2, 2]])
+    np.testing.assert_array_equal(in_place(motion).translations, [[0, 1, 0], [0, 2, 0]])
+
+
+def test_legs_twice_as_long_are_twice_as_long():
+    assert leg_ratio(REST_JOINTS * 2) == pytest.approx(2)
+
+
+@pytest.mark.parametrize("axis", ["x", "-x", "-y", "z", "-z"])
+def test_a_given_up_axis_is_turned_up(tmp_path, axis):
+    pose = np.zeros((2, 24, 3))
+    direction = np.eye(3)["xyz".index(axis[-1])] * (-1 if axis[0] == "-" else 1)
+    up = np.array([0.0, 1.0, 0.0])
+    turn = np.cross(up, direction) * np.pi / 2 if axis[-1] != "y" else np.array([np.pi, 0, 0])
+    pose[:, 0] = turn
+    np.savez(tmp_path / "p.npz", pose=pose.reshape(2, 72))
+    motion = read_motion(tmp_path / "p.npz", axis)
+    np.testing.assert_allclose(motion.rotations[0, 0] @ up, up, atol=1e-9)
+    assert motion.detected.up == axis
+
+
+def test_an_axis_that_is_none_is_rejected(tmp_path):
+    np.save(tmp_path / "p.npy", np.zeros(72))
+    with pytest.raises(MotionFileError, match="the axis 'w' cannot be up"):
+        read_motion(tmp_path / "p.npy", "w")
+
+
+def test_the_up_axis_of_a_bvh_is_reported_and_taken_in_the_files_own_axes(tmp_path):
+    rotations, moves = motion_of(0.2)
+    z_up = about_axis(0, np.pi / 2)
+    rest = REST_JOINTS @ z_up.T
+    turned = z_up @ rotations @ z_up.T
+    root = (REST_JOINTS[0] + moves) @ z_up.T
+    path = write_bvh(tmp_path / "m.bvh", rest, turned, root, scan_fixtures.MIXAMO)
+    found, given = read_motion(path), read_motion(path, "z")
+    assert found.detected.up == given.detected.up == "z"
+    np.testing.assert_allclose(found.rotations, given.rotations, atol=1e-12)
+    np.testing.assert_allclose(found.translations, moves, atol=1e-5)
+
+
+def test_bones_chosen_by_hand_are_as_good_as_known_names(tmp_path):
+    rotations, moves = motion_of()
+    root = REST_JOINTS[0] + moves
+    known = write_bvh(tmp_path / "a.bvh", REST_JOINTS, rotations, root, scan_fixtures.MIXAMO)
+    own = {name: f"bone {number}" for number, name in enumerate(JOINT_NAMES)}
+    strange = write_bvh(tmp_path / "b.bvh", REST_JOINTS, rotations, root, own)
+    a, b = read_motion(known), read_motion(strange, bones=own)
+    body = [j for j, name in enumerate(JOINT_NAMES) if not name.endswith("hand")]
+    np.testing.assert_allclose(to_axis_angle(b.rotations[:, body]), to_axis_angle(a.rotations[:, body]), atol=1e-6)
+    assert b.detected.rig == "chosen by hand"
+    assert b.detected.bones == own
+    with pytest.raises(MotionFileError, match="'tail', which is no joint of SMPL"):
+        read_motion(strange, bones={**own, "tail": "bone 1"})

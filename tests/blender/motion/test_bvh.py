@@ -1,0 +1,124 @@
+"""BVH files of other rigs, other rests, other units and Euler orders: the same motion on SMPL's skeleton."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+import scan_fixtures
+from blender_primdiffusion.formats.joints import JOINT_NAMES
+from bvh_files import FRAMES, motion_of, write_bvh
+
+from blender_primdiffusion.motion.bvh import parse_bvh
+from blender_primdiffusion.motion.files import MotionFileError, read_motion
+from blender_primdiffusion.motion.rotation import about_axis, to_axis_angle
+from blender_primdiffusion.motion.skeleton import REST_JOINTS, chain, joint_positions
+from blender_primdiffusion.scene.armature import build_armature, keyframe_poses
+from blender_primdiffusion.scene.convention import points_to_blender
+
+
+def test_euler_channels_are_read_in_the_order_they_are_written(tmp_path):
+    rotations, moves = motion_of(1.5)
+    path = write_bvh(tmp_path / "m.bvh", REST_JOINTS, rotations, moves, scan_fixtures.MIXAMO)
+    hierarchy = parse_bvh(path)
+    turned, places = hierarchy.world()
+    index = [hierarchy.names.index(scan_fixtures.MIXAMO[name]) for name in JOINT_NAMES]
+    np.testing.assert_allclose(turned[:, index], chain(rotations), atol=1e-6)
+    np.testing.assert_allclose(places, moves, atol=1e-6)
+    np.testing.assert_allclose(hierarchy.rest()[index], REST_JOINTS, atol=1e-6)
+
+
+@pytest.mark.parametrize("rig", ["MIXAMO", "UNREAL", "RIGIFY", "RENDERPEOPLE", "OWN"])
+@pytest.mark.parametrize("unit", [1.0, 100.0])
+def test_a_rig_at_smpls_rest_gives_smpls_rotations(tmp_path, rig, unit):
+    rotations, moves = motion_of()
+    rotations[:, [JOINT_NAMES.index("left_hand"), JOINT_NAMES.index("right_hand")]] = np.eye(3)
+    root = (REST_JOINTS[0] + moves) * unit
+    path = write_bvh(tmp_path / "m.bvh", REST_JOINTS * unit, rotations, root, getattr(scan_fixtures, rig))
+    motion = read_motion(path)
+    np.testing.assert_allclose(motion.rotations, rotations, atol=1e-6)
+    np.testing.assert_allclose(motion.translations, moves, atol=1e-5)
+    assert motion.fps == pytest.approx(120, abs=0.01)
+    assert any(("metres" if unit == 1 else "centimetres") in note for note in motion.notes)
+
+
+def test_a_rig_at_an_a_rest_puts_the_joints_where_the_file_has_them(tmp_path):
+    rest = joint_positions(scan_fixtures.a_pose())
+    rotations, _ = motion_of(0.25, 1)
+    path = write_bvh(tmp_path / "m.bvh", rest, rotations, np.tile(rest[0], (FRAMES, 1)), scan_fixtures.MIXAMO)
+    there = joint_positions(rotations, rest=rest)
+    here = read_motion(path).joints()
+    limbs = [JOINT_NAMES.index(n) for n in JOINT_NAMES if n.split("_")[-1] not in ("hand",)]
+    assert np.linalg.norm(here - there, axis=-1)[:, limbs].max() < 0.005
+
+
+def test_a_rest_facing_another_way_with_z_up_gives_the_same_motion(tmp_path):
+    turn = about_axis(2, 1.2) @ about_axis(0, np.pi / 2)  # z up, then away from the front
+    rotations, moves = motion_of()
+    rotations[:, 22:] = np.eye(3)
+    path = write_bvh(
+        tmp_path / "m.bvh", REST_JOINTS @ turn.T, turn @ rotations @ turn.T, (REST_JOINTS[0] + moves) @ turn.T,
+        scan_fixtures.MIXAMO,
+    )  # fmt: skip
+    motion = read_motion(path)
+    np.testing.assert_allclose(motion.rotations, rotations, atol=1e-3)  # the facing is that of hips and shoulders
+    np.testing.assert_allclose(motion.translations, moves, atol=1e-3)
+
+
+def test_a_rig_without_toes_and_fingers_moves_its_limbs_all_the_same(tmp_path):
+    left_out = ("left_foot", "right_foot", "left_hand", "right_hand")
+    rotations, _ = motion_of()
+    rotations[:, [JOINT_NAMES.index(name) for name in left_out]] = np.eye(3)
+    path = write_bvh(
+        tmp_path / "m.bvh", REST_JOINTS, rotations, np.tile(REST_JOINTS[0], (FRAMES, 1)), scan_fixtures.MIXAMO, left_out
+    )
+    found = read_motion(path).rotations
+    np.testing.assert_allclose(found[:, :20], rotations[:, :20], atol=1e-6)
+    np.testing.assert_allclose(found[:, 20:], rotations[:, 20:], atol=0.06)  # hands point along the end site
+
+
+def test_blenders_own_export_comes_back(tmp_path, empty_scene):
+    armature = build_armature("rig", points_to_blender(REST_JOINTS))
+    empty_scene.scene.collection.objects.link(armature)
+    rotations, moves = motion_of()
+    rotations[:, 22:] = np.eye(3)
+    keyframe_poses(armature, np.arange(1, FRAMES + 1), rotations, moves)
+    empty_scene.scene.frame_end = FRAMES
+    for name, other in scan_fixtures.RIGIFY.items():
+        armature.data.bones[name].name = other
+    empty_scene.view_layer.objects.active = armature
+    path = tmp_path / "blender.bvh"
+    bpy.ops.export_anim.bvh(filepath=str(path), frame_start=1, frame_end=FRAMES)
+    motion = read_motion(path)
+    off = np.linalg.norm(to_axis_angle(np.swapaxes(motion.rotations, -1, -2) @ rotations), axis=-1)
+    assert off.max() < 2e-3
+    assert np.abs(motion.joints() - joint_positions(rotations, moves)).max() < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda text: text.replace("mixamorig:LeftUpLeg", "Bone.017"), "no bone is known to be 'left_hip'"),
+        (lambda text: text.replace("Zrotation", "Wrotation"), "the channel 'Wrotation' is unknown"),
+        (lambda text: text[: len(text) - 900], "numbers are announced"),
+        (lambda text: text.replace("Frames: 6", "Frames: 0"), "0 frames"),
+        (lambda text: text.replace("MOTION", "MOVES"), "no HIERARCHY followed by MOTION"),
+        (lambda text: text.replace("}\nMOTION", "MOTION"), "a brace is not closed"),
+        (lambda text: text.replace("Frame Time: 0.0083333\n", "Frame Time: 0.0083333\nnan "), "NaN or infinite"),
+    ],
+)
+def test_broken_files_are_named(tmp_path, change, message):
+    rotations, moves = motion_of()
+    path = write_bvh(tmp_path / "m.bvh", REST_JOINTS, rotations, moves, scan_fixtures.MIXAMO)
+    path.write_text(change(path.read_text()))
+    with pytest.raises(MotionFileError, match=message) as caught:
+        read_motion(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_file_without_a_frame_time_gets_the_default_and_a_note(tmp_path):
+    rotations, moves = motion_of()
+    path = write_bvh(tmp_path / "m.bvh", REST_JOINTS, rotations, moves, scan_fixtures.MIXAMO, frame_time="0")
+    motion = read_motion(path)
+    assert motion.fps == 30
+    assert any("no frame rate" in note for note in motion.notes)

@@ -1,0 +1,266 @@
+"""Set Up Backend and its neighbours as operators: what they do, what they refuse, what panels show."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import bpy
+import pytest
+from tiny_packages import BACKEND, own_index, served, until, with_this_pip, write_lock, write_packages, write_wheel
+
+import blender_primdiffusion
+import build_addon
+from blender_primdiffusion import places
+from blender_primdiffusion.backend import setup
+from blender_primdiffusion.backend.environment import VARIABLE
+from blender_primdiffusion.ui.setup import known, operators, preferences
+from blender_primdiffusion.ui.setup.operators import session
+
+pytestmark = pytest.mark.any_blender
+
+press = bpy.ops.primdiffusion
+
+
+@pytest.fixture
+def wheels(empty_scene, tmp_path, monkeypatch) -> Path:
+    """The add-on registered, no backend yet; a folder with all wheels that it needs."""
+    folder = tmp_path / "große räder"
+    lock = write_lock(tmp_path / "lock.txt", write_packages(folder))
+    monkeypatch.delenv(VARIABLE, raising=False)
+    own_index(monkeypatch)
+    with_this_pip(monkeypatch, setup)
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.short_root", lambda *_: tmp_path / "eigener ordner")
+    monkeypatch.setattr(places, "backend_module_path", lambda: BACKEND)
+    monkeypatch.setattr("blender_primdiffusion.ui.setup.operators.backend_module_path", lambda: BACKEND)
+    monkeypatch.setattr(known, "_has_torch", lambda: False)
+    monkeypatch.setattr(known, "available", lambda: {"cpu": lock})
+    bpy.context.preferences.system.use_online_access = False
+    session.error = session.notice = ""
+    blender_primdiffusion.register()
+    yield folder
+    blender_primdiffusion.unregister()
+    bpy.context.preferences.system.use_online_access = False
+
+
+@pytest.fixture
+def online(wheels):
+    bpy.context.preferences.system.use_online_access = True
+    return wheels
+
+
+class Layout:
+    """Takes what a draw function asks for; remembers texts and buttons."""
+
+    def __init__(self):
+        self.texts, self.buttons, self.props = [], [], []
+        self.filepath = ""
+
+    def label(self, text="", **_):
+        self.texts.append(text)
+
+    def operator(self, idname, **_):
+        self.buttons.append(idname)
+        return self
+
+    def prop(self, _data, name, **_):
+        self.props.append(name)
+
+    def progress(self, text="", **_):
+        self.texts.append(text)
+
+    def box(self):
+        return self
+
+    def row(self, **_):
+        return self
+
+    def column(self, **_):
+        return self
+
+    @property
+    def said(self) -> str:
+        return " ".join(self.texts)
+
+
+def draw_preferences() -> Layout:
+    layout = Layout()
+    fake = type("Preferences", (), {"layout": layout})()
+    fake._draw_backend = lambda box: preferences.PRIMDIFFUSION_AP_preferences._draw_backend(fake, box)
+    fake._draw_buttons = lambda box, *told: preferences.PRIMDIFFUSION_AP_preferences._draw_buttons(fake, box, *told)
+    preferences.PRIMDIFFUSION_AP_preferences.draw(fake, bpy.context)
+    return layout
+
+
+def test_from_no_backend_to_a_backend_and_back(wheels):
+    layout = Layout()
+    assert not preferences.draw_set_up(layout)
+    assert "The backend is not set up yet" in layout.said
+    assert "Downloads" in layout.said
+    assert "primdiffusion.set_up_backend" in layout.buttons
+
+    assert press.install_from_folder(directory=str(wheels)) == {"FINISHED"}
+    assert known.known().state == "ready"
+    assert session.notice.startswith("The backend is ready: torch 0-tiny")
+    layout = Layout()
+    assert preferences.draw_set_up(layout)
+    assert not layout.texts
+    said = draw_preferences()
+    assert "Ready: torch 0-tiny" in said.said
+    assert str(places.set_up_folder().environment)[:40] in said.said
+    assert {"primdiffusion.repair_backend", "primdiffusion.remove_backend"} <= set(said.buttons)
+
+    assert press.set_up_backend() == {"FINISHED"}  # nothing to do
+    assert press.test_backend() == {"FINISHED"}
+    assert press.remove_backend() == {"FINISHED"}
+    assert known.known().state == "absent"
+
+
+def test_set_up_backend_downloads_when_blender_may_use_the_network(online, monkeypatch):
+    with served(online) as (index, _):
+        own_index(monkeypatch, index)
+        assert press.set_up_backend() == {"FINISHED"}
+        assert known.known().state == "ready"
+        next(places.set_up_folder().environment.rglob("tiny.py")).unlink()
+        assert press.repair_backend() == {"FINISHED"}
+    assert known.known().state == "ready"
+    assert list(places.set_up_folder().environment.rglob("tiny.py"))
+
+
+def test_without_online_access_set_up_is_rejected_with_the_remedy(wheels):
+    with pytest.raises(RuntimeError, match=r"Preferences > System > Network > Allow Online Access"):
+        press.set_up_backend()
+    layout = Layout()
+    preferences.draw_set_up(layout)
+    assert "Allow Online Access" in layout.said
+    assert not places.set_up_folder().root.exists()
+
+
+def test_a_failure_raises_and_stays_in_the_panel(online):
+    with pytest.raises(RuntimeError, match="The package index cannot be reached"):
+        press.set_up_backend()
+    layout = Layout()
+    preferences.draw_set_up(layout)
+    assert "cannot be reached" in layout.said
+    assert "Half installed" in layout.said
+    assert "wm.path_open" in draw_preferences().buttons
+
+
+@pytest.mark.parametrize("folder", ["", "/no/such/folder"])
+def test_a_folder_that_is_none_is_rejected(wheels, folder):
+    with pytest.raises(RuntimeError, match="is no folder: choose the one that holds the wheels"):
+        press.install_from_folder(directory=folder)
+
+
+def test_a_folder_may_bring_its_own_list_of_packages(wheels, tmp_path, monkeypatch):
+    ours = write_lock(tmp_path / "ours.txt", [write_wheel(tmp_path / "elsewhere", "torch", "")])
+    monkeypatch.setattr(known, "available", lambda: {"cpu": ours})
+    with pytest.raises(RuntimeError, match="hash differs"):
+        press.install_from_folder(directory=str(wheels))
+    write_lock(wheels / operators.OWN_LOCK, sorted(wheels.glob("*.whl")))
+    assert press.install_from_folder(directory=str(wheels)) == {"FINISHED"}
+    assert known.known().about["lock_name"] == "requirements.txt"
+
+
+def test_an_environment_with_outdated_packages_is_reported(wheels, monkeypatch):
+    assert press.install_from_folder(directory=str(wheels)) == {"FINISHED"}
+    (path,) = known.available().values()
+    monkeypatch.setattr(known, "LOCKS", path.parent)
+    path.write_text(path.read_text() + "# another\n")
+    known.read_once.cache_clear()
+    assert known.known().state == "outdated"
+    assert "press Repair" in known.known().line
+    with pytest.raises(RuntimeError, match="Blender may not use the network"):
+        press.repair_backend()
+    assert known.known().state == "outdated"  # still there, and it works
+
+
+def test_nothing_to_remove_test_or_cancel_is_rejected(wheels):
+    with pytest.raises(RuntimeError, match="There is no backend to remove"):
+        press.remove_backend()
+    with pytest.raises(RuntimeError, match="not set up yet: press Set Up Backend first"):
+        press.test_backend()
+    with pytest.raises(RuntimeError, match="Nothing is being set up"):
+        press.cancel_set_up()
+
+
+def test_while_one_is_under_way_a_second_is_rejected_and_cancel_ends_it(online, tmp_path, monkeypatch):
+    with served(online, stalls="torch") as (index, handler):
+        own_index(monkeypatch, index)
+        session.start(operators.installing())
+        until(lambda: session.tick() is None or any(path.startswith("/torch-") for path in handler.asked))
+        layout = Layout()
+        assert not preferences.draw_set_up(layout)
+        assert layout.buttons == ["primdiffusion.cancel_set_up"]
+        with pytest.raises(RuntimeError, match="being set up already"):
+            press.repair_backend()
+        assert press.cancel_set_up() == {"FINISHED"}
+    assert not session.busy
+    assert session.notice.startswith("Cancelled")
+    assert known.known().state == "broken"
+
+
+def test_an_existing_python_goes_first_and_is_tried(wheels, monkeypatch):
+    monkeypatch.setenv(VARIABLE, "/no/such/python")
+    assert known.known().line == f"Uses /no/such/python, named by the environment variable {VARIABLE}"
+    with pytest.raises(RuntimeError, match=r"/no/such/python .* does not exist"):
+        press.test_backend()
+
+
+def test_a_machine_without_packages_gets_an_error_with_a_remedy(online, monkeypatch):
+    monkeypatch.setattr(known, "available", dict)
+    with pytest.raises(RuntimeError, match="make an environment by hand and name its Python"):
+        press.set_up_backend()
+    layout = Layout()
+    preferences.draw_set_up(layout)
+    assert "There are no packages for" in layout.said
+
+
+def test_set_up_is_rejected_while_a_person_is_made(online, monkeypatch):
+    from blender_primdiffusion.jobs.queue import Queue
+
+    monkeypatch.setattr(Queue, "busy", property(lambda self: True))
+    with pytest.raises(RuntimeError, match="The backend is at work"):
+        press.set_up_backend()
+
+
+def test_disabling_the_extension_ends_a_set_up(online, monkeypatch):
+    with served(online, stalls="torch") as (index, _):
+        own_index(monkeypatch, index)
+        session.start(operators.installing())
+        blender_primdiffusion.unregister()
+        blender_primdiffusion.register()
+    assert not session.busy
+
+
+def test_the_preferences_show_what_was_found_and_what_it_costs(wheels):
+    said = draw_preferences()
+    assert re.search(r"Found: .*Python 3\.\d+", said.said)
+    assert re.search(r"Downloads \d+ MB, takes \d+ MB on disk, about \d+ min", said.said)
+    assert {"compute", "backend_python", "checkpoint", "encoder", "idle_minutes"} <= set(said.props)
+
+
+def test_the_zip_holds_the_locks_and_asks_for_the_network():
+    names = build_addon.contents()
+    assert "requirements/linux_x86_64-py311-cpu.txt" in names
+    assert "requirements/windows_x86_64-py313-cuda.txt" in names
+    manifest = (build_addon.ADDON / "blender_manifest.toml").read_text()
+    reason = re.search(r'^network = "(.+)"$', manifest, re.MULTILINE)
+    assert len(reason[1]) <= 64
+
+
+def test_registration_imports_no_heavy_modules():
+    program = (
+        "import sys, bpy; before = set(sys.modules); import blender_primdiffusion as addon; addon.register(); "
+        "new = set(sys.modules) - before; addon.unregister(); print(*sorted(new))"
+    )
+    root = Path(__file__).parents[4]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, cwd=root)
+    loaded = set(done.stdout.split())
+    assert "blender_primdiffusion.ui.setup.operators" in loaded, done.stderr
+    heavy = {"torch", "scipy", "numba", "ssl", "http.client", "urllib.request", "email", "asyncio", "multiprocessing"}
+    assert not heavy & loaded

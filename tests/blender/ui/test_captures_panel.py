@@ -1,0 +1,315 @@
+"""Render Captures as a user and a script press it, on a person in a .glb."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from blender_primdiffusion.formats.capture_layout import picture_path
+from blender_primdiffusion.formats.joints import JOINT_NAMES
+from capture_person import FACES, _few_faces, chequers, files_of
+
+import blender_primdiffusion
+from blender_primdiffusion.capture import launch
+from blender_primdiffusion.capture.body import read_body
+from blender_primdiffusion.capture.options import MARK, UsageError, parse, settings_of
+from blender_primdiffusion.capture.stage import data_blocks
+from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE
+from blender_primdiffusion.scene.armature import build_armature
+from blender_primdiffusion.scene.convention import points_to_blender
+from blender_primdiffusion.ui.captures_panel import RIG
+from blender_primdiffusion.ui.captures_session import captures
+from blender_primdiffusion.ui.captures_settings import words_of
+
+pytestmark = pytest.mark.any_blender
+
+ROOT = Path(__file__).resolve().parents[3]
+SMALL = "--poses 2 --cameras 2 --size 48 48 --samples 2 --device cpu --passes img mask depth"
+
+
+def write_person(path: Path) -> None:
+    """A skinned, textured .glb of the default body with few faces."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    body = read_body()
+    vertices, joints = body.rest(np.zeros(10))
+    kept, faces = _few_faces()
+    armature = build_armature("person", points_to_blender(joints))
+    bpy.context.scene.collection.objects.link(armature)
+    mesh = bpy.data.meshes.new("skin")
+    mesh.from_pydata(points_to_blender(vertices[kept]).tolist(), [], faces.tolist())
+    mesh.materials.append(chequers())
+    uv = mesh.uv_layers.new(name="UVMap")
+    uv.data.foreach_set("uv", (vertices[kept][faces.ravel(), :2] / 2 + 0.5).astype(np.float32).ravel())
+    thing = bpy.data.objects.new("skin", mesh)
+    bpy.context.scene.collection.objects.link(thing)
+    for joint, name in enumerate(JOINT_NAMES):
+        group = thing.vertex_groups.new(name=name)
+        for vertex in np.flatnonzero(body.skin_weights[kept, joint] > 0):
+            group.add([int(vertex)], float(body.skin_weights[kept[vertex], joint]), "REPLACE")
+    thing.parent = armature
+    thing.modifiers.new("armature", "ARMATURE").object = armature
+    path.parent.mkdir(parents=True)
+    bpy.ops.export_scene.gltf(filepath=str(path), export_format="GLB", export_animations=False)
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("people")
+    write_person(folder / "person_000000" / "person.glb")
+    (folder / "person_000001").mkdir()
+    (folder / "person_000001" / "person.glb").write_bytes(b"glTF, but not really")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def only_good(people, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("one")
+    (folder / "anna.glb").write_bytes((people / "person_000000" / "person.glb").read_bytes())
+    return folder
+
+
+@pytest.fixture
+def extension(empty_scene):
+    blender_primdiffusion.register()
+    yield empty_scene
+    blender_primdiffusion.unregister()
+
+
+def command(*words: str, **changes) -> subprocess.CompletedProcess:
+    line = [sys.executable, "-m", "blender_primdiffusion.capture", *words]
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    environment = {**os.environ, "PYTHONPATH": path}
+    return subprocess.run(
+        line, capture_output=True, text=True, check=False, timeout=200, cwd=ROOT, env=environment, **changes
+    )
+
+
+def first_message(child: subprocess.Popen) -> dict:
+    """Before it, 5.2 tells where a child has its colours from."""
+    assert child.stdout is not None
+    line = next(line for line in child.stdout if line.startswith(MARK))
+    return json.loads(line[len(MARK) :])
+
+
+def follow(until=lambda: False, seconds: float = 120) -> None:
+    """Tick as Blender's timer does."""
+    end = time.monotonic() + seconds
+    while captures.busy and not until():
+        assert time.monotonic() < end, captures.lines
+        captures.tick()
+        time.sleep(0.02)
+
+
+@pytest.mark.timeout(300)
+def test_the_operator_renders_in_background_mode_and_leaves_the_scene_alone(extension, only_good, tmp_path):
+    before = {(block.id_type, block.name) for block in data_blocks()}
+    out = tmp_path / "captures"
+    assert bpy.ops.primdiffusion.render_captures(people=str(only_good), out=str(out), options=SMALL) == {"FINISHED"}
+    assert {(block.id_type, block.name) for block in data_blocks()} == before
+    assert (out / "release_human_list.txt").read_text() == "anna\n"
+    assert json.loads((out / "dataset.json").read_text())["frames"] == 2
+    assert bpy.ops.primdiffusion.verify_captures(out=str(out)) == {"FINISHED"}
+    picture_path(out / "anna", "depth", 1, 1).unlink()
+    with pytest.raises(RuntimeError, match=r"1 problems; the first: .*0001.png: missing"):
+        bpy.ops.primdiffusion.verify_captures(out=str(out))
+    assert bpy.ops.primdiffusion.verify_captures(out=str(out), repair=True) == {"FINISHED"}
+    assert bpy.ops.primdiffusion.render_captures(people=str(only_good), out=str(out), options=SMALL) == {"FINISHED"}
+    assert bpy.ops.primdiffusion.verify_captures(out=str(out)) == {"FINISHED"}
+
+
+def test_the_operator_reports_an_error_in_one_sentence(extension, people, tmp_path):
+    render = bpy.ops.primdiffusion.render_captures
+    with pytest.raises(RuntimeError, match="choose a folder of people first"):
+        render()
+    with pytest.raises(RuntimeError, match="there is no folder of scans"):
+        render(people=str(tmp_path / "nobody"), out=str(tmp_path / "a"))
+    with pytest.raises(RuntimeError, match="--size"):
+        render(people=str(people), out=str(tmp_path / "a"), options="--size big")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").touch()
+    with pytest.raises(RuntimeError, match="not empty"):
+        render(people=str(people), out=str(tmp_path / "full"), options=SMALL)
+    with pytest.raises(RuntimeError, match="no pose file"):
+        render(people=str(people), out=str(tmp_path / "a"), options=f"{SMALL} --pose-files {tmp_path / 'none.npz'}")
+
+
+@pytest.mark.timeout(300)
+def test_a_batch_continues_past_a_broken_scan_reports_it_and_exits_with_1(people, tmp_path):
+    out = tmp_path / "captures"
+    done = command("--people", str(people), "--out", str(out), *SMALL.split())
+    assert done.returncode == FAILED, done.stdout + done.stderr
+    report = json.loads((out / "report.json").read_text())
+    assert report["done"] == ["person_000000"]
+    assert [failure["subject"] for failure in report["failed"]] == ["person_000001"]
+    assert "person_000001" in done.stdout
+    assert "Fra:" not in done.stdout
+    again = command("--people", str(people), "--out", str(out), *SMALL.split(), "--only", "person_000000")
+    assert again.returncode == DONE
+    assert "1 were there" in again.stdout
+    checked = command("--out", str(out), "--verify")
+    assert checked.returncode == DONE, checked.stdout  # nothing of the broken scan has come into the dataset
+    picture = picture_path(out / "person_000000", "img", 0, 0)
+    whole = picture.read_bytes()
+    picture.write_bytes(whole[: len(whole) // 2])
+    checked = command("--out", str(out), "--verify", "--repair")
+    assert checked.returncode == FAILED
+    assert str(picture) in checked.stdout
+    assert not picture.exists()
+    command("--people", str(people), "--out", str(out), *SMALL.split(), "--only", "person_000000")
+    assert picture.read_bytes() == whole
+
+
+def test_a_wrong_command_line_exits_with_2_and_an_error(tmp_path):
+    for words, said in (
+        (["--people", str(tmp_path)], "--out"),
+        (["--out", str(tmp_path), "--cameras", "none"], "--cameras"),
+        (["--out", str(tmp_path / "a"), "--people", str(tmp_path), "--shard", "4/4"], "no shard"),
+    ):
+        done = command(*words)
+        assert done.returncode == UNUSABLE
+        assert said in done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_shards_are_named_without_rendering(people, tmp_path):
+    for shard, name in (("0/2", "person_000000"), ("1/2", "person_000001")):
+        told = command("--people", str(people), "--out", str(tmp_path / "a"), "--list", "--shard", shard).stdout
+        assert [line for line in told.splitlines() if "color_management" not in line] == [name]  # 5.2's own line
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.timeout(300)
+def test_with_a_window_a_child_renders_and_is_followed(extension, only_good, tmp_path):
+    out = tmp_path / "captures"
+    asked = extension.scene.primdiffusion_captures
+    asked.people, asked.out = str(only_good), str(out)
+    asked.pose_count, asked.camera_count, asked.width, asked.height, asked.samples = 2, 2, 48, 48, 2
+    captures.start(words_of(asked, extension, captures.new_folder()))
+    messages = set()
+    while captures.busy:
+        captures.tick()
+        messages.add(captures.message)
+        time.sleep(0.02)
+    assert captures.error == ""
+    assert captures.exit_code == DONE
+    assert "anna: view 4 of 4" in messages
+    assert (out / "anna" / "complete.json").is_file()
+    asked.seed = 3
+    captures.start(words_of(asked, extension, captures.new_folder()))
+    follow()
+    assert "its seed is 0, wanted is 3" in captures.error
+
+
+@pytest.mark.timeout(300)
+def test_cancelling_ends_the_child_and_the_next_run_resumes(extension, only_good, tmp_path):
+    asked = extension.scene.primdiffusion_captures
+    asked.people, asked.out = str(only_good), str(tmp_path / "captures")
+    asked.pose_count, asked.camera_count, asked.width, asked.height, asked.samples = 2, 3, 400, 400, 30
+    captures.start(words_of(asked, extension, captures.new_folder()))
+    follow(until=lambda: captures.fraction > 0)
+    assert bpy.ops.primdiffusion.cancel_captures() == {"FINISHED"}
+    follow()
+    assert captures.notice.startswith("Cancelled")
+    assert captures.error == ""
+    asked.width = asked.height = 400
+    done = files_of(tmp_path / "captures")
+    captures.start(words_of(asked, extension, captures.new_folder()))
+    follow()
+    assert captures.exit_code == DONE, captures.error
+    after = files_of(tmp_path / "captures")
+    assert all(after[name] == done[name] for name in done if name.endswith((".jpg", ".png")))
+
+
+def test_a_child_whose_parent_is_gone_stops(only_good, tmp_path):
+    words = ["--people", str(only_good), "--out", str(tmp_path / "a"), "--progress", "json", "--while-stdin"]
+    child = subprocess.Popen(
+        [sys.executable, launch.__file__, "--", *words, "--size", "256", "256"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+    )  # fmt: skip
+    assert first_message(child)["total"] == 20 * 36
+    child.stdin.close()
+    assert child.wait(30) == CANCELLED
+    child.stdout.close()
+
+
+@pytest.mark.parametrize("moment", [0.1, 0.3])
+def test_a_polite_kill_in_the_midst_of_a_view_ends_the_command_after_it(only_good, tmp_path, moment):
+    words = ["--people", str(only_good), "--out", str(tmp_path / "a"), "--progress", "json"]
+    child = subprocess.Popen(
+        [sys.executable, launch.__file__, "--", *words, "--size", "256", "256"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    first_message(child)
+    time.sleep(moment)
+    child.send_signal(signal.SIGTERM)
+    _, complaints = child.communicate(timeout=30)
+    assert child.returncode == CANCELLED
+    assert complaints == ""
+
+
+def test_the_panels_defaults_are_the_commands(extension, tmp_path):
+    asked = extension.scene.primdiffusion_captures
+    from_panel = settings_of(parse(words_of(asked, extension, tmp_path, "people", "out")))
+    from_line = settings_of(parse(["--people", "people", "--out", bpy.path.abspath("out")]))
+    assert from_panel == from_line
+    assert (from_line.camera_count, from_line.pose_count, from_line.size, from_line.samples) == (36, 20, (512, 512), 16)
+
+
+def test_cameras_of_the_scene_are_taken_by_name(extension, tmp_path):
+    scene, asked = extension.scene, extension.scene.primdiffusion_captures
+    asked.arrangement, asked.width, asked.height = "custom", 80, 60
+    with pytest.raises(ValueError, match="no camera"):
+        words_of(asked, extension, tmp_path, "people", "out")
+    asked.cameras = bpy.data.collections.new("rig")
+    scene.collection.children.link(asked.cameras)
+    for name, x in (("b", 1.0), ("a", 2.0)):
+        camera = bpy.data.objects.new(name, bpy.data.cameras.new(name))
+        camera.location, camera.rotation_euler = (x, -4.0, 0.5), (np.pi / 2, 0, 0)
+        asked.cameras.objects.link(camera)
+    settings = settings_of(parse(words_of(asked, extension, tmp_path, "people", "out")))
+    assert [view.position.round(4).tolist() for view in settings.cameras] == [[2, 0.5, 4], [1, 0.5, 4]]
+    assert settings.camera_count == 2
+    assert (settings.cameras[0].width, settings.cameras[0].height) == (80, 60)
+
+
+def test_the_preview_shows_the_rig_and_goes_again(extension):
+    asked = extension.scene.primdiffusion_captures
+    asked.arrangement, asked.camera_count = "sphere", 7
+    before = {(block.id_type, block.name) for block in data_blocks()}
+    assert bpy.ops.primdiffusion.preview_rig() == {"FINISHED"}
+    shown = bpy.data.collections[RIG]
+    assert len(shown.objects) == 7
+    bpy.context.view_layer.update()
+    for camera in shown.objects:  # each looks at the middle
+        forward = np.array(camera.matrix_world)[:3, :3] @ (0, 0, -1)
+        position = np.array(camera.matrix_world.translation)
+        assert np.allclose(forward, -position / np.linalg.norm(position), atol=1e-5)
+    assert bpy.ops.primdiffusion.preview_rig() == {"FINISHED"}
+    assert {(block.id_type, block.name) for block in data_blocks()} == before
+
+
+def test_hostile_camera_files_are_rejected(tmp_path):
+    path = tmp_path / "cameras.json"
+    eye, twice = [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[2, 0, 0], [0, 1, 0], [0, 0, 1]]
+    stretched = json.dumps({"a": {"K": eye, "R": twice, "T": [0, 0, 0]}})
+    for content in ("[]", "{}", "no json", '{"a": {"K": 1}}', stretched):
+        path.write_text(content)
+        with pytest.raises(ValueError, match=r"cameras\.json"):
+            settings_of(parse(["--out", "a", "--camera-file", str(path)]))
+
+
+def test_unknown_options_are_rejected():
+    with pytest.raises(UsageError):
+        parse(["--out", "a", "--rm", "-rf"])
+
+
+def test_few_faces_are_a_few(empty_scene):
+    assert abs(len(_few_faces()[1]) - FACES) < 60

@@ -1,0 +1,226 @@
+"""Exports and imports by operators, with a child that has a synthetic person ready."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import bpy
+import exporting
+import numpy as np
+import pytest
+import synthetic
+from backend_python import found
+
+from blender_primdiffusion.scene.armature import keyframe_poses
+from blender_primdiffusion.scene.human import BETAS, armature_of, humans
+from blender_primdiffusion.scene.human_file import read_tensors
+from blender_primdiffusion.scene.proxy import proxy_of
+from blender_primdiffusion.scene.surface import primitives_of
+
+OPERATORS = bpy.ops.primdiffusion
+
+
+@pytest.fixture
+def store(saved_scene, tmp_path, monkeypatch):
+    """The add-on registered on an interpreter that runs the child of this file."""
+    import blender_primdiffusion
+    from blender_primdiffusion import places
+    from blender_primdiffusion.backend.environment import BackendPython
+
+    folder = tmp_path / "store"
+    folder.mkdir()
+    exporting.write_store(folder)
+    monkeypatch.setenv("EXPORT_FOLDER", str(folder))
+    python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", found(python))
+    monkeypatch.setattr(places, "backend_module_path", lambda: Path(__file__).parents[1] / "export_backend")
+    blender_primdiffusion.register()
+    yield folder
+    blender_primdiffusion.unregister()
+
+
+@pytest.fixture
+def anna(store):
+    return exporting.add_person(store)
+
+
+@pytest.fixture
+def out(tmp_path):
+    """A folder with a name that programs stumble over."""
+    folder = tmp_path / "für später"
+    folder.mkdir()
+    return folder
+
+
+def moving(person):
+    rng = np.random.default_rng(3)
+    turns = synthetic.axis_angle(rng.normal(0, 0.2, (3, 24, 3)))
+    keyframe_poses(armature_of(person), np.arange(1, 4), turns, rng.normal(0, 0.1, (3, 3)))
+    bpy.context.scene.frame_end = 3
+    return turns
+
+
+def everything():
+    kinds = ("scenes", "objects", "meshes", "materials", "images", "collections", "volumes", "actions")
+    return {kind: {thing.name for thing in getattr(bpy.data, kind)} for kind in kinds}
+
+
+def refused(sentence, operator, **properties):
+    with pytest.raises(RuntimeError, match=sentence):
+        operator(**properties)
+
+
+@pytest.mark.parametrize("name", ["a.glb", "b.fbx", "c.usdz", "d"])
+def test_a_mesh_is_exported_and_nothing_stays_in_the_scene(anna, out, name):
+    moving(anna)
+    before = everything()
+    assert OPERATORS.export_mesh(filepath=str(out / name), animation=True, texture_px=64) == {"FINISHED"}
+    assert everything() == before
+    assert [path.name for path in out.iterdir()] == [name if "." in name else f"{name}.glb"]
+
+
+def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
+    before = everything()
+    monkeypatch.setenv("EXPORT_FAILS", "1")
+    refused("too thin", OPERATORS.export_mesh, filepath=str(out / "a.glb"))
+    assert everything() == before
+    assert not list(out.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("operator", "properties", "sentence"),
+    [
+        ("export_mesh", {"filepath": "OUT/a.stl"}, "another ending"),
+        ("export_mesh", {"filepath": "OUT/none/a.glb"}, "there is no folder"),
+        ("export_mesh", {"filepath": ""}, "name a file"),
+        ("export_mesh", {"filepath": "OUT/a.glb", "human": "Bert"}, "'Bert' is not in the scene"),
+        ("export_gaussians", {"filepath": "OUT/a.glb"}, "another ending"),
+        ("export_human", {"filepath": "OUT/none/a.human"}, "there is no folder"),
+        ("export_vdb_sequence", {"directory": "OUT/none"}, "there is no folder"),
+        ("export_vdb_sequence", {"directory": "OUT", "first": 5, "last": 2}, "before the first"),
+        ("show_proxy", {"shown": "MESH"}, "no mesh proxy"),
+        ("remove_proxy", {}, "no mesh proxy"),
+        ("add_proxy", {"human": "Bert"}, "'Bert' is not in the scene"),
+        ("import_human", {"filepath": "OUT/none.human"}, "there is no file"),
+    ],
+)
+def test_an_impossible_export_is_reported_in_a_sentence(anna, out, operator, properties, sentence):
+    given = {name: v.replace("OUT", str(out)) if isinstance(v, str) else v for name, v in properties.items()}
+    refused(sentence, getattr(OPERATORS, operator), **given)
+    assert not list(out.iterdir())
+
+
+def test_without_a_human_there_is_nothing_to_export(store, out):
+    refused("poll", OPERATORS.export_mesh, filepath=str(out / "a.glb"))
+
+
+def test_a_missing_persons_file_is_named(anna, out):
+    for path in Path(bpy.data.filepath).parent.rglob("person.human.safetensors"):
+        if "store" not in path.parts:
+            path.unlink()
+    for operator, file in ((OPERATORS.export_mesh, "a.glb"), (OPERATORS.export_human, "a.human")):
+        refused("is missing", operator, filepath=str(out / file))
+
+
+def test_a_proxy_follows_the_armature_and_is_shown_in_its_place(anna):
+    OPERATORS.add_proxy(texture_px=64)
+    proxy = proxy_of(anna)
+    assert proxy.parent == armature_of(anna)
+    assert (proxy.hide_viewport, proxy.hide_render) == (False, True)
+    assert (primitives_of(anna).hide_viewport, primitives_of(anna).hide_render) == (True, False)
+    OPERATORS.show_proxy(shown="MESH")
+    assert (proxy.hide_render, primitives_of(anna).hide_render) == (False, True)
+    OPERATORS.show_proxy(shown="VOLUMES")
+    assert (proxy.hide_viewport, proxy.hide_render) == (True, True)
+    assert not primitives_of(anna).hide_viewport
+    assert not primitives_of(anna).hide_render
+
+
+def test_adding_a_proxy_again_replaces_it_and_removing_takes_all_of_it(anna):
+    before = everything()
+    OPERATORS.add_proxy(texture_px=64)
+    once = everything()
+    OPERATORS.add_proxy(texture_px=64)
+    assert {kind: len(names) for kind, names in everything().items()} == {k: len(n) for k, n in once.items()}
+    OPERATORS.remove_proxy()
+    assert everything() == before
+    assert not primitives_of(anna).hide_viewport
+
+
+def test_gaussians_are_requested_in_the_current_pose(anna, out):
+    turns = moving(anna)
+    bpy.context.scene.frame_set(2)
+    armature_of(anna).location.x = 3.0
+    OPERATORS.export_gaussians(filepath=str(out / "a.ply"), gaussians=123)
+    asked = json.loads((out / "a.ply").read_text())
+    assert asked["limit"] == 123
+    assert np.array(asked["object"])[0, 3] == pytest.approx(3.0)
+    assert np.array(asked["joints"])[0, :, :3] == pytest.approx(turns[1][0], abs=1e-5)
+
+
+def test_a_vdb_for_each_frame_lies_where_the_person_stands(anna, out):
+    moving(anna)
+    armature_of(anna).location = (2.0, 0.0, 0.0)
+    OPERATORS.export_vdb_sequence(directory=str(out), first=1, last=3, voxel=0.01)
+    assert sorted(path.name for path in out.iterdir()) == [f"Anna_{frame:04d}.vdb" for frame in (1, 2, 3)]
+    bpy.utils.expose_bundled_modules()
+    import openvdb
+
+    grids, _ = openvdb.readAll(str(out / "Anna_0002.vdb"))
+    assert {grid.name for grid in grids} == {"density", "Cd"}
+    assert grids[0].transform.indexToWorld((0, 0, 0))[0] == pytest.approx(2.0, abs=1e-6)
+
+
+def test_a_human_file_goes_out_and_comes_back_with_shape_and_motion(anna, out):
+    turns = moving(anna)
+    armature = armature_of(anna)
+    shape = np.linspace(-1, 1, 10)
+    armature[BETAS] = shape.tolist()
+    OPERATORS.export_human(filepath=str(out / "Anna Müller.human"), motion=True)
+    kept = read_tensors(out / "Anna Müller.human")
+    assert json.loads(kept.metadata["provenance"]) == {"seed": 5}
+    assert np.frombuffer(kept.arrays["betas"][2], "<f4") == pytest.approx(shape, abs=1e-6)
+    OPERATORS.import_human(filepath=str(out / "Anna Müller.human"))
+    other = next(person for person in humans(bpy.context.scene) if person != anna)
+    assert other.name == "Anna Müller"
+    bpy.context.scene.frame_set(2)
+    for bone in synthetic.NAMES:
+        mine, theirs = (armature_of(person).pose.bones[bone] for person in (anna, other))
+        assert np.abs(np.array(mine.matrix) - np.array(theirs.matrix)).max() < 1e-4
+    assert len(turns) == 3
+
+
+def test_a_human_file_without_motion_holds_the_person_alone(anna, out):
+    OPERATORS.export_human(filepath=str(out / "a"), motion=False)
+    kept = read_tensors(out / "a.human")
+    assert "motion" not in kept.metadata
+    assert set(kept.arrays) == {"betas"}
+
+
+def test_a_person_is_put_where_they_were_dropped(store):
+    OPERATORS.import_human(filepath=str(store / "person.human.safetensors"), location=(1.0, 2.0, 0.0))
+    person = humans(bpy.context.scene)[0]
+    assert armature_of(person).location.xy[:] == pytest.approx((1.0, 2.0))
+    assert person.name == "person"
+
+
+@pytest.mark.parametrize("damage", ["short", "text", "cut", "other"])
+def test_a_file_that_holds_no_person_is_rejected_before_any_work(store, out, damage):
+    path = out / "a.human"
+    exporting.write_person(path)
+    whole = path.read_bytes()
+    path.write_bytes({"short": b"abc", "text": b"not a person at all", "cut": whole[:-8], "other": whole.replace(
+        b"primdiffusion.human", b"primdiffusion.model")}[damage])  # fmt: skip
+    refused("holds no person", OPERATORS.import_human, filepath=str(path))
+    assert not humans(bpy.context.scene)
+
+
+def test_the_panels_draw_in_the_sidebar_and_files_can_be_dropped(store):
+    types = bpy.types
+    assert types.PRIMDIFFUSION_PT_export.bl_order == 6
+    assert types.PRIMDIFFUSION_PT_export.bl_category == "PrimDiffusion"
+    for name in ("mesh", "volumes"):
+        assert getattr(types, f"PRIMDIFFUSION_PT_export_{name}").bl_parent_id == "PRIMDIFFUSION_PT_export"
+    assert types.PRIMDIFFUSION_FH_human.bl_import_operator == "primdiffusion.import_human"

@@ -1,0 +1,37 @@
+"""Diagnostics for bug reports."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+import pytest
+
+from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.ui import jobs_panel
+
+pytestmark = pytest.mark.any_blender
+FAILS = 2
+"""Seeds that the fake child takes as orders."""
+ops = bpy.ops.primdiffusion
+
+
+def test_diagnostics_hold_versions_and_the_error_but_no_folder_or_name(addon, tmp_path, monkeypatch):
+    monkeypatch.setenv("USER", "annabel")
+    with pytest.raises(RuntimeError):
+        ops.generate(seed=FAILS, steps=1)
+    told = jobs_panel.diagnostics()
+    for part in (bpy.app.version_string, "0-fake", "fake device", "seed 2", "CheckpointError", "checkpoint is damaged"):
+        assert part in told
+    assert str(tmp_path) not in told
+    assert str(Path.home()) not in told
+    assert "annabel" not in told
+    assert ops.copy_diagnostics() == {"FINISHED"}
+    assert bpy.data.texts[jobs_panel.TEXT].as_string().strip() == told.strip()
+    ops.copy_diagnostics()
+    assert len(bpy.data.texts) == 1
+
+
+def test_diagnostics_can_be_copied_before_anything_was_done(addon):
+    queue.last = None
+    assert "not started yet" in jobs_panel.diagnostics()

@@ -1,0 +1,70 @@
+"""The manual as its readers meet it: every panel's page, every picture and section is there, and pictures are small."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+import build_manual
+from blender_primdiffusion.ui import manual
+
+pytestmark = pytest.mark.any_blender
+
+ROOT = Path(__file__).resolve().parents[3]
+MANUAL = ROOT / "docs" / "manual"
+PAGES = sorted(MANUAL.glob("*.md"))
+LINK = re.compile(r"(!?)\[[^\]]*\]\(([^)\s]+)\)")
+BUTTON = re.compile(
+    r"draw_manual_button\(\s*[\w.]+,\s*\"(\w+)\"(?:,\s*\"([\w-]+)\")?\)"
+    r"|manual_page(?:, manual_section)? = \"(\w+)\"(?:, \"([\w-]+)\")?"
+)
+
+
+def links(page: Path) -> list[str]:
+    """Targets within the repository."""
+    return [target for _, target in LINK.findall(page.read_text(encoding="utf-8")) if not re.match(r"[a-z]+:", target)]
+
+
+def headings(page: Path) -> set[str]:
+    """As links call them."""
+    return {build_manual.slug(h) for h in re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)}
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
+def test_links_pictures_and_sections_are_there(page):
+    for target in links(page):
+        name, _, section = target.partition("#")
+        path = page.parent / name if name else page
+        assert path.exists(), f"{page.name} leads to {target}"
+        if section:
+            assert section in headings(path), f"{page.name} leads to {target}"
+
+
+def test_every_question_mark_of_a_panel_has_its_page_and_section():
+    asked = {
+        (found[0] or found[2], found[1] or found[3])
+        for file in (ROOT / "blender_primdiffusion").rglob("*.py")
+        for found in BUTTON.findall(file.read_text(encoding="utf-8"))
+    }
+    assert {"first_human", "editing", "posing", "motion", "rendering", "captures", "export"} <= {p for p, _ in asked}
+    for page, section in asked:
+        path = manual.page_file(page)
+        assert path is not None, page
+        assert not section or section in headings(path), f"{page}#{section}"
+
+
+def test_the_list_of_pages_names_all_of_them():
+    named = {target for target in links(MANUAL / "index.md") if target.endswith(".md")}
+    assert named == {page.name for page in PAGES} - {"index.md"}
+
+
+def test_every_picture_is_shown_somewhere_and_small():
+    shown = {(MANUAL / target).resolve() for page in PAGES for target in links(page)}
+    shown |= {(ROOT / target).resolve() for target in links(ROOT / "README.md")}
+    pictures = list((MANUAL / "pictures").iterdir())
+    for picture in pictures:
+        assert picture.resolve() in shown, f"no page shows {picture.name}"
+        assert picture.stat().st_size <= (1_500_000 if picture.suffix == ".gif" else 120_000), picture.name
+    assert sum(picture.stat().st_size for picture in pictures) < 3_000_000

@@ -1,0 +1,179 @@
+"""Human from Captures as the user meets it, with the real client and a child that can be told to misbehave."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import bpy
+import pytest
+from backend_python import found
+from jobs_driven import drive, error_of, notice_of, shown, until_running
+
+import blender_primdiffusion
+from blender_primdiffusion.backend.environment import BackendPython
+from blender_primdiffusion.jobs import generate
+from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.scene.human import folder_of, humans
+from blender_primdiffusion.ui import reconstruct_panel
+from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
+from blender_primdiffusion.ui.reconstruct_panel import PRIMDIFFUSION_PT_human_from_captures
+
+pytestmark = pytest.mark.any_blender
+
+FAKE = Path(__file__).parents[1] / "fake_backend"
+
+
+@pytest.fixture
+def captures(tmp_path) -> Path:
+    (tmp_path / "captures").mkdir()
+    return tmp_path / "captures"
+
+
+def order(captures: Path, what: str) -> Path:
+    (captures / "order").write_text(what)
+    return captures
+
+
+def asked_of_the_child(person: bpy.types.Collection) -> dict:
+    return json.loads((folder_of(person) / "person.human.safetensors").read_bytes())
+
+
+def test_the_operator_builds_a_human_from_the_chosen_captures(addon, captures):
+    asked = {"directory": f"{captures}/", "subject": "anna", "frame": 2, "views": 5}
+    assert bpy.ops.primdiffusion.human_from_captures(**asked) == {"FINISHED"}
+    (person,) = humans(addon.scene)
+    assert sum(thing.type == "VOLUME" for thing in person.all_objects) == 8
+    sent = asked_of_the_child(person)
+    assert Path(sent.pop("capture")) == captures
+    assert Path(sent.pop("out_dir")).name.startswith("reconstruct_")
+    assert sent == {"subject": "anna", "frame": 2, "views": 5}
+    assert not list(Path(bpy.app.tempdir).glob("reconstruct_*"))
+    assert notice_of("reconstruct").startswith("Reconstructed in ")
+
+
+def test_properties_that_are_not_given_are_the_panels(addon, captures):
+    panel = addon.scene.primdiffusion_reconstruct
+    panel.capture, panel.subject, panel.frame, panel.views = "//captures", "berta", 3, 4
+    assert bpy.ops.primdiffusion.human_from_captures() == {"FINISHED"}
+    sent = asked_of_the_child(humans(addon.scene)[0])
+    assert Path(sent["capture"]) == captures
+    assert (sent["subject"], sent["frame"], sent["views"]) == ("berta", 3, 4)
+
+
+def test_the_panels_subject_is_not_looked_for_in_another_folder(addon, captures):
+    panel = addon.scene.primdiffusion_reconstruct
+    panel.capture, panel.subject = "//elsewhere", "berta"
+    bpy.ops.primdiffusion.human_from_captures(directory=str(captures))
+    assert "subject" not in asked_of_the_child(humans(addon.scene)[0])
+
+
+def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_job(addon, captures):
+    bpy.ops.ed.undo_push(message="before")
+    bpy.ops.primdiffusion.human_from_captures(directory=str(captures))
+    assert len(bpy.data.volumes) == 8
+    bpy.ops.ed.undo()
+    assert not humans(bpy.context.scene)
+    assert not bpy.data.volumes
+    bpy.ops.ed.redo()
+    assert len(humans(bpy.context.scene)) == 1
+    assert not queue.busy
+
+
+def test_the_operator_cannot_be_redone_with_a_slider():
+    options = reconstruct_panel.PRIMDIFFUSION_OT_human_from_captures.bl_options
+    assert not {"REGISTER", "UNDO"} & options
+
+
+def test_without_a_folder_a_script_gets_an_error_and_a_user_the_file_browser(addon):
+    with pytest.raises(RuntimeError, match="choose the folder of captures first"):
+        bpy.ops.primdiffusion.human_from_captures()
+    operator, context = SimpleNamespace(directory=""), MagicMock()
+    context.scene.primdiffusion_reconstruct.capture = ""
+    invoke = reconstruct_panel.PRIMDIFFUSION_OT_human_from_captures.invoke
+    assert invoke(operator, context, None) == {"RUNNING_MODAL"}
+    context.window_manager.fileselect_add.assert_called_once_with(operator)
+
+
+@pytest.mark.parametrize(("what", "sentence"), [("die", "ended by itself"), ("fail", "no subject 'nobody'")])
+def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, captures, tmp_path, what, sentence):
+    with pytest.raises(RuntimeError, match=sentence) as caught:
+        bpy.ops.primdiffusion.human_from_captures(directory=str(order(captures, what)))
+    assert str(caught.value).count("Error:") == 1
+    assert not bpy.data.objects
+    assert not (tmp_path / "shot_humans").exists()
+    assert not list(Path(bpy.app.tempdir).glob("reconstruct_*"))
+    assert sentence in " ".join(shown(PRIMDIFFUSION_PT_human_from_captures, addon))
+    assert sentence not in " ".join(shown(PRIMDIFFUSION_PT_generate, addon))
+
+
+def test_a_warning_of_the_backend_is_shown(addon, captures):
+    bpy.ops.primdiffusion.human_from_captures(directory=str(captures), views=1)
+    assert len(humans(addon.scene)) == 1
+    assert "One view only." in " ".join(shown(PRIMDIFFUSION_PT_human_from_captures, addon))
+
+
+def test_the_panel_shows_progress_and_cancel_ends_the_job_without_a_person(addon, captures):
+    assert "primdiffusion.human_from_captures" in shown(PRIMDIFFUSION_PT_human_from_captures, addon)
+    queue.add(addon, generate.ReconstructJob(str(order(captures, "take long")), "", 0, 8))
+    until_running()
+    texts = shown(PRIMDIFFUSION_PT_human_from_captures, addon)
+    assert texts == ["primdiffusion.human_from_captures", "Reconstructing", "primdiffusion.cancel"]
+    bpy.ops.primdiffusion.cancel()
+    drive()
+    assert (error_of("reconstruct"), notice_of("reconstruct")) == ("", "Cancelled")
+    assert not humans(addon.scene)
+
+
+def test_the_timer_builds_the_person(addon, captures):
+    queue.add(addon, generate.ReconstructJob(str(captures), "", 0, 8))
+    drive()
+    assert len(humans(addon.scene)) == 1
+
+
+def test_subjects_are_those_of_the_list_or_of_the_folders(captures):
+    for name in ("berta", "anna"):
+        (captures / name).mkdir()
+        (captures / name / "cameras.json").write_text("{}")
+    assert reconstruct_panel.subjects_in(captures) == ["anna", "berta"]
+    assert reconstruct_panel.subjects_in(captures / "anna") == []
+    (captures / "release_human_list.txt").write_text("clara\n\nanna\n")
+    assert reconstruct_panel.subjects_in(captures) == ["anna", "clara"]
+    assert reconstruct_panel.subjects_in(captures / "nowhere") == []
+
+
+def test_the_search_offers_subjects_that_hold_what_was_typed(captures):
+    (captures / "release_human_list.txt").write_text("clara\nanna\nHANNA\n")
+    asked = SimpleNamespace(capture=str(captures))
+    assert list(reconstruct_panel._search(asked, None, "ann")) == ["HANNA", "anna"]
+    assert list(reconstruct_panel._search(SimpleNamespace(capture=""), None, "")) == []
+
+
+@pytest.mark.slow
+def test_the_real_child_makes_a_person_of_real_captures(saved_scene, tmp_path, monkeypatch):
+    from capture_scenes import captured
+    from tiny_encoder import save_tiny_encoder
+
+    encoder = save_tiny_encoder(tmp_path / "encoder.safetensors")
+    folder = captured(tmp_path / "made", people=2, frames=1, passes=("img", "mask"))
+    python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", found(python))
+    monkeypatch.setattr(
+        "blender_primdiffusion.jobs.queue.preference", lambda name: str(encoder) if name == "encoder" else ""
+    )
+    blender_primdiffusion.register()
+    try:
+        with pytest.raises(RuntimeError, match=r"contains several subjects: name one of them \(person_000000"):
+            bpy.ops.primdiffusion.human_from_captures(directory=str(folder))
+        asked = {"directory": str(folder), "subject": "person_000001", "views": 3}
+        assert bpy.ops.primdiffusion.human_from_captures(**asked) == {"FINISHED"}
+        (person,) = humans(saved_scene.scene)
+        about = json.loads(person["primdiffusion_human"])
+        assert (about["reconstructed_from"], about["checkpoint"]) == ("person_000001", "tiny encoder")
+        assert len(about["views"]) == 3
+        assert sum(thing.type == "VOLUME" for thing in person.all_objects) > 500
+    finally:
+        blender_primdiffusion.unregister()

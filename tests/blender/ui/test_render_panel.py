@@ -1,0 +1,273 @@
+"""The Render panel as the user meets it, with the real client and a child that merges small grids."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+import synthetic
+import synthetic_shape
+from blender_primdiffusion.formats.requests import DENSITY_GAIN
+from jobs_driven import drive, error_of, notice_of, shown, until_running
+
+from blender_primdiffusion import places
+from blender_primdiffusion.jobs import merge
+from blender_primdiffusion.jobs.follow import follow
+from blender_primdiffusion.jobs.merge import MergeFramesJob, MergeJob, Moment
+from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.jobs.target import HumanTarget
+from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
+from blender_primdiffusion.scene.attachment import attachment_of
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.human import (
+    MARK,
+    armature_of,
+    folder_of,
+    humans,
+    remove_human,
+    sequence_files,
+    volume_path,
+)
+from blender_primdiffusion.scene.material import density_gain
+from blender_primdiffusion.scene.merged import merged_of, merged_state
+from blender_primdiffusion.ui import render_panel
+
+ops = bpy.ops.primdiffusion
+
+
+@pytest.fixture
+def person(addon, tmp_path, monkeypatch):
+    """Somebody in shot.blend whom there is to merge."""
+    monkeypatch.setattr(places, "backend_module_path", lambda: Path(__file__).parents[1] / "merge_backend")
+    kept = tmp_path / "person.human.safetensors"
+    kept.write_bytes(b"kept")
+    person = build_human(addon, synthetic_shape.write(tmp_path / "human.npz", 6), keep=[kept])
+    bpy.ops.ed.undo_push(message="a person")
+    return person
+
+
+def raise_left_arm(person, angle: float) -> None:
+    turns = np.zeros((24, 3))
+    turns[16, 2] = angle
+    pose_from_joint_rotations(armature_of(person), synthetic.axis_angle(turns))
+    bpy.context.view_layer.update()
+
+
+def drawn(panel_class, context) -> str:
+    """Operators and texts of a panel of the person."""
+    standing = SimpleNamespace(
+        draw=lambda asked, context: panel_class.draw_person(asked, context, humans(context.scene)[0])
+    )
+    return " | ".join(shown(standing, context))
+
+
+def density_of(person) -> float:
+    bpy.utils.expose_bundled_modules()
+    import openvdb
+
+    return openvdb.read(str(volume_path(merged_of(person).data)), "density").evalMinMax()[1]
+
+
+def test_a_merged_pose_is_one_undo_step_and_unmerging_goes_back(person):
+    raise_left_arm(person, 0.5)
+    bpy.ops.ed.undo_push(message="posed")
+    assert ops.merge(voxel=0.02) == {"FINISHED"}
+    assert attachment_of(person) == "MERGED"
+    assert density_of(person) == pytest.approx(10 + 10 * np.sin(0.5), rel=2e-3)
+    assert merged_state(merged_of(person)).voxel == pytest.approx(0.02)
+    assert "Merged Human at 20 mm" in notice_of("merge")
+    bpy.ops.ed.undo()
+    person = humans(bpy.context.scene)[0]
+    assert (attachment_of(person), merged_of(person)) == ("ARMATURE", None)
+    bpy.ops.ed.redo()
+    person = humans(bpy.context.scene)[0]
+    assert attachment_of(person) == "MERGED"
+    assert ops.unmerge() == {"FINISHED"}
+    assert (attachment_of(person), merged_of(person)) == ("ARMATURE", None)
+
+
+def test_unmerging_goes_back_to_the_surface_where_that_was_shown(person):
+    assert ops.set_attachment(mode="SURFACE") == {"FINISHED"}
+    ops.merge()
+    ops.merge()
+    ops.unmerge()
+    assert attachment_of(person) == "SURFACE"
+
+
+def test_the_panel_reports_a_changed_pose(person):
+    raise_left_arm(person, 0.3)
+    ops.merge()
+    assert not render_panel.outdated(person, bpy.context.scene)
+    armature_of(person).location.x = 2  # the merged volume moves along
+    bpy.context.view_layer.update()
+    assert not render_panel.outdated(person, bpy.context.scene)
+    raise_left_arm(person, 0.4)
+    assert render_panel.outdated(person, bpy.context.scene)
+    assert "of another pose" in drawn(render_panel.PRIMDIFFUSION_PT_merge, bpy.context).replace(" | ", " ")
+    ops.merge()
+    assert not render_panel.outdated(person, bpy.context.scene)
+    assert "of another pose" not in drawn(render_panel.PRIMDIFFUSION_PT_merge, bpy.context).replace(" | ", " ")
+
+
+def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(person):
+    frames = np.arange(5, 9)
+    turns = np.zeros((4, 24, 3))
+    turns[:, 16, 2] = 0.2 * np.arange(4)
+    keyframe_poses(armature_of(person), frames, synthetic.axis_angle(turns), np.zeros((4, 3)))
+    scene = bpy.context.scene
+    scene.frame_set(7)
+    scene.frame_start, scene.frame_end = 5, 8
+    assert ops.merge_frames(voxel=0.02) == {"FINISHED"}
+    assert scene.frame_current == 7
+    volume = merged_of(person).data
+    files = sequence_files(volume)
+    assert (len(files), volume.is_sequence, volume.frame_start, volume.frame_duration) == (4, True, 5, 4)
+    bpy.utils.expose_bundled_modules()
+    import openvdb
+
+    found = [openvdb.read(str(path), "density").evalMinMax()[1] for path in files]
+    np.testing.assert_allclose(found, 10 + 10 * np.sin(0.2 * np.arange(4)), rtol=2e-3)
+    for frame in (5, 6, 8):
+        scene.frame_set(frame)
+        assert not render_panel.outdated(person, scene)
+    assert ops.merge_frames(frame_start=6, frame_end=7) == {"FINISHED"}
+    assert merged_of(person).data.frame_duration == 2
+    ops.merge()
+    assert not merged_of(person).data.is_sequence
+
+
+def test_a_range_that_is_none_is_rejected(person):
+    with pytest.raises(RuntimeError, match="frames 7 to 7 are no sequence"):
+        ops.merge_frames(frame_start=7, frame_end=7)
+    assert merged_of(person) is None
+
+
+def test_a_cancelled_sequence_leaves_nothing(person, monkeypatch):
+    monkeypatch.setenv("FAKE_MERGE", "takes long")
+    moment = Moment.now(person)
+    before = sorted(folder_of(person).iterdir())
+    queue.add(bpy.context, MergeFramesJob(HumanTarget.of(person), [moment, moment], 1, 0.02))
+    until_running()
+    queue.cancel()
+    drive()
+    assert merged_of(person) is None
+    assert sorted(folder_of(person).iterdir()) == before
+
+
+def test_the_frames_of_a_sequence_are_written_one_at_a_tick(person, monkeypatch):
+    written, ticks = [], [0]
+    write_grid = merge.write_grid
+    monkeypatch.setattr(merge, "write_grid", lambda *args: written.append(ticks[0]) or write_grid(*args))
+    moment = Moment.now(person)
+    queue.add(bpy.context, MergeFramesJob(HumanTarget.of(person), [moment] * 5, 1, 0.02))
+    while follow() is not None:
+        ticks[0] += 1
+    assert len(written) == len(set(written)) == 5
+    assert len(sequence_files(merged_of(person).data)) == 5
+
+
+@pytest.mark.parametrize(
+    ("order", "message"), [("fails", "large grid"), ("gives garbage", "damaged"), ("dies", "ended")]
+)
+@pytest.mark.parametrize("merging", [ops.merge, ops.merge_frames])
+def test_a_child_that_misbehaves_leaves_the_person_as_they_were(person, monkeypatch, order, message, merging):
+    monkeypatch.setenv("FAKE_MERGE", order)
+    before = sorted(folder_of(person).iterdir())
+    with pytest.raises(RuntimeError, match=message):
+        merging()
+    assert (attachment_of(person), merged_of(person)) == ("ARMATURE", None)
+    assert sorted(folder_of(person).iterdir()) == before
+
+
+def test_a_human_removed_meanwhile_is_not_merged(person):
+    queue.add(bpy.context, MergeJob(HumanTarget.of(person), Moment.now(person), 0.02))
+    remove_human(person)
+    drive()
+    assert "was removed" in error_of("merge")
+    assert not bpy.data.volumes
+
+
+def test_a_renamed_bone_is_rejected_with_what_to_do(person):
+    armature_of(person).data.bones["left_knee"].name = "knee"
+    with pytest.raises(RuntimeError, match=r"no bone 'left_knee': give it this name again"):
+        ops.merge()
+
+
+def test_a_missing_file_of_the_person_is_named(person):
+    (folder_of(person) / "person.human.safetensors").unlink()
+    with pytest.raises(RuntimeError, match=r"person\.human\.safetensors"):
+        ops.fit_density_gain()
+
+
+def test_a_fitted_gain_is_the_person_s_and_the_slider_changes_it(person):
+    assert ops.fit_density_gain() == {"FINISHED"}
+    assert density_gain(person) == pytest.approx(1.54)
+    assert "1.54" in notice_of("fit_gain")
+    assert "1.4 % with 1.6" in notice_of("fit_gain")
+    person.primdiffusion_density_gain = 3.0
+    assert density_gain(person) == person.primdiffusion_density_gain == 3.0
+    bpy.ops.ed.undo()
+    assert density_gain(humans(bpy.context.scene)[0]) == pytest.approx(DENSITY_GAIN)
+
+
+def test_set_attachment_reports_what_stands_in_the_way(person):
+    with pytest.raises(RuntimeError, match="press Merge"):
+        ops.set_attachment(mode="MERGED")
+    with pytest.raises(RuntimeError, match="no merged volume"):
+        ops.unmerge()
+    with pytest.raises(RuntimeError, match="'Nobody' is not in the scene"):
+        ops.set_attachment(mode="SURFACE", human="Nobody")
+
+
+def test_panels_show_modes_warnings_and_memory(person):
+    context = bpy.context
+    assert "merge_frames" in drawn(render_panel.PRIMDIFFUSION_PT_merge, context)
+    assert drawn(render_panel.PRIMDIFFUSION_PT_attachment, context).count("set_attachment") == 2
+    ops.merge()
+    assert drawn(render_panel.PRIMDIFFUSION_PT_attachment, context).count("set_attachment") == 3
+    ops.unmerge()
+    person[MARK] = person[MARK].replace('"most_overlapping": ', '"most_overlapping": 9')
+    assert "volumes of 'Human' overlap" in drawn(render_panel.PRIMDIFFUSION_PT_cycles_look, context).replace(" | ", " ")
+    assert "MB" in drawn(render_panel.PRIMDIFFUSION_PT_memory, context)
+    assert "primdiffusion.set_up_cycles" in shown(render_panel.PRIMDIFFUSION_PT_render, context)
+
+
+def test_setting_up_cycles_leaves_camera_world_and_bounces_between_objects(person):
+    scene = bpy.context.scene
+    camera = bpy.data.objects.new("Mine", bpy.data.cameras.new("Mine"))
+    scene.collection.objects.link(camera)
+    scene.camera, scene.cycles.max_bounces = camera, 7
+    world = scene.world
+    assert ops.set_up_cycles() == {"FINISHED"}
+    assert (scene.render.engine, scene.camera, scene.world, scene.cycles.max_bounces) == ("CYCLES", camera, world, 7)
+    assert scene.cycles.transparent_max_bounces == 1024
+    assert scene.view_settings.view_transform == "Standard"
+    assert bpy.app.version < (5, 0) or scene.cycles.volume_biased
+    assert ops.set_up_engine() == {"FINISHED"}
+    assert (scene.render.engine, scene.camera) == ("PRIMDIFFUSION", camera)
+    scene.render.engine = "CYCLES"
+
+
+def test_a_camera_is_added_that_sees_the_whole_person(person):
+    from bpy_extras.object_utils import world_to_camera_view
+
+    assert ops.add_camera() == {"FINISHED"}
+    scene = bpy.context.scene
+    bpy.context.view_layer.update()
+    armature = armature_of(person)
+    for bone in armature.pose.bones:
+        x, y, depth = world_to_camera_view(scene, scene.camera, armature.matrix_world @ bone.head)
+        assert 0 < x < 1
+        assert 0 < y < 1
+        assert depth > 0
+    assert any(light.type == "SUN" for light in bpy.data.lights)
+
+
+def test_a_scene_without_humans_is_rejected(addon):
+    with pytest.raises(RuntimeError, match="no person in the scene"):
+        ops.add_camera()
+    assert not ops.merge.poll()
+    assert not bpy.data.cameras
