@@ -60,9 +60,9 @@ def read_tensors(path: Path) -> HumanTensors:
                 raise ValueError("it is truncated")
             arrays[name] = (str(about["dtype"]), tuple(about["shape"]), raw)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{path.name!r} holds no person ({error}); {_REMEDY}") from error
+        raise ValueError(f"{path.name!r} contains no human ({error}); {_REMEDY}") from error
     if metadata.get("format") != "primdiffusion.human":
-        raise ValueError(f"{path.name!r} holds no person but something else; {_REMEDY}")
+        raise ValueError(f"{path.name!r} contains no human but something else; {_REMEDY}")
     return HumanTensors(metadata, arrays)
 
 

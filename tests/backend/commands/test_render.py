@@ -72,7 +72,7 @@ BROKEN = [[1.0, 0.0, 0.0, 0.0], [0.0, math.nan, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
         ({"world_to_camera": BROKEN}, "world_to_camera holds nan"),
         ({"people": ["h"]}, "JSON object"),
         ({"people": person(object=BROKEN)}, "object holds nan"),
-        ({"people": person(joints=[STILL] * 23)}, "23 entries where 24 x 3 x 4"),
+        ({"people": person(joints=[STILL] * 23)}, "23 entries instead of 24 x 3 x 4"),
         ({"people": person(joints=[STILL] * 23 + [BROKEN])}, "joints holds nan"),
         ({"people": person(betas=[1.0, math.inf])}, "betas holds inf"),
         ({"people": person(pose=1)}, "'pose'"),

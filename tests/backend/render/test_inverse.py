@@ -125,7 +125,7 @@ def test_input_that_cannot_be_fitted_is_named():
         dataclasses.replace(targets[0], rgba=targets[0].rgba * np.nan)
     with pytest.raises(ValueError, match="does not fit its camera"):
         dataclasses.replace(targets[0], rgba=targets[0].rgba[1:])
-    with pytest.raises(ValueError, match="one person"):
+    with pytest.raises(ValueError, match="one human"):
         fit_payload(start.map(lambda field: field[None]), targets, FULL)
     with pytest.raises(ValueError, match="same cameras"):
         fit_colours([start, start], start, [targets, targets * 2])
