@@ -151,7 +151,6 @@ class EvaluateGeneration:
         Raises:
             ValueError, FileNotFoundError: people or checkpoint are missing, damaged or too few.
         """
-
         if self.count <= NEIGHBOURS:
             raise ValueError(
                 f"count is {self.count}: ask for more than {NEIGHBOURS} people, or nothing can be compared"
@@ -159,10 +158,11 @@ class EvaluateGeneration:
         train, held = stage_two.split_people(stage_two.find_people(self.people), self.holdout, self.seed)
         model = stage_two.load_model(self.checkpoint)
         if self.assets is None:
-            real = [payload_sources(paths, stage_two.read_person) for paths in (train, held)]
+            real = (payload_sources(train, stage_two.read_person), payload_sources(held, stage_two.read_person))
         else:
             assets = open_assets(self.assets)
-            real = [mesh_sources(assets, [read_seed(path) for path in paths], COLOURINGS) for paths in (train, held)]
+            trained_on, others = ([read_seed(path) for path in paths] for paths in (train, held))
+            real = (mesh_sources(assets, trained_on, COLOURINGS), mesh_sources(assets, others, COLOURINGS))
         with tqdm(unit="person", disable=None) as bar:
 
             def report(done: int, total: int) -> None:

@@ -77,9 +77,11 @@ def ssim(image: Float[Tensor, "*b H W 3"], target: Float[Tensor, "*b H W 3"]) ->
     height, width = image.shape[-3:-1]
     if min(height, width) < WINDOW:
         raise ValueError(f"images have {width} x {height} pixels: SSIM needs at least {WINDOW} x {WINDOW}")
-    pair = (picture.reshape(-1, height, width, 3).movedim(-1, 1) for picture in (image, target))
+    one, other = (picture.reshape(-1, height, width, 3).movedim(-1, 1) for picture in (image, target))
     # Its own mean takes windows across the border too, in mirrored images.
-    _, windows = structural_similarity_index_measure(*pair, data_range=1.0, reduction="none", return_full_image=True)
+    _, windows = structural_similarity_index_measure(
+        one, other, data_range=1.0, reduction="none", return_full_image=True
+    )
     inside = slice(WINDOW // 2, -(WINDOW // 2))
     return windows[..., inside, inside].mean((-3, -2, -1)).reshape(image.shape[:-3])
 

@@ -69,7 +69,7 @@ class TexturedPart:
 
 def vertex_normals(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V 3"]:
     """Area-weighted unit normals, outwards; zero where there are no faces, or only degenerate ones."""
-    return mean_vertex_normals(len(vertices), faces, cross(vertices[faces]))
+    return np.asarray(mean_vertex_normals(len(vertices), faces, cross(vertices[faces])))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
