@@ -113,7 +113,7 @@ def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, captures, tmp_p
 def test_a_warning_of_the_backend_is_shown(addon, captures):
     bpy.ops.primdiffusion.human_from_captures(directory=str(captures), views=1)
     assert len(humans(addon.scene)) == 1
-    assert "One view only." in " ".join(shown(PRIMDIFFUSION_PT_human_from_captures, addon))
+    assert "Only one view." in " ".join(shown(PRIMDIFFUSION_PT_human_from_captures, addon))
 
 
 def test_the_panel_shows_progress_and_cancel_ends_the_job_without_a_person(addon, captures):
