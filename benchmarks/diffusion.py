@@ -30,6 +30,7 @@ from diffusion_sets import (
     voxels,
 )
 from march import from_script
+from neighbours import nearest_stored
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.attribute_network import category, features_of
@@ -43,7 +44,6 @@ from primdiffusion.evaluation.generation import (
     real_vs_real,
     table,
 )
-from primdiffusion.evaluation.neighbours import nearest_stored
 from primdiffusion.evaluation.pretrained_networks import load_clip_vision, load_inception
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.primitives.primitives import Primitives

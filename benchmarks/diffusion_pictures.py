@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from diffusion import epoch, progress
 from diffusion_sets import gaussian, generated, placed, seeds_of, stored_voxels, voxels
+from neighbours import nearest_stored
 from PIL import Image, ImageDraw, ImageFont
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
@@ -25,7 +26,6 @@ from primdiffusion.evaluation.attribute_network import features_of
 from primdiffusion.evaluation.distances import nearest
 from primdiffusion.evaluation.gallery import made_gallery, payload_of, payload_sources
 from primdiffusion.evaluation.generation import ReferenceSet, open_reference_set
-from primdiffusion.evaluation.neighbours import nearest_stored
 from primdiffusion.evaluation.portraits import PORTRAITS, Portrait, camera_of
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import place

@@ -18,7 +18,6 @@ from primdiffusion.evaluation.gallery import (
     read_seed,
 )
 from primdiffusion.evaluation.generation import COLUMNS, compare, open_reference_set, real_vs_real, table
-from primdiffusion.evaluation.neighbours import nearest_stored
 from primdiffusion.evaluation.portraits import PORTRAITS, SIDE, camera_of
 from primdiffusion.people.assets import AssetsMissingError, open_assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
@@ -155,19 +154,6 @@ def test_table_has_a_row_for_each_set(reference):
     assert len({line.count("|") for line in lines}) == 1
     assert lines[0].count("|") == len(COLUMNS) + 2
     assert lines[2].startswith("| one | 4 |")
-
-
-def test_nearest_stored_person_of_a_stored_person_is_that_person(people):
-    paths, model = find_people(people), tiny_model()
-    queries = torch.stack([model.encode(payload_of(read_person(paths[number]), 1)).flatten() for number in (4, 2)])
-    found = nearest_stored(queries, paths, read_person, model.encode)
-    assert found.file.tolist() == [4, 2]
-    assert found.colouring.tolist() == [1, 1]
-    assert float(found.distance.max()) == pytest.approx(0, abs=1e-3)
-    without = nearest_stored(queries, [*paths[:2], paths[3], paths[5]], read_person, model.encode)
-    assert float(without.distance.min()) > 1e-3
-    with pytest.raises(ValueError, match="payload files"):
-        nearest_stored(queries, [], read_person, model.encode)
 
 
 def stage_two():

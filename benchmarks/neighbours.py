@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
-
 from primdiffusion.evaluation.gallery import ReadPerson, Report, payload_of, silent
 from primdiffusion.primitives.primitives import Payload
+from torch import Tensor
 
 Encode = Callable[[Payload], Tensor]
 """Encodes a payload as a clean latent: `DiffusionModel.encode`."""

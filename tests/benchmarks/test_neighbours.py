@@ -1,0 +1,28 @@
+"""Nearest stored samples in latent space."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from diffusion_people import write_people
+from primdiffusion.evaluation.gallery import payload_of
+from primdiffusion.training.stored_people import find_people, read_person
+from tiny_model import tiny_model
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from neighbours import nearest_stored
+
+
+def test_nearest_stored_person_of_a_stored_person_is_that_person(tmp_path):
+    write_people(tmp_path, 6)
+    paths, model = find_people(tmp_path), tiny_model()
+    queries = torch.stack([model.encode(payload_of(read_person(paths[number]), 1)).flatten() for number in (4, 2)])
+    found = nearest_stored(queries, paths, read_person, model.encode)
+    assert found.file.tolist() == [4, 2]
+    assert found.colouring.tolist() == [1, 1]
+    assert float(found.distance.max()) == pytest.approx(0, abs=1e-3)
+    without = nearest_stored(queries, [*paths[:2], paths[3], paths[5]], read_person, model.encode)
+    assert float(without.distance.min()) > 1e-3
+    with pytest.raises(ValueError, match="payload files"):
+        nearest_stored(queries, [], read_person, model.encode)
