@@ -108,7 +108,7 @@ def main() -> None:
             arguments.reference, progress("portraits"), epoch,
         )  # fmt: skip
         rows = comparisons(reference, model, assets, arguments)
-        figures |= attribute_hits(reference, model, 1 if arguments.quick else 6)
+        figures |= attribute_hits(reference, model, 1 if arguments.quick else arguments.hits)
     if arguments.people is not None:
         train, held = split_people(find_people(arguments.people), arguments.holdout, arguments.seed)
         figures |= photograph_figures(model, held, arguments)
@@ -137,6 +137,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--inception", type=Path, help="weights for FID: pt_inception-2015-12-05-6726825d.pth")
     parser.add_argument("--clip", type=Path, help="weights for FID_CLIP: ViT-B/32 as .safetensors")
     parser.add_argument("--count", type=int, default=256, help="samples of each set")
+    parser.add_argument("--hits", type=int, default=6, help="samples of each value of an attribute")
     parser.add_argument("--quick", action="store_true", help="16 samples of each set, no search among latents")
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--table", type=Path, help="markdown file for the table")

@@ -1,8 +1,8 @@
 """A feature space for humans: the features of a small network that predicts known attributes from portraits.
 
 Networks pretrained on photographs need weights that are not always available. This one is trained within minutes on the
-diffusion model's training set; sets are compared by the features it learns to classify outfit, hair, age or pattern. It
-also learns to tell how much a portrait was blurred: attributes alone show through any blur.
+diffusion model's training set; sets are compared by the features it learns to classify outfit, hair, age or pattern.
+Attributes show through any blur, so the energy of fine detail in each portrait is added to the learned features.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ POOLED = 3
 """Side of the last feature map after pooling."""
 SHIFT = 8
 """Largest random shift of portraits in training, pixels."""
-BLUR = (0.5, 4.0)
-"""Standard deviations, in pixels, of the Gaussian blur that half of the training portraits get."""
+BANDS = (1.0, 2.0, 4.0)
+"""Standard deviations, in pixels, of the Gaussians whose differences are bands of detail: finer than each."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,8 +81,13 @@ def attribute_space(attributes: Sequence[Mapping[str, Any]]) -> AttributeSpace:
 
 
 class AttributeNetwork(nn.Module):
-    """Convolutions on each portrait, a linear layer on all of them (the features), a linear head an attribute and one
-    for blur."""
+    """Convolutions on each portrait, a linear layer on all of them (the learned features), a linear head per attribute.
+
+    Learned features and detail have unit variance over the training set.
+    """
+
+    detail_mean: Tensor
+    detail_std: Tensor
 
     def __init__(self, space: AttributeSpace):
         super().__init__()
@@ -100,20 +105,49 @@ class AttributeNetwork(nn.Module):
         )
         sizes = {name: len(values) for name, values in space.categories.items()} | dict.fromkeys(space.scalars, 1)
         self.heads = nn.ModuleDict({name: nn.Linear(FEATURES, size) for name, size in sizes.items()})
-        self.blur = nn.Linear(FEATURES, 1)
+        self.register_buffer("detail_mean", torch.zeros(len(PORTRAITS) * len(BANDS)))
+        self.register_buffer("detail_std", torch.ones(len(PORTRAITS) * len(BANDS)))
 
-    def forward(self, pictures: UInt8[Tensor, "n v h w 4"] | Float[Tensor, "n v h w 4"]) -> Float[Tensor, "n 96"]:
-        """Features of portraits, of values 0 to 255."""
+    def forward(self, pictures: UInt8[Tensor, "n v h w 4"]) -> Float[Tensor, "n f"]:
+        """Features of portraits: the learned ones, then detail."""
+        detail = (detail_energies(pictures) - self.detail_mean) / self.detail_std
+        return torch.cat([self.learned(pictures), detail], dim=1)
+
+    def learned(self, pictures: UInt8[Tensor, "n v h w 4"]) -> Float[Tensor, "n 96"]:
+        """Learned features of portraits."""
         values = pictures.movedim(-1, -3).flatten(0, 1).float() / 255 - 0.25
         return self.features(self.trunk(values).unflatten(0, pictures.shape[:2]).flatten(1))
 
-    def predict(self, features: Float[Tensor, "n 96"]) -> dict[str, Tensor]:
-        """Logits of each category and standardised scalars."""
-        active = functional.relu(features)
+    def predict(self, features: Float[Tensor, "n f"]) -> dict[str, Tensor]:
+        """Logits of each category and standardised scalars, from the learned features."""
+        active = functional.relu(features[:, :FEATURES])
         return {name: head(active) for name, head in self.heads.items()}
 
 
-def features_of(network: AttributeNetwork, pictures: UInt8[Tensor, "n v h w 4"]) -> Float[Tensor, "n 96"]:
+def detail_energies(pictures: UInt8[Tensor, "n v h w 4"]) -> Float[Tensor, "n d"]:
+    """Logarithm of the energy of each band of detail inside each portrait's figure, away from its outline."""
+    rgba = pictures.flatten(0, 1).float() / 255
+    alpha = rgba[..., 3]
+    image = (rgba[..., :3].mean(-1) + 0.5 * (1 - alpha))[:, None]
+    energies, finer = [], image
+    for sigma in BANDS:
+        coarser = _blurred(image, sigma)
+        reach = 2 * round(3 * sigma) + 1
+        inside = -functional.max_pool2d(-alpha[:, None], reach, stride=1, padding=reach // 2) > 0.95
+        energy = ((finer - coarser).square() * inside).sum((1, 2, 3)) / inside.sum((1, 2, 3)).clamp_min(1)
+        energies.append((energy + 1e-7).log())
+        finer = coarser
+    return torch.stack(energies, dim=1).reshape(len(pictures), -1)
+
+
+def _blurred(images: Float[Tensor, "n 1 h w"], sigma: float) -> Float[Tensor, "n 1 h w"]:
+    offset = torch.arange(-round(3 * sigma), round(3 * sigma) + 1)
+    kernel = torch.exp(-0.5 * (offset / sigma) ** 2)
+    kernel = (kernel / kernel.sum()).reshape(1, 1, 1, -1)
+    return functional.conv2d(functional.conv2d(images, kernel, padding="same"), kernel.mT, padding="same")
+
+
+def features_of(network: AttributeNetwork, pictures: UInt8[Tensor, "n v h w 4"]) -> Float[Tensor, "n f"]:
     """Features of any number of samples, computed in batches without gradients."""
     with torch.inference_mode():
         return torch.cat([network(part) for part in pictures.split(64)]).clone()
@@ -142,17 +176,16 @@ def fit_attribute_network(
         for epoch in range(epochs):
             losses = []
             for chosen in torch.randperm(len(attributes), generator=generator).split(batch):
-                seen, blur = _blurred(_shifted(pictures[chosen], generator), generator)
-                features = network(seen)
-                predicted = network.predict(features)
+                predicted = network.predict(network.learned(_shifted(pictures[chosen], generator)))
                 loss = _loss(predicted, {name: values[chosen] for name, values in labels.items()}, space)
-                loss = loss + (network.blur(functional.relu(features))[:, 0] - blur).square().mean()
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
                 scheduler.step()
                 losses.append(float(loss.detach()))
             report(epoch + 1, sum(losses) / len(losses))
+    detail = torch.cat([detail_energies(part) for part in pictures.split(64)])
+    network.detail_mean, network.detail_std = detail.mean(0), detail.std(0, correction=0).clamp_min(0.05)
     return network.eval().requires_grad_(False)
 
 
@@ -162,23 +195,6 @@ def _shifted(pictures: Tensor, generator: torch.Generator) -> Tensor:
     padded = functional.pad(pictures, (0, 0, SHIFT, SHIFT, SHIFT, SHIFT))
     height, width = pictures.shape[2:4]
     return padded[:, :, SHIFT - down : SHIFT - down + height, SHIFT - right : SHIFT - right + width]
-
-
-def _blurred(pictures: Tensor, generator: torch.Generator) -> tuple[Float[Tensor, "n v h w 4"], Float[Tensor, "n"]]:
-    """Blur the first half of a batch by one random Gaussian; also each sample's standard deviation, pixels."""
-    half = len(pictures) // 2
-    sigma = BLUR[0] + (BLUR[1] - BLUR[0]) * float(torch.rand((), generator=generator))
-    offset = torch.arange(-round(3 * sigma), round(3 * sigma) + 1)
-    kernel = torch.exp(-0.5 * (offset / sigma) ** 2)
-    kernel = (kernel / kernel.sum()).expand(4, 1, 1, -1)
-    seen = pictures.float()
-    planes = seen[:half].movedim(-1, -3).flatten(0, 1)
-    planes = functional.conv2d(planes, kernel, padding="same", groups=4)
-    planes = functional.conv2d(planes, kernel.mT, padding="same", groups=4)
-    seen[:half] = planes.unflatten(0, (half, -1)).movedim(-3, -1)
-    blur = torch.zeros(len(pictures))
-    blur[:half] = sigma
-    return seen, blur
 
 
 def _loss(predicted: Mapping[str, Tensor], labels: Mapping[str, Tensor], space: AttributeSpace) -> Tensor:
@@ -195,7 +211,7 @@ def _loss(predicted: Mapping[str, Tensor], labels: Mapping[str, Tensor], space: 
 
 
 def accuracies(
-    network: AttributeNetwork, features: Float[Tensor, "n 96"], attributes: Sequence[Mapping[str, Any]]
+    network: AttributeNetwork, features: Float[Tensor, "n f"], attributes: Sequence[Mapping[str, Any]]
 ) -> dict[str, float]:
     """Accuracy for each category, R^2 about the training mean for each scalar."""
     labels = network.space.labels(attributes)
@@ -213,7 +229,8 @@ def accuracies(
 
 def save_attribute_network(path: Path, network: AttributeNetwork) -> None:
     """Write the network in half precision, atomically."""
-    tensors = {k: v.half() if v.is_floating_point() else v for k, v in network.state_dict().items()}
+    halved = {k for k, v in network.state_dict().items() if v.is_floating_point() and not k.startswith("detail_")}
+    tensors = {k: v.half() if k in halved else v for k, v in network.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as unfinished:
         unfinished.write_bytes(save(tensors, metadata={"answers": json.dumps(dataclasses.asdict(network.space))}))

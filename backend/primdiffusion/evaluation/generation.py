@@ -36,8 +36,8 @@ class ReferenceSet:
     network: AttributeNetwork
     train: Gallery
     held: Gallery
-    train_features: Float[Tensor, "n 96"]
-    held_features: Float[Tensor, "m 96"]
+    train_features: Float[Tensor, "n f"]
+    held_features: Float[Tensor, "m f"]
 
     @property
     def held_accuracies(self) -> dict[str, float]:
@@ -79,7 +79,7 @@ class Comparison:
     """Median distance to the nearest training sample, divided by that of held-out samples: 1 means no copying."""
 
 
-def compare(reference: ReferenceSet, made: Float[Tensor, "n 96"]) -> Comparison:
+def compare(reference: ReferenceSet, made: Float[Tensor, "n f"]) -> Comparison:
     """Compare features of generated samples with the held-out and training sets."""
     held = reference.held_features
     to_train = [nearest(features, reference.train_features).distance.median() for features in (made, held)]
