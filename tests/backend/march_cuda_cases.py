@@ -314,14 +314,14 @@ def test_voxels_without_density_receive_the_gradient_of_their_limit():
 
 
 @pytest.mark.parametrize("name", ["position", "rotation", "half_extent", "rgb", "density"])
-def test_nan_is_refused_by_name(name):
+def test_nan_is_rejected_by_name(name):
     boxes = random_boxes(2)
     getattr(boxes, name).view(-1)[-1] = torch.nan
     with pytest.raises(ValueError, match=rf"primitives\.{name} holds NaN"):
         draw(boxes, camera_at((0.0, 0.0, 0.5)))
 
 
-def test_bad_scenes_are_refused_as_check_scene_does():
+def test_bad_scenes_are_rejected_as_check_scene_does():
     boxes, camera = random_boxes(2), camera_at((0.0, 0.0, 0.5))
     with pytest.raises(ValueError, match="smallest density is -1"):
         draw(dataclasses.replace(boxes, density=boxes.density * 0 - 1), camera)

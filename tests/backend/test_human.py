@@ -87,7 +87,7 @@ def test_an_exception_of_the_watcher_ends_the_sampling():
 
 
 @pytest.mark.parametrize("wrong", [{"seed": -1}, {"steps": 0}, {"steps": 1001}, {"sampler": "magic"}])
-def test_settings_out_of_range_are_refused(wrong):
+def test_settings_out_of_range_are_rejected(wrong):
     with pytest.raises(ValueError, match="|".join(str(value) for value in wrong.values())):
         generate(tiny_model(), **{"seed": 1, **wrong})
 
@@ -127,7 +127,7 @@ def test_moving_the_body_moves_the_primitives_rigidly(human):
     assert torch.allclose(moved.rotation, rest.rotation, atol=1e-4)
 
 
-def test_a_body_without_its_anchors_is_refused(human):
+def test_a_body_without_its_anchors_is_rejected(human):
     with pytest.raises(ValueError, match="anchors"):
         place(human, body=default_body())
 

@@ -86,7 +86,7 @@ def damage(path, human, how):
         ("giant", "largest beta is 6"),
     ],
 )
-def test_a_damaged_file_is_refused_by_name_with_its_damage(human, tmp_path, how, told):
+def test_a_damaged_file_is_rejected_by_name_with_its_damage(human, tmp_path, how, told):
     path = tmp_path / "bad.human.safetensors"
     damage(path, human, how)
     with pytest.raises(HumanFileError, match=r"bad\.human\.safetensors") as error:
@@ -99,7 +99,7 @@ def test_a_damaged_file_is_refused_by_name_with_its_damage(human, tmp_path, how,
     ("version", "told"),
     [("3", "newer PrimDiffusion"), ("10", "newer PrimDiffusion"), ("one", "format version 'one'"), ("0", "'0'")],
 )
-def test_a_file_of_another_version_is_refused_with_what_to_do(human, tmp_path, version, told):
+def test_a_file_of_another_version_is_rejected_with_what_to_do(human, tmp_path, version, told):
     path = tmp_path / "other.human.safetensors"
     save_human(path, human)
     safetensors.torch.save_file(safetensors.torch.load_file(path), path, {**META, "format_version": version})
@@ -107,7 +107,7 @@ def test_a_file_of_another_version_is_refused_with_what_to_do(human, tmp_path, v
         load_human(path)
 
 
-def test_a_newer_file_is_refused_for_its_version_even_where_its_tensors_are_others(human, tmp_path):
+def test_a_newer_file_is_rejected_for_its_version_even_where_its_tensors_are_others(human, tmp_path):
     path = tmp_path / "newer.human.safetensors"
     safetensors.torch.save_file({"latents": torch.zeros(3)}, path, {**META, "format_version": "3"})
     with pytest.raises(HumanFileError, match="newer PrimDiffusion"):
@@ -139,7 +139,7 @@ def test_a_file_of_the_first_release_is_read(human, tmp_path):
         ('{"edits": [{"amount": 0.5}]}', "'edits'"),
     ],
 )
-def test_a_provenance_of_the_wrong_kind_is_refused_by_its_entry(human, tmp_path, provenance, told):
+def test_a_provenance_of_the_wrong_kind_is_rejected_by_its_entry(human, tmp_path, provenance, told):
     path = tmp_path / "odd.human.safetensors"
     save_human(path, human)
     safetensors.torch.save_file(safetensors.torch.load_file(path), path, {**META, "provenance": provenance})
@@ -149,7 +149,7 @@ def test_a_provenance_of_the_wrong_kind_is_refused_by_its_entry(human, tmp_path,
     assert len(str(error.value)) < 300 + len(str(tmp_path))
 
 
-def test_entries_of_the_provenance_that_nobody_knows_are_kept(human, tmp_path):
+def test_unknown_entries_of_the_provenance_are_saved(human, tmp_path):
     path = tmp_path / "person.human.safetensors"
     more = {**human.provenance, "studio": {"shot": [1, None]}, "edits": [{"edit": "vary", "amount": 0.5}]}
     save_human(path, dataclasses.replace(human, provenance=more))

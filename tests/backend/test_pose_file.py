@@ -39,7 +39,7 @@ def test_a_frame_of_an_amass_file_is_read_without_its_hands(tmp_path):
     assert_same(read_pose(path, frame=4), np.pad(THETA[:66], (0, 6)), translation=(0.1, 0.2, 0.3))
 
 
-def test_an_npz_that_would_run_code_is_refused(tmp_path):
+def test_an_npz_that_would_run_code_is_rejected(tmp_path):
     class Trap:
         def __reduce__(self):
             return (open, (str(tmp_path / "trapped"), "w"))
@@ -54,7 +54,7 @@ def test_an_npz_that_would_run_code_is_refused(tmp_path):
 @pytest.mark.parametrize(
     "content", [[1, 2, 3], {"theta": None}, {"pose": "up"}, {}, [[0, 0, 0]] * 23, [math.nan] * 72, None, {"pose": []}]
 )
-def test_numbers_that_are_no_pose_are_refused_by_name(content):
+def test_numbers_that_are_no_pose_are_rejected_by_name(content):
     with pytest.raises(InvalidPoseError, match=r"my pose"):
         pose_from_numbers(content, "my pose")
 

@@ -77,7 +77,7 @@ def test_reshaping_twice_is_reshaping_once_and_back_again_is_nothing(human):
     assert torch.allclose(back.payload.delta_scale, human.payload.delta_scale, rtol=1e-5)
 
 
-def test_another_number_of_betas_and_nan_are_refused(human):
+def test_another_number_of_betas_and_nan_are_rejected(human):
     with pytest.raises(ValueError, match="3 betas for a body with 10"):
         reshaped(human, torch.zeros(3))
     with pytest.raises(ValueError, match="finite"):

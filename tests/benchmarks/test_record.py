@@ -26,7 +26,7 @@ def test_a_record_holds_the_figures_and_where_they_come_from(tmp_path):
 
 
 @pytest.mark.parametrize("figures", [{"seconds": float("nan")}, {"seconds": float("inf")}, {"device": 3}])
-def test_a_figure_that_is_none_is_refused_by_name(tmp_path, figures):
+def test_a_figure_that_is_none_is_rejected_by_name(tmp_path, figures):
     with pytest.raises(ValueError, match=next(iter(figures))):
         record.write_record(tmp_path / "f.json", figures)
     assert list(tmp_path.iterdir()) == []

@@ -121,7 +121,7 @@ def codec() -> VoxelCodec:
     return fit_voxel_codec(lambda: people(6), 16)
 
 
-def test_codec_keeps_the_cells_where_somebody_is_and_their_mirror_images(codec):
+def test_codec_keeps_occupied_cells_and_their_mirror_images(codec):
     assert torch.equal(codec.mirrored[codec.mirrored], torch.arange(len(codec.cells)))
     z, x = codec.cells // BLOCKS**2, codec.cells % BLOCKS
     assert (int(z.min()), int(z.max())) == (5, 9)

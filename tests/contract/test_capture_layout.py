@@ -76,7 +76,7 @@ def test_a_camera_straight_above_is_possible():
 
 
 @pytest.mark.parametrize("wrong", [{"count": 0}, {"vertical_fov": 0.0}, {"width": 0}, {"elevations": (90.0,)}])
-def test_impossible_rigs_are_refused(wrong):
+def test_impossible_rigs_are_rejected(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         camera_rig.Rig(**wrong)
 

@@ -103,7 +103,7 @@ def test_a_request_cancelled_before_the_child_is_up_is_cancelled(checkpoint, tmp
     backend.shutdown()
 
 
-def test_the_second_of_two_clicks_is_refused_with_a_sentence_and_the_first_goes_on(start):
+def test_the_second_of_two_clicks_is_rejected_with_a_sentence_and_the_first_goes_on(start):
     first, second = start(3), start(3, "second")
     assert second.state == "failed"
     assert second.error.kind == "busy"
@@ -131,7 +131,7 @@ def test_a_killed_child_fails_the_request_leaves_nothing_and_the_next_request_wo
         ({"steps": 0}, "", "0 steps"),
     ],
 )
-def test_a_refusal_of_the_backend_becomes_the_requests_error(start, settings, kind, named):
+def test_a_error_of_the_backend_becomes_the_requests_error(start, settings, kind, named):
     request = start(**{"steps": 1, **settings})
     assert follow(request)[-1] == "failed"
     assert request.error.kind == kind

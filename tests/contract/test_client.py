@@ -187,7 +187,7 @@ def test_heartbeats_are_no_events_but_end_the_silence(fake_child):
         time.sleep(0.05)
 
 
-def test_time_in_which_nobody_polled_is_no_silence_of_the_child(fake_child):
+def test_time_without_polls_is_no_silence_of_the_child(fake_child):
     client = fake_child("time.sleep(60)", silence_s=1.5)
     client.poll()
     time.sleep(2.0)  # a suspended laptop, a modal dialogue of the system

@@ -169,7 +169,7 @@ def test_a_cancel_ends_an_edit_within_a_step_and_leaves_nothing(child, people, a
         ("transfer", {"source": "/nobody.human.safetensors"}, DOMAIN_ERROR, "missing_file", "there is no human file"),
     ],
 )
-def test_a_refusal_names_what_was_wrong_and_leaves_nothing(child, people, asked, method, wrong, code, kind, told):
+def test_a_error_names_what_was_wrong_and_leaves_nothing(child, people, asked, method, wrong, code, kind, told):
     error = child.ask(10, method, **{**asked, **parameters(method, people), **wrong})["error"]
     assert error["code"] == code
     assert told in error["message"]
@@ -183,7 +183,7 @@ def test_a_missing_parameter_is_named(child, people):
     assert (error["code"], "'other'" in error["message"]) == (INVALID_PARAMS, True)
 
 
-def test_painted_weights_of_another_body_are_refused(child, asked, tmp_path):
+def test_painted_weights_of_another_body_are_rejected(child, asked, tmp_path):
     np.savez(tmp_path / "smpl.npz", weights=np.ones(6890))
     error = child.ask(12, "inpaint", **asked, region={"weights": str(tmp_path / "smpl.npz")})["error"]
     assert "12196 vertices" in error["message"]

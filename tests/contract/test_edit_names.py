@@ -36,7 +36,7 @@ DAMAGED = [b"", b"PK\x03\x04", b"\xff" * 64, b"\x02" + bytes(7) + b"{}", b"\x09"
 
 
 @pytest.mark.parametrize("contents", DAMAGED)
-def test_a_file_that_is_no_checkpoint_is_refused_with_its_path(tmp_path, contents):
+def test_a_file_that_is_no_checkpoint_is_rejected_with_its_path(tmp_path, contents):
     path = tmp_path / "broken.safetensors"
     path.write_bytes(contents)
     with pytest.raises(ValueError, match=r"broken\.safetensors is damaged or no checkpoint"):

@@ -74,7 +74,7 @@ def test_a_cancelled_edit_leaves_nothing(backend, people, checkpoint, tmp_path):
     ("changes", "named"),
     [({"person": "nobody.human.safetensors"}, "nobody"), ({"amount": 2.0}, "amount is 2"), ({"seed": -1}, "seed -1")],
 )
-def test_what_the_child_refuses_becomes_the_requests_error(backend, people, checkpoint, tmp_path, changes, named):
+def test_what_the_child_rejects_becomes_the_requests_error(backend, people, checkpoint, tmp_path, changes, named):
     wanted = {**PARAMS["vary"], **changes}
     person = Path(wanted.pop("person", people[0]))
     request = edit_request(backend, "vary", person, **wanted, out_dir=tmp_path / "out", steps=2, checkpoint=checkpoint)

@@ -92,7 +92,7 @@ def test_a_broken_environment_of_the_extension_is_passed_over(bundled, tmp_path)
     assert run_to_end(search(own_environment=tmp_path, module_path=bundled)).path == PYTHON
 
 
-def test_an_old_python_is_told_so():
+def test_an_old_python_is_reported():
     old = "import sys; sys.version_info = (3, 9); "
     done = subprocess.run([sys.executable, "-c", old + TRIAL], capture_output=True, text=True, check=False)
     assert done.returncode == 1

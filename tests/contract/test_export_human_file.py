@@ -50,7 +50,7 @@ def test_a_reshaped_person_in_a_file_is_the_backends_reshaped_person(saved, tmp_
     assert wanted.payload.delta_scale.max() > 1.05 * person().payload.delta_scale.max()
 
 
-def test_boxes_of_another_body_are_refused(saved):
+def test_boxes_of_another_body_are_rejected(saved):
     with pytest.raises(ValueError, match=r"not F32\[5, 3\]; choose a .human file"):
         reshaped(read_tensors(saved), np.zeros(10), np.ones((5, 3)))
 
@@ -66,7 +66,7 @@ def test_a_motion_comes_back_as_it_was_and_can_be_taken_away(saved, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["fps", "order", "shape"])
-def test_a_damaged_motion_is_refused_with_a_sentence(saved, damage):
+def test_a_damaged_motion_is_rejected_with_a_sentence(saved, damage):
     motion = walk()
     if damage == "order":
         motion = HumanMotion(motion.frames[::-1].copy(), motion.rotations, motion.translations, 24.0)
@@ -80,7 +80,7 @@ def test_a_damaged_motion_is_refused_with_a_sentence(saved, damage):
 
 
 @pytest.mark.parametrize("data", [b"", b"\xff" * 40, b"\x02\0\0\0\0\0\0\0[]", b"\x02\0\0\0\0\0\0\0{}"])
-def test_what_is_no_person_is_refused_with_a_sentence(tmp_path, data):
+def test_what_is_no_person_is_rejected_with_a_sentence(tmp_path, data):
     path = tmp_path / "x.human"
     path.write_bytes(data)
     with pytest.raises(ValueError, match="no human"):

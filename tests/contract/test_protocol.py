@@ -134,7 +134,7 @@ def test_notifications_and_blank_lines_are_not_answered(child):
     assert child.until(lambda m: "method" not in m)["id"] == 60
 
 
-def test_a_second_generate_is_refused_while_one_runs_and_cancel_stops_the_first_within_a_step(
+def test_a_second_generate_is_rejected_while_one_runs_and_cancel_stops_the_first_within_a_step(
     child, checkpoint, tmp_path
 ):
     first, second = tmp_path / "first", tmp_path / "second"
@@ -206,7 +206,7 @@ def test_a_bad_checkpoint_is_one_sentence_and_leaves_no_folder(child, checkpoint
     assert not out.exists()
 
 
-def test_a_folder_that_cannot_be_written_to_is_refused_before_any_step(child, checkpoint, tmp_path):
+def test_a_folder_that_cannot_be_written_to_is_rejected_before_any_step(child, checkpoint, tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("no folder")
     for id, out in ((110, blocked), (111, blocked / "below")):
@@ -234,7 +234,7 @@ def test_the_child_ends_within_a_step_and_tidies_up_when_its_parent_goes_while_i
     assert not out.exists()
 
 
-def test_the_child_ends_when_nobody_reads_its_output(tmp_path):
+def test_the_child_ends_when_its_output_is_not_read(tmp_path):
     process = subprocess.Popen([sys.executable, "-m", "primdiffusion.serve"], stdin=-1, stdout=-1, stderr=-1)
     process.stdout.close()
     assert process.wait(10) == 0

@@ -59,7 +59,7 @@ def test_an_apple_computer_takes_its_own_packages():
         (LINUX, "apple", BOTH, "there are no packages for Apple Silicon here, but for CPU, NVIDIA"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_sentence(machine, wish, available, said):
+def test_what_cannot_be_is_rejected_in_a_sentence(machine, wish, available, said):
     with pytest.raises(ValueError, match=said):
         chosen_compute(machine, wish, available)
 

@@ -31,7 +31,7 @@ def test_variations_name_each_picture_as_it_appears_and_whom_it_shows(child, che
     assert len(list(out.iterdir())) == 6
 
 
-def test_wrong_seeds_are_refused_in_a_sentence(child, tmp_path):
+def test_wrong_seeds_are_rejected_in_a_sentence(child, tmp_path):
     error = child.ask(2, "variations", seeds=[1, 1], out_dir=str(tmp_path))["error"]
     assert error["code"] == -32602
     assert "two of the seeds are equal" in error["message"]

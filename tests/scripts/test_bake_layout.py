@@ -165,7 +165,7 @@ def test_the_charts_tile_the_grid():
     assert (chart_of_cells() >= 0).all()
 
 
-def test_a_lopsided_body_is_refused():
+def test_a_lopsided_body_is_rejected():
     with pytest.raises(ValueError, match="mirror image"):
         mirror_vertices(np.array([[0.1, 0, 0], [-0.2, 0, 0]]))
 

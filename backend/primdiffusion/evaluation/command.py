@@ -80,7 +80,7 @@ class EvaluateReconstruction:
         """
 
         if self.people < 0:
-            raise ValueError(f"people is {self.people}: ask for one or more, or 0 for everybody")
+            raise ValueError(f"people is {self.people}: choose 1 or more, or 0 for all")
         captures = open_captures(self.captures)
         names = captures.subjects[: self.people or None]
         settings = EvaluationSettings(names, given_views=self.views, given_frame=self.frame, size=self.size)

@@ -126,7 +126,7 @@ def test_a_mask_of_another_size_is_named(folder):
         captured_person(folder, FIRST)
 
 
-def test_masks_without_anybody_are_rejected(folder):
+def test_empty_masks_are_rejected(folder):
     for camera in range(4):
         Image.new("L", (32, 32), 0).save(picture_path(folder / FIRST, "mask", camera, 0))
     with pytest.raises(ConditioningError, match="shows a person"):

@@ -63,7 +63,7 @@ def test_conditioning_views_show_the_near_t_pose_by_default(captures):
     assert all(torch.equal(sample.conditioning.pose.joint_rotation, near_t.joint_rotation) for sample in samples)
 
 
-def test_an_epoch_shows_every_pose_of_everybody_once_in_an_order_of_its_own(captures):
+def test_an_epoch_has_every_pose_of_every_human_once_in_its_own_order(captures):
     dataset = CaptureDataset(captures, SETTINGS)
     epochs = [[(int(s.subject), int(s.frame)) for s in (dataset[e, i] for i in range(len(dataset)))] for e in (0, 1)]
     assert sorted(epochs[0]) == sorted(epochs[1]) == list(itertools.product(range(3), range(3)))

@@ -137,7 +137,7 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(line, tmp_path, capsys
     assert not (tmp_path / "out").exists()
 
 
-def test_paint_of_another_body_is_refused_with_the_number_of_vertices(line, folder, tmp_path, capsys):
+def test_paint_of_another_body_is_rejected_with_the_number_of_vertices(line, folder, tmp_path, capsys):
     np.savez(folder / "other_body.npz", weights=np.ones(6890, np.float32))
     with pytest.raises(SystemExit):
         cli.main(line("inpaint", "--weights", "other_body.npz"))

@@ -51,7 +51,7 @@ def test_a_posed_person_becomes_gaussians(saved):
         (["--out", "nowhere/anna.glb"], "there is no folder"),
     ],
 )
-def test_what_cannot_be_exported_is_refused_before_any_work(saved, monkeypatch, more, sentence):
+def test_what_cannot_be_exported_is_rejected_before_any_work(saved, monkeypatch, more, sentence):
     monkeypatch.chdir(saved.parent)
     with pytest.raises((ValueError, FileNotFoundError), match=sentence):
         cli.run(["export", str(saved), *more])
@@ -106,12 +106,12 @@ def test_a_cancelled_proxy_leaves_nothing(saved, tmp_path):
         (HumanNpzRequest, {"person": "p", "out_dir": "x", "size": 0}),
     ],
 )
-def test_impossible_parameters_are_refused(kind, wrong):
+def test_impossible_parameters_are_rejected(kind, wrong):
     with pytest.raises(ValueError):
         read_request(kind, wrong, "export")
 
 
-def test_betas_of_another_body_are_refused(saved, tmp_path):
+def test_betas_of_another_body_are_rejected(saved, tmp_path):
     request = ProxyRequest(person=saved, out_dir=tmp_path / "out", betas=[0.0] * 3)
     with pytest.raises(ValueError, match="3 betas"):
         request.run(Session(), silent)

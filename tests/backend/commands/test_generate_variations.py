@@ -138,6 +138,6 @@ def test_a_person_that_is_not_there_is_named(checkpoint, tmp_path):
         ({"guidance": float("nan")}, "guidance is nan"),
     ],
 )
-def test_what_cannot_be_is_refused_before_any_work(changes, sentence):
+def test_what_cannot_be_is_rejected_before_any_work(changes, sentence):
     with pytest.raises(ValueError, match=sentence):
         read_request(VariationsRequest, {"seeds": [1], "out_dir": "out", **changes}, "variations")

@@ -170,7 +170,7 @@ def test_a_person_is_drawn_from_both_sides_in_halves_of_a_square(checkpoint, tmp
 
 
 @pytest.mark.parametrize("px", [-1, 1025])
-def test_sizes_out_of_range_are_refused(tmp_path, px):
+def test_sizes_out_of_range_are_rejected(tmp_path, px):
     with pytest.raises(ValueError, match=f"picture_px is {px}: choose 0, for no previews, to 1024"):
         GenerateRequest(seed=1, out_dir=tmp_path, picture_px=px).check()
     with pytest.raises(ValueError, match=f"picture_px is {px}"):

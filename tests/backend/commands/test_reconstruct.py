@@ -122,7 +122,7 @@ def test_a_dataset_in_the_released_layout_gives_the_same_person(dataset, line, t
     assert torch.equal(ours.payload.rgb, theirs.payload.rgb)
 
 
-def test_one_view_works_and_the_user_is_told_that_the_rest_is_guessed(dataset, line, tmp_path, capsys):
+def test_one_view_works_with_a_warning_that_the_rest_is_guessed(dataset, line, tmp_path, capsys):
     cli.main([*line, "--capture", str(dataset / FIRST), "--views", "1"])
     told = "primdiffusion: warning: only one view: the sides that it does not show are guessed\n"
     assert capsys.readouterr().err == told
@@ -227,6 +227,6 @@ def test_the_request_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypa
 
 
 @pytest.mark.parametrize("wrong", [{"frame": -1}, {"views": 0}, {"size": 0}, {"capture": ""}, {"out_dir": ""}])
-def test_impossible_parameters_are_refused(wrong):
+def test_impossible_parameters_are_rejected(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         read_request(ReconstructRequest, {"capture": "captures", "out_dir": "out", **wrong}, "reconstruct")

@@ -100,20 +100,20 @@ def test_a_missing_file_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("keep", [0, 6, 500, 0.5, 0.999])
-def test_a_truncated_file_is_refused(path, keep):
+def test_a_truncated_file_is_rejected(path, keep):
     content = path.read_bytes()
     path.write_bytes(content[: keep if isinstance(keep, int) else int(keep * len(content))])
     with pytest.raises(CheckpointError, match="truncated"):
         load_checkpoint(path)
 
 
-def test_a_file_of_another_kind_is_refused(path):
+def test_a_file_of_another_kind_is_rejected(path):
     rewrite(path, change_metadata=lambda m: {"format": "pt"})
     with pytest.raises(CheckpointError, match="'pt'"):
         load_checkpoint(path)
 
 
-def test_another_version_is_refused(path):
+def test_another_version_is_rejected(path):
     rewrite(path, change_metadata=lambda m: m | {"format_version": "99"})
     with pytest.raises(CheckpointError, match="version 99"):
         load_checkpoint(path)
@@ -134,7 +134,7 @@ def test_weights_that_are_not_numbers_are_named(path):
         lambda t: t | {"denoiser.prior_surplus": torch.zeros(1)},
     ],
 )
-def test_weights_that_do_not_fit_are_refused(path, damage):
+def test_weights_that_do_not_fit_are_rejected(path, damage):
     rewrite(path, damage)
     with pytest.raises(CheckpointError, match="does not match its own description"):
         load_checkpoint(path)

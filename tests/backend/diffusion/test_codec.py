@@ -128,6 +128,6 @@ def test_decoded_payloads_are_clamped_and_their_haze_removed():
     assert payload_from_cells(-cells, 100.0).delta_scale.min() == 0
 
 
-def test_too_few_people_are_refused(cells):
+def test_too_few_people_are_rejected(cells):
     with pytest.raises(ValueError, match="components"):
         fit_codec(cells[:0], channels=16, generator=torch.Generator())

@@ -98,7 +98,7 @@ def test_draws_are_of_the_kind_that_is_asked_for(prior):
     assert torch.allclose(c.mean(0), torch.einsum("gm,gmr->r", share, prior.centre), atol=0.05)
 
 
-def test_a_kind_that_nobody_has_is_not_held_against_anybody(prior):
+def test_an_unknown_kind_excludes_no_part(prior):
     nobody = type(prior)(**{**vars(prior), "kind": torch.zeros_like(prior.kind)})
     asked = torch.eye(3, dtype=F64)[:1]
     assert torch.equal(nobody.log_weights(asked)[0], nobody.log_weight)

@@ -93,7 +93,7 @@ def test_wrong_settings_are_named(model, settings, word):
 
 
 @pytest.mark.parametrize("seed", [-1, 2**63])
-def test_seeds_out_of_range_are_refused(model, seed):
+def test_seeds_out_of_range_are_rejected(model, seed):
     with pytest.raises(ValueError, match="seed"):
         sample(model, [seed])
 
@@ -104,7 +104,7 @@ def test_people_are_the_same_in_any_company(model, sampler):
     assert torch.allclose(together[1:2], result(model, [6], 4, sampler), atol=1e-4)
 
 
-def test_guidance_goes_on_from_anybody_past_the_one_asked_for(model):
+def test_guidance_extrapolates_from_unconditional_to_conditional(model):
     x, condition = torch.randn(2, 4, GRID, GRID), model.condition({"outfit": "suit"})
     anybody, asked, guided = (
         model.denoise(x, 600),

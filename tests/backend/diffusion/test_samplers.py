@@ -168,7 +168,7 @@ def test_steps_count_up_go_down_and_end_clean(sampler):
 
 @every_sampler
 @pytest.mark.parametrize("chain", [[10, 20], [10, 10], [5, CLEAN, 3]])
-def test_steps_that_do_not_go_down_are_refused(sampler, chain):
+def test_steps_that_do_not_go_down_are_rejected(sampler, chain):
     with pytest.raises(ValueError, match=r"goes from t to an earlier"):
         list(sampler(of_mixture(linear()), linear(), start(), chain, torch.Generator()))
 
@@ -219,7 +219,7 @@ def test_one_generator_draws_a_whole_batch_at_once():
     assert torch.equal(gaussian_noise(torch.zeros(3, 4), torch.Generator().manual_seed(1)), expected)
 
 
-def test_too_few_generators_are_refused():
+def test_too_few_generators_are_rejected():
     with pytest.raises(ValueError, match=r"3 samples.*2"):
         gaussian_noise(torch.zeros(3, 4), seeded(1, 2))
 

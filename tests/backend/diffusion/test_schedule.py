@@ -91,14 +91,14 @@ def test_the_fine_schedule_ends_as_the_paper_s_and_begins_with_less_noise():
 
 
 @pytest.mark.parametrize("steps", [0, 1001, -3])
-def test_impossible_numbers_of_steps_are_refused(steps):
+def test_impossible_numbers_of_steps_are_rejected(steps):
     with pytest.raises(ValueError, match=str(steps)):
         trailing_steps(1000, steps)
     with pytest.raises(ValueError, match=str(steps)):
         dense_steps(1000, steps)
 
 
-def test_steps_forward_and_noise_of_a_clean_sample_are_refused():
+def test_steps_forward_and_noise_of_a_clean_sample_are_rejected():
     with pytest.raises(ValueError, match="t_prev=5"):
         linear().posterior_std(5, 5)
     with pytest.raises(ValueError, match="t_prev=7"):
@@ -121,6 +121,6 @@ def test_half_log_snr_without_a_signal_is_minus_infinite():
     assert Schedule(torch.tensor([0.5, 0.0], dtype=torch.float64)).half_log_snr(1) == -math.inf
 
 
-def test_betas_outside_their_range_are_refused():
+def test_betas_outside_their_range_are_rejected():
     with pytest.raises(ValueError, match="beta"):
         linear(last=1.5)

@@ -124,7 +124,7 @@ def test_edits_go_down_from_the_level_of_their_amount():
     ],
 )
 @pytest.mark.parametrize("name", EDITS)
-def test_steps_and_seeds_out_of_range_are_refused_before_any_work(human, name, wrong, fact):
+def test_steps_and_seeds_out_of_range_are_rejected_before_any_work(human, name, wrong, fact):
     with pytest.raises(ValueError, match=fact):
         EDITS[name](model_that_must_not_work(), human, **wrong)
 
@@ -188,7 +188,7 @@ def test_a_person_of_another_density_scale_stays_as_dense(human):
 
 
 @pytest.mark.parametrize("density", [0.0, -3.0, "solid", float("nan"), True])
-def test_a_density_scale_that_is_none_is_refused(human, density):
+def test_a_density_scale_that_is_none_is_rejected(human, density):
     odd = dataclasses.replace(human, provenance={"full_density": density})
     with pytest.raises(ValueError, match="full_density"):
         vary(small_model(), odd)
@@ -296,7 +296,7 @@ def test_the_arc_keeps_the_distance_from_the_middle():
     ("wrong", "fact"),
     [({"fraction": 1.5}, "fraction is 1.5"), ({"steps": 1}, "2 to 1000"), ({"steps": 1001}, "2 to 1000")],
 )
-def test_an_interpolation_out_of_range_is_refused(human, other, wrong, fact):
+def test_an_interpolation_out_of_range_is_rejected(human, other, wrong, fact):
     with pytest.raises(ValueError, match=fact):
         interpolate(model_that_must_not_work(), human, other, **wrong)
 

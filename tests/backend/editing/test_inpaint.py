@@ -20,7 +20,7 @@ def test_the_path_goes_down_with_every_stretch_sampled_again():
 
 
 @pytest.mark.parametrize(("jump", "resamples"), [(0, 2), (2, 0)])
-def test_a_path_of_no_steps_is_refused(jump, resamples):
+def test_a_path_of_no_steps_is_rejected(jump, resamples):
     with pytest.raises(ValueError, match="1 or more"):
         resampling_path(4, jump, resamples)
 

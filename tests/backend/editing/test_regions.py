@@ -91,7 +91,7 @@ def test_hair_covers_the_crown_and_the_back_of_the_head_but_no_cheek(rest, joint
     assert face[nose & (rest[:, 1] > joints["head"][1])].sum() >= 4
 
 
-def test_an_unknown_part_is_refused_with_the_choices():
+def test_an_unknown_part_is_rejected_with_the_choices():
     with pytest.raises(ValueError, match=r"'hat': choose from face, hair"):
         region_of(["top", "hat"])
     with pytest.raises(ValueError, match="face, hair"):

@@ -14,7 +14,7 @@ def test_configurations_come_back_from_json(preset):
     assert config_from_json(json.loads(json.dumps(dataclasses.asdict(config)))) == config
 
 
-def test_unknown_and_missing_settings_are_refused_by_name():
+def test_unknown_and_missing_settings_are_rejected_by_name():
     tree = dataclasses.asdict(TINY)
     with pytest.raises(ValueError, match="differs in colour_of_eyes: use the release"):
         config_from_json({**tree, "colour_of_eyes": "blue"})
@@ -33,7 +33,7 @@ def test_unknown_and_missing_settings_are_refused_by_name():
         ({"scale_outputs": 2}, "3 numbers"),
     ],
 )
-def test_impossible_settings_are_refused(settings, message):
+def test_impossible_settings_are_rejected(settings, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(TINY, **settings)
 

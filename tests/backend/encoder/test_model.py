@@ -40,12 +40,12 @@ def test_pictures_without_the_person_still_give_finite_values():
 
 
 @pytest.mark.parametrize("betas", [torch.zeros(9), torch.zeros(2, 10), torch.full((10,), torch.nan)])
-def test_betas_of_another_body_are_refused(betas):
+def test_betas_of_another_body_are_rejected(betas):
     with pytest.raises(ValueError, match="needs 10 finite numbers"):
         look_up(TINY, blank_views(), betas.reshape(-1) if betas.ndim > 1 else betas)
 
 
-def test_poses_that_are_not_finite_are_refused():
+def test_poses_that_are_not_finite_are_rejected():
     views = blank_views()
     broken = dataclasses.replace(views, pose=views.pose.map(lambda tensor: tensor * torch.nan))
     with pytest.raises(ValueError, match="NaN"):

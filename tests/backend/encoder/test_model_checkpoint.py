@@ -46,7 +46,7 @@ def test_a_missing_file_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("kept", [0, 5, 400, -100])
-def test_a_truncated_file_is_refused(saved, tmp_path, kept):
+def test_a_truncated_file_is_rejected(saved, tmp_path, kept):
     (tmp_path / "cut").write_bytes(saved.read_bytes()[:kept])
     with pytest.raises(CheckpointError, match="truncated"):
         load_encoder(tmp_path / "cut")
@@ -65,14 +65,14 @@ def test_a_truncated_file_is_refused(saved, tmp_path, kept):
         ({"config": json.dumps(dataclasses.asdict(TINY) | {"stem": 3})}, "does not match its own description"),
     ],
 )
-def test_a_file_that_is_something_else_is_refused_in_one_line(saved, tmp_path, metadata, said):
+def test_a_file_that_is_something_else_is_rejected_in_one_line(saved, tmp_path, metadata, said):
     with pytest.raises(CheckpointError, match=said) as error:
         load_encoder(changed(saved, tmp_path / "other", **metadata))
     assert "\n" not in str(error.value)
     assert str(tmp_path / "other") in str(error.value)
 
 
-def test_weights_that_are_missing_or_not_finite_are_refused(saved, tmp_path):
+def test_weights_that_are_missing_or_not_finite_are_rejected(saved, tmp_path):
     tensors = load_file(saved)
     key = next(iter(tensors))
     with pytest.raises(CheckpointError, match="Missing key"):

@@ -31,7 +31,7 @@ def test_it_is_the_default_preset_and_its_card_says_how_it_was_trained(encoder):
     assert encoder.card["full_density"] == encoder.config.full_density
 
 
-def test_it_draws_somebody_it_never_saw_from_a_side_and_in_a_pose_it_was_not_given(encoder, tmp_path):
+def test_an_unseen_human_is_rendered_from_a_new_side_in_a_new_pose(encoder, tmp_path):
     people = {"person_000000": save_person(tmp_path / "person.glb", patched_person())}
     poses = built_in_poses().map(lambda values: values[:2])
     assert isinstance(poses, BodyPose)

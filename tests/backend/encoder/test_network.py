@@ -361,7 +361,7 @@ def test_each_output_channel_of_a_convolution_has_one_gain(resize, shape):
 # What it refuses.
 
 
-def test_what_another_kind_of_encoder_looks_up_is_refused():
+def test_what_another_kind_of_encoder_looks_up_is_rejected():
     texels = dataclasses.replace(TINY, appearance="texels")
     with pytest.raises(ValueError, match="as for voxels"):
         Encoder(TINY)(seen_from(texels), poses())

@@ -93,7 +93,7 @@ def test_a_surface_hides_what_lies_more_than_2_cm_behind_it(gap, seen):
     assert (behind == seen).all()
 
 
-def test_texels_outside_of_every_chart_are_seen_by_nobody():
+def test_texels_outside_every_chart_are_not_visible():
     body = plates(0.0, uv_width=0.5)
     found = unproject_texels(views_of([plain(RED)], [filling(0, 16)]), body.template, 0, body)
     assert (found.seen[..., 1:-1, 1:127] == 255).all()
@@ -306,20 +306,20 @@ def refused(message: str, views: Views | None = None, vertices=POSED, frames: Fr
         look_up()
 
 
-def test_views_that_are_none_batched_or_no_bytes_are_refused():
+def test_views_that_are_none_batched_or_no_bytes_are_rejected():
     views = person_views()
     refused(r"uint8 \[v, H, W, 4\], v > 0", Views(views.rgba[:0], views.camera, views.pose))
     refused(r"\(1, 4, 40, 40, 4\): give one person's", Views(views.rgba[None], views.camera, views.pose))
     refused("torch.float32", Views(views.rgba / 255, views.camera, views.pose))
 
 
-def test_cameras_that_do_not_go_with_the_pictures_are_refused():
+def test_cameras_that_do_not_go_with_the_pictures_are_rejected():
     views = person_views()
     refused("40 x 20 pixels, but their cameras 40 x 40", Views(views.rgba[:, :20], views.camera, views.pose))
     refused("give one for each picture", Views(views.rgba[:2], views.camera, views.pose))
 
 
-def test_bodies_that_are_broken_or_others_are_refused():
+def test_bodies_that_are_broken_or_others_are_rejected():
     refused("NaN", vertices=POSED * torch.nan)
     refused("of the same body", vertices=POSED[:-1])
     refused("of the same body", vertices=POSED[None])

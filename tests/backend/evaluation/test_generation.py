@@ -125,7 +125,7 @@ def test_a_file_without_attributes_is_named(tmp_path):
         read_seed(tmp_path / "person.npz")
 
 
-def test_copies_of_training_samples_are_told_from_new_ones(reference):
+def test_copies_of_training_samples_are_distinguished_from_new_ones(reference):
     copies = compare(reference, reference.train_features)
     assert copies.nearest_ratio == pytest.approx(0, abs=1e-6)
     assert compare(reference, reference.held_features).nearest_ratio == pytest.approx(1)
@@ -171,7 +171,7 @@ def test_command_compares_generated_people_and_writes_figures(people, reference,
     assert figures["feature_accuracy"] == reference.held_accuracies
 
 
-def test_command_refuses_too_few_people_before_it_works(people, tmp_path):
+def test_command_rejects_too_few_people_before_it_works(people, tmp_path):
     line = ["generation", "--people", str(people), "--reference", str(tmp_path / "judge"), "--count", "3"]
     with pytest.raises(ValueError, match="more than 3"):
         command.run(line, lambda path: None, stage_two)

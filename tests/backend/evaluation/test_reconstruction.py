@@ -77,7 +77,7 @@ def scored(captures):
     return model, list(evaluate(model, captures, settings))
 
 
-def test_every_picture_is_scored_once_and_everybody_encoded_once(scored, captures):
+def test_every_picture_is_scored_once_and_every_human_encoded_once(scored, captures):
     model, scores = scored
     places = [(score.subject, score.frame, score.camera) for score in scores]
     assert places == [(name, frame, camera) for name in captures.subjects for frame in range(3) for camera in range(4)]
@@ -131,7 +131,7 @@ def test_chosen_subjects_frames_and_cameras_are_kept_to(captures):
     assert all(score.given_view and not score.given_pose for score in scores)
 
 
-def test_frames_that_are_not_there_are_refused(captures):
+def test_frames_that_are_not_there_are_rejected(captures):
     with pytest.raises(ConditioningError, match=r"frames 0 to 2, not 7"):
         list(evaluate(Grey(), captures, EvaluationSettings(given_frame=7, size=32)))
     with pytest.raises(KeyError, match="nobody"):
@@ -139,7 +139,7 @@ def test_frames_that_are_not_there_are_refused(captures):
 
 
 @pytest.mark.parametrize(("name", "value"), [("given_views", 0), ("size", 10)])
-def test_impossible_settings_are_refused(name, value):
+def test_impossible_settings_are_rejected(name, value):
     with pytest.raises(ValueError, match=f"{name} of the evaluation is {value}"):
         EvaluationSettings(**{name: value})
 

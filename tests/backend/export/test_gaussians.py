@@ -85,12 +85,12 @@ def test_a_limit_keeps_the_most_opaque_and_thins_hands_and_torso_alike():
     assert float(few.position[:, 0].max()) > float(many.position[:, 0].max()) - 0.1
 
 
-def test_matter_that_nobody_sees_is_left_out():
+def test_invisible_matter_is_left_out():
     primitives = place(person())
     assert len(everything().opacity) < 0.8 * float((primitives.density > 0).sum())
 
 
-def test_a_limit_of_none_and_a_person_of_nothing_are_refused():
+def test_a_limit_of_none_and_a_person_of_nothing_are_rejected():
     primitives = sparse()
     with pytest.raises(ValueError, match="1 or more"):
         gaussians_of(primitives, 0)

@@ -100,7 +100,7 @@ def test_arrays_for_blender_are_plain_and_complete(tmp_path):
     assert np.array_equal(np.array(picture), proxy().texture)
 
 
-def test_stages_are_told_and_may_end_the_work():
+def test_stages_are_reported_and_may_end_the_job():
     def stop(stage, _done, _total):
         raise InterruptedError(stage)
 
@@ -109,6 +109,6 @@ def test_stages_are_told_and_may_end_the_work():
 
 
 @pytest.mark.parametrize("wrong", [{"spacing": 0.0}, {"triangles": 10}, {"texture_px": 9000}])
-def test_impossible_settings_are_refused(wrong):
+def test_impossible_settings_are_rejected(wrong):
     with pytest.raises(ValueError, match="choose"):
         ProxySettings(**wrong)

@@ -32,7 +32,7 @@ def test_faces_look_outwards():
     assert as_trimesh(outside_surface(pack_field(ball()), 0.02)).volume > 0.1
 
 
-def test_what_nobody_sees_has_no_surface():
+def test_invisible_matter_has_no_surface():
     shell = as_trimesh(outside_surface(pack_field(ball(0.3, hollow=0.15)), 0.02))
     full = as_trimesh(outside_surface(pack_field(ball(0.3)), 0.02))
     assert shell.body_count == 1
@@ -53,14 +53,14 @@ def test_depth_is_measured_from_the_surface():
     assert depth == pytest.approx([0.315, 0.115, 0, 0], abs=0.02)
 
 
-def test_a_person_of_nothing_is_refused_with_a_sentence():
+def test_a_person_of_nothing_is_rejected_with_a_sentence():
     primitives = place(person())
     empty = type(primitives)(**{**vars(primitives), "density": torch.zeros_like(primitives.density)})
     with pytest.raises(NoSurface, match="dense enough"):
         outside_surface(pack_field(empty), 0.02)
 
 
-def test_without_xatlas_unwrapping_is_refused_with_what_to_do(monkeypatch):
+def test_without_xatlas_unwrapping_is_rejected_with_what_to_do(monkeypatch):
     monkeypatch.setitem(sys.modules, "xatlas", None)
     with pytest.raises(NoUnwrapping, match="xatlas"):
         unwrapped(np.zeros((3, 3)), np.array([[0, 1, 2]]), 64)

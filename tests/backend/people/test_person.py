@@ -177,7 +177,7 @@ def test_recolouring_shares_geometry_and_changes_colours(people):
     assert same_pictures(recolour(other, SEEDS[0]), people[0])
 
 
-def test_everybody_wears_an_outfit_and_shoes_and_has_a_face(people):
+def test_every_human_wears_an_outfit_and_shoes_and_has_a_face(people):
     for person in people:
         names = [part.name for part in person.mesh.parts]
         assert len(set(names)) == len(names)

@@ -178,7 +178,7 @@ def test_a_body_that_is_gone_changed_or_moved(copied):
     assert load_checkpoint(elsewhere / checkpoint.name).body_setup is not None
 
 
-def test_a_person_whose_body_is_gone_is_told_by_its_file(copied, person):
+def test_a_missing_body_is_named_by_its_file(copied, person):
     saved = copied / "person.human.safetensors"
     human = load_human(person / "person.human.safetensors")
     save_human(saved, human)
@@ -199,7 +199,7 @@ def test_a_person_whose_body_is_gone_is_told_by_its_file(copied, person):
         load_human(saved)
 
 
-def test_an_imported_file_that_contradicts_itself_is_refused(copied):
+def test_an_imported_file_that_contradicts_itself_is_rejected(copied):
     path = copied / "imported.safetensors"
     with safetensors.safe_open(path, framework="pt") as file:
         metadata = file.metadata()
@@ -226,7 +226,7 @@ def test_an_imported_file_that_contradicts_itself_is_refused(copied):
         ("unknown tensor", "'diffusion.label_emb.weight'"),
     ],
 )
-def test_what_cannot_be_imported_is_refused_in_a_sentence_and_nothing_written(tmp_path, capsys, change, told):
+def test_what_cannot_be_imported_is_rejected_in_a_sentence_and_nothing_written(tmp_path, capsys, change, told):
     prepared(tmp_path)
     weights, smpl, uv = (tmp_path / name for name in ("primdiffusion.pt", "SMPL_NEUTRAL.pkl", "smpl_uv.obj"))
     if change == "truncated":

@@ -118,7 +118,7 @@ def test_packing_is_the_inverse_of_unpacking(painted):
     torch.testing.assert_close(codec.from_payload(codec.to_payload(x, 25.5), 25.5), x, atol=1e-5, rtol=0)
 
 
-def test_stray_delta_scales_give_bounded_boxes_and_boxes_without_size_are_refused(painted):
+def test_stray_delta_scales_give_bounded_boxes_and_boxes_without_size_are_rejected(painted):
     stray = painted.clone()
     stray.view(S, 7, GRID * S, GRID * S)[:, 4:] = -3
     payload = ReleasedSlab().to_payload(network_values(stray), 25.5)

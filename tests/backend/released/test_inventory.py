@@ -76,7 +76,7 @@ def test_each_tensor_of_another_shape_is_named(released):
         assert str(tuple(other.shape)) in str(caught.value)
 
 
-def test_a_transformer_of_another_width_is_refused(released):
+def test_a_transformer_of_another_width_is_rejected(released):
     key = "bodydecoder.transformer.transformer_blocks.1.ff.net.2.weight"
     with pytest.raises(ReleasedFileError, match=r"1024\).*ff\.net\.2\.weight' \(256, 512\)"):
         take_inventory({**released, key: blank(256, 512)})
@@ -90,7 +90,7 @@ def test_a_schedule_buffer_that_does_not_follow_from_the_schedule_is_named(relea
         take_inventory({**released, name: wrong})
 
 
-def test_the_linear_schedule_is_told_from_the_released_one(released):
+def test_the_linear_schedule_is_not_taken_for_the_released_one(released):
     other = {**released, "alphas_cumprod": linear().alpha_bar.float()}
     with pytest.raises(ReleasedFileError, match="alphas_cumprod"):
         take_inventory(other)
@@ -165,7 +165,7 @@ def bad_file(path, kind):
     "kind", ["hostile torch file", "hostile pickle", "truncated", "empty", "text", "a list", "a sparse tensor",
              "other keys", "no tensors", "a tensor", "another network", "nothing"]
 )  # fmt: skip
-def test_what_is_no_released_checkpoint_is_refused_in_one_sentence(tmp_path, monkeypatch, kind):
+def test_what_is_no_released_checkpoint_is_rejected_in_one_sentence(tmp_path, monkeypatch, kind):
     monkeypatch.setenv("HOSTILE", str(tmp_path / "ran"))
     expected = bad_file(tmp_path / "file.pt", kind)
     with pytest.raises(ReleasedFileError, match=expected) as caught:

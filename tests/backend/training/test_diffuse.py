@@ -203,7 +203,7 @@ def test_a_damaged_shard_ends_the_run_and_is_named(people, tmp_path):
     assert not (tmp_path / "run" / "prepared.safetensors").exists()
 
 
-def test_other_people_or_settings_in_the_same_folder_are_refused(people, few, run):
+def test_other_people_or_settings_in_the_same_folder_are_rejected(people, few, run):
     train(settings(people, run, minutes=0.0))
     with pytest.raises(ValueError, match=r"another training set .*\(16 and 3 people\)"):
         train(settings(few, run))
@@ -329,7 +329,7 @@ def test_bfloat16_computes_the_network_in_it_and_nothing_else(few):
         (TrainingConfig, {"preset": "paper", "slab": PhaseConfig(steps=1, batch=1)}, "whitened"),
     ],
 )
-def test_settings_that_cannot_be_are_refused(settings_of, changes, word):
+def test_settings_that_cannot_be_are_rejected(settings_of, changes, word):
     given = {"steps": 1, "batch": 1} if settings_of is PhaseConfig else {"data": Path("a"), "run": Path("b")}
     with pytest.raises(ValueError, match=word):
         settings_of(**{**given, **changes})

@@ -132,7 +132,7 @@ def test_the_perceptual_loss_is_read_from_its_file_and_counted(captures, tmp_pat
     assert rows(tmp_path / "run")[0]["perceptual"] > 0
 
 
-def test_a_perceptual_weight_without_a_file_is_refused_and_a_missing_file_named(captures, tmp_path):
+def test_a_perceptual_weight_without_a_file_is_rejected_and_a_missing_file_named(captures, tmp_path):
     with pytest.raises(ValueError, match=r"--loss.perceptual-weights"):
         settings(captures, tmp_path / "run", loss=LossConfig(perceptual=1.0))
     loss = LossConfig(perceptual=1.0, perceptual_weights=tmp_path / "nowhere.pth")
@@ -151,14 +151,14 @@ def test_settings_that_cannot_be_are_named(captures, tmp_path, change):
         settings(captures, tmp_path / "run", **change)
 
 
-def test_losses_without_colour_are_refused():
+def test_losses_without_colour_are_rejected():
     with pytest.raises(ValueError, match="colours"):
         LossConfig(rgb=0.0)
     with pytest.raises(ValueError, match=r"loss\.volume"):
         LossConfig(volume=-1.0)
 
 
-def test_captures_without_people_are_refused(tmp_path):
+def test_captures_without_people_are_rejected(tmp_path):
     (tmp_path / "captures").mkdir()
     with pytest.raises(FileNotFoundError, match="no finished captures"):
         fit(settings(tmp_path / "captures", tmp_path / "run"))
@@ -189,7 +189,7 @@ def test_a_mask_of_another_size_is_named(own, tmp_path):
         fit(settings(own, tmp_path / "run"))
 
 
-def test_somebody_of_another_body_is_named_before_training_begins(own, tmp_path):
+def test_a_human_on_another_body_is_named_before_training_begins(own, tmp_path):
     path = own / "person_000001" / "outputs_re_fitting"
     (plain,) = path.glob("*plain*.npz")
     with np.load(plain) as arrays:

@@ -151,13 +151,13 @@ def test_only_the_layers_asked_for_are_computed(vgg_file):
     assert len(load_perceptual(vgg_file, ["relu2_2"], [1.0]).network.features) == 9
 
 
-def test_a_file_of_another_network_is_refused(tmp_path):
+def test_a_file_of_another_network_is_rejected(tmp_path):
     torch.save(PictureFeatures(VGG16, ["relu5_3"]).state_dict(), tmp_path / "vgg16.pth")
     with pytest.raises(WeightsFileError, match=r"vgg16\.pth has .*VGG19"):
         load_perceptual(tmp_path / "vgg16.pth")
 
 
-def test_weights_that_are_not_finite_are_refused(vgg_file, tmp_path):
+def test_weights_that_are_not_finite_are_rejected(vgg_file, tmp_path):
     state = torch.load(vgg_file, weights_only=True)
     state["features.0.bias"][0] = torch.nan
     torch.save(state, tmp_path / "nan.pth")

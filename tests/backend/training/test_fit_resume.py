@@ -205,7 +205,7 @@ def test_other_settings_in_the_same_folder_are_named_and_limits_may_change(captu
     assert logged(begun.run) == [1, 2]
 
 
-def test_other_people_in_the_same_folder_are_refused(begun, tmp_path):
+def test_other_people_in_the_same_folder_are_rejected(begun, tmp_path):
     others = captured(tmp_path / "others", people=3, frames=1, passes=("img", "mask"))
     with pytest.raises(ValueError, match=r"another training set .*\(2 and 3 people\)"):
         fit(settings(others, begun.run))
@@ -228,7 +228,7 @@ def test_a_damaged_file_of_the_run_is_named_and_kept(captures, begun, name):
     assert path.read_bytes() == damaged
 
 
-def test_a_state_of_another_encoder_is_refused_in_one_sentence(captures, begun, tmp_path):
+def test_a_state_of_another_encoder_is_rejected_in_one_sentence(captures, begun, tmp_path):
     other = settings(captures, tmp_path / "other", minutes=0.0, encoder="no_attention")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "no_attention", TINY)
@@ -239,7 +239,7 @@ def test_a_state_of_another_encoder_is_refused_in_one_sentence(captures, begun, 
     assert len(sentence(error.value)) < 500
 
 
-def test_another_number_of_processes_is_told(captures, begun, caplog):
+def test_another_number_of_processes_is_reported(captures, begun, caplog):
     about = json.loads((begun.run / RUN).read_text())
     about["starts"][0]["processes"] = 4
     (begun.run / RUN).write_text(json.dumps(about))

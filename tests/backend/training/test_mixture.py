@@ -60,12 +60,12 @@ def test_kinds_are_all_that_can_be_put_together_and_weights_sum_to_one(mixture):
     assert not mixture.kind[..., WORDS.blocks()["hair"]][~real].any()
 
 
-def test_nobody_gets_the_hair_of_the_other_sex(mixture):
+def test_no_human_gets_the_hair_of_the_other_sex(mixture):
     male, crew = WORDS.encode({"sex": "male"}), WORDS.encode({"hair": "crew"})
     assert torch.equal((mixture.kind @ male).bool(), (mixture.kind @ crew).bool())
 
 
-def test_a_kind_that_nobody_showed_is_where_its_attributes_together_put_it(mixture):
+def test_an_unseen_kind_is_the_sum_of_the_effects_of_its_attributes(mixture):
     # nobody wears jeans and pumps with long hair
     new = part(mixture, sex="female", outfit="jeans", hair="long", shoes="pumps")
     assert torch.allclose(mixture.centre[new][:3], torch.tensor([10.0, 5.0, 3.0]), atol=0.8)

@@ -165,13 +165,13 @@ def spoiled(human: Human, name: str) -> Human:
         (lambda human, views: (dataclasses.replace(human, betas=torch.full((10,), torch.nan)), [views]), "betas"),
     ],
 )
-def test_what_cannot_be_refined_is_refused_in_a_sentence(views, broken, sentence):
+def test_what_cannot_be_refined_is_rejected_in_a_sentence(views, broken, sentence):
     with pytest.raises(ValueError, match=sentence):
         refine(*broken(person(2), views[0]), QUICK)
 
 
 @pytest.mark.parametrize("wrong", [{"steps": 0}, {"views": 0}, {"seconds": math.nan}, {"colour_rate": -1}])
-def test_impossible_settings_are_refused(wrong):
+def test_impossible_settings_are_rejected(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         RefineSettings(**wrong)
 
@@ -252,7 +252,7 @@ def test_a_cancelled_command_leaves_nothing(line, tmp_path, monkeypatch):
         (("--minutes", "-1"), "seconds"),
     ],
 )
-def test_the_command_refuses_in_one_sentence(line, tmp_path, capsys, change, sentence):
+def test_the_command_rejects_in_one_sentence(line, tmp_path, capsys, change, sentence):
     option, value = change
     given = [*line, option, value] if option not in line else [*line[: line.index(option) + 1], value,
                                                                *line[line.index(option) + 2 :]]  # fmt: skip

@@ -107,7 +107,7 @@ def test_a_shard_is_checked_once(packed, monkeypatch):
         ('{"format": "primdiffusion-payloads", "version": 1, "full_density": 100}', "damaged"),
     ],
 )
-def test_an_index_that_cannot_be_used_is_refused(copied, content, word):
+def test_an_index_that_cannot_be_used_is_rejected(copied, content, word):
     (copied / INDEX).write_text(content)
     with pytest.raises(ShardError, match=word):
         open_people(copied)
@@ -132,14 +132,14 @@ def test_a_damaged_person_is_named_and_leaves_no_index(folder, tmp_path):
     assert not (tmp_path / "out" / INDEX).exists()
 
 
-def test_packing_into_packed_people_is_refused(folder, copied):
+def test_packing_into_packed_people_is_rejected(folder, copied):
     before = (copied / INDEX).read_bytes()
     with pytest.raises(ShardError, match="already"):
         list(pack_people(folder, copied))
     assert (copied / INDEX).read_bytes() == before
 
 
-def test_people_of_several_densities_are_refused(folder, tmp_path):
+def test_people_of_several_densities_are_rejected(folder, tmp_path):
     for path in folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     with np.load(tmp_path / "person_000001.npz") as file:
@@ -148,14 +148,14 @@ def test_people_of_several_densities_are_refused(folder, tmp_path):
         open_people(tmp_path)
 
 
-def test_delta_scales_of_another_shape_are_refused(folder, tmp_path):
+def test_delta_scales_of_another_shape_are_rejected(folder, tmp_path):
     with np.load(folder / "person_000001.npz") as file:
         np.savez(tmp_path / "person.npz", **file, delta_scale=np.ones((1, K, 3), np.float16))
     with pytest.raises(ValueError, match="holds delta_scale"):
         read_person(tmp_path / "person.npz")
 
 
-def test_the_index_is_plain_json_with_what_is_known_of_everybody(packed):
+def test_the_index_is_plain_json_with_all_known_attributes(packed):
     index = json.loads((packed / INDEX).read_text())
     assert [len(shard["people"]) for shard in index["shards"]] == [2, 2, 1]
     assert index["shards"][0]["people"][1]["attributes"] == {"outfit": "outfit1"}

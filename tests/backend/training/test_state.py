@@ -48,7 +48,7 @@ def test_the_average_lags_behind_the_weights():
     assert 0 < lagged < moved
 
 
-def test_a_damaged_or_foreign_state_is_refused(tmp_path):
+def test_a_damaged_or_foreign_state_is_rejected(tmp_path):
     state, other = state_of_a_line(), TrainingState(torch.nn.Linear(2, 2), PhaseConfig(steps=1, batch=1), 0)
     state.save(tmp_path / "state")
     with pytest.raises(ValueError, match="does not fit"):

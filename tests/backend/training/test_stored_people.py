@@ -17,6 +17,6 @@ def test_a_damaged_person_is_named(tmp_path, people):
         read_person(path)
 
 
-def test_an_empty_folder_is_refused(tmp_path):
+def test_an_empty_folder_is_rejected(tmp_path):
     with pytest.raises(FileNotFoundError, match="primdiffusion payloads"):
         find_people(tmp_path)
