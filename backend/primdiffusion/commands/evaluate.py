@@ -1,26 +1,177 @@
-"""Evaluate trained models: `primdiffusion evaluate`."""
+"""The command `primdiffusion evaluate`: quality of trained models."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import tyro
+from tqdm import tqdm
+
+from primdiffusion import __version__
+from primdiffusion.capture.reader import open_captures
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.encoder.model import load_encoder
-from primdiffusion.evaluation import command
-from primdiffusion.evaluation.command import StageTwo, TrainedReconstructor
+from primdiffusion.evaluation import generation, reconstruction
+from primdiffusion.evaluation.attribute_network import features_of
+from primdiffusion.evaluation.distances import NEIGHBOURS
+from primdiffusion.evaluation.gallery import (
+    COLOURINGS,
+    made_gallery,
+    mesh_sources,
+    payload_sources,
+    read_seed,
+)
+from primdiffusion.evaluation.generation import compare, open_reference_set, real_vs_real
+from primdiffusion.evaluation.image_metrics import load_lpips
+from primdiffusion.evaluation.reconstruction import EvaluationSettings, evaluate, summary
+from primdiffusion.human import generate, place
 from primdiffusion.machine import best_device
+from primdiffusion.people.assets import open_assets
+from primdiffusion.staging import written_whole
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person
+
+DESCRIPTION = "Measure the quality of trained models."
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateReconstruction:
+    """Compare encoded humans with their captures: PSNR, SSIM, mask overlap, and LPIPS if weights are given.
+
+    Each human is encoded once, from some views of one pose, and rendered from all cameras in all poses.
+    """
+
+    captures: Path
+    """Folder of captures."""
+    checkpoint: Path | None = None
+    """Trained encoder (.safetensors); the default one if omitted."""
+    people: int = 0
+    """Number of humans, in the order of their names; 0: all."""
+    views: int = 8
+    """Number of cameras given to the encoder, spread around the human."""
+    frame: int = 0
+    """The pose in which."""
+    size: int = 512
+    """Pixels a side of the pictures that are compared."""
+    lpips: tuple[Path, ...] = ()
+    """LPIPS' weights: one file with all, or torchvision's of VGG16 or AlexNet and the linear weights."""
+    json: Path | None = None
+    """File for the means and every picture's scores."""
+
+    def run(self) -> None:
+        """Evaluate, and print a table.
+
+        Raises:
+            ValueError, FileNotFoundError: captures, checkpoint or weights are missing, damaged or do not fit.
+        """
+        if self.people < 0:
+            raise ValueError(f"people is {self.people}: choose 1 or more, or 0 for all")
+        captures = open_captures(self.captures)
+        names = captures.subjects[: self.people or None]
+        settings = EvaluationSettings(names, given_views=self.views, given_frame=self.frame, size=self.size)
+        lpips = load_lpips(self.lpips) if self.lpips else None
+        model = load_encoder(self.checkpoint, best_device())
+        scores = []
+        with tqdm(total=len(names), unit="person", disable=None) as bar:
+            for score in evaluate(model, captures, settings, lpips):
+                bar.update(len({*names[: bar.n], score.subject}) - bar.n)
+                scores.append(score)
+        means = summary(scores)
+        if self.json is not None:
+            record = {
+                "version": __version__,
+                "checkpoint": dict(model.card),
+                "settings": dataclasses.asdict(settings),
+                "means": {name: dataclasses.asdict(part) for name, part in means.items()},
+                "pictures": [dataclasses.asdict(score) for score in scores],
+            }
+            _write(self.json, record)
+        print(reconstruction.table(means))
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateGeneration:
+    """Compare generated humans with ones held out from training, in a feature space of human attributes.
+
+    Also reports whether they are copies: their distance to the training set, relative to that of held-out humans.
+    """
+
+    people: Path
+    """Folder of the payloads that the model was trained on, those held out among them."""
+    reference: Path
+    """Folder for portraits and feature network; what is missing is computed, which takes minutes."""
+    assets: Path | None = None
+    """MakeHuman's assets, if the training set was made from them: the reference is then renders of the meshes, so that
+    detail which payloads lack counts too. Without them it is renders of the payloads."""
+    checkpoint: Path | None = None
+    """Model (.safetensors); the default one if omitted."""
+    count: int = 256
+    """Number of humans to generate, from successive seeds."""
+    first_seed: int = 0
+    """The first seed."""
+    steps: int = 30
+    """Sampling steps."""
+    holdout: float = 0.05
+    """Share that was held out in training."""
+    seed: int = 0
+    """Seed of the training run."""
+    json: Path | None = None
+    """File for the figures."""
+
+    def run(self) -> None:
+        """Evaluate, and print a table.
+
+        Raises:
+            ValueError, FileNotFoundError: people or checkpoint are missing, damaged or too few.
+        """
+        if self.count <= NEIGHBOURS:
+            raise ValueError(
+                f"count is {self.count}: ask for more than {NEIGHBOURS} people, or nothing can be compared"
+            )
+        train, held = split_people(find_people(self.people), self.holdout, self.seed)
+        model = load_checkpoint(self.checkpoint, best_device())
+        if self.assets is None:
+            real = (payload_sources(train, read_person), payload_sources(held, read_person))
+        else:
+            assets = open_assets(self.assets)
+            trained_on, others = ([read_seed(path) for path in paths] for paths in (train, held))
+            real = (mesh_sources(assets, trained_on, COLOURINGS), mesh_sources(assets, others, COLOURINGS))
+        with tqdm(unit="person", disable=None) as bar:
+
+            def report(done: int, total: int) -> None:
+                bar.update(1)
+
+            reference = open_reference_set(*real, self.reference, report)
+        with tqdm(range(self.first_seed, self.first_seed + self.count), unit="person", disable=None) as seeds:
+            made = made_gallery(place(generate(model, seed, self.steps)) for seed in seeds)
+        rows = {
+            "generated": compare(reference, features_of(reference.network, made)),
+            "trained on": real_vs_real(reference, self.count),
+        }
+        if self.json is not None:
+            record = {
+                "version": __version__,
+                "checkpoint": dict(model.card),
+                "people": {name: dataclasses.asdict(row) for name, row in rows.items()},
+                "feature_accuracy": reference.held_accuracies,
+            }
+            _write(self.json, record)
+        print(generation.table(rows))
+
+
+def _write(path: Path, record: Mapping[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as unfinished:
+        unfinished.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
 
 def run(arguments: Sequence[str]) -> None:
     """Run a command line; raises its errors."""
-
-    def load(path: Path | None) -> TrainedReconstructor:
-        return load_encoder(path, best_device())
-
-    def stage_two() -> StageTwo:
-        return StageTwo(lambda path: load_checkpoint(path, best_device()), find_people, split_people, read_person)
-
-    command.run(arguments, load, stage_two)
+    commands: dict[str, Any] = {"reconstruction": EvaluateReconstruction, "generation": EvaluateGeneration}
+    tyro.extras.subcommand_cli_from_dict(
+        commands, prog="primdiffusion evaluate", description=DESCRIPTION, args=arguments or ["--help"]
+    ).run()

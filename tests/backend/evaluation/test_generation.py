@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 from diffusion_people import write_people
-from primdiffusion.evaluation import command
+from primdiffusion.commands import evaluate as command
 from primdiffusion.evaluation.attribute_network import features_of
 from primdiffusion.evaluation.gallery import (
     Source,
@@ -156,14 +156,16 @@ def test_table_has_a_row_for_each_set(reference):
     assert lines[2].startswith("| one | 4 |")
 
 
-def stage_two():
-    return command.StageTwo(lambda path: tiny_model(), find_people, split_people, read_person)
+@pytest.fixture
+def _tiny_checkpoint(monkeypatch):
+    monkeypatch.setattr(command, "load_checkpoint", lambda path, device: tiny_model())
 
 
+@pytest.mark.usefixtures("_tiny_checkpoint")
 def test_command_compares_generated_people_and_writes_figures(people, reference, reference_folder, tmp_path, capsys):
     line = ["generation", "--people", str(people), "--reference", str(reference_folder), "--holdout", "0.34"]
     line += ["--count", "5", "--steps", "2", "--json", str(tmp_path / "new" / "figures.json")]
-    command.run(line, lambda path: None, stage_two)
+    command.run(line)
     assert "| generated | 5 |" in capsys.readouterr().out
     figures = json.loads((tmp_path / "new" / "figures.json").read_text())
     assert set(figures["people"]) == {"generated", "trained on"}
@@ -174,5 +176,5 @@ def test_command_compares_generated_people_and_writes_figures(people, reference,
 def test_command_rejects_too_few_people_before_it_works(people, tmp_path):
     line = ["generation", "--people", str(people), "--reference", str(tmp_path / "judge"), "--count", "3"]
     with pytest.raises(ValueError, match="more than 3"):
-        command.run(line, lambda path: None, stage_two)
+        command.run(line)
     assert not (tmp_path / "judge").exists()

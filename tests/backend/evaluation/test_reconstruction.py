@@ -10,10 +10,10 @@ from primdiffusion import cli
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.conditioning import ConditioningError, spread_cameras
 from primdiffusion.capture.reader import open_captures
+from primdiffusion.commands import evaluate as command
 from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.model import EncoderModel, save_encoder
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.evaluation import command
 from primdiffusion.evaluation.reconstruction import (
     SPLITS,
     EvaluationSettings,
@@ -197,15 +197,17 @@ def test_summary_averages_each_part_alone():
     assert rows[5] == "| given views, novel poses | 0 | - | - | - | - | - | - |"
 
 
-def test_command_prints_the_table_and_writes_all_scores(captures, tmp_path, capsys):
+def test_command_prints_the_table_and_writes_all_scores(captures, tmp_path, capsys, monkeypatch):
     paths = []
 
-    def load(path):
+    def load(path, device):
         paths.append(path)
         return Grey()
 
+    monkeypatch.setattr(command, "load_encoder", load)
+
     line = ["--captures", str(captures.root), "--people", "1", "--views", "2", "--size", "32", "--json"]
-    command.run(["reconstruction", *line, str(tmp_path / "new" / "scores.json")], load)
+    command.run(["reconstruction", *line, str(tmp_path / "new" / "scores.json")])
     assert paths == [None]
     assert capsys.readouterr().out.splitlines()[2].startswith("| all views, all poses | 12 | ")
     record = json.loads((tmp_path / "new" / "scores.json").read_text())
