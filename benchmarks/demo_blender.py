@@ -15,8 +15,8 @@ import time
 from importlib import import_module
 from pathlib import Path
 
+import blender_isolated  # noqa: F401  before bpy
 import bpy
-import isolated_blender  # noqa: F401  before bpy
 import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body

@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import blender_isolated  # noqa: F401  before bpy
 import bpy
-import isolated_blender  # noqa: F401  before bpy
 import numpy as np
 import torch
 from march_people import checkered_human

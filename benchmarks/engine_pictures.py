@@ -13,8 +13,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+import blender_isolated  # noqa: F401  before bpy
 import bpy
-import isolated_blender  # noqa: F401  before bpy
 import numpy as np
 from march_people import generated
 from PIL import Image

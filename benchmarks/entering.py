@@ -17,8 +17,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import blender_isolated  # noqa: F401  before bpy
 import bpy
-import isolated_blender  # noqa: F401  before bpy
 from march_people import checkered_human
 from primdiffusion.human_file import export_for_blender
 from record import command_line, report

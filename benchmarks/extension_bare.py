@@ -17,8 +17,8 @@ import shutil
 import tempfile
 from pathlib import Path
 
+import blender_isolated  # before bpy
 import bpy
-import isolated_blender  # before bpy
 import numpy as np
 import resident
 
@@ -87,7 +87,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     print(json.dumps(figures(parser.parse_args().rounds), indent=1), flush=True)
-    isolated_blender.remove()
+    blender_isolated.remove()
     os._exit(0)  # bpy as a module may hang at exit
 
 

@@ -12,8 +12,8 @@ import sys
 import time
 from pathlib import Path
 
+import blender_isolated  # before bpy
 import bpy
-import isolated_blender  # before bpy
 import numpy as np
 import psutil
 import resident
@@ -211,7 +211,7 @@ def main() -> None:
     arguments = parser.parse_args()
     figures = PARTS[arguments.part](arguments)
     print("\nfigures " + json.dumps(figures), flush=True)
-    isolated_blender.remove()
+    blender_isolated.remove()
     os._exit(0)  # bpy as a module may hang at exit
 
 

@@ -12,8 +12,8 @@ import sys
 import time
 from pathlib import Path
 
+import blender_isolated  # noqa: F401  before bpy
 import bpy
-import isolated_blender  # noqa: F401  before bpy
 import numpy as np
 import psutil
 import torch

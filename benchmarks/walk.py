@@ -55,8 +55,8 @@ class Trace:
 
 
 def main() -> None:
-    # not in the child; isolated_blender before bpy
-    import isolated_blender
+    # not in the child; blender_isolated before bpy
+    import blender_isolated
     import record
 
     arguments = record.command_line(__doc__).parse_args()
@@ -73,13 +73,13 @@ def main() -> None:
             figures[f"walk_{program}_files"] = len(passed)
         record.report(figures, arguments.json)
     sys.stdout.flush()
-    isolated_blender.remove()
+    blender_isolated.remove()
     os._exit(0)  # bpy as a module may hang at exit
 
 
 def _generate(folder: Path, log: Path) -> int:
     """Generate a person; returns the number of volumes in the scene."""
-    import bpy  # after isolated_blender
+    import bpy  # after blender_isolated
 
     sys.path.insert(0, str(ROOT))
     import blender_primdiffusion
