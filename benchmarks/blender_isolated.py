@@ -1,6 +1,7 @@
 """Run Blender as a module without touching the user's settings: private settings and temporary files.
 
-Import this before bpy; its name sorts before bpy among imports. The files are removed when Python exits; a program that exits by `os._exit` calls `remove`.
+Import this before bpy, as its name sorts among imports. The files are removed when Python exits; a program that exits
+by `os._exit` calls `remove`.
 """
 
 from __future__ import annotations
