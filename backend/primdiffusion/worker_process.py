@@ -49,10 +49,10 @@ class ProcessDied(RuntimeError):
     """The process exited without returning a result."""
 
 
-def run_in_process(function: Callable[..., Any], *arguments: Any, meanwhile: Callable[[], None]) -> Any:
+def run_in_process(function: Callable[..., Any], *arguments: Any, on_wait: Callable[[], None]) -> Any:
     """Return `function(*arguments)`, computed in a spawned process; arguments and result are pickled.
 
-    The process imports the function's module, so that module should import quickly. `meanwhile` is called every
+    The process imports the function's module, so that module should import quickly. `on_wait` is called every
     POLL_S; an exception it raises kills the process. Raises the function's own exceptions, and ProcessDied.
     """
     context = multiprocessing.get_context("spawn")
@@ -62,7 +62,7 @@ def run_in_process(function: Callable[..., Any], *arguments: Any, meanwhile: Cal
     answering.close()
     try:
         while not answers.poll(POLL_S):
-            meanwhile()
+            on_wait()
         done, answer = answers.recv()
     except EOFError as e:
         raise ProcessDied(f"the process of {function.__name__} died, perhaps out of memory: try again") from e

@@ -131,7 +131,7 @@ def test_a_killed_child_fails_the_request_leaves_nothing_and_the_next_request_wo
         ({"steps": 0}, "", "0 steps"),
     ],
 )
-def test_a_error_of_the_backend_becomes_the_requests_error(start, settings, kind, named):
+def test_an_error_of_the_backend_becomes_the_requests_error(start, settings, kind, named):
     request = start(**{"steps": 1, **settings})
     assert follow(request)[-1] == "failed"
     assert request.error.kind == kind

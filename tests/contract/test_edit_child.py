@@ -169,7 +169,7 @@ def test_a_cancel_ends_an_edit_within_a_step_and_leaves_nothing(child, people, a
         ("transfer", {"source": "/nobody.human.safetensors"}, DOMAIN_ERROR, "missing_file", "there is no human file"),
     ],
 )
-def test_a_error_names_what_was_wrong_and_leaves_nothing(child, people, asked, method, wrong, code, kind, told):
+def test_an_error_names_what_was_wrong_and_leaves_nothing(child, people, asked, method, wrong, code, kind, told):
     error = child.ask(10, method, **{**asked, **parameters(method, people), **wrong})["error"]
     assert error["code"] == code
     assert told in error["message"]

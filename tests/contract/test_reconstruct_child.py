@@ -70,7 +70,7 @@ def test_reconstruct_reports_its_stages_and_leaves_whole_files(child, asked):
         ({"views": "all"}, INVALID_PARAMS, None, "reconstruct.views"),
     ],
 )
-def test_a_error_names_what_was_wrong_and_leaves_nothing(child, asked, wrong, code, kind, told):
+def test_an_error_names_what_was_wrong_and_leaves_nothing(child, asked, wrong, code, kind, told):
     error = child.ask(2, "reconstruct", **{**asked, **wrong})["error"]
     assert error["code"] == code
     assert told in error["message"]
@@ -125,7 +125,7 @@ def test_the_panels_job_runs_from_a_cold_start_to_its_files(start):
     assert request.result["warnings"][0] == "only one view: the sides that it does not show are guessed"
 
 
-def test_a_error_of_the_backend_becomes_the_requests_error(start):
+def test_an_error_of_the_backend_becomes_the_requests_error(start):
     request = start(subject="nobody")
     follow(request)
     assert (request.state, request.error.kind) == ("failed", "bad_input")

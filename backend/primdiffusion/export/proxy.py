@@ -108,13 +108,13 @@ def mesh_proxy(human: Human, settings: ProxySettings = DEFAULT_PROXY, on_stage: 
     field = pack_field(place(human))
     on_stage("surface", 0, 3)
 
-    def meanwhile() -> None:
+    def on_wait() -> None:
         on_stage("surface", 0, 3)
 
-    fine = outside_surface(field, settings.spacing, meanwhile)
-    surface = OuterSurface(*run_in_process(simplified, *fine, settings.triangles, meanwhile=meanwhile))
+    fine = outside_surface(field, settings.spacing, on_wait)
+    surface = OuterSurface(*run_in_process(simplified, *fine, settings.triangles, on_wait=on_wait))
     weights = skin_weights(field, surface, anchor_skin_weights(anchors, body))
-    corner_uv = run_in_process(unwrapped, *surface, settings.texture_px, meanwhile=lambda: on_stage("unwrap", 1, 3))
+    corner_uv = run_in_process(unwrapped, *surface, settings.texture_px, on_wait=lambda: on_stage("unwrap", 1, 3))
     texture = bake_texture(field, surface, corner_uv, settings.texture_px, lambda: on_stage("texture", 2, 3))
     joints = body.shape(human.betas).joints.detach().double().numpy()
     skeleton = Skeleton(JOINT_NAMES, body.parents.tolist(), joints)
@@ -142,7 +142,7 @@ def bake_texture(
     surface: OuterSurface,
     corner_uv: Float[Array, "f 3 2"],
     texture_px: int,
-    meanwhile: Callable[[], None] = lambda: None,
+    on_wait: Callable[[], None] = lambda: None,
 ) -> UInt8[Array, "h w 3"]:
     """Bake a texture by marching inwards along each texel's normal; texels outside all charts copy the nearest one."""
     raster = rasterise_uv(corner_uv, texture_px, texture_px)
@@ -156,7 +156,7 @@ def bake_texture(
         some = slice(first, first + RAYS_AT_ONCE)
         starts = points[some] + OUTSIDE * normals[some]
         colour[some], alpha[some] = march_rays(field, starts, -normals[some], OUTSIDE + INSIDE, STEP)
-        meanwhile()
+        on_wait()
     seen = alpha > 0.1
     picture = np.zeros((texture_px, texture_px, 3), np.float32)
     picture[row[seen], column[seen]] = encode_srgb(np.clip(colour[seen], 0, 1))

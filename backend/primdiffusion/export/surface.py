@@ -44,14 +44,14 @@ class DensityGrid(NamedTuple):
     spacing: float
 
 
-def outside_surface(field: Field, spacing: float, meanwhile: Callable[[], None] = lambda: None) -> OuterSurface:
+def outside_surface(field: Field, spacing: float, on_wait: Callable[[], None] = lambda: None) -> OuterSurface:
     """Extract the outer surface by marching cubes (libigl); cavities are filled, small pieces dropped.
 
-    `spacing` is the grid's in metres. `meanwhile` is called regularly; exceptions it raises cancel. Raises NoSurface.
+    `spacing` is the grid's in metres. `on_wait` is called regularly; exceptions it raises cancel. Raises NoSurface.
     """
     import igl  # large, and used only here
 
-    grid = density_grid(field, spacing, meanwhile)
+    grid = density_grid(field, spacing, on_wait)
     solid = filled(grid.density > LEVEL, spacing)
     if not solid.any():
         raise NoSurface(THIN)
@@ -59,12 +59,12 @@ def outside_surface(field: Field, spacing: float, meanwhile: Callable[[], None] 
     values = np.where(solid, np.minimum(values, 2 * LEVEL), np.minimum(grid.density, LEVEL * 0.999))
     corners, cubes = _cubes_across(solid)
     places = grid.origin + spacing * np.stack(np.unravel_index(corners, solid.shape), -1)
-    meanwhile()
+    on_wait()
     vertices, faces, _ = igl.marching_cubes(values.ravel()[corners].astype(np.float64), places, cubes, LEVEL)
     return _large_pieces(np.asarray(vertices), np.asarray(faces)[:, ::-1])
 
 
-def density_grid(field: Field, spacing: float, meanwhile: Callable[[], None] = lambda: None) -> DensityGrid:
+def density_grid(field: Field, spacing: float, on_wait: Callable[[], None] = lambda: None) -> DensityGrid:
     """Sample the field on a grid around all boxes, padded by three empty points on every side."""
     margin = 3 * spacing
     reach = np.abs(np.linalg.inv(field.to_local)).sum(-1)
@@ -76,7 +76,7 @@ def density_grid(field: Field, spacing: float, meanwhile: Callable[[], None] = l
         index = np.arange(first, min(first + POINTS_AT_ONCE, total))
         points = low + spacing * np.stack(np.unravel_index(index, tuple(shape)), -1)
         density[first : first + len(index)] = density_at(field, points)
-        meanwhile()
+        on_wait()
     return DensityGrid(density.reshape(shape), low, spacing)
 
 

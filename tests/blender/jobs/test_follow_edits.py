@@ -27,7 +27,7 @@ COUNT = 12
 """Primitives of the synthetic person."""
 OF_THE_REGION = 2
 """Primitives that the fake child changes where a region is given."""
-MEANWHILE = "blender_primdiffusion.jobs.follow.SLICE_S"
+SLICE_SECONDS = "blender_primdiffusion.jobs.follow.SLICE_S"
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def person(addon, tmp_path, monkeypatch):
 @pytest.fixture
 def varied(person, monkeypatch):
     """The person, whose other volumes are written, and whose other grids are about to be read."""
-    monkeypatch.setattr(MEANWHILE, 0.0)
+    monkeypatch.setattr(SLICE_SECONDS, 0.0)
     vary(person)
     until_read()
     return person
@@ -86,7 +86,7 @@ def check_drawn(person) -> None:
 
 
 def test_an_edit_writes_its_volumes_in_slices(person, monkeypatch):
-    monkeypatch.setattr(MEANWHILE, 0.0)
+    monkeypatch.setattr(SLICE_SECONDS, 0.0)
     written, write_file, ticks = [], volumes._write_file, [0]
     monkeypatch.setattr(volumes, "_write_file", lambda *args: written.append(ticks[0]) or write_file(*args))
     vary(person)
@@ -96,7 +96,7 @@ def test_an_edit_writes_its_volumes_in_slices(person, monkeypatch):
 
 
 def test_only_what_the_edit_changes_is_written_and_read(person, monkeypatch):
-    monkeypatch.setattr(MEANWHILE, 0.0)
+    monkeypatch.setattr(SLICE_SECONDS, 0.0)
     before = set(shown(person).values())
     queue.add(bpy.context, RedressJob.of(person, 2, {"region": ["top"], "seed": FINE}))
     until_read()
@@ -149,7 +149,7 @@ def test_undo_that_makes_the_person_another_meanwhile_rejects_the_result(person,
     vary(person)
     drive()
     files = on_disk(folder_of(person).parents[1])
-    monkeypatch.setattr(MEANWHILE, 0.0)
+    monkeypatch.setattr(SLICE_SECONDS, 0.0)
     vary(person, FINE + 1)
     until_read()
     bpy.ops.ed.undo()
@@ -167,7 +167,7 @@ def test_volumes_deleted_and_brought_back_meanwhile_show_what_they_should(person
     before = shown(person)
     bpy.data.objects.remove(bpy.data.objects[removed])
     bpy.ops.ed.undo_push(message="a volume deleted")
-    monkeypatch.setattr(MEANWHILE, 0.0)
+    monkeypatch.setattr(SLICE_SECONDS, 0.0)
     vary(person)
     until_read()
     assert len(building._writing.result.files) == COUNT - 1
@@ -208,7 +208,7 @@ def test_a_first_save_meanwhile_takes_the_edited_person_along(addon, tmp_path, m
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared.npz", COUNT)))
     bpy.ops.wm.read_homefile(use_empty=True)
     bpy.ops.primdiffusion.generate(seed=7, steps=1)
-    monkeypatch.setattr(MEANWHILE, 0.0)
+    monkeypatch.setattr(SLICE_SECONDS, 0.0)
     vary(humans(bpy.context.scene)[0])
     until_read()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "late.blend"))
@@ -239,7 +239,7 @@ def test_cancel_leaves_files_that_undo_and_redo_need(person, monkeypatch):
     drive()
     bpy.ops.ed.undo()
     person = humans(bpy.context.scene)[0]
-    monkeypatch.setattr(MEANWHILE, 0.0)
+    monkeypatch.setattr(SLICE_SECONDS, 0.0)
     vary(person)  # to the very person that redo brings
     until_read()
     bpy.ops.primdiffusion.cancel()
@@ -307,7 +307,7 @@ def test_a_script_that_does_not_wait_for_the_volumes_gets_the_whole_edit(person)
 @pytest.fixture
 def lost(person, monkeypatch):
     """The person after five volumes were lost while Blender was closed, and were asked for; about to be read."""
-    monkeypatch.setattr(MEANWHILE, 0.0)
+    monkeypatch.setattr(SLICE_SECONDS, 0.0)
     bpy.ops.wm.save_mainfile()
     for path in sorted(folder_of(person).glob("*.vdb"))[:5]:
         path.unlink()
@@ -344,7 +344,7 @@ def test_lost_volumes_of_a_file_saved_elsewhere_meanwhile_are_restored(lost, tmp
 
 
 def test_a_person_generated_again_is_written_in_the_thread(person, monkeypatch):
-    monkeypatch.setattr(MEANWHILE, 0.0)
+    monkeypatch.setattr(SLICE_SECONDS, 0.0)
     bpy.ops.wm.save_mainfile()
     made = made_from_seed(person)
     for path in folder_of(person).iterdir():
