@@ -13,7 +13,7 @@ from collections.abc import Callable, Generator, Mapping
 from typing import Any, Literal
 
 from .client import BackendClient, Died, ErrorResponse, Event, Notification, Response, Silent
-from .requests import CANCELLED_CODE, Backend, RequestError
+from .requests import CANCELLED_CODE, Backend, RequestError, connecting_error
 
 IDLE_S = 600.0
 """A child at rest holds about half a gigabyte; starting one takes seconds."""
@@ -175,7 +175,7 @@ class DrawingChild:
             self._ask(connected.value, drawing)
         except Exception as e:
             self._connecting = None
-            drawing.become("failed", error=RequestError(str(e) or type(e).__name__, "", "environment"))
+            drawing.become("failed", error=connecting_error(e))
 
     def _ask(self, client: BackendClient, drawing: Drawing) -> None:
         client.poll()  # what concerned an earlier picture

@@ -31,8 +31,21 @@ TRIAL = (
 )
 
 
+tried: dict[Path, bool] = {}
+"""Interpreters that were tried since Blender was started, and whether they imported torch and the backend."""
+
+
 class BackendNotFound(RuntimeError):
     """No Python that can run the backend; the message names each that was tried and why it will not do."""
+
+    kind = "environment"
+    """Of the error that a request becomes."""
+
+
+class ImportTimedOut(BackendNotFound):
+    """A Python took too long to import torch; on a busy machine another attempt may succeed."""
+
+    kind = "timeout"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,17 +133,25 @@ def search(
     """Try each candidate in a process of its own, which takes seconds; yields while it runs, and returns the first that
     imports primdiffusion and torch.
 
-    `module_path` and `cache_dir` as in `child_environment`. Raises BackendNotFound with one reason for each candidate.
+    `module_path` and `cache_dir` as in `child_environment`. Raises BackendNotFound with one reason for each candidate,
+    ImportTimedOut where one of them took longer than `timeout_s`.
     """
     environment = child_environment(module_path, cache_dir, {})
-    reasons = []
+    errors: list[BackendNotFound] = []
     for source, path in candidates(preference, own_environment):
         try:
-            return (yield from _try(path, source, environment, timeout_s))
+            found = yield from _try(path, source, environment, timeout_s)
         except BackendNotFound as e:
-            reasons.append(str(e))
+            errors.append(e)
+            tried[path] = False
+        else:
+            tried[path] = True
+            return found
+    reasons = "; ".join(map(str, errors))
     advice = "press Set Up Backend, or name a Python with PrimDiffusion's packages in the extension's preferences"
-    raise BackendNotFound(f"No Python for the backend: {'; '.join(reasons)}. To go on, {advice}.")
+    if any(isinstance(error, ImportTimedOut) for error in errors):
+        raise ImportTimedOut(f"No Python for the backend: {reasons}. The machine may be busy: try again, or {advice}.")
+    raise BackendNotFound(f"No Python for the backend: {reasons}. To go on, {advice}.")
 
 
 def _try(
@@ -151,7 +172,7 @@ def _try(
         try:
             while (exit_code := process.poll()) is None:
                 if time.monotonic() > end:
-                    raise BackendNotFound(f"{named} did not import torch within {timeout_s:.0f} s")
+                    raise ImportTimedOut(f"{named} did not import torch within {timeout_s:.0f} s")
                 yield
         finally:
             if process.poll() is None:

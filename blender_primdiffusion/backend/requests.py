@@ -177,6 +177,11 @@ class RequestError:
         return " ".join(sentence(part) for part in (self.message, self.remedy) if part)
 
 
+def connecting_error(error: Exception) -> RequestError:
+    """The error of a request for which no child could be started."""
+    return RequestError(str(error) or type(error).__name__, "", getattr(error, "kind", "environment"))
+
+
 class ChildRequest:
     """One request to the child. Call `tick` from a timer until `finished`; then read `result` or `error`.
 
@@ -270,7 +275,7 @@ class ChildRequest:
             if not client.info.get("ready"):
                 self.message = "Loading PyTorch"
         except Exception as error:  # any error must reach the user
-            self._fail(RequestError(str(error) or type(error).__name__, "", "environment"))
+            self._fail(connecting_error(error))
 
     def _ask(self, client: BackendClient) -> None:
         """Send the request, once the child has ended an abandoned one."""

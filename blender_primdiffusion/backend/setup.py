@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .client import BackendClient
-from .environment import MARK, BackendPython, SetUpFolder, search
+from .environment import MARK, BackendPython, SetUpFolder, search, tried
 from .packages import Lock, SetUpFailed, clean_environment, followed, what_went_wrong
 from .requests import Backend, ChildRequest
 
@@ -153,6 +153,7 @@ def _trial(python: Path, module_path: Path, cache: Path, temporary: Path) -> Gen
             yield Step(f"Testing the backend: {request.message}", _INSTALLED)
             request.tick()
         if request.error is not None:
+            tried[python] = False
             last = f" ({request.error.log[-1]})" if request.error.kind == "died" and request.error.log else ""
             raise SetUpFailed(f"the self-test failed: {request.error.message}{last}")
         if not Path((request.result or {}).get("human", "")).is_file():

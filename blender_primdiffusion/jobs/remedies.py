@@ -33,6 +33,7 @@ _REMEDIES = {
     "unwritable": _SAVE_AS,
     "file_system": _SAVE_AS,
     "busy": _TRY_AGAIN,
+    "timeout": _TRY_AGAIN,
     "died": _TRY_AGAIN,
     "hung": _TRY_AGAIN,
 }

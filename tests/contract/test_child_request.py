@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from backend.client import BackendClient
-from backend.environment import BackendNotFound
+from backend.environment import BackendNotFound, ImportTimedOut
 from backend.requests import Backend, ChildRequest
 from child_requests import generate_request, this_pythons_backend
 from conversation import BUSY_STEPS
@@ -147,6 +147,16 @@ def test_a_missing_python_is_the_requests_error(tmp_path):
     assert follow(request) == ["starting", "failed"]
     assert request.error.kind == "environment"
     assert str(request.error) == "No Python for the backend: name one in the preferences."
+
+
+def test_a_python_that_took_too_long_is_an_error_of_its_own(tmp_path):
+    def busy():
+        raise ImportTimedOut("python did not import torch within 90 s")
+        yield
+
+    request = generate_request(Backend(busy), seed=1, steps=1, out_dir=tmp_path / "out")
+    assert follow(request) == ["starting", "failed"]
+    assert request.error.kind == "timeout"
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="needs SIGSTOP to hang a process")

@@ -12,9 +12,11 @@ from backend.environment import (
     TRIAL,
     VARIABLE,
     BackendNotFound,
+    ImportTimedOut,
     candidates,
     python_of_environment,
     search,
+    tried,
 )
 from backend.requests import run_to_end
 
@@ -29,8 +31,9 @@ def script(path: Path, text: str) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def no_variable(monkeypatch):
+def nothing_tried(monkeypatch):
     monkeypatch.delenv(VARIABLE, raising=False)
+    tried.clear()
 
 
 @pytest.fixture
@@ -83,6 +86,22 @@ def test_a_python_that_will_not_do_is_named_with_its_reason_and_what_to_do(tmp_p
     assert reason in str(error.value)
     assert str(python) in str(error.value)
     assert "preferences" in str(error.value)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="shell scripts")
+def test_a_python_that_took_too_long_may_be_tried_again(tmp_path):
+    with pytest.raises(ImportTimedOut, match=r"The machine may be busy: try again") as error:
+        run_to_end(search(script(tmp_path / "python", "exec sleep 30"), timeout_s=0.1))
+    assert error.value.kind == "timeout"
+
+
+def test_a_python_counts_as_tried_once_it_has_answered(bundled, tmp_path):
+    broken = tmp_path / "no-python"
+    assert PYTHON not in tried
+    run_to_end(search(PYTHON, module_path=bundled))
+    with pytest.raises(BackendNotFound):
+        run_to_end(search(broken))
+    assert (tried[PYTHON], tried[broken]) == (True, False)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="shell scripts")

@@ -110,7 +110,7 @@ def ask(
     if request.state == "cancelled":
         raise Stopped
     if request.error is not None:
-        raise (NoBackend if request.error.kind == "environment" else ChildFailed)(str(request.error))
+        raise (NoBackend if request.error.kind in {"environment", "timeout"} else ChildFailed)(str(request.error))
     return request.result or {}
 
 

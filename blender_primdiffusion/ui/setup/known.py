@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import bpy
 
-from ...backend.environment import VARIABLE
+from ...backend.environment import VARIABLE, tried
 from ...backend.packages import Lock, Machine, chosen_compute, locks_for, read_lock, this_machine
 from ...backend.setup import state_of
 from ...places import EXTENSION, preference, set_up_folder
@@ -33,23 +33,28 @@ class Known:
     """For the panels."""
     about: dict[str, Any] = dataclasses.field(default_factory=dict)
     """What the environment's mark says."""
+    works: bool | None = None
+    """Whether it imported torch and the backend; None until it was tried."""
 
 
 def known() -> Known:
     """Which Python would run the backend, in the order in which it is searched."""
     if named := preference("backend_python"):
-        return Known("named", True, f"Uses {named}")
+        return Known("named", True, f"Uses {named}", works=tried.get(Path(named)))
     if named := os.environ.get(VARIABLE):
-        return Known("named", True, f"Uses {named}, named by the environment variable {VARIABLE}")
+        line = f"Uses {named}, named by the environment variable {VARIABLE}"
+        return Known("named", True, line, works=tried.get(Path(named)))
     state, about = state_of(set_up_folder())
     if state == "ready":
         versions = f"torch {about.get('torch')}, Python {about.get('python')}"
-        line = f"Ready: {versions}, {about.get('device') or 'CPU'}"
+        line, works = f"Ready: {versions}, {about.get('device') or 'CPU'}", tried.get(set_up_folder().python, True)
         if _made_of_another_lock(about):
-            return Known("outdated", True, f"{line}. Made for another version of the extension: press Repair", about)
-        return Known("ready", True, line, about)
+            return Known(
+                "outdated", True, f"{line}. Made for another version of the extension: press Repair", about, works
+            )
+        return Known("ready", True, line, about, works)
     if _has_torch():
-        return Known("own Python", True, "Uses Blender's own Python, which has torch")
+        return Known("own Python", True, "Uses Blender's own Python, which has torch", works=True)
     if state == "broken":
         return Known("broken", False, "Half installed, or made by a Blender that is gone: press Repair", about)
     return Known("absent", False, "The backend is not set up yet")

@@ -5,9 +5,10 @@ from __future__ import annotations
 import bpy
 
 from ...backend.requests import sentence
+from ...jobs.queue import queue
 from ...places import EXTENSION, set_up_folder
 from ..drawing import draw_lines
-from .known import chosen, cost, gigabytes, known, machine
+from .known import Known, chosen, cost, gigabytes, known, machine
 from .operators import redraw, session
 
 _SIDEBAR = 30
@@ -79,8 +80,12 @@ _COMPUTE = (
 )
 
 
-def _redraw(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
-    """Panels depend on the preferences."""
+def _python_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
+    """What the former Python did is of no interest any more."""
+    session.error = session.notice = ""
+    for kind, outcome in list(queue.outcomes.items()):
+        if outcome.error is not None and outcome.error.kind in {"environment", "timeout"}:
+            del queue.outcomes[kind]
     redraw()
 
 
@@ -97,7 +102,7 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         description="Python 3.11 or newer with PrimDiffusion's packages (torch), used instead of the private "
         "environment; empty: the private environment",
         subtype="FILE_PATH",
-        update=_redraw,
+        update=_python_changed,
     )
     checkpoint: bpy.props.StringProperty(
         name="Checkpoint",
@@ -131,7 +136,9 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
             draw_progress(box, _WIDTH)
             return
         now, folder = known(), set_up_folder()
-        draw_lines(box, now.line, "CHECKMARK" if now.usable else "ERROR", _WIDTH)
+        draw_lines(box, now.line, _icon(now), _WIDTH)
+        if now.usable and now.works is None:
+            draw_lines(box, "Not tested yet: press Test", "BLANK1", _WIDTH)
         if folder.environment.is_dir():
             size = f"{gigabytes(now.about['bytes'])} in " if "bytes" in now.about else ""
             draw_lines(box, f"{size}{folder.environment}", "FILE_FOLDER", _WIDTH)
@@ -148,6 +155,12 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         if private or state not in {"absent", "own Python", "named"}:
             row.operator("primdiffusion.repair_backend", icon="TOOL_SETTINGS")
             row.operator("primdiffusion.remove_backend", icon="TRASH")
+
+
+def _icon(now: Known) -> str:
+    if not now.usable or now.works is False:
+        return "ERROR"
+    return "QUESTION" if now.works is None else "CHECKMARK"
 
 
 def _draw_private(preferences: PRIMDIFFUSION_AP_preferences, box: bpy.types.UILayout) -> None:

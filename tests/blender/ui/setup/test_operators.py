@@ -210,6 +210,29 @@ def test_an_existing_python_goes_first_and_is_tried(wheels, monkeypatch):
         press.test_backend()
 
 
+def test_a_named_python_has_no_tick_before_it_was_tried(wheels, monkeypatch):
+    monkeypatch.setattr(known, "tried", tried := {})
+    monkeypatch.setenv(VARIABLE, "/some/python")
+    for works, icon in ((None, "QUESTION"), (False, "ERROR"), (True, "CHECKMARK")):
+        if works is not None:
+            tried[Path("/some/python")] = works
+        assert preferences._icon(known.known()) == icon
+        assert ("Not tested yet: press Test" in draw_preferences().said) == (works is None)
+        assert known.known().usable
+
+
+def test_another_python_clears_what_the_one_before_failed_at(wheels, monkeypatch):
+    from blender_primdiffusion.backend.requests import RequestError
+    from blender_primdiffusion.jobs.queue import JobOutcome, queue
+
+    monkeypatch.setattr(session, "error", "The self-test failed: no torch.")
+    failed = {kind: JobOutcome(None, error=RequestError("", "", kind)) for kind in ("environment", "timeout", "died")}
+    monkeypatch.setattr(queue, "outcomes", failed)
+    preferences._python_changed(None, bpy.context)
+    assert not session.error
+    assert list(queue.outcomes) == ["died"]
+
+
 def test_a_machine_without_packages_gets_an_error_with_a_remedy(online, monkeypatch):
     monkeypatch.setattr(known, "available", dict)
     with pytest.raises(RuntimeError, match="make an environment by hand and name its Python"):
