@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
 READY_TO_TEST := $(VENV)/ready-to-test
-PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock
+PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c requirements.lock
 ASSETS ?=
 TEST_ARGS ?=
 
@@ -15,11 +15,12 @@ VENV52 := .venv52
 PYTHON313 ?= $(shell for python in python3.13 "$${PYENV_ROOT:-$$HOME/.pyenv}"/versions/3.13*/bin/python3.13; do \
 	"$$python" -c "import sys, ensurepip; sys.exit(sys.version_info[:2] != (3, 13))" 2>/dev/null && echo "$$python" && break; done)
 
-# Sizes of the environments in megabytes (`du -sm`): missing disk space is reported before pip begins.
+# Sizes of the environments in megabytes (`du -sm`), with torch's CPU build: missing disk space is reported before pip
+# begins.
 ROOM := sh scripts/enough_room.sh
 VENV_MB := $(VENV):3700
-VENV45_MB := $(VENV45):1000
-VENV52_MB := $(VENV52):1200
+VENV45_MB := $(VENV45):850
+VENV52_MB := $(VENV52):1300
 
 # One worker per core with one thread each: more threads would compete for the cores.
 ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE
@@ -86,6 +87,7 @@ $(READY): pyproject.toml requirements.lock
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info[:2] != (3, 11))" || { echo "$(PYTHON) is not Python 3.11, which bpy 5.0 needs: run make PYTHON=/path/to/python3.11"; exit 1; }
 	@$(ROOM) $(VENV_MB)
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@echo "Installing Blender's Python module, torch and other packages into $(VENV): this takes some minutes"
 	$(PIP_INSTALL) -e ".[training,blender]"
 	@$(BIN)/python -c "import bpy" || { echo "Blender's module did not load: install the system packages named in README.md"; exit 1; }
 	touch $(READY)
@@ -98,14 +100,14 @@ $(READY_TO_TEST): $(READY)
 $(VENV45)/ready: $(READY_TO_TEST) Makefile
 	@$(ROOM) $(VENV45_MB)
 	test -x $(VENV45)/bin/python || $(BIN)/python -m venv --without-pip $(VENV45)
-	$(BIN)/python -m pip --python $(VENV45)/bin/python install --quiet --disable-pip-version-check --no-deps bpy==4.5.15
+	$(BIN)/python -m pip --python $(VENV45)/bin/python install --disable-pip-version-check --no-deps bpy==4.5.15
 	$(BIN)/python -c "import site; print('import site; site.addsitedir(%r)' % site.getsitepackages()[0])" > `echo $(VENV45)/lib/python3.*/site-packages`/zz_shared.pth
 	touch $@
 
 $(VENV52)/ready: requirements52.lock
 	@$(ROOM) $(VENV52_MB)
 	test -x $(VENV52)/bin/python || $(PYTHON313) -m venv $(VENV52)
-	$(VENV52)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements52.lock
+	$(VENV52)/bin/python -m pip install --disable-pip-version-check --no-deps -r requirements52.lock
 	touch $@
 
 ## clean: remove demo_out, build and dist

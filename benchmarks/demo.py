@@ -5,6 +5,7 @@ Each stage runs in its own process and is measured from outside. `--json FILE` a
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -21,6 +22,10 @@ from primdiffusion.machine import share_processors
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 FRAMES, SHOWN = 48, 31
+PRINT_S = 5.0
+"""Seconds between lines of progress."""
+LINE = 100
+"""Characters of such a line."""
 
 
 def main() -> None:
@@ -94,10 +99,21 @@ class StageFailed(RuntimeError):
 
 
 def run_stage(name: str, command: Sequence[str | Path], log: Path) -> Stage:
-    """Runs `command` with its output in `log`; raises StageFailed with the end of that output if it fails."""
+    """Runs `command` with its output in `log`, of which it prints the last line every PRINT_S seconds.
+
+    Raises StageFailed with the end of that output if it fails.
+    """
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("wb") as output, record.measured() as took:
-        code = subprocess.run([str(part) for part in command], stdout=output, stderr=subprocess.STDOUT).returncode
+        began = time.perf_counter()
+        process = subprocess.Popen([str(part) for part in command], stdout=output, stderr=subprocess.STDOUT)
+        while True:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                code = process.wait(PRINT_S)
+                break
+            lines = log.read_text(errors="replace").split("\n")
+            last = next((line.strip() for line in reversed(lines) if line.strip()), "")
+            print(f"  {time.perf_counter() - began:3.0f} s  {last[:LINE]}", flush=True)
     if code != 0:
         tail = "\n".join(log.read_text(errors="replace").splitlines()[-25:])
         raise StageFailed(f"{name} ended with exit code {code}; the whole output is in {log}:\n{tail}")
