@@ -19,5 +19,5 @@ def test_a_long_stage_shows_how_far_it_is(tmp_path, capsys, monkeypatch):
 
 
 def test_a_stage_that_fails_shows_the_end_of_its_output(tmp_path):
-    with pytest.raises(demo.StageFailed, match="exit code 3.*\n.*no room"):
+    with pytest.raises(demo.StageFailed, match=r"exit code 3.*\n.*no room"):
         demo.run_stage("build", [sys.executable, "-c", "print('no room'); raise SystemExit(3)"], tmp_path / "0.log")
