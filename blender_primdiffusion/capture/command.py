@@ -19,12 +19,12 @@ import bpy
 from ..backend.child_streams import stdin_has_ended
 from ..console import CANCELLED, DONE, FAILED, UNUSABLE, Stop, UsageError, duration, separate_stdout, stopped_by_signals
 from ..formats.capture_layout import CaptureFolderError
+from ..formats.capture_repair import repair, verify
 from .job import CaptureError, CaptureProgress, run
 from .options import MARK, parse, settings_of
 from .report import Report, report_path
 from .scan import ScanError, ScanFile, find_scans
 from .settings import CaptureSettings
-from .subject import repair, verify
 
 _PRINT_S = 1.0
 """Between lines of progress."""
@@ -94,9 +94,11 @@ def _run(options: argparse.Namespace, say: Say, stop: Stop) -> int:
 
 
 def _check(options: argparse.Namespace, say: Say) -> int:
-    wrong = repair(options.out) if options.repair else verify(options.out)
-    for sentence in wrong:
-        say(sentence)
+    wrong = verify(options.out)
+    if options.repair:
+        repair(options.out, wrong)
+    for path, what in wrong.items():
+        say(f"{path}: {what}")
     say(f"{options.out}: {f'{len(wrong)} problems' if wrong else 'no problems'}")
     return FAILED if wrong else DONE
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
+import os
+import shutil
 import time
 from collections.abc import Generator, Sequence
 from pathlib import Path
@@ -13,8 +15,10 @@ from typing import Protocol
 import bpy
 import numpy as np
 
+from ..formats.camera_files import write_layouts
 from ..formats.camera_rig import View, bounding_sphere
-from ..formats.capture_layout import claim, complete, view_seed
+from ..formats.capture_layout import RELEASED_REFERENCE, claim, complete, damage, view_seed, write_joints, write_smpl
+from ..formats.capture_repair import is_complete_view, list_subjects, remove_damaged
 from ..motion.files import MotionFileError, read_motion
 from ..motion.motion import Motion
 from ..motion.poses import built_in_poses, pick_poses
@@ -25,7 +29,6 @@ from .scan import Scan, ScanFile, load_scan
 from .settings import CaptureSettings
 from .skinned_surface import cameras_inside
 from .stage import Stage, shoot_centres, shoot_colours
-from .subject import CapturePlan, begin, is_drawn, is_finished, list_subjects, name_reference
 from .surfaces import mark_parts, prepare_materials
 
 
@@ -120,7 +123,7 @@ def run(
         for scan_file in mine:
             yield from _try_subject(context, settings, scan_file, poses, body, load, clock)
             if settings.released_reference and scan_file is ordered[0] and scan_file.name in report.done:
-                name_reference(settings.out, scan_file.name)
+                _name_reference(settings.out, scan_file.name)
             report.write(settings.out, settings.shard)
     finally:
         list_subjects(settings.out)
@@ -134,10 +137,12 @@ def _try_subject(
     folder, report = settings.out / scan_file.name, clock.report
     clock.begin(scan_file.name)
     views = len(poses) * settings.camera_count
-    if is_finished(folder):
+    wrong = damage(folder, checksums=False)
+    if not wrong:
         report.skipped.append(scan_file.name)
         yield clock.skip_rest(views)
         return
+    remove_damaged(folder, wrong)
     try:
         yield from _capture(context, settings, scan_file, poses, body, load, clock)
         complete(folder)
@@ -154,6 +159,20 @@ def _try_subject(
     yield clock.skip_rest(views)
 
 
+def _name_reference(root: Path, subject: str) -> None:
+    """Link the finished `subject` under the name from which the released code takes its rest sizes."""
+    reference = root / RELEASED_REFERENCE
+    if subject == RELEASED_REFERENCE or reference.exists():
+        return
+    try:
+        os.symlink(subject, reference, target_is_directory=True)
+    except OSError:  # Windows without the right to links, or a disk that has none
+        partial = root / f".{RELEASED_REFERENCE}.partial"
+        shutil.rmtree(partial, ignore_errors=True)
+        shutil.copytree(root / subject, partial)
+        os.replace(partial, reference)
+
+
 def _capture(context, settings, scan_file, poses, body, load, clock: _Clock) -> Generator[CaptureProgress, None, None]:
     folder = settings.out / scan_file.name
     with contextlib.closing(Stage(context, settings)) as stage:
@@ -166,9 +185,14 @@ def _capture(context, settings, scan_file, poses, body, load, clock: _Clock) -> 
             prepare_materials(scan.objects, unlit=settings.light == "uniform")
             views = list(settings.cameras) or _views_around(scan, settings, poses)
             joints = np.stack([scan.pose(*pose) for pose in zip(poses.rotations, poses.translations, strict=True)])
-        begin(folder, CapturePlan(scan.betas, poses, joints, views), settings.layouts)
+        theta = poses.axis_angle().reshape(len(poses), 72)
+        write_smpl(folder, theta[:, :3], theta[:, 3:], scan.betas, poses.translations)
+        write_joints(folder, views, joints)
+        write_layouts(folder, views, len(poses), settings.layouts)
         for frame in range(len(poses)):
-            missing = [camera for camera in range(len(views)) if not is_drawn(folder, settings.kinds, frame, camera)]
+            missing = [
+                camera for camera in range(len(views)) if not is_complete_view(folder, settings.kinds, camera, frame)
+            ]
             if missing:
                 with stage.entered() as own:
                     scan.pose(poses.rotations[frame], poses.translations[frame])

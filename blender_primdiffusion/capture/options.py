@@ -12,8 +12,8 @@ import numpy as np
 
 from ..console import UsageError
 from ..formats.camera_rig import Arrangement, Rig, View
+from ..formats.requests import LAYOUTS, PASSES
 from .blender_camera import CameraError
-from .names import LAYOUTS, PASSES
 from .settings import Background, CaptureSettings, Device, Light
 
 MARK = "PRIMDIFFUSION "

@@ -12,7 +12,7 @@ from ..formats.camera_rig import Rig, View
 from ..formats.capture_layout import ENDINGS
 from ..formats.joints import JOINT_NAMES
 from ..formats.picture_files import DEPTH_UNIT
-from .names import LAYOUTS, PASSES
+from ..formats.requests import LAYOUTS, PASSES
 
 Light = Literal["uniform", "dome", "hdri"]
 Background = Literal["black", "transparent"]

@@ -215,6 +215,26 @@ _PRINT_S = 1.0
 """Between lines of progress on the console in background mode."""
 
 
+class Reporting:
+    """Base of operators whose errors become reports; subclasses define `act`.
+
+    No options: with REGISTER a redo slider would start an expensive job again, and results make their own UNDO step.
+    """
+
+    bl_options: set[str] = set()
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            return self.act(context)
+        except (ValueError, OSError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+
+    def act(self, context: bpy.types.Context) -> set[str]:
+        """The operator itself; ValueError and OSError become reports."""
+        raise NotImplementedError
+
+
 def submit(operator: bpy.types.Operator, context: bpy.types.Context, job: Job) -> set[str]:
     """Queue `job` for the scene of `context`; with a window a timer follows it, in background mode this waits."""
     if not bpy.app.background:

@@ -7,11 +7,11 @@ from pathlib import Path
 import bpy
 
 from ..backend.requests import sentence
-from ..jobs.follow import submit
+from ..jobs.follow import Reporting, submit
 from ..jobs.target import HumanTarget, selected_person
 from ..scene.human import humans
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
-from .on_person import SKIP, OnPerson, Reporting
+from .on_person import SKIP, OnPerson
 from .translations import CONTEXT
 
 _PICTURE = "Image file for the preview; empty: one is drawn"

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING
 import bpy
 from mathutils import Vector
 
-from ..jobs.follow import redraw
+from ..jobs.follow import Reporting, redraw
 from .captures_session import Busy, captures
 from .captures_settings import words_of
 from .drawing import SidebarPanel, draw_lines, property_columns
-from .on_person import Reporting
 
 if TYPE_CHECKING:
     import numpy as np
@@ -119,7 +118,7 @@ class PRIMDIFFUSION_OT_verify_captures(Reporting, bpy.types.Operator):
         """With a window another Blender verifies; in background mode this one, failing on damage."""
         # needs numpy
         from ..capture.options import parse
-        from ..capture.subject import repair, verify
+        from ..formats.capture_repair import repair, verify
 
         out = bpy.path.abspath(self.out or context.scene.primdiffusion_captures.out)
         if not out:
@@ -130,11 +129,14 @@ class PRIMDIFFUSION_OT_verify_captures(Reporting, bpy.types.Operator):
             bpy.app.timers.register(follow, first_interval=_TICK_S, persistent=True)
             return {"FINISHED"}
         root = parse(words).out
-        wrong = repair(root) if self.repair else verify(root)
-        for sentence in wrong:
-            print(f"PrimDiffusion: {sentence}")
-        if wrong and not self.repair:
-            raise ValueError(f"{len(wrong)} problems; the first: {wrong[0]}")
+        wrong = verify(root)
+        for path, what in wrong.items():
+            print(f"PrimDiffusion: {path}: {what}")
+        if self.repair:
+            repair(root, wrong)
+        elif wrong:
+            first, what = next(iter(wrong.items()))
+            raise ValueError(f"{len(wrong)} problems; the first: {first}: {what}")
         return {"FINISHED"}
 
 

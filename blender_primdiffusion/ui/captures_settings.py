@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ..capture.names import LAYOUTS, PASSES
+from ..formats.requests import LAYOUTS, PASSES
 from .translations import CONTEXT
 
 if TYPE_CHECKING:

@@ -8,12 +8,12 @@ from typing import Any
 import bpy
 
 from ..formats.requests import AMOUNT, FRACTION, PARTS, SIDED_PARTS, STEPS, TRANSFERS, WHOLE_PARTS
-from ..jobs.follow import submit
+from ..jobs.follow import Reporting, submit
 from ..jobs.target import named_person, selected_person
 from ..scene.human import BODY_MARK, MARK, body_of, humans, person_file
 from .attributes import PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed, title
 from .drawing import SidebarPanel, draw_job, property_columns
-from .on_person import PANELS, SKIP, OnPerson, Reporting
+from .on_person import PANELS, SKIP, OnPerson
 from .translations import CONTEXT
 
 PAINTED_GROUP = "PrimDiffusion Region"

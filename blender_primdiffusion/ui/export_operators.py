@@ -9,10 +9,10 @@ from pathlib import Path
 import bpy
 
 from ..formats import requests
-from ..jobs.follow import submit
+from ..jobs.follow import Reporting, submit
 from ..jobs.target import HumanTarget
 from ..scene.human import armature_of
-from .on_person import PANELS, SKIP, OnPerson, Reporting
+from .on_person import PANELS, SKIP, OnPerson
 from .translations import CONTEXT
 
 

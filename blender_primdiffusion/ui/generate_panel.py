@@ -11,13 +11,12 @@ from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
 
 from ..formats import requests
-from ..jobs.follow import submit
+from ..jobs.follow import Reporting, submit
 from ..jobs.memory import device_line
 from ..jobs.queue import queue
 from .attributes import CATEGORIES, SCALARS, PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
 from .manual import draw_manual_button
-from .on_person import Reporting
 from .setup.preferences import draw_set_up
 from .translations import CONTEXT
 

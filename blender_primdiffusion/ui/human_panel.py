@@ -7,12 +7,12 @@ from pathlib import Path
 import bpy
 
 from ..backend.requests import sentence
-from ..jobs.follow import submit
+from ..jobs.follow import Reporting, submit
 from ..jobs.missing_files import look, state
 from ..jobs.target import HumanTarget, selected_person
 from ..scene.human import armature_of, check_editable, humans, humans_folder, person_file, remove_human
 from .drawing import SidebarPanel, draw_job, draw_lines
-from .on_person import OnPerson, Reporting
+from .on_person import OnPerson
 
 
 class _Find:

@@ -12,13 +12,12 @@ from bpy.app.handlers import persistent
 
 from ..backend.redact import redact
 from ..jobs import follow, memory
-from ..jobs.follow import building, redraw, submit
+from ..jobs.follow import Reporting, building, redraw, submit
 from ..jobs.memory import device_line
 from ..jobs.pictures import so_far
 from ..jobs.queue import queue
 from ..places import EXTENSION, backend_module_path, preference
 from .drawing import SidebarPanel, draw_ended, draw_lines, draw_queue
-from .on_person import Reporting
 
 TEXT = "PrimDiffusion Diagnostics"
 _LOG_LINES = 60

@@ -9,10 +9,11 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ..backend.requests import sentence
+from ..jobs.follow import Reporting
 from ..scene.actions import action_curves, end_repeat, loops, repeat
 from .drawing import SidebarPanel, draw_lines, property_columns
 from .export_operators import destination
-from .on_person import FACTS, OnArmature, Reporting, WhereTo, scene_fps, target_armature
+from .on_person import FACTS, OnArmature, WhereTo, scene_fps, target_armature
 from .translations import CONTEXT
 
 _BUILT_IN = [

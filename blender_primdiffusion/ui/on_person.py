@@ -5,31 +5,12 @@ from __future__ import annotations
 import bpy
 
 from ..formats.joints import JOINT_NAMES
+from ..jobs.follow import Reporting
 from ..jobs.target import named_person, selected_person
 from ..scene.human import armature_of, human_of, humans
 
 SKIP = {"SKIP_SAVE"}
 PANELS = "Not given: the panel's"
-
-
-class Reporting:
-    """Base of operators whose errors become reports; subclasses define `act`.
-
-    No options: with REGISTER a redo slider would start an expensive job again, and results make their own UNDO step.
-    """
-
-    bl_options: set[str] = set()
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        try:
-            return self.act(context)
-        except (ValueError, OSError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-
-    def act(self, context: bpy.types.Context) -> set[str]:
-        """The operator itself; ValueError and OSError become reports."""
-        raise NotImplementedError
 
 
 class OnPerson(Reporting):

@@ -8,9 +8,8 @@ from pathlib import Path
 import bpy
 
 from ..formats.requests import CAPTURE_VIEWS
-from ..jobs.follow import submit
+from ..jobs.follow import Reporting, submit
 from .drawing import SidebarPanel, draw_job, property_columns
-from .on_person import Reporting
 
 _CAMERAS_FILE = "cameras.json"
 

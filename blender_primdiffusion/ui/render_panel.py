@@ -11,12 +11,12 @@ from mathutils import Euler, Vector
 from ..backend.requests import sentence
 from ..engine.engine import ENGINE
 from ..formats.requests import DENSITY_GAIN, VOXEL
+from ..jobs.follow import Reporting
 from ..jobs.target import selected_person
 from ..scene.attachment import MODES, attachment_of
 from ..scene.human import human_of, humans
 from ..scene.material import density_gain, set_density_gain
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
-from .on_person import Reporting
 from .render_operators import ATTACHMENT_ITEMS
 
 _FROM_EEVEE = frozenset(

@@ -12,13 +12,12 @@ from bpy.app.translations import pgettext_iface, pgettext_tip
 
 from ..backend.requests import sentence
 from ..formats.requests import AMOUNT
-from ..jobs.follow import redraw, submit
+from ..jobs.follow import Reporting, redraw, submit
 from ..jobs.pictures import icons
 from ..jobs.queue import queue
 from ..jobs.variations import Variation, VariationsJob, sheet
 from .drawing import SidebarPanel, draw_job, property_columns
 from .generate_panel import LARGEST_SEED, STEPS_AND_SAMPLER, GenerateOptions, last_seed
-from .on_person import Reporting
 
 if TYPE_CHECKING:
     from ..jobs.variations import VariationsJob

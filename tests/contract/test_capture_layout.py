@@ -137,21 +137,21 @@ def test_damage_is_found(tmp_path):
     capture_layout.write_joints(tmp_path, views, np.zeros((2, 24, 3)))
     for camera in range(3):
         picture_files.write_png(capture_layout.picture_path(tmp_path, "mask", camera, 0), np.zeros((60, 40), np.uint8))
-    assert capture_layout.damaged(tmp_path) == [f"{tmp_path}: not finished"]
+    assert capture_layout.damage(tmp_path) == {tmp_path: "not finished"}
     capture_layout.complete(tmp_path)
-    assert capture_layout.damaged(tmp_path) == []
+    assert capture_layout.damage(tmp_path) == {}
     paths = [capture_layout.picture_path(tmp_path, "mask", camera, 0) for camera in range(3)]
     paths[0].unlink()
     paths[1].write_bytes(paths[1].read_bytes()[:-5])
     changed = bytearray(paths[2].read_bytes())
     changed[40] ^= 1
     paths[2].write_bytes(changed)
-    assert [sentence.split(": ")[1] for sentence in capture_layout.damaged(tmp_path)] == [
+    assert list(capture_layout.damage(tmp_path).values()) == [
         "missing",
         f"{paths[1].stat().st_size} bytes instead of {paths[1].stat().st_size + 5}",
         "altered",
     ]
-    assert len(capture_layout.damaged(tmp_path, checksums=False)) == 2
+    assert len(capture_layout.damage(tmp_path, checksums=False)) == 2
     assert not picture_files.is_whole_picture(paths[1])
 
 

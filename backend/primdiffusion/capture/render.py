@@ -21,9 +21,10 @@ from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.capture.people_files import SkinnedPerson, read_person
 from primdiffusion.failures import describe
 from primdiffusion.formats import camera_files, capture_layout, picture_files
-from primdiffusion.formats.arrays import ArrayFileError, read_numbers
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
+from primdiffusion.formats.capture_repair import is_complete_view, list_subjects
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.formats.requests import PASSES
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.raster.multisample import Figure, RenderedView, figure_from_mesh, render_view
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, encode_bytes
@@ -86,15 +87,9 @@ def write_parameters(subject: Path, setup: CaptureSetup) -> None:
         OSError: a file cannot be written.
     """
     theta = matrix_to_axis_angle(setup.poses.joint_rotation).numpy().reshape(len(setup.skinning), -1)
-    translation = setup.poses.translation.numpy()
-    _check_same_parameters(subject, theta, setup.betas, translation)
-    capture_layout.write_smpl(subject, theta[:, :3], theta[:, 3:], setup.betas, translation)
+    capture_layout.write_smpl(subject, theta[:, :3], theta[:, 3:], setup.betas, setup.poses.translation.numpy())
     capture_layout.write_joints(subject, setup.views, setup.joints)
-    camera_files.write_cameras(subject, setup.views)
-    camera_files.write_opencv(subject, setup.views)
-    for frame in range(len(theta)):
-        camera_files.write_nerf(subject, setup.views, frame)
-        camera_files.write_colmap(subject, setup.views, frame)
+    camera_files.write_layouts(subject, setup.views, len(theta))
 
 
 def render_frames(
@@ -114,21 +109,9 @@ def render_frames(
             yield frame, camera
 
 
-def last_pass(passes: Sequence[str]) -> str:
-    """The pass that is written last; its image marks the view as complete."""
-    return "img" if "img" in passes else passes[-1]
-
-
-def is_complete_view(subject: Path, passes: Sequence[str], camera: int, frame: int) -> bool:
-    """Whether all images of a view exist and are complete."""
-    return all(
-        picture_files.is_whole_picture(capture_layout.picture_path(subject, kind, camera, frame)) for kind in passes
-    )
-
-
 def write_view(subject: Path, passes: Sequence[str], camera: int, frame: int, rendered: RenderedView) -> None:
-    """Write the images of one view atomically, the one that marks the view as complete last."""
-    for kind in sorted(passes, key=lambda kind: kind == last_pass(passes)):
+    """Write the images of one view atomically."""
+    for kind in passes:
         path = capture_layout.picture_path(subject, kind, camera, frame)
         if kind == "img":
             with capture_layout.replacing(path) as partial:
@@ -148,23 +131,6 @@ def srgb_bytes(linear: np.ndarray) -> np.ndarray:
     encoded = np.empty(linear.shape, np.uint8)
     encode_bytes(np.ascontiguousarray(linear, np.float32).ravel(), BYTE_OF_LINEAR, encoded.ravel())
     return encoded
-
-
-def _check_same_parameters(subject: Path, theta: np.ndarray, betas: np.ndarray, translation: np.ndarray) -> None:
-    path = subject / capture_layout.SMPL_FOLDER / capture_layout.SMPL_PLAIN_FILE
-    wanted = {"global_orient": theta[:, :3], "body_pose": theta[:, 3:], "betas": betas[None], "transl": translation}
-    try:
-        present = read_numbers(path, tuple(wanted))
-    except (FileNotFoundError, ArrayFileError):
-        return  # missing or truncated: it is written again
-    for name, values in wanted.items():
-        if present[name].shape != values.shape or not np.allclose(present[name], values, atol=1e-5):
-            raise capture_layout.CaptureFolderError(
-                f"{subject} contains another subject or other poses ({name} differs): choose another folder"
-            )
-
-
-PASSES = tuple(kind for kind in capture_layout.ENDINGS if kind in ("img", "mask", "depth", "normal", "part"))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -241,15 +207,10 @@ def render(job: RenderJob, workers: int = 1) -> Iterator[SubjectResult]:
     _write_report(job, outcomes)
 
 
-def finished_subjects(root: Path) -> list[str]:
-    """Names of the subjects with a completion mark."""
-    return sorted(path.parent.name for path in root.glob(f"*/{capture_layout.COMPLETE_FILE}"))
-
-
 def _outcomes(job: RenderJob, workers: int) -> Iterator[SubjectResult]:
     waiting = []
     for name in job.people:
-        if capture_layout.damaged(job.out / name, checksums=False):
+        if capture_layout.damage(job.out / name, checksums=False):
             waiting.append(name)
         else:
             yield SubjectResult(name, "skipped")
@@ -314,7 +275,7 @@ def _finish(job: RenderJob, name: str, outcomes: Sequence[SubjectResult]) -> Sub
 
 def _write_report(job: RenderJob, outcomes: Sequence[SubjectResult]) -> None:
     """Write the list of finished subjects and the report."""
-    capture_layout.write_list(job.out, finished_subjects(job.out))
+    list_subjects(job.out)
     report = {
         "done": [outcome.subject for outcome in outcomes if outcome.status == "done"],
         "failed": [{"subject": "", "what": "poses", "why": error} for error in job.unread_poses]

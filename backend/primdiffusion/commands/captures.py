@@ -15,9 +15,10 @@ from tqdm import tqdm
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import MotionFileError, choose_poses, read_motion, read_motions
-from primdiffusion.capture.render import PASSES, RenderJob, render
+from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
+from primdiffusion.formats.requests import PASSES
 
 DESCRIPTION = "Multi-view captures, to train on."
 
@@ -131,11 +132,11 @@ class VerifyCaptures:
     def run(self) -> None:
         """Print a line for each finding; raises ValueError if there is any."""
         # used by this subcommand alone
-        from primdiffusion.capture.verify import repair, subject_folders, verify
+        from primdiffusion.formats.capture_repair import repair, subject_folders, verify
 
         findings = verify(self.root, checksums=not self.quick)
-        for finding in findings:
-            print(finding)
+        for path, what in findings.items():
+            print(f"{path}: {what}")
         if not findings:
             print(f"{self.root}: {len(subject_folders(self.root))} subjects, nothing wrong")
             return

@@ -3,12 +3,93 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 import tyro
 from tqdm import tqdm
+
+from primdiffusion.formats.requests import Making
+
+
+@dataclasses.dataclass(frozen=True)
+class MakePeople:
+    """Make dressed, rigged humans as glTF files, from which captures are rendered."""
+
+    out: Path
+    """Folder to write person_NNNNNN/person.glb and manifest.json into; complete ones are skipped."""
+    assets: Path | None = None
+    """MakeHuman asset folder (CC0); the default is the environment variable PRIMDIFFUSION_ASSETS."""
+    count: int = 100
+    """Number of humans."""
+    seed: int = 0
+    """Seed of the first human; the others have the following seeds."""
+    workers: int = os.cpu_count() or 1
+    """Processes; each needs a core and about 1 GB."""
+
+    def run(self) -> None:
+        """Make the humans, show progress, and print the folder. Raises ValueError, FileNotFoundError, OSError."""
+        # torch is loaded late
+        from primdiffusion.people.assets import open_assets
+        from primdiffusion.people.folder import PeopleSet, make_people, unknown_licences
+        from primdiffusion.people.wardrobe import required_meshes
+
+        people = PeopleSet(self.out, self.seed, self.count)
+        assets = open_assets(self.assets, required_meshes())
+        with tqdm(total=self.count, unit="person", desc="people", disable=None) as bar:
+            for done in make_people(assets, people, self.workers):
+                bar.update(done - bar.n)
+        unknown = unknown_licences(self.out)
+        if unknown:
+            print(
+                f"primdiffusion: {len(unknown)} asset files state no licence ({unknown[0]}, ...), so the manifest "
+                "lists it as unknown: list them in a LICENSES.txt beside the asset folder",
+                file=sys.stderr,
+            )
+        print(self.out)
+
+
+@dataclasses.dataclass(frozen=True)
+class MakePayloads:
+    """Make dressed humans as primitives: the training set of the diffusion model.
+
+    `payloads encode` makes them from captures instead; `payloads pack` stores either in few files, whose checksums
+    `payloads verify` compares (each with its own --help).
+    """
+
+    out: Path
+    """Folder to write person_NNNNNN.npz into; complete ones are skipped."""
+    assets: Path | None = None
+    """MakeHuman asset folder (CC0); the default is the environment variable PRIMDIFFUSION_ASSETS."""
+    count: int = 100
+    """Number of humans."""
+    variants: int = 4
+    """Colourings of each human."""
+    seed: int = 0
+    """Seed of the first human; the others have the following seeds."""
+    making: Making = "fitted"
+    """fitted: the primitives are fitted to renders of the mesh, about 30 s per human and core; from_mesh: each voxel
+    takes the colour of the nearest surface point, 2 s, blurred."""
+    workers: int = os.cpu_count() or 1
+    """Processes; each needs a core and about 1.5 GB."""
+
+    def run(self) -> None:
+        """Make the payloads and show progress. Raises ValueError, FileNotFoundError, OSError."""
+        # torch is loaded late
+        from primdiffusion.people.assets import open_assets
+        from primdiffusion.people.payloads import make_payloads
+        from primdiffusion.people.wardrobe import required_meshes
+
+        assets = open_assets(self.assets, required_meshes())
+        with tqdm(total=self.count, unit="person", desc="payloads") as bar:
+
+            def report(done: int, total: int) -> None:
+                bar.update(done - bar.n)
+
+            make_payloads(assets, self.out, self.count, self.variants, self.seed, self.workers, self.making, report)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,18 +195,13 @@ PAYLOADS_COMMANDS = {"encode": EncodePayloads, "pack": PackPayloads, "verify": V
 
 def run_people(arguments: Sequence[str]) -> None:
     """Run a command line of `people`; raises its errors."""
-    from primdiffusion.people import command  # slow to import, and not needed by `payloads encode`
-
-    command.run_people(tyro.cli(command.PeopleCommand, args=arguments, prog="primdiffusion people"))
+    tyro.cli(MakePeople, args=arguments, prog="primdiffusion people").run()
 
 
 def run_payloads(arguments: Sequence[str]) -> None:
     """Run a command line of `payloads`, with or without one of PAYLOADS_COMMANDS; raises its errors."""
-    prog = "primdiffusion payloads"
+    command, prog = MakePayloads, "primdiffusion payloads"
     if arguments and arguments[0] in PAYLOADS_COMMANDS:
-        name = arguments[0]
-        tyro.cli(PAYLOADS_COMMANDS[name], args=arguments[1:], prog=f"{prog} {name}").run()
-        return
-    from primdiffusion.people import command  # slow to import, and not needed by `payloads encode`
-
-    command.run_payloads(tyro.cli(command.PayloadsCommand, args=arguments, prog=prog))
+        command, prog = PAYLOADS_COMMANDS[arguments[0]], f"{prog} {arguments[0]}"
+        arguments = arguments[1:]
+    tyro.cli(command, args=arguments, prog=prog).run()

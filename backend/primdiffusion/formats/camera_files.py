@@ -12,8 +12,21 @@ from numpy.typing import NDArray
 
 from .camera_rig import View
 from .capture_layout import picture_path, replacing, write_npz
+from .requests import LAYOUTS
 
 _FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
+
+
+def write_layouts(subject: Path, views: Sequence[View], frames: int, layouts: Sequence[str] = LAYOUTS) -> None:
+    """Write cameras.json, and the files of other `layouts` for all frames. Raises OSError."""
+    write_cameras(subject, views)
+    if "opencv" in layouts:
+        write_opencv(subject, views)
+    for frame in range(frames):
+        if "nerf" in layouts:
+            write_nerf(subject, views, frame)
+        if "colmap" in layouts:
+            write_colmap(subject, views, frame)
 
 
 def write_cameras(subject: Path, views: Sequence[View]) -> None:

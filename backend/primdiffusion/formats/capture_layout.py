@@ -36,6 +36,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import ArrayFileError, read_numbers
 from .camera_rig import View
 
 FORMAT, VERSION = "primdiffusion-captures", 1
@@ -140,13 +141,17 @@ def write_list(root: Path, subjects: Sequence[str]) -> None:
 
 
 def write_smpl(subject: Path, global_orient: NDArray, body_pose: NDArray, betas: NDArray, translation: NDArray) -> None:
-    """Write SMPL parameters: axis-angle [F,3] and [F,69], betas [B], metres [F,3]; frame 0 is the near-T pose."""
+    """Write SMPL parameters: axis-angle [F,3] and [F,69], betas [B], metres [F,3]; frame 0 is the near-T pose.
+
+    Raises CaptureFolderError if the folder holds those of another human, or other poses.
+    """
     arrays = {
         "global_orient": np.asarray(global_orient, np.float32),
         "body_pose": np.asarray(body_pose, np.float32),
         "betas": np.asarray(betas, np.float32).reshape(1, -1),
         "transl": np.asarray(translation, np.float32),
     }
+    _check_same_smpl(subject, arrays)
     write_npz(subject / SMPL_FOLDER / SMPL_PLAIN_FILE, **arrays)
     write_npz(subject / SMPL_FOLDER / SMPL_FILE, smpl=np.array(arrays, dtype=object))
 
@@ -178,16 +183,12 @@ def complete(subject: Path) -> None:
         path.write_text(json.dumps(files, indent=0), encoding="utf-8")
 
 
-def damaged(subject: Path, *, checksums: bool = True) -> list[str]:
-    """Return an error message for each damaged file of a finished subject, or one if it is unfinished.
-
-    An unfinished subject has no readable complete.json. Without `checksums` only sizes are compared.
-    """
-    return [f"{path}: {what}" for path, what in damage(subject, checksums=checksums).items()]
-
-
 def damage(subject: Path, *, checksums: bool = True) -> dict[Path, str]:
-    """As `damaged`, by file, or by the folder of an unfinished subject. Never names a file outside of it."""
+    """Return what is wrong with each damaged file of a finished subject, or with the folder of an unfinished one.
+
+    An unfinished subject has no readable complete.json. Without `checksums` only sizes are compared. Never names a
+    file outside of the subject.
+    """
     try:
         files = json.loads((subject / COMPLETE_FILE).read_text(encoding="utf-8"))
         noted = {_inside(subject, name): (int(size), int(crc)) for name, (size, crc) in files.items()}
@@ -202,6 +203,18 @@ def damage(subject: Path, *, checksums: bool = True) -> dict[Path, str]:
         elif checksums and _crc(path) != crc:
             wrong[path] = "altered"
     return wrong
+
+
+def _check_same_smpl(subject: Path, wanted: Mapping[str, NDArray]) -> None:
+    try:
+        present = read_numbers(subject / SMPL_FOLDER / SMPL_PLAIN_FILE, tuple(wanted))
+    except (FileNotFoundError, ArrayFileError):
+        return  # missing or truncated: it is written again
+    for name, values in wanted.items():
+        if present[name].shape != values.shape or not np.allclose(present[name], values, atol=1e-5):
+            raise CaptureFolderError(
+                f"{subject} holds another human or other poses ({name} differs): choose another folder, or remove it"
+            )
 
 
 def _inside(subject: Path, name: str) -> Path:

@@ -35,6 +35,12 @@ AMOUNT = 0.5
 """Strength of a variation: 0 changes nothing, 1 leaves hardly anything in common."""
 FRACTION = 0.5
 """Position between two humans."""
+Making = Literal["fitted", "from_mesh"]
+"""How payloads are made: fitted to renders of the mesh, or with the colours of the nearest surface point."""
+PASSES = ("img", "mask", "depth", "normal", "part")
+"""Images of a captured view."""
+LAYOUTS = ("nerf", "opencv", "colmap")
+"""Camera files of other projects beside captures; the released code's files are always written."""
 CAPTURE_VIEWS = 8
 """Cameras whose images the encoder gets."""
 PICTURE_SIZE = 512

@@ -19,7 +19,6 @@ import math
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -28,6 +27,7 @@ from numpy import ndarray
 
 from primdiffusion.body.model import default_body
 from primdiffusion.formats.arrays import read_arrays
+from primdiffusion.formats.requests import Making
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
@@ -45,9 +45,6 @@ from primdiffusion.worker_process import each
 VARIANT_STRIDE = 1 << 32
 """Variant j of seed s is coloured with seed s + j * VARIANT_STRIDE."""
 KEYS = ("voxels", "betas", "attributes", "full_density", "seed", "making")
-Making = Literal["fitted", "from_mesh"]
-"""fitted: to renders of the mesh (`fitted_payloads`); from_mesh: colours of the nearest surface point, ten times
-faster and blurrier."""
 VERSIONS: dict[Making, str] = {"fitted": "fitted 1", "from_mesh": "from_mesh 2"}
 """Method and version stored in files; those of other versions are made again."""
 

@@ -16,9 +16,9 @@ from capture_scenes import box_person, captured, save_person, small_job
 from primdiffusion import cli
 from primdiffusion.capture.people_files import GlbError, find_people, read_glb, read_person
 from primdiffusion.capture.render import render
-from primdiffusion.capture.verify import verify
 from primdiffusion.commands.captures import parse_shard
 from primdiffusion.formats import capture_layout
+from primdiffusion.formats.capture_repair import verify
 
 NAMES = ["person_000000", "person_000001"]
 
@@ -105,7 +105,7 @@ def test_captures_have_the_layouts_files_and_are_whole(tmp_path):
     )
     for name in NAMES:
         subject = root / name
-        assert capture_layout.damaged(subject) == []
+        assert capture_layout.damage(subject) == {}
         for kind in ("img", "mask", "depth", "normal", "part"):
             pictures = [
                 capture_layout.picture_path(subject, kind, camera, frame) for camera in range(4) for frame in range(3)
@@ -154,7 +154,7 @@ import sys; sys.path.insert(0, {str(Path(__file__).parents[1])!r})
 from pathlib import Path
 from capture_scenes import small_job
 from primdiffusion.capture.render import render
-from primdiffusion.capture.verify import verify
+from primdiffusion.formats.capture_repair import verify
 list(render(small_job(Path({str(tmp_path)!r}), frames=12)))
 """
     child = subprocess.Popen([sys.executable, "-c", program])
@@ -168,7 +168,7 @@ list(render(small_job(Path({str(tmp_path)!r}), frames=12)))
     assert not (job.out / NAMES[1] / capture_layout.COMPLETE_FILE).exists()
     assert {outcome.status for outcome in render(job)} <= {"done", "skipped"}
     assert everything(job.out) == expected
-    assert verify(job.out) == []
+    assert verify(job.out) == {}
 
 
 def test_what_a_killed_process_left_half_written_goes(tmp_path):
@@ -179,7 +179,7 @@ def test_what_a_killed_process_left_half_written_goes(tmp_path):
     left.write_bytes(b"half")
     list(render(job))
     assert not left.exists()
-    assert verify(job.out) == []
+    assert verify(job.out) == {}
 
 
 def test_workers_end_when_the_command_is_killed(tmp_path):

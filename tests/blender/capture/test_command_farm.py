@@ -14,9 +14,9 @@ import numpy as np
 import psutil
 import pytest
 import scan_fixtures
+from blender_primdiffusion.formats.capture_repair import verify
 
 from blender_primdiffusion.capture.body import read_body
-from blender_primdiffusion.capture.subject import verify
 from blender_primdiffusion.formats import capture_layout
 
 pytest.importorskip("ray", reason="Ray is not installed")
@@ -52,7 +52,7 @@ def test_a_killed_workers_person_is_finished_by_another_and_no_view_is_lost_or_d
     assert process.returncode == 0, told
     assert killed in NAMES
     assert sorted(line.split()[1] for line in told.splitlines() if "/3 " in line) == sorted(NAMES)
-    assert verify(out) == []
+    assert verify(out) == {}
     assert len(list(out.glob("*/img/*/*.jpg"))) == 3 * 2 * 4
     assert all(path.stat().st_ino == inode for path, inode in written.items()), "a whole view was rendered again"
     assert (out / capture_layout.LIST_FILE).read_text().split() == list(NAMES)

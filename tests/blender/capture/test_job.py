@@ -24,6 +24,7 @@ from blender_primdiffusion.formats.capture_layout import (
     CaptureFolderError,
     picture_path,
 )
+from blender_primdiffusion.formats.capture_repair import repair, verify
 from capture_child import PEOPLE, small
 from capture_person import NamedPerson, files_of, load_painted, plain, two_poses
 
@@ -32,7 +33,6 @@ from blender_primdiffusion.capture.job import CaptureError, run
 from blender_primdiffusion.capture.report import Report
 from blender_primdiffusion.capture.settings import CaptureSettings
 from blender_primdiffusion.capture.stage import data_blocks
-from blender_primdiffusion.capture.subject import repair, verify
 from blender_primdiffusion.motion.motion import Motion
 
 pytestmark = pytest.mark.any_blender
@@ -77,7 +77,7 @@ def copy(whole, tmp_path) -> Path:
 
 
 def test_the_layout_is_complete_and_verified(whole):
-    assert verify(whole) == []
+    assert verify(whole) == {}
     assert (whole / LIST_FILE).read_text().split() == ["anna", "bert"]
     names = set(files_of(whole / "anna"))
     pictures = {
@@ -148,9 +148,9 @@ def test_damage_is_named_repaired_and_only_it_rendered_again(copy, whole, empty_
     paths[1].write_bytes(altered)
     paths[2].unlink()
     size = picture_path(whole / "anna", "img", 1, 0).stat().st_size
-    expected = [f"{paths[0]}: {size - 20} bytes instead of {size}", f"{paths[1]}: altered", f"{paths[2]}: missing"]
-    assert sorted(verify(copy)) == sorted(expected)
-    assert sorted(repair(copy)) == sorted(expected)
+    wrong = verify(copy)
+    assert wrong == {paths[0]: f"{size - 20} bytes instead of {size}", paths[1]: "altered", paths[2]: "missing"}
+    repair(copy, wrong)
     assert not any(path.exists() for path in paths)
     assert (copy / LIST_FILE).read_text() == ""
     untouched = picture_path(copy / "anna", "img", 0, 0)
@@ -158,7 +158,7 @@ def test_damage_is_named_repaired_and_only_it_rendered_again(copy, whole, empty_
     report = capture(empty_scene, small(copy))
     assert report.done == ["anna", "bert"]
     assert untouched.stat().st_mtime_ns == before
-    assert verify(copy) == []
+    assert verify(copy) == {}
     ours, undisturbed = files_of(copy), files_of(whole)
     ours.pop("report.json"), undisturbed.pop("report.json")
     assert ours == undisturbed
@@ -169,13 +169,13 @@ def test_truncated_files_are_rendered_again_even_without_repair(copy, whole, emp
     path.write_bytes(b"")
     capture(empty_scene, small(copy))
     assert path.read_bytes() == picture_path(whole / "anna", "mask", 0, 1).read_bytes()
-    assert verify(copy) == []
+    assert verify(copy) == {}
 
 
 def test_an_unfinished_subject_is_reported(copy):
     (copy / "bert" / COMPLETE_FILE).unlink()
     picture_path(copy / "bert", "part", 0, 0).unlink()
-    assert verify(copy)[0] == f"{copy / 'bert'}: not finished: 19 of 20 pictures are there"
+    assert verify(copy)[copy / "bert"] == "not finished: 19 of 20 pictures are there"
 
 
 def test_a_picture_that_the_mark_does_not_name_is_missed(copy):
@@ -185,7 +185,7 @@ def test_a_picture_that_the_mark_does_not_name_is_missed(copy):
     del files[name]
     mark.write_text(json.dumps(files))
     (copy / "anna" / name).unlink()
-    assert verify(copy) == [f"{copy / 'anna' / name}: missing"]
+    assert verify(copy) == {copy / "anna" / name: "missing"}
 
 
 def test_nothing_stays_in_the_file(empty_scene, tmp_path):
@@ -242,7 +242,7 @@ def test_shards_share_people_without_gap_or_overlap(empty_scene, tmp_path):
     assert (tmp_path / LIST_FILE).read_text().split() == ["a", "b", "c"]
     assert (tmp_path / "report-0-of-2.json").is_file()
     assert (tmp_path / "report-1-of-2.json").is_file()
-    assert verify(tmp_path) == []
+    assert verify(tmp_path) == {}
 
 
 def test_the_released_codes_reference_is_written_on_request(empty_scene, tmp_path):
@@ -250,7 +250,7 @@ def test_the_released_codes_reference_is_written_on_request(empty_scene, tmp_pat
     reference = tmp_path / RELEASED_REFERENCE
     assert files_of(reference) == files_of(tmp_path / "anna")
     assert (tmp_path / LIST_FILE).read_text().split() == ["anna", "bert"]
-    assert verify(tmp_path) == []
+    assert verify(tmp_path) == {}
 
 
 @pytest.mark.parametrize("change", [{"seed": 5}, {"samples": 3}, {"light": "dome"}, {"passes": ("img",)}])
@@ -289,7 +289,7 @@ def test_fixed_cameras_are_used_for_all_subjects(empty_scene, tmp_path):
     for name in ("anna", "bert"):
         cameras = json.loads((tmp_path / name / "cameras.json").read_text())
         assert np.allclose(cameras["camera0001"]["T"], views[1].translation)
-    assert verify(tmp_path) == []
+    assert verify(tmp_path) == {}
 
 
 def test_the_noise_is_the_same_in_whatever_order_views_are_rendered(empty_scene, tmp_path):
@@ -323,7 +323,7 @@ def test_a_full_disk_ends_the_batch_with_an_error(empty_scene, tmp_path, monkeyp
     assert [failure["subject"] for failure in report.failed] == ["anna"]
     monkeypatch.undo()
     assert capture(empty_scene, small(tmp_path)).done == ["anna", "bert"]
-    assert verify(tmp_path) == []
+    assert verify(tmp_path) == {}
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="a file system of a few kilobytes needs root")

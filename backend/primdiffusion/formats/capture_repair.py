@@ -1,0 +1,124 @@
+"""Find damaged files in captures, and remove them so that the next run renders only what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from .capture_layout import (
+    COMPLETE_FILE,
+    DATASET_FILE,
+    ENDINGS,
+    LIST_FILE,
+    RELEASED_REFERENCE,
+    CaptureFolderError,
+    damage,
+    picture_path,
+    read_about,
+    write_list,
+)
+from .picture_files import is_whole_picture
+
+
+def verify(root: Path, *, checksums: bool = True) -> dict[Path, str]:
+    """Return what is wrong with a dataset, by file, or by the folder of an unfinished subject.
+
+    Finished subjects are compared with the sizes and, if `checksums`, the checksums that they had. Raises
+    CaptureFolderError if the folder contains no captures.
+    """
+    about = _read_checked(root)
+    wrong: dict[Path, str] = {}
+    for subject in subject_folders(root):
+        wrong |= _problems(subject, about, checksums)
+        wrong |= dict.fromkeys(_partial_files(subject), "left behind by a killed process")
+    path, finished = root / LIST_FILE, finished_subjects(root)
+    listed = path.read_text(encoding="utf-8", errors="replace").split() if path.is_file() else []
+    if differing := set(listed).symmetric_difference(finished):
+        wrong[path] = f"differs from the finished subjects by {', '.join(sorted(differing))}"
+    return wrong
+
+
+def repair(root: Path, wrong: Collection[Path]) -> None:
+    """Remove the files that `verify` has found, with the completion marks of their subjects; rewrite the list.
+
+    The command that rendered the dataset then renders only those files again. Raises OSError.
+    """
+    for subject in subject_folders(root):
+        partial = _partial_files(subject)
+        damaged = [path for path in wrong if path.is_relative_to(subject) and path not in partial]
+        if damaged:
+            remove_damaged(subject, damaged)
+        for path in partial:
+            path.unlink(missing_ok=True)
+    list_subjects(root)
+
+
+def remove_damaged(subject: Path, wrong: Collection[Path]) -> None:
+    """Remove files of a subject, and first the completion mark; the subject's folder itself stays."""
+    (subject / COMPLETE_FILE).unlink(missing_ok=True)
+    for path in wrong:
+        if path != subject:
+            path.unlink(missing_ok=True)
+
+
+def subject_folders(root: Path) -> list[Path]:
+    """Sorted folders of subjects, finished or not, without the released code's reference, which repeats one."""
+    return sorted(
+        path
+        for path in root.iterdir()
+        if path.is_dir()
+        and not path.name.startswith(".")
+        and path.name != RELEASED_REFERENCE
+        and any((path / mark).exists() for mark in ("cameras.json", COMPLETE_FILE))
+    )
+
+
+def finished_subjects(root: Path) -> list[str]:
+    """Sorted names of the subjects with a completion mark."""
+    return [path.name for path in subject_folders(root) if (path / COMPLETE_FILE).is_file()]
+
+
+def list_subjects(root: Path) -> None:
+    """Write the list of finished subjects."""
+    write_list(root, finished_subjects(root))
+
+
+def is_complete_view(subject: Path, passes: Sequence[str], camera: int, frame: int) -> bool:
+    """Whether all images of a view exist and are complete."""
+    return all(is_whole_picture(picture_path(subject, kind, camera, frame)) for kind in passes)
+
+
+def _read_checked(root: Path) -> dict[str, Any]:
+    about = read_about(root)
+    numbers = (about.get("frames"), (about.get("rig") or {}).get("count"))
+    passes = about.get("passes")
+    if not all(isinstance(n, int) and 0 < n <= 10**6 for n in numbers) or not isinstance(passes, list):
+        raise CaptureFolderError(
+            f"{root / DATASET_FILE} lacks the numbers of frames and cameras: render into a new folder"
+        )
+    if not set(passes) <= set(ENDINGS):
+        raise CaptureFolderError(f"{root / DATASET_FILE} names passes that this program does not know: {passes}")
+    return about
+
+
+def _problems(subject: Path, about: Mapping[str, Any], checksums: bool) -> dict[Path, str]:
+    wrong = damage(subject, checksums=checksums)
+    pictures = list(_pictures(subject, about))
+    if subject not in wrong:
+        return wrong | {path: "missing" for path in pictures if not path.is_file()}
+    whole = [is_whole_picture(path) for path in pictures]
+    cut = {path: "cut short" for path, ok in zip(pictures, whole, strict=True) if not ok and path.is_file()}
+    marked = f"; its {COMPLETE_FILE} cannot be read" if (subject / COMPLETE_FILE).exists() else ""
+    return {subject: f"not finished: {sum(whole)} of {len(pictures)} pictures are there{marked}", **cut}
+
+
+def _pictures(subject: Path, about: Mapping[str, Any]) -> Iterator[Path]:
+    for frame in range(about["frames"]):
+        for camera in range(about["rig"]["count"]):
+            for kind in about["passes"]:
+                yield picture_path(subject, kind, camera, frame)
+
+
+def _partial_files(subject: Path) -> list[Path]:
+    return sorted(subject.rglob(".*.partial*"))
