@@ -212,7 +212,9 @@ def export_for_blender(path: str | Path, human: Human) -> None:
 
     Since format version 2 also the dependence on betas: template [V,3] and shape_basis [V,3,10] of the
     surface, joint_template [24,3] and joint_basis [24,3,10], and the inputs of `attach`: face [K], barycentric [K,3],
-    stencil_vertex [K,m], stencil_du [K,m], stencil_dv [K,m]. Half extents and weights do not depend on the shape.
+    stencil_vertex [K,m], stencil_du [K,m], stencil_dv [K,m]. Half extents and weights do not depend on the shape:
+    rest_half_extent [K,3] is without the delta scale. A body with pose-dependent correctives also has pose_basis
+    [U,3,207] (SMPL eq. 9) of the U vertices that stencil_vertex and face use, in ascending order.
     """
     human.validate()
     body, anchors = body_of(human)
@@ -249,7 +251,10 @@ def _shape_fields(body: BodyModel, anchors: Anchors, betas: int) -> dict[str, to
     """Return the dependence of the rest body and its frames on the first `betas` shape coefficients."""
     basis = body.shape_basis[..., :betas]
     regressor = body.joint_regressor.double()
+    used = torch.cat([anchors.stencil_vertex.flatten(), body.faces[anchors.face].flatten()]).unique()
     return {
+        **({"pose_basis": body.pose_basis[used]} if body.pose_basis.numel() else {}),
+        "rest_half_extent": anchors.rest_half_extent,
         "template": body.template,
         "shape_basis": basis,
         "joint_template": (regressor @ body.template.double()).float(),

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from ..scene.convention import transforms_to_backend
 from ..scene.human import BETAS, MARK, person_file
+from ..scene.shape import BODY_FILE, body_file
 from .solids import scene_solids, stored, visible_instances
 
 SMALLEST_SCALE = 1e-4
@@ -33,6 +34,8 @@ class PosedHuman:
     """The body's shape; None for the file's."""
     pelvis: NDArray[np.float64]
     """Position [3] in Blender's world."""
+    body: Path | None
+    """The body's file; None for a human of an early version, whose collection does not name one."""
 
     def params(self) -> dict[str, object]:
         """Parameters of the child's `draw`."""
@@ -164,6 +167,7 @@ def pose_of(armature: bpy.types.Object, matrix: NDArray, owner: bpy.types.Collec
         transforms_to_backend(posed @ np.linalg.inv(rest)),
         _betas(armature, owner.name),
         (matrix @ posed[0])[:3, 3],
+        body_file(owner) if BODY_FILE in owner else None,
     )
 
 

@@ -7,6 +7,7 @@ files are eight bytes of length, a JSON header, then plain arrays, so numpy is e
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import os
 from pathlib import Path
@@ -14,10 +15,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.arrays import check_shapes
+from .human import BETA_COUNT
+
 _LARGEST_HEADER = 1 << 20
 _METADATA = "__metadata__"
 _DTYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U8": "|u1", "BF16": "<u2"}
 _MOTION = {"motion.frames": ("F",), "motion.rotations": ("F", 24, 3, 3), "motion.translations": ("F", 3)}
+_FLOATS = ("F64", "F32", "F16")
+_FORMAT_VERSIONS = ("1", "2")
+_PAYLOAD: dict[str, tuple[int | str, ...]] = {
+    "rgb": ("K", 3, 8, 8, 8), "density": ("K", 8, 8, 8), "delta_scale": ("K", 3), "betas": (BETA_COUNT,),
+    "rest_half_extent": ("K", 3),
+}  # fmt: skip
 _REMEDY = "choose a .human file, or export the person again"
 
 
@@ -61,9 +71,65 @@ def read_tensors(path: Path) -> HumanTensors:
             arrays[name] = (str(about["dtype"]), tuple(about["shape"]), raw)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path.name!r} contains no human ({error}); {_REMEDY}") from error
-    if metadata.get("format") != "primdiffusion.human":
+    if not isinstance(metadata, dict) or metadata.get("format") != "primdiffusion.human":
         raise ValueError(f"{path.name!r} contains no human but something else; {_REMEDY}")
     return HumanTensors(metadata, arrays)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class HumanPayload:
+    """What fills a human's boxes, and how large they are, as the backend's `Payload` and `Human` say."""
+
+    rgb: NDArray[np.float32]
+    """Linear colour [K, 3, 8, 8, 8]; voxels in the order D, H, W = along N, B, T."""
+    density: NDArray[np.float32]
+    """Opacity per metre [K, 8, 8, 8], without the marcher's window."""
+    delta_scale: NDArray[np.float32]
+    """Factors on the rest half extents [K, 3]."""
+    betas: NDArray[np.float32]
+    """The body's shape [10]."""
+    rest_half_extent: NDArray[np.float32] | None
+    """[K, 3], metres; None on the default body."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FileVersion:
+    """A file as it is now; another one when it is written again."""
+
+    path: Path
+    modified: int
+    size: int
+
+
+def file_version(path: Path) -> FileVersion:
+    """Raises OSError."""
+    found = path.stat()
+    return FileVersion(path, found.st_mtime_ns, found.st_size)
+
+
+def read_payload(path: Path) -> HumanPayload:
+    """Read what is drawn of a .human file. Raises ValueError for a damaged file or a newer one, OSError."""
+    human = read_tensors(path)
+    if human.metadata.get("format_version") not in _FORMAT_VERSIONS:
+        raise ValueError(f"{path.name!r} was written by a newer PrimDiffusion: update it")
+    shapes = {name: shape for name, shape in _PAYLOAD.items() if name in human.arrays or name != "rest_half_extent"}
+    try:
+        if wrong := [name for name in shapes if human.arrays[name][0] not in _FLOATS]:
+            raise ValueError(f"{wrong[0]!r} holds no numbers")
+        arrays = {name: _loaded(*human.arrays[name]).astype(np.float32, copy=False) for name in shapes}
+        check_shapes(path.name, arrays, shapes, {})
+        if wrong := [name for name, values in arrays.items() if not np.isfinite(values).all()]:
+            raise ValueError(f"{wrong[0]!r} holds NaN or infinite numbers")
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{path.name!r} is damaged ({error}); {_REMEDY}") from error
+    return HumanPayload(**{"rest_half_extent": None, **arrays})
+
+
+@functools.lru_cache(maxsize=64)
+def read_sizes(version: FileVersion) -> HumanPayload:
+    """As `read_payload`, without colours and densities (empty arrays); cached."""
+    nothing = np.empty(0, np.float32)
+    return dataclasses.replace(read_payload(version.path), rgb=nothing, density=nothing)
 
 
 def reshaped(human: HumanTensors, betas: NDArray, growth: NDArray | None) -> HumanTensors:

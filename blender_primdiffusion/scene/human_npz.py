@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..formats.arrays import ArrayFileError, array_names, check_shapes, read_arrays
 from ..formats.joints import JOINT_NAMES, PARENTS
 from .cycles import max_overlap
-from .shape import FIELDS, INTEGERS, ShapeModel, body_file_name, faulty_field, saved_body_file
+from .shape import FIELDS, OPTIONAL_FIELDS, ShapeModel, body_file_name, faulty_field, saved_body_file
 from .volumes import VOXELS, Grids, bake, file_name, remove_empty, staged
 
 FORMAT_VERSION = 2
@@ -101,9 +101,8 @@ def read_human(path: str | Path) -> HumanFile:
     human = _checked_values(HumanFile(meta=meta, **_fields(arrays, path, _SHAPES, sizes)), path)
     if version == 1:
         return human
-    fields = _fields(arrays, path, FIELDS, sizes)
-    dtypes = {name: np.int32 if name in INTEGERS else np.float32 for name in FIELDS}
-    model = ShapeModel(**{name: value.astype(dtypes[name]) for name, value in fields.items()})
+    given = {name: shape for name, shape in OPTIONAL_FIELDS.items() if name in arrays}
+    model = ShapeModel.from_arrays(_fields(arrays, path, FIELDS | given, sizes))
     return dataclasses.replace(human, shape_model=_checked_shape(model, human, path))
 
 

@@ -9,7 +9,7 @@ import json
 import os
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +18,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import read_arrays
+from ..formats.arrays import check_shapes, read_arrays
 from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, VolumeWriteError, armature_of, folders_of
 
 _TINY = 1e-12
@@ -76,6 +76,27 @@ class ShapeModel:
     """dP/du = sum over m of stencil_du[k, m] * vertices[stencil_vertex[k, m]], metres per cell of the grid."""
     stencil_dv: NDArray[np.float32]
     """Likewise dP/dv; du x dv points out of the body."""
+    skin_weights: NDArray[np.float32] | None = None
+    """Skinning of the vertices [V, 24]; rows sum to one. None, like the next one, in files of earlier versions."""
+    rest_half_extent: NDArray[np.float32] | None = None
+    """Half sides of the boxes along T, B, N before their delta scale [K, 3], metres."""
+    pose_basis: NDArray[np.float32] | None = None
+    """Pose-dependent correctives (SMPL eq. 9) of the vertices `used` [U, 3, 207]; None for a body without."""
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray]) -> ShapeModel:
+        """The model of a file's arrays, in the dtypes above."""
+        names = [*FIELDS, *(name for name in OPTIONAL_FIELDS if name in arrays)]
+        return cls(**{name: arrays[name].astype(np.int32 if name in INTEGERS else np.float32) for name in names})
+
+    def arrays(self) -> dict[str, NDArray]:
+        """The arrays of the model's file."""
+        optional = [name for name in OPTIONAL_FIELDS if getattr(self, name) is not None]
+        return {name: getattr(self, name) for name in (*FIELDS, *optional)}
+
+    def used(self) -> NDArray[np.int32]:
+        """The vertices that determine the primitives' frames [U], ascending."""
+        return np.unique(np.concatenate([self.stencil_vertex.ravel(), self.faces[self.face].ravel()]))
 
     def rest(self, betas: NDArray) -> Rest:
         """The human of these betas [10] at rest (SMPL eqs. 8 and 10; paper sec. 3.1)."""
@@ -90,12 +111,9 @@ class ShapeModel:
     def frames(self, vertices: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Centres [K, 3] and axes [K, 3, 3] of the primitives on a body with vertices [V, 3], posed or not.
 
-        T = normalize(dP/du), N = normalize(T x dP/dv), B = N x T (SPEC 1.8, 2), in the axes of the vertices.
+        In the axes of the vertices; see `tangent_frames`.
         """
-        du, dv = self._planes(vertices)
-        tangent = _unit(du)
-        normal = _unit(np.cross(tangent, dv))
-        rotation = np.stack([tangent, np.cross(normal, tangent), normal], -1)
+        rotation = tangent_frames(*self._planes(vertices))
         return np.einsum("kc,kcx->kx", self.barycentric, vertices[self.faces[self.face]]), rotation
 
     def growth(self, before: NDArray, after: NDArray) -> NDArray[np.float64]:
@@ -105,20 +123,35 @@ class ShapeModel:
         """
         if np.allclose(before, after, rtol=0, atol=SAME_BETAS):
             return np.ones((len(self.face), 3))
-        stretch = self._sides(after) / np.maximum(self._sides(before), _TINY)
-        return np.concatenate([stretch**SHARE, np.ones_like(stretch[:, :1])], -1)
-
-    def _sides(self, betas: NDArray) -> NDArray[np.float64]:
-        """Lengths of cells along T and widths along B at rest [K, 2], metres."""
-        du, dv = self._planes(self.surface(betas))
-        length = np.linalg.norm(du, axis=-1)
-        area = np.linalg.norm(np.cross(du, dv), axis=-1)
-        return np.stack([length, area / np.maximum(length, _TINY)], -1)
+        return box_growth(self._planes(self.surface(before)), self._planes(self.surface(after)))
 
     def _planes(self, vertices: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """dP/du and dP/dv [K, 3] of the cells, metres per cell."""
         support = vertices[self.stencil_vertex]
         return np.matmul(self.stencil_du[:, None], support)[:, 0], np.matmul(self.stencil_dv[:, None], support)[:, 0]
+
+
+def tangent_frames(du: NDArray, dv: NDArray) -> NDArray[np.float64]:
+    """Axes [K, 3, 3] of primitives whose cells have these dP/du and dP/dv [K, 3].
+
+    T = normalize(dP/du), N = normalize(T x dP/dv), B = N x T as columns (SPEC 1.8, 2).
+    """
+    tangent = _unit(du)
+    normal = _unit(np.cross(tangent, dv))
+    return np.stack([tangent, np.cross(normal, tangent), normal], -1)
+
+
+def box_growth(before: tuple[NDArray, NDArray], after: tuple[NDArray, NDArray]) -> NDArray[np.float64]:
+    """Scale factors [K, 3] of boxes whose cells' dP/du and dP/dv [K, 3] at rest change so; see `ShapeModel.growth`."""
+    stretch = _sides(*after) / np.maximum(_sides(*before), _TINY)
+    return np.concatenate([stretch**SHARE, np.ones_like(stretch[:, :1])], -1)
+
+
+def _sides(du: NDArray, dv: NDArray) -> NDArray[np.float64]:
+    """Lengths of cells along T and widths along B [K, 2], metres."""
+    length = np.linalg.norm(du, axis=-1)
+    area = np.linalg.norm(np.cross(du, dv), axis=-1)
+    return np.stack([length, area / np.maximum(length, _TINY)], -1)
 
 
 FIELDS: dict[str, tuple[int | str, ...]] = {
@@ -128,19 +161,24 @@ FIELDS: dict[str, tuple[int | str, ...]] = {
     "stencil_vertex": ("K", "m"), "stencil_du": ("K", "m"), "stencil_dv": ("K", "m"),
 }  # fmt: skip
 """Shapes of a ShapeModel's arrays, which files store under the same names."""
+OPTIONAL_FIELDS: dict[str, tuple[int | str, ...]] = {
+    "skin_weights": ("V", 24), "rest_half_extent": ("K", 3), "pose_basis": ("U", 3, 207),
+}  # fmt: skip
 INTEGERS = ("faces", "face", "stencil_vertex")
 
 
 def faulty_field(model: ShapeModel) -> str | None:
     """The first field that holds impossible values, if any."""
-    for name in FIELDS:
-        if not np.isfinite(getattr(model, name)).all():
+    for name, values in model.arrays().items():
+        if not np.isfinite(values).all():
             return name
     limits = {"faces": len(model.template), "face": len(model.faces), "stencil_vertex": len(model.template)}
     for name, limit in limits.items():
         values = getattr(model, name)
         if values.min() < 0 or values.max() >= limit:
             return name
+    if model.pose_basis is not None and len(model.pose_basis) != len(model.used()):
+        return "pose_basis"
     weights = model.barycentric
     return "barycentric" if weights.min() < -1e-3 or np.abs(weights.sum(-1) - 1).max() > 1e-3 else None
 
@@ -275,16 +313,21 @@ def shape_model_of(collection: bpy.types.Collection) -> ShapeModel:
             f"the person {collection.name!r} was made by an earlier version and cannot be reshaped: generate the "
             "person again, or vary it"
         )
+    return read_body_file(body_file(collection))
+
+
+def body_file(collection: bpy.types.Collection) -> Path:
+    """The file of the human's body, or where it should be; the collection must have a BODY_FILE."""
     name = str(collection[BODY_FILE])
     paths = [folder / name for near in folders_of(collection) for folder in (near.parent, near)]
-    return read_body_file(next((path for path in paths if path.is_file()), paths[0]))
+    return next((path for path in paths if path.is_file()), paths[0])
 
 
 def body_file_name(model: ShapeModel) -> str:
     """The name of a shape model's file."""
     digest = hashlib.sha256()
-    for name in FIELDS:
-        digest.update(np.ascontiguousarray(getattr(model, name)).tobytes())
+    for values in model.arrays().values():
+        digest.update(np.ascontiguousarray(values).tobytes())
     return f"body_{digest.hexdigest()[:12]}.npz"
 
 
@@ -337,9 +380,10 @@ def read_body_file(path: Path) -> ShapeModel:
             "person again"
         )
     try:
-        arrays = read_arrays(path, tuple(FIELDS))
-        dtypes = {name: np.int32 if name in INTEGERS else np.float32 for name in FIELDS}
-        model = ShapeModel(**{name: arrays[name].astype(dtypes[name]) for name in FIELDS})
+        arrays = read_arrays(path, tuple(FIELDS), tuple(OPTIONAL_FIELDS))
+        shapes = FIELDS | {name: shape for name, shape in OPTIONAL_FIELDS.items() if name in arrays}
+        check_shapes(path, arrays, shapes, {})
+        model = ShapeModel.from_arrays(arrays)
         fault = faulty_field(model)
     except (OSError, ValueError, IndexError) as error:
         raise ValueError(f"the body's file {str(path)!r} is damaged ({error}); generate the person again") from error
@@ -349,7 +393,7 @@ def read_body_file(path: Path) -> ShapeModel:
 
 
 def _write(path: Path, model: ShapeModel) -> None:
-    arrays = {name: getattr(model, name) for name in FIELDS}
+    arrays = model.arrays()
     for name in INTEGERS:
         if arrays[name].max() < _SMALL_LIMIT:
             arrays[name] = arrays[name].astype(_SMALL)

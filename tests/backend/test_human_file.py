@@ -188,7 +188,7 @@ def test_the_export_has_the_shapes_blender_expects(exported):
         "rotation": (K, 3, 3), "half_extent": (K, 3), "primitive_weights": (K, 24), "rgb": (K, 8, 8, 8, 3),
         "density": (K, 8, 8, 8), "template": (v, 3), "shape_basis": (v, 3, 10), "joint_template": (24, 3),
         "joint_basis": (24, 3, 10), "face": (K,), "barycentric": (K, 3), "stencil_vertex": (K, 64),
-        "stencil_du": (K, 64), "stencil_dv": (K, 64),
+        "stencil_du": (K, 64), "stencil_dv": (K, 64), "rest_half_extent": (K, 3),
     }  # fmt: skip
     assert {name: array.shape for name, array in exported.items()} == shapes
     assert tuple(exported["joint_names"]) == JOINT_NAMES

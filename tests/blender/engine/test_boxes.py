@@ -1,0 +1,171 @@
+"""Boxes placed in Blender are where the backend puts them; people's files are read or rejected in one sentence."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from engine_stage import PYTHON, ROOT
+
+from blender_primdiffusion.engine.boxes import boxes_of
+from blender_primdiffusion.engine.picture import PosedHuman
+from blender_primdiffusion.scene.human_file import HumanTensors, file_version, read_payload, read_sizes, read_tensors
+from blender_primdiffusion.scene.human_file import write_tensors as write
+from blender_primdiffusion.scene.human_npz import read_human
+from blender_primdiffusion.scene.shape import read_body_file, saved_body_file
+
+pytestmark = pytest.mark.any_blender
+CASES = 20
+
+
+def made(folder: Path, kind: str) -> SimpleNamespace:
+    folder.mkdir()
+    command = [PYTHON, str(ROOT / "tests/blender/boxes_oracle.py"), str(folder), str(CASES), kind]
+    subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT / "backend")}, check=True)
+    model = read_human(folder / "human.npz").shape_model
+    with saved_body_file(model, folder) as name, np.load(folder / "cases.npz") as cases:
+        return SimpleNamespace(
+            file=folder / "person.human.safetensors", body=folder / name, model=model, cases=dict(cases)
+        )
+
+
+@pytest.fixture(scope="module", params=["default", "own"])
+def person(request, tmp_path_factory):
+    return made(tmp_path_factory.mktemp("boxes") / request.param, request.param)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    return made(tmp_path_factory.mktemp("boxes") / "plain", "default")
+
+
+def posed(person, case: int = 0, **changes) -> PosedHuman:
+    cases = person.cases
+    human = PosedHuman(
+        file=person.file,
+        object_to_world=cases["object"][case].astype(np.float64),
+        joints=cases["joints"][case].astype(np.float64),
+        betas=None if case % 3 == 0 else cases["betas"][case].tolist(),
+        pelvis=np.zeros(3),
+        body=person.body,
+    )
+    return dataclasses.replace(human, **changes)
+
+
+@pytest.mark.parametrize("case", range(CASES))
+def test_boxes_are_where_the_backend_places_them(person, case):
+    boxes, expected = boxes_of(posed(person, case)), {name: values[case] for name, values in person.cases.items()}
+    tolerance = 1e-5 * max(1.0, 1 / float(expected["density_scale"]))  # metres on a body of natural size
+    assert np.abs(boxes.position - expected["position"]).max() < tolerance
+    sides = boxes.rotation * boxes.half_extent[:, None]
+    assert np.abs(sides - expected["rotation"] * expected["half_extent"][:, None]).max() < tolerance
+    np.testing.assert_allclose(boxes.half_extent, expected["half_extent"], rtol=1e-4)
+    assert boxes.density_scale == pytest.approx(expected["density_scale"], rel=1e-4)
+    mirrored = np.linalg.det(expected["object"][:, :3]) < 0
+    assert (np.linalg.det(boxes.rotation) < 0).all() == mirrored
+
+
+def test_the_bodys_file_gives_the_model_back(person):
+    back = read_body_file(person.body)
+    assert (back.pose_basis is None) == (person.model.pose_basis is None)
+    for name, values in person.model.arrays().items():
+        np.testing.assert_array_equal(getattr(back, name), values)
+
+
+def test_a_body_of_an_earlier_version_is_rejected_in_a_sentence(plain, tmp_path):
+    early = dataclasses.replace(plain.model, skin_weights=None, rest_half_extent=None)
+    with saved_body_file(early, tmp_path) as name, pytest.raises(ValueError, match="earlier version"):
+        boxes_of(posed(plain, body=tmp_path / name))
+    with pytest.raises(ValueError, match="earlier version"):
+        boxes_of(posed(plain, body=None))
+
+
+def test_a_body_with_another_number_of_boxes_is_rejected(plain, tmp_path):
+    per_box = ("face", "barycentric", "stencil_vertex", "stencil_du", "stencil_dv", "rest_half_extent")
+    fewer = dataclasses.replace(plain.model, **{name: getattr(plain.model, name)[:4] for name in per_box})
+    with saved_body_file(fewer, tmp_path) as name, pytest.raises(ValueError, match="does not fit"):
+        boxes_of(posed(plain, body=tmp_path / name))
+
+
+def test_what_is_scaled_to_zero_is_rejected_by_name(plain):
+    human = posed(plain)
+    with pytest.raises(ValueError, match="mean scale is 0"):
+        boxes_of(dataclasses.replace(human, object_to_world=human.object_to_world * [0, 0, 0, 1]))
+    human.joints[4, :, :3] = 0
+    with pytest.raises(ValueError, match="left_knee"):
+        boxes_of(human)
+
+
+def test_a_payload_is_read_as_the_backend_wrote_it(person):
+    payload = read_payload(person.file)
+    assert payload.rgb.shape == (1024, 3, 8, 8, 8)
+    for name in ("rgb", "density", "delta_scale", "betas"):
+        dtype, shape, raw = read_tensors(person.file).arrays[name]
+        assert dtype == "F32"
+        np.testing.assert_array_equal(getattr(payload, name), np.frombuffer(raw, "<f4").reshape(shape))
+    assert (payload.rest_half_extent is None) == (person.model.pose_basis is None)
+
+
+def test_sizes_are_read_once_until_the_file_changes(plain, tmp_path):
+    path = tmp_path / "copy.human.safetensors"
+    path.write_bytes(plain.file.read_bytes())
+    first = read_sizes(file_version(path))
+    assert read_sizes(file_version(path)) is first
+    assert first.rgb.size == first.density.size == 0
+    os.utime(path, ns=(1, 1))
+    assert read_sizes(file_version(path)) is not first
+
+
+def damaged(path: Path, how: str) -> None:
+    human, data = read_tensors(path), path.read_bytes()
+    arrays, metadata = dict(human.arrays), dict(human.metadata)
+    dtype, shape, raw = arrays["density"]
+    match how:
+        case "truncated":
+            path.write_bytes(data[:-1000])
+        case "empty":
+            path.write_bytes(b"")
+        case "text":
+            path.write_text("hello")
+        case "long header":
+            path.write_bytes((2**62).to_bytes(8, "little") + data[8:])
+        case "metadata":
+            header = json.dumps({"__metadata__": []}).encode()
+            path.write_bytes(len(header).to_bytes(8, "little") + header)
+        case "newer":
+            write(path, HumanTensors({**metadata, "format_version": "3"}, arrays))
+        case "no density":
+            del arrays["density"]
+        case "other shape":
+            arrays["density"] = (dtype, (512, 2, 8, 8, 8), raw)
+        case "huge shape":
+            arrays["density"] = (dtype, (2**40, 8, 8, 8), raw)
+        case "whole numbers":
+            arrays["density"] = ("I32", shape, raw)
+        case "NaN":
+            arrays["density"] = (dtype, shape, np.float32(np.nan).tobytes() + raw[4:])
+        case "fewer boxes":
+            arrays["density"] = (dtype, (512, 8, 8, 8), raw[: len(raw) // 2])
+    if arrays != human.arrays:
+        write(path, HumanTensors(metadata, arrays))
+
+
+@pytest.mark.parametrize(
+    "how",
+    ["truncated", "empty", "text", "long header", "metadata", "newer", "no density", "other shape", "huge shape",
+     "whole numbers", "NaN", "fewer boxes"],
+)  # fmt: skip
+def test_a_damaged_file_is_rejected_in_one_sentence(plain, tmp_path, how):
+    path = tmp_path / "bad.human.safetensors"
+    path.write_bytes(plain.file.read_bytes())
+    damaged(path, how)
+    with pytest.raises(ValueError, match=r"bad\.human\.safetensors") as error:
+        read_payload(path)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 250
