@@ -1,6 +1,7 @@
 """The backend by itself, in a process of its own: makes people and draws them with `place` and `march` alone.
 
-Speaks JSON, an object a line: {"make": folder, "seed": 0, "betas": [...]} or {"draw": {...}, "out": npz}; answers {}.
+Speaks JSON, an object a line: {"make": folder, "seed": 0, "betas": [...]}, {"place": {...}, "out": npz} (a posed
+person's boxes) or {"draw": {...}, "out": npz}, where {"boxes": npz} may stand for a person; answers {}.
 Run by the backend's Python; Blender's tests compare the engine's pictures with it.
 """
 
@@ -21,7 +22,7 @@ from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import from_mesh
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.lattice import MarchSettings
-from primdiffusion.render.march import march
+from primdiffusion.render.march import Span, march
 from primdiffusion.reshaping import reshaped
 
 
@@ -68,14 +69,32 @@ def placed(
     )
 
 
-def draw(out: str, people: list, intrinsics: list, world_to_camera: list, width: int, height: int, step: float) -> None:
-    """Combined [h, w, 4] and depth along the optical axis [h, w], top row first."""
-    primitives = Primitives.together([placed(**person) for person in people])
+def boxes(file: str) -> Primitives:
+    """Boxes from an npz of their fields."""
+    with np.load(file) as fields:
+        return Primitives(**{name: torch.from_numpy(fields[name]) for name in fields.files})
+
+
+def draw(
+    out: str,
+    people: list,
+    intrinsics: list,
+    world_to_camera: list,
+    width: int,
+    height: int,
+    step: float,
+    clip: list | None = None,
+) -> None:
+    """Combined [h, w, 4] and depth along the optical axis [h, w], top row first; `clip` is along that axis."""
+    primitives = Primitives.together(
+        [boxes(person["boxes"]) if "boxes" in person else placed(**person) for person in people]
+    )
     matrices = (torch.tensor(matrix, dtype=torch.float32) for matrix in (intrinsics, world_to_camera))
     camera = Camera(*matrices, width, height)
-    rendering = march(primitives, camera, MarchSettings(step=step))
-    ahead = (camera.rays()[1] @ camera.world_to_camera[2, :3]).numpy()
-    depth = rendering.first_hit.numpy() * ahead
+    cosine = camera.rays()[1] @ camera.world_to_camera[2, :3]
+    span = None if clip is None else Span(clip[0] / cosine, clip[1] / cosine)
+    rendering = march(primitives, camera, MarchSettings(step=step), span=span)
+    depth = (rendering.first_hit * cosine).numpy()
     depth[~np.isfinite(depth)] = 1e10
     np.savez(out, combined=np.concatenate([rendering.rgb, rendering.alpha[..., None]], -1), depth=depth)
 
@@ -84,6 +103,8 @@ for line in sys.stdin:
     request = json.loads(line)
     if "make" in request:
         make(Path(request["make"]), request["seed"], request["betas"])
+    elif "place" in request:
+        np.savez(request["out"], **{name: tensor.numpy() for name, tensor in vars(placed(**request["place"])).items()})
     else:
         draw(request["out"], **request["draw"])
     print("{}", flush=True)

@@ -1,0 +1,247 @@
+"""The marcher's compute shaders (docs/design/marcher.md), in the GLSL that Blender translates for OpenGL, Vulkan and
+Metal. `gpu_march` documents the box records that they read."""
+
+from __future__ import annotations
+
+import gpu
+
+TILE = 8
+"""Pixels along a side of the tile that a work group marches."""
+ACROSS = 32
+"""Boxes along a side of the atlas."""
+VOXELS = 8
+"""Along a side of a box."""
+TEXELS = 9
+"""Texels of a box record."""
+BOXES_A_ROW = 128
+ENTRIES_A_ROW = 4096
+CHUNK = 16
+"""Lattice points that are composited together: a multiple of the largest stride."""
+
+_RECORDS = f"""
+vec4 record(int box, int texel)
+{{
+  return texelFetch(boxes, ivec2((box % {BOXES_A_ROW}) * {TEXELS} + texel, box / {BOXES_A_ROW}), 0);
+}}
+"""
+
+_LIST = (
+    _RECORDS
+    + f"""
+void store(int place, int value)
+{{
+  imageStore(entries_image, ivec2(place % {ENTRIES_A_ROW}, place / {ENTRIES_A_ROW}), uvec4(uint(value)));
+}}
+
+void main()
+{{
+  ivec2 tile = ivec2(gl_GlobalInvocationID.xy);
+  if (tile.x >= size.x || tile.y >= size.y) {{
+    return;
+  }}
+  int begin = int(texelFetch(tiles, tile, 0).x);
+  int place = begin + 1;
+  float finest = 4.0;
+  vec2 at = vec2(tile);
+  for (int box = 0; box < size.z; box++) {{
+    vec4 reach = record(box, 8);
+    if (at.x >= reach.x && at.y >= reach.y && at.x <= reach.z && at.y <= reach.w) {{
+      store(place, box);
+      place += 1;
+      finest = min(finest, record(box, 0).w);
+    }}
+  }}
+  store(begin, int(finest));
+}}
+"""
+)
+
+_MARCH = (
+    _RECORDS
+    + f"""
+int entry(int place)
+{{
+  return int(texelFetch(entries, ivec2(place % {ENTRIES_A_ROW}, place / {ENTRIES_A_ROW}), 0).x);
+}}
+
+float along(float slope)
+{{
+  return abs(slope) < 1e-12 ? 1e-12 : slope;
+}}
+
+void main()
+{{
+  ivec2 pixel = (ivec2(gl_WorkGroupID.xy) + ivec2(0, tiling.x)) * {TILE} + ivec2(gl_LocalInvocationID.xy);
+  if (pixel.x >= size.x || pixel.y >= size.y) {{
+    return;
+  }}
+  ivec2 target = ivec2(pixel.x, size.y - 1 - pixel.y);
+  float spacing = lattice.x;
+  float base = lattice.y;
+  float base_depth = lattice.z;
+
+  /* Lattice points are counted from `base`; `secant` is a ray's length per metre along the optical axis. */
+  vec2 slope = (vec2(pixel) + 0.5 - lens.zw) / lens.xy;
+  float squared = dot(slope, slope);
+  float secant = sqrt(1.0 + squared);
+  float shift = base * (squared / (secant + 1.0));
+  float ray_first = max(ceil(planes.x * secant + shift), 1.0 - base);
+  float ray_last = floor(min(planes.y * secant + shift, 1.6e7));
+  if (tiling.z != 0) {{
+    float end = (texelFetch(ends, target, 0).x - base_depth) / spacing;
+    ray_last = min(ray_last, floor(end * secant + shift));
+  }}
+
+  vec2 span = texelFetch(tiles, pixel / tiling.y, 0).xy;
+  int opened = int(span.x) + 1;
+  int closed = opened + int(span.y);
+  vec4 colour = vec4(0.0);
+  float surface = -1.0;
+  vec4 sums[{CHUNK}];
+  float finest = float(entry(int(span.x)));
+  float begin = 3e7;
+  if (span.y > 0.5) {{
+    begin = floor(record(entry(opened), 0).y / finest) * finest;
+  }}
+
+  while (opened < closed && begin <= ray_last && colour.a < 1.0) {{
+    for (int i = 0; i < {CHUNK}; i++) {{
+      sums[i] = vec4(0.0);
+    }}
+    float stop = begin + finest * {CHUNK}.0;
+    float next = 3e7;
+    for (int place = opened; place < closed; place++) {{
+      int box = entry(place);
+      vec4 reach = record(box, 0);
+      if (reach.y >= stop) {{
+        next = min(next, reach.y);
+        break;
+      }}
+      if (reach.z >= stop) {{
+        next = min(next, max(reach.y, stop));
+      }}
+      if (reach.z < begin) {{
+        continue;
+      }}
+      vec4 right = record(box, 1);
+      vec4 down = record(box, 2);
+      vec4 middle = record(box, 3);
+      vec4 offset = record(box, 4);
+      vec4 low = record(box, 5);
+      vec4 high = record(box, 6);
+      vec4 centre = record(box, 7);
+
+      /* The ray in the box is p + (n - n0) q, see `gpu_march`. */
+      float du = (float(pixel.x) - centre.x) + centre.y;
+      float dv = (float(pixel.y) - centre.z) + centre.w;
+      float more = du * (down.w + du * metric.x) + dv * (middle.w + dv * metric.y);
+      float root = sqrt(right.w * right.w + more);
+      vec3 turn = (du * right.xyz + dv * down.xyz - (more / (root + right.w)) * middle.xyz) / root;
+      vec3 p = offset.xyz + offset.w * turn;
+      vec3 q = (middle.xyz + turn) * spacing;
+      q = vec3(along(q.x), along(q.y), along(q.z));
+      vec3 one = (low.xyz - p) / q;
+      vec3 other = (high.xyz - p) / q;
+      vec3 enter = min(one, other);
+      vec3 leave = max(one, other);
+      float first = max(max(enter.x, enter.y), enter.z);
+      float last = min(min(leave.x, leave.y), leave.z);
+      float stride = reach.w;
+      first = max(max(first + reach.x, begin), ray_first);
+      last = min(min(last + reach.x, stop - 1.0), ray_last);
+      float brick = high.w;
+      float row = floor(brick / {ACROSS}.0);
+      float layer = floor(row / lattice.w);
+      vec3 origin = vec3(brick - row * {ACROSS}.0, row - layer * lattice.w, layer) * {VOXELS}.0;
+
+      for (float n = ceil(first / stride) * stride; n <= last; n += stride) {{
+        vec3 y = p + (n - reach.x) * q;
+        /* Voxel centres are at the corners, so filtering stays in the brick. */
+        vec4 value = textureLod(atlas, (origin + clamp((y + 1.0) * 3.5, 0.0, 7.0) + 0.5) / atlas_size, 0.0);
+        vec3 y2 = y * y;
+        vec3 y4 = y2 * y2;
+        float opacity = value.a * exp(-8.0 * dot(y4, y4)) * low.w;
+        sums[int((n - begin) / finest)] += vec4(value.rgb * opacity, opacity);
+      }}
+    }}
+
+    for (int i = 0; i < {CHUNK}; i++) {{
+      float opacity = sums[i].a;
+      float missing = 1.0 - colour.a;
+      if (opacity > 0.0 && missing > 0.0) {{
+        bool ends_here = opacity >= missing;
+        colour.rgb += sums[i].rgb * (ends_here ? missing / opacity : 1.0);
+        colour.a = ends_here ? 1.0 : colour.a + opacity;
+        if (surface < 0.0 && colour.a >= 0.5) {{
+          surface = spacing * ((begin + finest * float(i) - shift) / secant) + base_depth;
+        }}
+      }}
+    }}
+    begin = floor(next / finest) * finest;
+    float done = begin - 1.0;
+    while (opened < closed && done < begin) {{
+      done = record(entry(opened), 0).z;
+      opened += done < begin ? 1 : 0;
+    }}
+  }}
+  imageStore(colour_image, target, colour);
+  imageStore(depth_image, target, vec4(surface < 0.0 ? 1e10 : surface));
+}}
+"""
+)
+
+_COPY = """
+void main()
+{
+  ivec3 at = ivec3(gl_GlobalInvocationID.xyz);
+  imageStore(atlas_image, at + ivec3(0, 0, layer), texelFetch(one, at, 0));
+}
+"""
+
+
+def list_shader() -> gpu.types.GPUShader:
+    """Writes the boxes of each tile, one invocation a tile, in the order of their first lattice points."""
+    info = gpu.types.GPUShaderCreateInfo()
+    info.sampler(0, "FLOAT_2D", "boxes")
+    info.sampler(1, "FLOAT_2D", "tiles")
+    info.image(0, "R32UI", "UINT_2D", "entries_image", qualifiers={"WRITE"})
+    info.push_constant("IVEC3", "size")
+    return _compiled(info, _LIST, (TILE, TILE))
+
+
+def march_shader() -> gpu.types.GPUShader:
+    """Marches the rays of a tile's pixels, one invocation a pixel."""
+    info = gpu.types.GPUShaderCreateInfo()
+    for slot, (kind, name) in enumerate(
+        [
+            ("FLOAT_2D", "boxes"),
+            ("FLOAT_2D", "tiles"),
+            ("UINT_2D", "entries"),
+            ("FLOAT_3D", "atlas"),
+            ("FLOAT_2D", "ends"),
+        ]
+    ):
+        info.sampler(slot, kind, name)
+    info.image(0, "RGBA32F", "FLOAT_2D", "colour_image", qualifiers={"WRITE"})
+    info.image(1, "R32F", "FLOAT_2D", "depth_image", qualifiers={"WRITE"})
+    for kind, name in [("VEC4", "lens"), ("VEC4", "lattice"), ("VEC2", "planes"), ("VEC2", "metric")]:
+        info.push_constant(kind, name)
+    info.push_constant("VEC3", "atlas_size")
+    info.push_constant("IVEC2", "size")
+    info.push_constant("IVEC3", "tiling")
+    return _compiled(info, _MARCH, (TILE, TILE))
+
+
+def copy_shader() -> gpu.types.GPUShader:
+    """Copies the atlas of one person into layers of a common one."""
+    info = gpu.types.GPUShaderCreateInfo()
+    info.sampler(0, "FLOAT_3D", "one")
+    info.image(0, "RGBA16F", "FLOAT_3D", "atlas_image", qualifiers={"WRITE"})
+    info.push_constant("INT", "layer")
+    return _compiled(info, _COPY, (8, 8))
+
+
+def _compiled(info: gpu.types.GPUShaderCreateInfo, source: str, group: tuple[int, int]) -> gpu.types.GPUShader:
+    info.local_group_size(*group)
+    info.compute_source(source)
+    return gpu.shader.create_from_info(info)
