@@ -12,8 +12,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.capture_layout import picture_path, replacing
+from ..formats.capture_layout import picture_path
 from ..formats.picture_files import depth_steps, is_whole_picture, normal_bytes, write_png
+from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
 from .surfaces import PART
 

@@ -6,7 +6,7 @@ import dataclasses
 import json
 from pathlib import Path
 
-from ..formats.capture_layout import replacing
+from ..formats.whole_files import replacing
 
 
 @dataclasses.dataclass

@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.capture_layout import replacing
+from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
 from ..scene.human import BODY_MARK
 from ..scene.proxy import PROXY_MARK

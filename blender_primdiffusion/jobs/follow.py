@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
+from ..backend.requests import sentence
+from ..places import missing_packages
 from .memory import release_when_idle
 from .pictures import so_far
 from .queue import GONE, Entry, Job, JobOutcome, queue
@@ -228,7 +230,11 @@ class Reporting:
             return self.act(context)
         except (ValueError, OSError) as error:
             self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        except ModuleNotFoundError:
+            if not (lacking := missing_packages()):
+                raise
+            self.report({"ERROR"}, sentence(lacking))
+        return {"CANCELLED"}
 
     def act(self, context: bpy.types.Context) -> set[str]:
         """The operator itself; ValueError and OSError become reports."""
@@ -236,7 +242,13 @@ class Reporting:
 
 
 def submit(operator: bpy.types.Operator, context: bpy.types.Context, job: Job) -> set[str]:
-    """Queue `job` for the scene of `context`; with a window a timer follows it, in background mode this waits."""
+    """Queue `job` for the scene of `context`; with a window a timer follows it, in background mode this waits.
+
+    A job whose result could not be shown is rejected.
+    """
+    if job.undo and (lacking := missing_packages()):
+        operator.report({"ERROR"}, sentence(lacking))
+        return {"CANCELLED"}
     if not bpy.app.background:
         queue.add(context, job)
         keep_following()

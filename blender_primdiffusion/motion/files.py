@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.arrays import ArrayFileError, array_names, read_arrays, read_npy
-from ..formats.capture_layout import replacing
+from ..formats.whole_files import replacing
 from .adjust import axis_direction, axis_name, find_up, turn_y_up
 from .bvh import BvhError, read_bvh
 from .motion import Detected, Motion

@@ -19,6 +19,8 @@ TEMPORARY = "primdiffusion_humans"
 """Folder, among Blender's temporary files, for the humans of a .blend that was never saved."""
 PERSON_FILE = "person.human.safetensors"
 """The human as the backend saves it, beside the volumes."""
+NPZ_FILE = "human.npz"
+"""The human for Blender, beside PERSON_FILE."""
 PERSON = "primdiffusion_person_file"
 """Custom property of a human's collection: the name of the backend's file since the last edit. Undo switches it back,
 as it does the paths of the volumes."""

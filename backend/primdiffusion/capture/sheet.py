@@ -13,7 +13,7 @@ from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.formats.arrays import ArrayFileError, read_numbers
 from primdiffusion.formats.camera_rig import View
-from primdiffusion.formats.capture_layout import replacing
+from primdiffusion.formats.whole_files import replacing
 
 BONE, JOINT = (255, 255, 255), (255, 64, 64)
 

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera_rig import View
-from .capture_layout import picture_path, replacing, write_npz
+from .capture_layout import picture_path, write_npz
 from .requests import LAYOUTS
+from .whole_files import replacing
 
 _FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 

@@ -29,7 +29,7 @@ import io
 import json
 import os
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 
 from .arrays import ArrayFileError, read_numbers
 from .camera_rig import View
+from .whole_files import replacing
 
 FORMAT, VERSION = "primdiffusion-captures", 1
 ENDINGS = {"img": ".jpg", "mask": ".png", "depth": ".png", "normal": ".png", "part": ".png", "rgba": ".png"}
@@ -61,25 +62,6 @@ def view_seed(seed: int, subject: str, frame: int, camera: int) -> int:
     """Return the noise seed of an image, 0 ... 2^31 - 1, independent of the order of rendering."""
     digest = hashlib.sha256(f"{seed}/{subject}/{frame}/{camera}".encode()).digest()
     return int.from_bytes(digest[:4], "big") >> 1
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path that replaces `path` at the end, or is removed after an error.
-
-    OSErrors name `path`, also those of a full disk, for which Python names no file.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
-    try:
-        yield partial
-        os.replace(partial, path)
-    except OSError as e:
-        if e.errno is None or e.filename not in (None, str(partial)):
-            raise
-        raise OSError(e.errno, e.strerror, str(path)) from e
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def write_npz(path: Path, **arrays: NDArray) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .capture_layout import replacing
+from .whole_files import replacing
 
 DEPTH_UNIT = 0.00025
 """Metres per unit of a depth file, which reaches 16.38 m."""

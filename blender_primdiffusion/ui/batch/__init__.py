@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import bpy
 
 from ...console import DONE, UNUSABLE
+from ...places import missing_packages
 
 COMMAND = "primdiffusion"
 _HELP = """\
@@ -23,13 +24,19 @@ _handles: list[object] = []
 def execute(argv: Sequence[str]) -> int:
     """Run a command; returns its exit code."""
     command, words = argv[:1], list(argv[1:])
-    if command == ["generate"]:
-        from .generate import main  # needs numpy
-    elif command == ["render"]:
-        from .render import main  # needs numpy
-    elif command == ["capture"]:
-        from ...capture.command import main  # needs numpy
-    else:
+    try:
+        if command == ["generate"]:
+            from .generate import main
+        elif command == ["render"]:
+            from .render import main  # needs numpy
+        elif command == ["capture"]:
+            from ...capture.command import main  # needs numpy
+    except ModuleNotFoundError:
+        if not (lacking := missing_packages()):
+            raise
+        print(f"{command[0]}: {lacking}", file=sys.stderr, flush=True)
+        return UNUSABLE
+    if command not in (["generate"], ["render"], ["capture"]):
         asked = command in (["--help"], ["-h"])
         print(_HELP, file=sys.stdout if asked else sys.stderr, flush=True)
         return DONE if asked else UNUSABLE

@@ -11,15 +11,19 @@ import argparse
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ...backend.requests import Backend, ChildRequest
 from ...capture.report import Report
 from ...console import Stop, duration
-from ...places import preference
+from ...places import missing_packages, preference
+from ...scene.human import NPZ_FILE, PERSON_FILE
 from ..attributes import Attributes, parsed
-from .people import NPZ_FILE, PERSON_FILE, Movement, motion_name, movement_of, person_blend
 from .running import Clock, NoBackend, Say, Stopped, ask, backend_of, begun, publish, reason, run, staging
-from .words import parse_generate
+from .words import motion_name, parse_generate
+
+if TYPE_CHECKING:
+    from .people import Movement
 
 SETTINGS = "settings.json"
 """The settings of a folder's humans."""
@@ -28,12 +32,18 @@ _PRINT_S = 2.0
 
 
 def main(argv: Sequence[str]) -> int:
-    """The command with its words; returns the exit code."""
+    """The command with its words; returns the exit code. Without --blend, Blender needs no further Python packages."""
     return run("generate", argv, parse_generate, _generate)
 
 
 def _generate(options: argparse.Namespace, say: Say, stop: Stop) -> Report:
-    attributes, movement = parsed(", ".join(options.attributes)), movement_of(options)
+    attributes, movement = parsed(", ".join(options.attributes)), None
+    if options.blend is not None:
+        if lacking := missing_packages():
+            raise ValueError(f"--blend: {lacking}; or leave out --blend")
+        from .people import movement_of  # needs numpy
+
+        movement = movement_of(options)
     params = _params(options, attributes)
     report, clock = Report(), Clock(options.count)
     settings = {**params, "motion": motion_name(options)}
@@ -83,15 +93,21 @@ class _Person:
         self._printed = 0.0
 
     def make(self, backend: Backend) -> None:
-        """Write the folder, or the .blend that is missing in it. Raises as `ask`, and ValueError and OSError."""
-        with staging(self._folder) as made:
-            source = self._folder
-            if not (source / PERSON_FILE).is_file():
+        """Write the folder, then the .blend; what is there already stays. Raises as `ask`, and ValueError and OSError.
+
+        Where the .blend cannot be made the human stays.
+        """
+        if not (self._folder / PERSON_FILE).is_file():
+            with staging(self._folder) as made:
                 ask(backend, "generate", {**self._params, "out_dir": str(made)}, self._stop, self._print_progress)
-                source = made
-            if self._blend is not None:
-                person_blend(source / NPZ_FILE, source / PERSON_FILE, made / self._blend, self.name, self._movement)
-            publish(made, self._folder, last=self._blend or PERSON_FILE)
+                publish(made, self._folder, last=PERSON_FILE)
+        if self._blend is not None:
+            from .people import person_blend  # needs numpy
+
+            npz, person = self._folder / NPZ_FILE, self._folder / PERSON_FILE
+            with staging(self._folder) as made:
+                person_blend(npz, person, made / self._blend, self.name, self._movement)
+                publish(made, self._folder, last=self._blend)
 
     def _print_progress(self, request: ChildRequest) -> None:
         if not request.finished and time.monotonic() - self._printed > _PRINT_S:

@@ -16,11 +16,8 @@ from ...motion.motion import Motion
 from ...scene.armature import keyframe_poses, pose_from_joint_rotations
 from ...scene.build import build_human
 from ...scene.cycles import frame_box, framing_distance, humans_extent, setup_cycles_preview
-from ...scene.human import PERSON_FILE as PERSON_FILE
 from ...scene.human import armature_of, humans
 
-NPZ_FILE = "human.npz"
-"""The person for Blender, beside `PERSON_FILE`."""
 _SAMPLED = 24
 """Frames of a motion that determine the distance of the camera."""
 
@@ -49,12 +46,6 @@ def movement_of(options: argparse.Namespace) -> Movement | None:
     """What --pose or --motion names. Raises MotionFileError."""
     path = options.pose or options.motion
     return None if path is None else Movement(read_motion(path), options.pose is not None)
-
-
-def motion_name(options: argparse.Namespace) -> str | None:
-    """The absolute path of what --pose or --motion names."""
-    path = options.pose or options.motion
-    return None if path is None else str(path.resolve())
 
 
 def person_blend(npz: Path, person: Path, blend: Path, name: str, movement: Movement | None) -> None:

@@ -22,16 +22,14 @@ from ...capture.report import Report
 from ...console import Stop
 from ...engine import studio
 from ...engine.engine import ENGINE
-from ...formats.capture_layout import replacing
+from ...formats.whole_files import replacing
 from ...scene.cycles import fit_cycles_to_volumes, new_camera
-from ...scene.human import PERSON_FILE, humans, humans_folder, volume_path
+from ...scene.human import NPZ_FILE, PERSON_FILE, humans, humans_folder, volume_path
 from .people import (
-    NPZ_FILE,
     Movement,
     build_person,
     go_round,
     look_from,
-    motion_name,
     movement_of,
     moving_extent,
     new_file,
@@ -49,7 +47,7 @@ from .running import (
     reason,
     run,
 )
-from .words import ENGINES, parse_render
+from .words import ENGINES, motion_name, parse_render
 
 PERSON_ENDINGS = (".human.safetensors", ".human")
 

@@ -30,7 +30,7 @@ from ...console import (
     separate_stdout,
     stopped_by_signals,
 )
-from ...formats.capture_layout import replacing
+from ...formats.whole_files import replacing
 from ...places import EXTENSION, new_backend, preference
 
 _TICK_S = 0.03

@@ -78,6 +78,12 @@ def parse_render(argv: Sequence[str]) -> argparse.Namespace:
     return options
 
 
+def motion_name(options: argparse.Namespace) -> str | None:
+    """The absolute path of what --pose or --motion names."""
+    path = options.pose or options.motion
+    return None if path is None else str(path.resolve())
+
+
 def _parser(name: str, description: str) -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(prog=f"primdiffusion {name}", description=description, epilog=_ENDS)
     made.error = _raise_usage_error

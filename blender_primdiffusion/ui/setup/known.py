@@ -13,8 +13,9 @@ import bpy
 
 from ...backend.environment import VARIABLE, tried
 from ...backend.packages import Lock, Machine, chosen_compute, locks_for, read_lock, this_machine
+from ...backend.requests import sentence
 from ...backend.setup import state_of
-from ...places import EXTENSION, preference, set_up_folder
+from ...places import EXTENSION, missing_packages, preference, set_up_folder
 
 LOCKS = Path(__file__).resolve().parents[2] / "requirements"
 _LINE_BYTES_PER_S = 50e6 / 8
@@ -27,7 +28,7 @@ _SELF_TEST_S = 30.0
 class Known:
     """Which Python would run the backend."""
 
-    state: Literal["named", "own Python", "ready", "outdated", "broken", "absent"]
+    state: Literal["named", "own Python", "ready", "outdated", "broken", "absent", "lacking"]
     usable: bool
     line: str
     """For the panels."""
@@ -38,7 +39,9 @@ class Known:
 
 
 def known() -> Known:
-    """Which Python would run the backend, in the order in which it is searched."""
+    """Which Python would run the backend, in the order in which it is searched; whether Blender can show people."""
+    if lacking := missing_packages():
+        return Known("lacking", False, sentence(lacking))
     if named := preference("backend_python"):
         return Known("named", True, f"Uses {named}", works=tried.get(Path(named)))
     if named := os.environ.get(VARIABLE):

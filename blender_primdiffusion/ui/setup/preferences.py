@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+
 import bpy
 
 from ...backend.requests import sentence
 from ...jobs.queue import queue
-from ...places import EXTENSION, set_up_folder
+from ...places import EXTENSION, missing_packages, set_up_folder
 from ..drawing import draw_lines
 from .known import Known, chosen, cost, gigabytes, known, machine
 from .operators import redraw, session
@@ -29,6 +31,8 @@ def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
         return True
     box = layout.box()
     draw_lines(box, now.line, "ERROR", width)
+    if now.state == "lacking":
+        return False
     if not draw_cost(box, width):
         props = box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES")
         props.module = EXTENSION
@@ -137,6 +141,8 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
             return
         now, folder = known(), set_up_folder()
         draw_lines(box, now.line, _icon(now), _WIDTH)
+        if now.state == "lacking":
+            return
         if now.usable and now.works is None:
             draw_lines(box, "Not tested yet: press Test", "BLANK1", _WIDTH)
         if folder.environment.is_dir():
@@ -155,6 +161,31 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         if private or state not in {"absent", "own Python", "named"}:
             row.operator("primdiffusion.repair_backend", icon="TOOL_SETTINGS")
             row.operator("primdiffusion.remove_backend", icon="TRASH")
+
+
+def register() -> None:
+    """Say which Python packages are missing: on the console, and to a user who has just enabled the extension."""
+    if lacking := missing_packages():
+        print(f"PrimDiffusion: {lacking}", file=sys.stderr, flush=True)
+        if not bpy.app.background:
+            bpy.app.timers.register(_pop_up, first_interval=0.1)
+
+
+def _pop_up() -> None:
+    """A message over the preferences, if they are shown; elsewhere the sidebar has it."""
+    for window in bpy.context.window_manager.windows:
+        if any(area.type == "PREFERENCES" for area in window.screen.areas):
+            with bpy.context.temp_override(window=window):
+                window_manager = bpy.context.window_manager
+                window_manager.popup_menu(
+                    lambda menu, _: draw_lines(menu.layout, known().line, "NONE", _WIDTH), title="PrimDiffusion"
+                )
+
+
+def unregister() -> None:
+    """No message after the extension was disabled."""
+    if bpy.app.timers.is_registered(_pop_up):
+        bpy.app.timers.unregister(_pop_up)
 
 
 def _icon(now: Known) -> str:

@@ -86,6 +86,7 @@ def test_one_who_fails_is_named_and_does_not_stop_the_others(out, capfd):
     assert "checkpoint is damaged" in failed[0]["why"]
     assert failed[1]["subject"] == "person_000003"
     assert "is damaged" in failed[1]["why"]
+    assert (out / "person_000003" / "person.human.safetensors").is_file()  # the .blend alone failed
     assert report(out)["done"][-1] == "person_000005"
     assert not list(out.glob(".*"))
     assert "person_000002 failed: " in capfd.readouterr().out
