@@ -18,6 +18,8 @@ from .settings import Background, CaptureSettings, Device, Light
 
 MARK = "PRIMDIFFUSION "
 """Begins each line of --progress json; an object follows: {"line": ...}, or the fields of `job.Progress`."""
+ASK_FROM = 100
+"""Views, before which a user at a terminal is asked."""
 _POSE_ENDINGS = (".npz", ".npy", ".json", ".bvh")
 
 
@@ -59,6 +61,7 @@ def parser() -> argparse.ArgumentParser:
         help="the first subject also under the name the released code needs",
     )
     add("--list", action="store_true", help="list the subjects of the shard, render nothing")
+    add("--yes", action="store_true", help=f"do not ask before {ASK_FROM} views or more; only a terminal is asked")
     add("--verify", action="store_true", help="check the dataset, render nothing")
     add("--repair", action="store_true", help="with --verify: remove damaged files; without: then render them again")
     add("--progress", choices=("text", "json", "none"), default="text", help="on stdout")

@@ -39,6 +39,27 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
     out: bpy.props.StringProperty(name="Captures", description="Empty: the panel's")
     options: bpy.props.StringProperty(name="Options", description="More words, as on the command line")
 
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask before a long run; errors are reported by `execute`."""
+        # needs numpy
+        from ..capture.command import estimate, scans_in
+        from ..capture.options import ASK_FROM, parse, settings_of
+
+        try:
+            options = parse(self._words(context))
+            views, message = estimate(settings_of(options), len(scans_in(options.people, options.only)))
+        except (OSError, ValueError, RuntimeError):
+            return self.execute(context)
+        if views < ASK_FROM:
+            return self.execute(context)
+        return context.window_manager.invoke_confirm(
+            self, event, title="Render Captures?", message=message, confirm_text="Render"
+        )
+
+    def _words(self, context: bpy.types.Context) -> list[str]:
+        asked = context.scene.primdiffusion_captures
+        return words_of(asked, context, captures.new_folder(), self.people, self.out) + shlex.split(self.options)
+
     def execute(self, context: bpy.types.Context) -> set[str]:
         """With a window another Blender renders and a timer follows it; in background mode this one renders."""
         from ..capture.options import parse, settings_of  # needs numpy
@@ -46,10 +67,7 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
         try:
             if captures.busy:
                 raise Busy("captures are being rendered; wait for them or press Cancel")
-            words = words_of(
-                context.scene.primdiffusion_captures, context, captures.new_folder(), self.people, self.out
-            )
-            words += shlex.split(self.options)
+            words = self._words(context)
             if bpy.app.background:
                 return self._render_here(context, words)
             settings_of(parse(words))  # report impossible settings at once

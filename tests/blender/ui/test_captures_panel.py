@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -25,7 +26,7 @@ from blender_primdiffusion.capture.stage import data_blocks
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.ui.captures_panel import RIG
+from blender_primdiffusion.ui.captures_panel import RIG, PRIMDIFFUSION_OT_render_captures
 from blender_primdiffusion.ui.captures_session import captures
 from blender_primdiffusion.ui.captures_settings import words_of
 
@@ -313,3 +314,20 @@ def test_unknown_options_are_rejected():
 
 def test_few_faces_are_a_few(empty_scene):
     assert abs(len(_few_faces()[1]) - FACES) < 60
+
+
+def test_the_button_asks_before_hundreds_of_views(extension, only_good, tmp_path, monkeypatch):
+    asked, begun = [], []
+    panel = extension.scene.primdiffusion_captures
+    panel.people, panel.out = str(only_good), str(tmp_path / "captures")
+    manager = SimpleNamespace(invoke_confirm=lambda *_, **words: asked.append(words) or {"RUNNING_MODAL"})
+    context = SimpleNamespace(scene=extension.scene, window_manager=manager)
+    button = SimpleNamespace(people="", out="", options="", execute=lambda _: begun.append(1) or {"FINISHED"})
+    button._words = lambda context: PRIMDIFFUSION_OT_render_captures._words(button, context)
+    assert PRIMDIFFUSION_OT_render_captures.invoke(button, context, None) == {"RUNNING_MODAL"}
+    assert asked[0]["message"].startswith("720 views (1 person x 20 poses x 36 cameras) take about 26 min")
+    panel.pose_count = 1
+    assert PRIMDIFFUSION_OT_render_captures.invoke(button, context, None) == {"FINISHED"}
+    panel.people = ""  # the error is for `execute`
+    assert PRIMDIFFUSION_OT_render_captures.invoke(button, context, None) == {"FINISHED"}
+    assert (len(asked), len(begun)) == (1, 2)
