@@ -10,7 +10,7 @@ is m0 + du a + dv b; its direction is D + delta, delta = (du a + dv b - D (|m| -
 
 The nine texels of a box's record: (n0, first, last, stride), (W a, |m0|), (W b, 2 m0.a), (W D, 2 m0.b), (e, t0), (lower
 bounds of its content, length of a sample times the scale of its density), (upper bounds, place in the atlas), (u0 and
-v0, each as whole and 1/2 - fraction), (first column, row, last column, row of tiles). Lattice points count from a
+v0, each as whole and 1/2 - fraction), (first column, row, last column, row of pixels). Lattice points count from a
 common one near the boxes. Records and lists are textures: Python gets storage buffers with Blender 5.3.
 """
 
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import gpu_shaders
-from .gpu_shaders import ACROSS, BOXES_A_ROW, ENTRIES_A_ROW, TEXELS, TILE, VOXELS
+from .gpu_shaders import ACROSS, BOXES_A_ROW, ENTRIES_A_ROW, TEXELS, TILE, VOXELS, WIDER
 from .view import PinholeView
 
 STRIDES = (4, 2, 1)
@@ -70,24 +70,21 @@ class Boxes:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Lists:
-    """Boxes as one view sees them."""
+class _Tiles:
+    """Tiles of a view that have a list of boxes each."""
 
-    records: NDArray[np.float32]
-    """[N, TEXELS, 4], in the order of their first lattice points."""
-    base: int
-    """Lattice point from which records count."""
-    tile: int
-    """Pixels along a side of the tiles that have a list."""
+    side: int
+    """Pixels."""
     begin: NDArray[np.int64]
     """Where a tile's list begins [rows, columns]."""
     count: NDArray[np.int64]
+    """Boxes in it [rows, columns]; one more entry precedes them."""
 
 
 class GpuMarch:
     """A picture that is marched in slices; `colour` and `depth` are complete when `advance` returns True.
 
-    Pictures have their bottom row first. `colour` is RGBA32F, linear and premultiplied; `depth` R32F, metres along the
+    Pictures have their bottom row first. `colour` is RGBA16F, linear and premultiplied; `depth` R32F, metres along the
     optical axis to where people are half opaque, 1e10 where they are not.
     """
 
@@ -96,40 +93,55 @@ class GpuMarch:
         shaders: dict[str, gpu.types.GPUShader],
         atlas: gpu.types.GPUTexture,
         atlas_size: tuple[int, int, int],
-        lists: _Lists,
+        records: NDArray[np.float64],
         view: PinholeView,
         spacing: float,
         ends: gpu.types.GPUTexture | None,
     ):
         size = (view.width, view.height)
-        self.colour = gpu.types.GPUTexture(size, format="RGBA32F")
+        self.colour = gpu.types.GPUTexture(size, format="RGBA16F")
         self.depth = gpu.types.GPUTexture(size, format="R32F")
-        self._shader = shaders["march"]
-        self._rows, self._done = -(-view.height // TILE), 0
-        self._columns = -(-view.width // TILE)
-        self._atlas, self._ends, self._tile = atlas, ends, lists.tile
-        self._boxes = _texture(_padded(lists.records), "RGBA32F")
-        self._tiles = _texture(np.stack([lists.begin, lists.count, lists.begin, lists.count], -1), "RGBA32F")
-        total = int((lists.count + 1).sum())
-        self._entries = gpu.types.GPUTexture((ENTRIES_A_ROW, -(-total // ENTRIES_A_ROW)), format="R32UI")
-        rows, columns = lists.count.shape
-        shader = shaders["list"]
-        shader.bind()
-        shader.uniform_sampler("boxes", self._boxes)
-        shader.uniform_sampler("tiles", self._tiles)
-        shader.image("entries_image", self._entries)
-        shader.uniform_int("size", (columns, rows, len(lists.records)))
-        gpu.compute.dispatch(shader, -(-columns // TILE), -(-rows // TILE), 1)
+        self._shader, self._size, self._done = shaders["march"], size, 0
+        self._columns, self._rows = -(-view.width // TILE), -(-view.height // TILE)
+        self._atlas, self._ends = atlas, ends
+        base = int(records[0, 0, 1]) // STRIDES[0] * STRIDES[0] if len(records) else 0
+        records[:, 0, :3] -= base
+        self._boxes = _texture(_padded(records), "RGBA32F")
+        fine = _tiles(records, view, TILE)
+        wide = _tiles(records, view, fine.side * WIDER)
+        self._tile_side = fine.side
+        wide_tiles, wide_entries = self._list(shaders["list"], wide, len(records), None)
+        self._tiles, self._entries = self._list(shaders["list"], fine, -1, (wide_tiles, wide_entries))
         focal = (view.intrinsics[0, 0], view.intrinsics[1, 1])
-        offset = view.depth_offset
         self._constants = {
             "lens": (*focal, view.intrinsics[0, 2], view.intrinsics[1, 2]),
-            "lattice": (spacing, lists.base, lists.base * spacing - offset, atlas_size[1] // VOXELS),
-            "planes": tuple(min(edge / spacing, 1e12) - lists.base for edge in view.clip),
+            "lattice": (spacing, base, base * spacing - view.depth_offset, atlas_size[1] // VOXELS),
+            "planes": tuple(min(edge / spacing, 1e12) - base for edge in view.clip),
             "metric": (focal[0] ** -2, focal[1] ** -2),
             "atlas_size": atlas_size,
         }
-        self._size = size
+
+    def _list(
+        self,
+        shader: gpu.types.GPUShader,
+        tiles: _Tiles,
+        boxes: int,
+        wider: tuple[gpu.types.GPUTexture, gpu.types.GPUTexture] | None,
+    ) -> tuple[gpu.types.GPUTexture, gpu.types.GPUTexture]:
+        """Tiles and their lists, chosen among as many boxes, or out of the lists of wider tiles."""
+        rows, columns = tiles.count.shape
+        spans = _texture(np.stack([tiles.begin, tiles.count] * 2, -1), "RGBA32F")
+        total = int((tiles.count + 1).sum())
+        entries = gpu.types.GPUTexture((ENTRIES_A_ROW, -(-total // ENTRIES_A_ROW)), format="R32UI")
+        wide_tiles, wide_entries = wider or (spans, gpu.types.GPUTexture((1, 1), format="R32UI"))
+        shader.bind()
+        for name, texture in (("boxes", self._boxes), ("tiles", spans), ("wide_tiles", wide_tiles)):
+            shader.uniform_sampler(name, texture)
+        shader.uniform_sampler("entries", wide_entries)
+        shader.image("entries_image", entries)
+        shader.uniform_int("tiling", (columns, rows, tiles.side, boxes))
+        gpu.compute.dispatch(shader, -(-columns // TILE), -(-rows // TILE), 1)
+        return spans, entries
 
     def advance(self, tile_rows: int | None = None) -> bool:
         """March as many rows of tiles, all by default, from the top; True when the picture is complete."""
@@ -146,7 +158,7 @@ class GpuMarch:
             for name, values in self._constants.items():
                 shader.uniform_float(name, values)
             shader.uniform_int("size", self._size)
-            shader.uniform_int("tiling", (self._done, self._tile, int(self._ends is not None)))
+            shader.uniform_int("tiling", (self._done, self._tile_side, int(self._ends is not None)))
             gpu.compute.dispatch(shader, self._columns, rows, 1)
             self._done += rows
         return self._done >= self._rows
@@ -185,8 +197,8 @@ class GpuMarcher:
         spacing = step / STRIDES[0]
         size = (ACROSS * VOXELS, max([payload.rows for payload, _ in people], default=1) * VOXELS)
         atlas_size = (*size, max(len(people), 1) * VOXELS)
-        lists = _listed(people, view, spacing, atlas_size[1] // VOXELS)
-        return GpuMarch(self._shaders, self._common(people, atlas_size), atlas_size, lists, view, spacing, ends)
+        records = _all_records(people, view, spacing, atlas_size[1] // VOXELS)
+        return GpuMarch(self._shaders, self._common(people, atlas_size), atlas_size, records, view, spacing, ends)
 
     def _common(self, people: Sequence[tuple[GpuPayload, Boxes]], size: tuple[int, int, int]) -> gpu.types.GPUTexture:
         """One atlas of all people, a layer of bricks for each."""
@@ -216,27 +228,26 @@ def _content(solid: NDArray[np.bool_]) -> NDArray[np.float64]:
     return bounds / (VOXELS - 1) * 2 - 1
 
 
-def _listed(people: Sequence[tuple[GpuPayload, Boxes]], view: PinholeView, spacing: float, rows: int) -> _Lists:
-    """All boxes with content in the view, and the sizes of the tiles' lists."""
+def _all_records(
+    people: Sequence[tuple[GpuPayload, Boxes]], view: PinholeView, spacing: float, rows: int
+) -> NDArray[np.float64]:
+    """Records [N, TEXELS, 4] of all boxes with content in the view, in the order of their first lattice points; `rows`
+    is the height of an atlas layer in bricks."""
     parts = [_records(payload, boxes, view, spacing) for payload, boxes in people]
+    for number, (part, shown) in enumerate(parts):
+        part[:, 6, 3] = number * rows * ACROSS + shown
     records = np.concatenate([part for part, _ in parts]) if parts else np.zeros((0, TEXELS, 4))
-    # A person's bricks are below each other in the atlas, people are behind each other.
-    brick = [number * rows * ACROSS + shown for number, (_, shown) in enumerate(parts)]
-    records[:, 6, 3] = np.concatenate(brick) if brick else 0
-    records = records[np.argsort(records[:, 0, 1], kind="stable")]
-    base = int(records[0, 0, 1]) // STRIDES[0] * STRIDES[0] if len(records) else 0
-    records[:, 0, :3] -= base
-    tile = TILE
+    return records[np.argsort(records[:, 0, 1], kind="stable")]
+
+
+def _tiles(records: NDArray[np.float64], view: PinholeView, side: int) -> _Tiles:
+    """Tiles of `side` pixels, or larger ones where their lists would be too long together."""
     while True:
-        across = np.array([-(-view.width // tile), -(-view.height // tile)])
-        reach = records[:, 8].astype(np.int64) // tile
-        count = _counts(reach, across)
+        across = np.array([-(-view.width // side), -(-view.height // side)])
+        count = _counts(records[:, 8].astype(np.int64) // side, across)
         if count.sum() <= MOST_ENTRIES or count.size == 1:
-            break
-        tile *= 2
-    records[:, 8] = reach
-    begin = np.cumsum(count + 1).reshape(count.shape) - (count + 1)
-    return _Lists(records.astype(np.float32), base, tile, begin, count)
+            return _Tiles(side, np.cumsum(count + 1).reshape(count.shape) - (count + 1), count)
+        side *= 2
 
 
 def _counts(reach: NDArray[np.int64], across: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -251,7 +262,7 @@ def _counts(reach: NDArray[np.int64], across: NDArray[np.int64]) -> NDArray[np.i
 def _records(
     payload: GpuPayload, boxes: Boxes, view: PinholeView, spacing: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Records [N, TEXELS, 4] of the boxes with content in the view, and their indices; tiles are pixels here."""
+    """Records [N, TEXELS, 4] of the boxes with content in the view, and their indices."""
     solid = (payload.bounds[:, 0] < payload.bounds[:, 1]).all(1) & (boxes.half_extent > 0).all(1)
     shown = np.flatnonzero(solid)
     position, rotation = np.asarray(boxes.position, np.float64)[shown], np.asarray(boxes.rotation, np.float64)[shown]
@@ -330,7 +341,7 @@ def _rectangles(corners: NDArray, view: PinholeView, near: float) -> NDArray[np.
     return np.concatenate([first, last], 1)
 
 
-def _padded(records: NDArray[np.float32]) -> NDArray[np.float32]:
+def _padded(records: NDArray) -> NDArray[np.float32]:
     """Records as the rows of a texture [rows, BOXES_A_ROW * TEXELS, 4]."""
     rows = max(-(-len(records) // BOXES_A_ROW), 1)
     padded = np.zeros((rows * BOXES_A_ROW, TEXELS, 4), np.float32)

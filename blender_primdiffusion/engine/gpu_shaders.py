@@ -15,6 +15,8 @@ TEXELS = 9
 """Texels of a box record."""
 BOXES_A_ROW = 128
 ENTRIES_A_ROW = 4096
+WIDER = 8
+"""Tiles are listed out of lists of tiles that are as many times wider."""
 CHUNK = 16
 """Lattice points that are composited together: a multiple of the largest stride."""
 
@@ -22,6 +24,11 @@ _RECORDS = f"""
 vec4 record(int box, int texel)
 {{
   return texelFetch(boxes, ivec2((box % {BOXES_A_ROW}) * {TEXELS} + texel, box / {BOXES_A_ROW}), 0);
+}}
+
+int entry(int place)
+{{
+  return int(texelFetch(entries, ivec2(place % {ENTRIES_A_ROW}, place / {ENTRIES_A_ROW}), 0).x);
 }}
 """
 
@@ -36,16 +43,22 @@ void store(int place, int value)
 void main()
 {{
   ivec2 tile = ivec2(gl_GlobalInvocationID.xy);
-  if (tile.x >= size.x || tile.y >= size.y) {{
+  if (tile.x >= tiling.x || tile.y >= tiling.y) {{
     return;
+  }}
+  vec2 first = vec2(tile * tiling.z);
+  vec2 last = first + float(tiling.z - 1);
+  vec2 span = vec2(-1.0, float(tiling.w));
+  if (tiling.w < 0) {{
+    span = texelFetch(wide_tiles, tile / {WIDER}, 0).xy;
   }}
   int begin = int(texelFetch(tiles, tile, 0).x);
   int place = begin + 1;
   float finest = 4.0;
-  vec2 at = vec2(tile);
-  for (int box = 0; box < size.z; box++) {{
+  for (int i = 0; i < int(span.y); i++) {{
+    int box = tiling.w < 0 ? entry(int(span.x) + 1 + i) : i;
     vec4 reach = record(box, 8);
-    if (at.x >= reach.x && at.y >= reach.y && at.x <= reach.z && at.y <= reach.w) {{
+    if (last.x >= reach.x && last.y >= reach.y && first.x <= reach.z && first.y <= reach.w) {{
       store(place, box);
       place += 1;
       finest = min(finest, record(box, 0).w);
@@ -59,11 +72,6 @@ void main()
 _MARCH = (
     _RECORDS
     + f"""
-int entry(int place)
-{{
-  return int(texelFetch(entries, ivec2(place % {ENTRIES_A_ROW}, place / {ENTRIES_A_ROW}), 0).x);
-}}
-
 float along(float slope)
 {{
   return abs(slope) < 1e-12 ? 1e-12 : slope;
@@ -200,12 +208,15 @@ void main()
 
 
 def list_shader() -> gpu.types.GPUShader:
-    """Writes the boxes of each tile, one invocation a tile, in the order of their first lattice points."""
+    """Writes each tile's list, one invocation a tile: the finest stride, then the boxes that the tile may see in the
+    order of their first lattice points, out of all boxes or of the lists of wider tiles."""
     info = gpu.types.GPUShaderCreateInfo()
     info.sampler(0, "FLOAT_2D", "boxes")
     info.sampler(1, "FLOAT_2D", "tiles")
+    info.sampler(2, "FLOAT_2D", "wide_tiles")
+    info.sampler(3, "UINT_2D", "entries")
     info.image(0, "R32UI", "UINT_2D", "entries_image", qualifiers={"WRITE"})
-    info.push_constant("IVEC3", "size")
+    info.push_constant("IVEC4", "tiling")
     return _compiled(info, _LIST, (TILE, TILE))
 
 
@@ -222,7 +233,7 @@ def march_shader() -> gpu.types.GPUShader:
         ]
     ):
         info.sampler(slot, kind, name)
-    info.image(0, "RGBA32F", "FLOAT_2D", "colour_image", qualifiers={"WRITE"})
+    info.image(0, "RGBA16F", "FLOAT_2D", "colour_image", qualifiers={"WRITE"})
     info.image(1, "R32F", "FLOAT_2D", "depth_image", qualifiers={"WRITE"})
     for kind, name in [("VEC4", "lens"), ("VEC4", "lattice"), ("VEC2", "planes"), ("VEC2", "metric")]:
         info.push_constant(kind, name)

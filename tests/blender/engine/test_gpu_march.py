@@ -214,7 +214,7 @@ def test_slices_and_larger_tiles_give_the_same_picture(marcher, backend, payload
     monkeypatch.setattr(gpu_march, "MOST_ENTRIES", 1500)
     larger = marcher.march(people, view, STEP)
     larger.advance()
-    assert larger._tile > gpu_march.TILE
+    assert larger._tile_side > gpu_march.TILE
     assert np.abs(read(larger.colour, view) - whole).max() < 1e-5
     assert np.array_equal(read(larger.depth, view), depth)
 
