@@ -42,7 +42,7 @@ def missing_packages() -> str:
         return ""
     debian = " ".join(_PACKAGES[name] for name in missing)
     return (
-        f"the Python of this Blender lacks {' and '.join(missing)}, without which people cannot be shown: install them "
+        f"the Python of this Blender lacks {' and '.join(missing)}, without which humans cannot be shown: install them "
         f"(on Debian and Ubuntu: sudo apt install {debian}), then start Blender again"
     )
 

@@ -146,7 +146,7 @@ def chosen_compute(machine: Machine, wish: str, available: Iterable[str]) -> tup
     if machine.platform == "macos_x86_64":
         raise ValueError(
             "PyTorch is no longer made for Macs with Intel chips (2.2 was the last, and 2.6 is needed): generate on "
-            "another computer; a .blend with people in it opens here and renders in Cycles"
+            "another computer; a .blend with humans in it opens here and renders in Cycles"
         )
     if not available:
         version = ".".join(map(str, machine.python))

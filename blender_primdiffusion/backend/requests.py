@@ -157,7 +157,7 @@ STAGES = {
     "encode": "Reconstructing",
     "preview": "Drawing the previews",
     "render": "Drawing the previews",
-    "write": "Writing the person",
+    "write": "Writing the human",
     "merge": "Merging the volumes",
     "fit": "Fitting",
 }

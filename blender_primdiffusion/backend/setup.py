@@ -112,7 +112,7 @@ def set_up(
 
 
 def self_test(folder: SetUpFolder, python: Path | None, module_path: Path, cache: Path) -> Steps:
-    """Make a person in a few steps with the environment, or with another `python`."""
+    """Make a human in a few steps with the environment, or with another `python`."""
     folder.temporary.mkdir(parents=True, exist_ok=True)
     about = yield from _trial(python or folder.python, module_path, cache, folder.temporary)
     return _ready(about)
@@ -138,7 +138,7 @@ def _pip(python: Path) -> list[str]:
 
 
 def _trial(python: Path, module_path: Path, cache: Path, temporary: Path) -> Generator[Step, None, dict[str, Any]]:
-    """The real child makes a person; returns what it is and what it computes on."""
+    """The real child makes a human; returns what it is and what it computes on."""
     found: list[BackendPython] = []
 
     def make_client() -> Generator[None, None, BackendClient]:
@@ -157,7 +157,7 @@ def _trial(python: Path, module_path: Path, cache: Path, temporary: Path) -> Gen
             last = f" ({request.error.log[-1]})" if request.error.kind == "died" and request.error.log else ""
             raise SetUpFailed(f"the self-test failed: {request.error.message}{last}")
         if not Path((request.result or {}).get("human", "")).is_file():
-            raise SetUpFailed("the self-test failed: the backend made no person and did not say why")
+            raise SetUpFailed("the self-test failed: the backend made no human and did not say why")
         return {
             "device": request.info.get("device_name") or "",
             "seconds": round(time.monotonic() - began, 1),

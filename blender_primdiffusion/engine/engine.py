@@ -16,7 +16,7 @@ ENGINE = "PRIMDIFFUSION"
 
 
 class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
-    """Draws people exactly, by marching rays through their primitives, and solid objects with simple shading."""
+    """Draws humans exactly, by marching rays through their primitives, and solid objects with simple shading."""
 
     bl_idname = ENGINE
     bl_label = "PrimDiffusion"

@@ -26,7 +26,7 @@ class RenderFailed(RuntimeError):
 def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph) -> Drawing:
     """Draw one view layer into the engine's result; returns when it is finished or cancelled by the user.
 
-    Raises RenderFailed, FileNotFoundError for a person without a file, and ValueError for what cannot be drawn.
+    Raises RenderFailed, FileNotFoundError for a human without a file, and ValueError for what cannot be drawn.
     """
     scene = depsgraph.scene
     camera = engine.camera_override or scene.camera

@@ -31,12 +31,12 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
     )
     view: bpy.props.EnumProperty(
         name="View",
-        description="What is drawn of people",
+        description="What is drawn of humans",
         items=(
-            ("COLOUR", "Colour", "People as they look"),
+            ("COLOUR", "Colour", "Humans as they look"),
             ("DEPTH", "Depth", "Near is bright"),
-            ("ALPHA", "Alpha", "How opaque the people are"),
-            ("BOXES", "Primitives", "The boxes that people are made of, shaded, each in a different colour"),
+            ("ALPHA", "Alpha", "How opaque the humans are"),
+            ("BOXES", "Primitives", "The boxes that humans are made of, shaded, each in a different colour"),
         ),
         default="COLOUR",
         update=_redraw,
@@ -45,13 +45,13 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
         name="Solid Objects",
         description="How meshes and other surfaces are drawn",
         items=(
-            ("SHADED", "Shaded", "Drawn with simple shading; they hide people behind"),
+            ("SHADED", "Shaded", "Drawn with simple shading; they hide humans behind"),
             (
                 "HOLDOUT",
                 "Holdout",
-                "Not drawn, but they cut holes into people, for compositing over a Cycles render",
+                "Not drawn, but they cut holes into humans, for compositing over a Cycles render",
             ),
-            ("IGNORED", "Ignored", "People are drawn as if they were not there"),
+            ("IGNORED", "Ignored", "Humans are drawn as if they were not there"),
         ),
         default="SHADED",
         update=_redraw,

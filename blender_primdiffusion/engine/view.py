@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..scene.convention import BLENDER_FROM_BACKEND
 
 PARALLEL_M = 2000.0
-"""An orthographic view is drawn by a pinhole this far from the person: over a body's thickness its scale then varies by
+"""An orthographic view is drawn by a pinhole this far from the human: over a body's thickness its scale then varies by
 a ten-thousandth. Farther away, float32 positions along a ray would be coarser than a tenth of a millimetre."""
 NO_SURFACE_M = 1e10
 """Depth where a ray meets nothing, as Cycles writes it."""

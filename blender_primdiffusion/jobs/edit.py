@@ -175,7 +175,7 @@ class RegenerateJob(Job):
                 raise ValueError(
                     f"{person.name!r} was made by the checkpoint {before.get('checkpoint')!r}, and this one is "
                     f"{made.get('checkpoint')!r}: choose that one in the preferences, "
-                    "otherwise the result would be another person"
+                    "otherwise the result would be another human"
                 )
         show_in_place(context, person, result)
         look()

@@ -31,10 +31,10 @@ _WORTH_REPORTING = 50e6
 def device_line() -> str:
     """The device as panels show it: its name, and its total and free memory as far as the child has reported them."""
     if queue.child_message:
-        return f"{queue.child_message}; restarts with the next person"
+        return f"{queue.child_message}; restarts with the next human"
     info = queue.info
     if not info.get("device_name"):
-        return "starts with the first person"
+        return "starts with the first human"
     of = "device_memory" if info.get("device_memory_gb") else "memory"
     total, free = info.get(f"{of}_gb"), info.get(f"{of}_free_gb")
     if not total:

@@ -31,12 +31,12 @@ class HumanTarget:
         person = next((person for person in people if person.session_uid == self.uid), None)
         if person is None or not any(obj.type == "ARMATURE" for obj in person.objects):
             raise ValueError(
-                f"the person {self.name!r} was removed during the edit; nothing was changed. Undo the "
+                f"the human {self.name!r} was removed during the edit; nothing was changed. Undo the "
                 "removal and edit again"
             )
         if person_file_name(person) != self.file:
             raise ValueError(
-                f"the person {person.name!r} changed during the edit (by undo or redo); nothing was changed. Edit again"
+                f"the human {person.name!r} changed during the edit (by undo or redo); nothing was changed. Edit again"
             )
         check_editable(person)
         return person
@@ -58,8 +58,8 @@ def selected_person(context: bpy.types.Context) -> bpy.types.Collection:
     if len(people) == 1:
         return people[0]
     if not people:
-        raise ValueError("there is no person in the scene: generate one first")
-    raise ValueError(f"{len(people)} people are in the scene: select the one you mean")
+        raise ValueError("there is no human in the scene: generate one first")
+    raise ValueError(f"{len(people)} humans are in the scene: select the one you mean")
 
 
 def named_person(context: bpy.types.Context, name: str) -> bpy.types.Collection:
@@ -69,5 +69,5 @@ def named_person(context: bpy.types.Context, name: str) -> bpy.types.Collection:
         if person.name == name:
             return person
     if not people:
-        raise ValueError(f"the person {name!r} is not in the scene: it has no people")
-    raise ValueError(f"the person {name!r} is not in the scene: choose from {', '.join(repr(p.name) for p in people)}")
+        raise ValueError(f"the human {name!r} is not in the scene: it has no humans")
+    raise ValueError(f"the human {name!r} is not in the scene: choose from {', '.join(repr(p.name) for p in people)}")

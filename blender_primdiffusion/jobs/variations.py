@@ -108,7 +108,7 @@ class VariationsJob(Job):
     person: str = ""
     """File of the human to vary; empty for new humans."""
     amount: float = 0.5
-    title: str = "New people"
+    title: str = "New humans"
     checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
 
     @property
@@ -119,7 +119,7 @@ class VariationsJob(Job):
         params: dict[str, Any] = {"seeds": list(self.seeds), "steps": self.steps, "sampler": self.sampler, **self.asked}
         if self.person:
             if not Path(self.person).is_file():
-                raise FileNotFoundError("the person to vary was cleared: show variations again")
+                raise FileNotFoundError("the human to vary was cleared: show variations again")
             params |= {"person": self.person, "amount": self.amount}
         if self.checkpoint:
             params["checkpoint"] = self.checkpoint
@@ -128,4 +128,4 @@ class VariationsJob(Job):
     def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         sheet.fill(result["people"], self.title, around=bool(self.person))
         icons.free()  # of the steps
-        return f"{len(self.seeds)} people in {result['seconds']:.1f} s"
+        return f"{len(self.seeds)} humans in {result['seconds']:.1f} s"

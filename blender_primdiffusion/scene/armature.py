@@ -119,7 +119,7 @@ def rest_rotations(armature: bpy.types.Object) -> NDArray[np.float64]:
     bones = armature.data.bones
     missing = [name for name in JOINT_NAMES if name not in bones]
     if missing:
-        raise ValueError(f"the armature {armature.name!r} has no bone {missing[0]!r}; select a person's armature")
+        raise ValueError(f"the armature {armature.name!r} has no bone {missing[0]!r}; select a human's armature")
     return np.array([np.array(bones[name].matrix_local.to_3x3()) for name in JOINT_NAMES], np.float64)
 
 

@@ -154,7 +154,7 @@ def build_body_mesh(
     uv_layer.data.foreach_set("uv", np.asarray(uv_corner, np.float32).ravel())
     mesh.update(calc_edges=True)
     if mesh.validate():
-        raise ValueError(f"the body surface of {name!r} has impossible faces; generate the person again")
+        raise ValueError(f"the body surface of {name!r} has impossible faces; generate the human again")
     mesh.shade_smooth()
 
     body = bpy.data.objects.new(name, mesh)

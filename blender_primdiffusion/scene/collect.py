@@ -65,7 +65,7 @@ def collect_files() -> Collected:
     where they cannot be written; then nothing has changed.
     """
     if not bpy.data.filepath:
-        raise ValueError("this file was never saved: save it first, which collects the files of its people too")
+        raise ValueError("this file was never saved: save it first, which collects the files of its humans too")
     home = humans_folder()
     away = [volume for volume in _local() if not _inside(volume_path(volume), home)]
     gone = [volume for volume in away if not volume_path(volume).is_file()]
@@ -156,7 +156,7 @@ def _collect(blend_path: str, away: Iterable[bpy.types.Volume]) -> Collected:
         for path in made:
             path.unlink(missing_ok=True)
         raise VolumeWriteError(
-            f"the files of people could not be copied to {str(target)!r} ({error}); save the .blend in a folder with "
+            f"the files of humans could not be copied to {str(target)!r} ({error}); save the .blend in a folder with "
             "write permission and free space"
         ) from error
     for volume, path in moved.items():

@@ -1,7 +1,7 @@
 """The one place where the backend's axes (y up, facing +z) become Blender's (z up, facing -y), and matrices become
 quaternions.
 
-Both systems are right-handed and in metres, so the change is a quarter turn about x: the person's left stays +x.
+Both systems are right-handed and in metres, so the change is a quarter turn about x: the human's left stays +x.
 """
 
 from __future__ import annotations

@@ -54,10 +54,10 @@ def rename_human(collection: bpy.types.Collection, name: str) -> None:
     armature = armature_of(collection)
     name = name.strip()[:LONGEST_NAME]
     if not name:
-        raise ValueError(f"the person {collection.name!r} needs a name: type one")
+        raise ValueError(f"the human {collection.name!r} needs a name: type one")
     linked = next((obj.library for obj in (collection, armature) if obj.library is not None), None)
     if linked is not None:
-        raise ValueError(f"the person {collection.name!r} is linked from {linked.filepath!r}: rename it there")
+        raise ValueError(f"the human {collection.name!r} is linked from {linked.filepath!r}: rename it there")
     before = collection.name
     collection.name = name
     parts = [*collection.children_recursive, *collection.all_objects]

@@ -70,7 +70,7 @@ def _replace(collection: bpy.types.Collection, written: WrittenHuman, person: Pa
     shown = volumes_of(collection)
     if max(shown) >= len(human.density):
         raise ValueError(
-            f"the person {collection.name!r} has a volume {max(shown)} and the edited one only {len(human.density)}; "
+            f"the human {collection.name!r} has a volume {max(shown)} and the edited one only {len(human.density)}; "
             "use an add-on and a backend of the same release"
         )
     new_betas = not np.allclose(human.betas, generated_betas(collection), atol=SAME_BETAS)
@@ -139,8 +139,8 @@ def _restore(collection: bpy.types.Collection, written: WrittenHuman, lost: set[
     shown = volumes_of(collection)
     if max(shown) >= len(human.density):
         raise ValueError(
-            f"the person {collection.name!r} has a volume {max(shown)} and {person.name!r} only {len(human.density)}: "
-            "it is the file of another person"
+            f"the human {collection.name!r} has a volume {max(shown)} and {person.name!r} only {len(human.density)}: "
+            "it is the file of another human"
         )
     home = home_of(collection)
     which = [k for k, objects in shown.items() if lost.intersection(objects)]

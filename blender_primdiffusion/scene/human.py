@@ -117,8 +117,8 @@ def person_file(collection: bpy.types.Collection) -> Path:
         if (folder / name).is_file():
             return folder / name
     raise MissingPersonFile(
-        f"the file of the person {collection.name!r} is missing: {str(folders[0] / name)!r}; put it back beside "
-        "the person's volumes, press Find Missing Volumes in the panel Human, or generate the person again"
+        f"the file of the human {collection.name!r} is missing: {str(folders[0] / name)!r}; put it back beside "
+        "the human's volumes, press Find Missing Volumes in the panel Human, or generate the human again"
     )
 
 
@@ -166,7 +166,7 @@ def armature_of(collection: bpy.types.Collection) -> bpy.types.Object:
     for obj in collection.objects:
         if MARK in collection and obj.type == "ARMATURE":
             return obj
-    raise ValueError(f"the collection {collection.name!r} holds no generated person; select one that does")
+    raise ValueError(f"the collection {collection.name!r} holds no generated human; select one that does")
 
 
 def body_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
@@ -222,11 +222,11 @@ def check_editable(collection: bpy.types.Collection) -> None:
     linked = next((part.library for part in parts if part.library is not None), None)
     if linked is not None:
         raise ValueError(
-            f"the person {collection.name!r} is linked from {linked.filepath!r}: edit it there, or make it local with "
+            f"the human {collection.name!r} is linked from {linked.filepath!r}: edit it there, or make it local with "
             "Object > Relations > Make Local > All"
         )
     if not volumes_of(collection):
-        raise ValueError(f"the person {collection.name!r} has no volumes left; generate a person again")
+        raise ValueError(f"the human {collection.name!r} has no volumes left; generate a human again")
 
 
 def remove_human(collection: bpy.types.Collection) -> None:

@@ -28,7 +28,7 @@ _PAYLOAD: dict[str, tuple[int | str, ...]] = {
     "rgb": ("K", 3, 8, 8, 8), "density": ("K", 8, 8, 8), "delta_scale": ("K", 3), "betas": (BETA_COUNT,),
     "rest_half_extent": ("K", 3),
 }  # fmt: skip
-_REMEDY = "choose a .human file, or export the person again"
+_REMEDY = "choose a .human file, or export the human again"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,7 +142,7 @@ def reshaped(human: HumanTensors, betas: NDArray, growth: NDArray | None) -> Hum
         dtype, shape, raw = human.arrays.get("delta_scale", ("", (), b""))
         if dtype != "F32" or shape != growth.shape:
             given, expected = f"{dtype}{list(shape)}", f"F32{list(growth.shape)}"
-            raise ValueError(f"the person's file holds sizes of boxes as {given}, not {expected}; {_REMEDY}")
+            raise ValueError(f"the human's file holds sizes of boxes as {given}, not {expected}; {_REMEDY}")
         arrays["delta_scale"] = _stored((_loaded(dtype, shape, raw) * growth).astype(np.float32))
     return HumanTensors(human.metadata, arrays)
 

@@ -70,7 +70,7 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
 _DTYPES: dict[str, type] = {"faces": np.int64, "rgb": np.float32, "density": np.float32}
 _SAME_SURFACE = 1e-4
 """Metres the surface may be off what the shape model gives for the betas."""
-_REMEDY = "generate the person again"
+_REMEDY = "generate the human again"
 
 
 def read_human(path: str | Path) -> HumanFile:

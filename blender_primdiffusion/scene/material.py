@@ -81,11 +81,11 @@ def set_density_gain(collection: bpy.types.Collection, gain: float) -> None:
     material = person_material(collection)
     if _gain_node(material) is None:
         raise ValueError(
-            f"the material {material.name!r} of {collection.name!r} has no node {GAIN_NODE!r}: give the person's "
+            f"the material {material.name!r} of {collection.name!r} has no node {GAIN_NODE!r}: give the human's "
             f"volumes the material {volume_material().name!r} again"
         )
     if material.library is not None or any(data.library is not None for data in _volumes(collection)):
-        raise ValueError(f"the person {collection.name!r} is linked: make it local to change the density gain")
+        raise ValueError(f"the human {collection.name!r} is linked: make it local to change the density gain")
     current = _gain_node(material).outputs[0]
     if abs(current.default_value - gain) <= _SAME:
         return

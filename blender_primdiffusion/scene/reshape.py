@@ -24,7 +24,7 @@ def check_shapeable(collection: bpy.types.Collection) -> None:
     for obj in (armature, armature.data, body and body.data):
         if obj and obj.library is not None:
             raise ValueError(
-                f"the person {collection.name!r} is linked from {obj.library.filepath!r}: reshape it there, or "
+                f"the human {collection.name!r} is linked from {obj.library.filepath!r}: reshape it there, or "
                 "make it local with Object > Relations > Make Local > All"
             )
     missing = [name for name in JOINT_NAMES if name not in armature.data.bones]

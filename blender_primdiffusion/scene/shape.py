@@ -293,7 +293,7 @@ def generated_betas(collection: bpy.types.Collection) -> NDArray[np.float64]:
     if betas.shape != (BETA_COUNT,):
         raise ValueError(
             f"the custom property {MARK!r} of {collection.name!r} was changed by hand and holds no shape: undo that, "
-            "or generate the person again"
+            "or generate the human again"
         )
     return betas
 
@@ -310,8 +310,8 @@ def shape_model_of(collection: bpy.types.Collection) -> ShapeModel:
     """The model by which the human's body follows its shape. Raises ValueError or FileNotFoundError."""
     if BODY_FILE not in collection:
         raise ValueError(
-            f"the person {collection.name!r} was made by an earlier version and cannot be reshaped: generate the "
-            "person again, or vary it"
+            f"the human {collection.name!r} was made by an earlier version and cannot be reshaped: generate the "
+            "human again, or vary it"
         )
     return read_body_file(body_file(collection))
 
@@ -376,8 +376,8 @@ def read_body_file(path: Path) -> ShapeModel:
     """
     if not path.is_file():
         raise FileNotFoundError(
-            f"the body's file is missing: {str(path)!r}; put it back beside the people's folders, or generate the "
-            "person again"
+            f"the body's file is missing: {str(path)!r}; put it back beside the humans' folders, or generate the "
+            "human again"
         )
     try:
         arrays = read_arrays(path, tuple(FIELDS), tuple(OPTIONAL_FIELDS))
@@ -386,9 +386,9 @@ def read_body_file(path: Path) -> ShapeModel:
         model = ShapeModel.from_arrays(arrays)
         fault = faulty_field(model)
     except (OSError, ValueError, IndexError) as error:
-        raise ValueError(f"the body's file {str(path)!r} is damaged ({error}); generate the person again") from error
+        raise ValueError(f"the body's file {str(path)!r} is damaged ({error}); generate the human again") from error
     if fault is not None:
-        raise ValueError(f"the field {fault!r} of {str(path)!r} holds impossible values; generate the person again")
+        raise ValueError(f"the field {fault!r} of {str(path)!r} holds impossible values; generate the human again")
     return model
 
 

@@ -58,7 +58,7 @@ def build_surface(collection: bpy.types.Collection) -> bpy.types.Object:
     if body is None or len(body.data.vertices) != len(model.template):
         state = "was deleted" if body is None else "has other vertices now"
         raise ValueError(
-            f"the body mesh of {collection.name!r} {state}: undo that, or generate the person again, to attach volumes "
+            f"the body mesh of {collection.name!r} {state}: undo that, or generate the human again, to attach volumes "
             "to its surface"
         )
     carrier = carrier_of(collection)

@@ -1,4 +1,4 @@
-"""The sub-panel Assets: the selected person, their pose and the built-in poses in the Asset Browser."""
+"""The sub-panel Assets: the selected human, its pose and the built-in poses in the Asset Browser."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _PICTURE = "Image file for the preview; empty: one is drawn"
 
 
 class PRIMDIFFUSION_OT_mark_human_as_asset(OnPerson, bpy.types.Operator):
-    """Mark the selected person as an asset with a preview, to drag from the Asset Browser into any file"""
+    """Mark the selected human as an asset with a preview, to drag from the Asset Browser into any file"""
 
     bl_idname = "primdiffusion.mark_human_as_asset"
     bl_label = "Mark Human as Asset"
@@ -37,7 +37,7 @@ class PRIMDIFFUSION_OT_mark_human_as_asset(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_mark_pose_as_asset(OnPerson, bpy.types.Operator):
-    """Mark the selected person's pose as an asset, to apply to any person from the pose library"""
+    """Mark the selected human's pose as an asset, to apply to any human from the pose library"""
 
     bl_idname = "primdiffusion.mark_pose_as_asset"
     bl_label = "Mark Pose as Asset"
@@ -57,7 +57,7 @@ class PRIMDIFFUSION_OT_mark_pose_as_asset(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_unmark_human_asset(OnPerson, bpy.types.Operator):
-    """Unmark the selected person as an asset; the person stays"""
+    """Unmark the selected human as an asset; the human stays"""
 
     bl_idname = "primdiffusion.unmark_human_asset"
     bl_label = "Unmark Human Asset"
@@ -92,7 +92,7 @@ class PRIMDIFFUSION_OT_make_pose_assets(Reporting, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_PT_assets(SidebarPanel, bpy.types.Panel):
-    """People and poses for other files."""
+    """Humans and poses for other files."""
 
     bl_label = "Assets"
     bl_translation_context = CONTEXT

@@ -71,7 +71,7 @@ def title(name: str) -> str:
 def _menu_property(name: str):
     items: Callable = lambda _self, _context: menu(name)  # noqa: E731  bpy wants a function of its own for each
     return bpy.props.EnumProperty(
-        name=title(name), description="Attribute of the generated person", items=items, translation_context=CONTEXT
+        name=title(name), description="Attribute of the generated human", items=items, translation_context=CONTEXT
     )
 
 

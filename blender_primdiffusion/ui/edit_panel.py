@@ -20,8 +20,8 @@ PAINTED_GROUP = "PrimDiffusion Region"
 """Vertex group of the body mesh that Paint Region makes."""
 
 _TRANSFERS = {
-    "texture": ("Texture", "Colours only, on the person's own shape"),
-    "garment": ("Garment", "Colours and shape: what the other person wears there"),
+    "texture": ("Texture", "Colours only, on the human's own shape"),
+    "garment": ("Garment", "Colours and shape: what the other human wears there"),
 }
 TRANSFER_ITEMS = [(name, *_TRANSFERS[name]) for name in TRANSFERS]
 
@@ -31,7 +31,7 @@ def parts_property():
     return bpy.props.EnumProperty(
         name="Parts",
         translation_context=CONTEXT,
-        description="Parts to change: Shift-click for several. Left and right are the person's",
+        description="Parts to change: Shift-click for several. Left and right are the human's",
         items=[(name, title(name), "", 1 << i) for i, name in enumerate(PARTS)],
         options={"ENUM_FLAG", "SKIP_SAVE"},
         default={"top"},
@@ -53,7 +53,7 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
     )
     amount: bpy.props.FloatProperty(
         name="Amount",
-        description="How much the new person may differ from this one: 0 not at all, 1 completely",
+        description="How much the new human may differ from this one: 0 not at all, 1 completely",
         default=AMOUNT,
         min=0.0,
         max=1.0,
@@ -61,7 +61,7 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
     )
     region: bpy.props.EnumProperty(
         name="Region",
-        description="Where to change the person; everything else stays exactly as it is",
+        description="Where to change the human; everything else stays exactly as it is",
         items=[
             ("PARTS", "Parts", "Parts of the body, by name"),
             ("PAINTED", "Painted", "A vertex group of the body mesh: where its weight is one half or more"),
@@ -69,16 +69,16 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
     )
     parts: parts_property()
     vertex_group: bpy.props.StringProperty(
-        name="Vertex Group", description="Vertex group of the person's body mesh", default=PAINTED_GROUP
+        name="Vertex Group", description="Vertex group of the human's body mesh", default=PAINTED_GROUP
     )
     attributes: bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_attributes)
     other: bpy.props.PointerProperty(
-        name="Other Person", description="The other person", type=bpy.types.Collection, poll=_may_be_other
+        name="Other Human", description="The other human", type=bpy.types.Collection, poll=_may_be_other
     )
-    what: bpy.props.EnumProperty(name="Transfer", description="What the person gets", items=TRANSFER_ITEMS)
+    what: bpy.props.EnumProperty(name="Transfer", description="What the human gets", items=TRANSFER_ITEMS)
     harmonise: bpy.props.FloatProperty(
         name="Harmonise",
-        description="How much the region is denoised again to match the rest of the person: 0 copies it exactly",
+        description="How much the region is denoised again to match the rest of the human: 0 copies it exactly",
         default=0.0,
         min=0.0,
         max=1.0,
@@ -87,7 +87,7 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
     fraction: bpy.props.FloatProperty(
         name="Fraction",
         translation_context=CONTEXT,
-        description="Share of the other person: 0 is this person, 1 the other",
+        description="Share of the other human: 0 is this human, 1 the other",
         default=FRACTION,
         min=0.0,
         max=1.0,
@@ -96,7 +96,7 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
 
 
 class PRIMDIFFUSION_OT_paint_region(Reporting, bpy.types.Operator):
-    """Show the body mesh of the selected person and paint the region to change"""
+    """Show the body mesh of the selected human and paint the region to change"""
 
     bl_idname = "primdiffusion.paint_region"
     bl_label = "Paint Region"
@@ -190,7 +190,7 @@ class _Region:
 
 
 class PRIMDIFFUSION_OT_vary(_Edit, bpy.types.Operator):
-    """Turn the selected person into a similar one; the smaller the amount, the more similar"""
+    """Turn the selected human into a similar one; the smaller the amount, the more similar"""
 
     bl_idname = "primdiffusion.vary"
     bl_label = "Vary"
@@ -212,7 +212,7 @@ class PRIMDIFFUSION_OT_vary(_Edit, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
-    """Generate a region of the selected person again; everything else stays exactly as it is"""
+    """Generate a region of the selected human again; everything else stays exactly as it is"""
 
     bl_idname = "primdiffusion.redress"
     bl_label = "Re-dress Region"
@@ -234,13 +234,13 @@ class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
-    """Transfer the texture, or the garment, of another person to a region of the selected person"""
+    """Transfer the texture, or the garment, of another human to a region of the selected human"""
 
     bl_idname = "primdiffusion.transfer_texture"
     bl_label = "Transfer Texture"
     job = "TransferJob"
 
-    source: bpy.props.StringProperty(name="Source", description=f"Name of the other person. {PANELS}", options=SKIP)
+    source: bpy.props.StringProperty(name="Source", description=f"Name of the other human. {PANELS}", options=SKIP)
     what: bpy.props.EnumProperty(name="Transfer", items=TRANSFER_ITEMS, description=PANELS, options=SKIP)
     harmonise: bpy.props.FloatProperty(name="Harmonise", min=0.0, max=1.0, description=PANELS, options=SKIP)
 
@@ -256,13 +256,13 @@ class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
-    """Change the selected person towards another one, who stays unchanged"""
+    """Change the selected human towards another one, which stays unchanged"""
 
     bl_idname = "primdiffusion.blend"
     bl_label = "Blend"
     job = "BlendJob"
 
-    other: bpy.props.StringProperty(name="Other", description=f"Name of the other person. {PANELS}", options=SKIP)
+    other: bpy.props.StringProperty(name="Other", description=f"Name of the other human. {PANELS}", options=SKIP)
     fraction: bpy.props.FloatProperty(
         name="Fraction", translation_context=CONTEXT, min=0.0, max=1.0, description=PANELS, options=SKIP
     )
@@ -274,13 +274,13 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
 
 
 def _other(context: bpy.types.Context, person: bpy.types.Collection, name: str) -> str:
-    """The backend's file of the other person, named by a script or picked in the panel."""
+    """The backend's file of the other human, named by a script or picked in the panel."""
     picked = context.scene.primdiffusion_edit.other
     if not name and picked is None:
-        raise ValueError("choose the other person in the panel first")
+        raise ValueError("choose the other human in the panel first")
     other = named_person(context, name or picked.name)
     if other == person:
-        raise ValueError(f"{person.name!r} cannot be the other person too: choose another one")
+        raise ValueError(f"{person.name!r} cannot be the other human too: choose another one")
     return str(person_file(other))
 
 

@@ -1,4 +1,4 @@
-"""Export the selected person, and import .human files."""
+"""Export the selected human, and import .human files."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
     )
     gaussians: bpy.props.IntProperty(
         name="Gaussians",
-        description="Maximum number of Gaussians; about 130,000 of a person are visible",
+        description="Maximum number of Gaussians; about 130,000 of a human are visible",
         default=requests.GAUSSIANS,
         min=1000,
         max=1_000_000,
@@ -102,7 +102,7 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
     )
     motion: bpy.props.BoolProperty(
         name="With Motion",
-        description="Include the motion of the scene's frame range in the .human file; otherwise only the person",
+        description="Include the motion of the scene's frame range in the .human file; otherwise only the human",
         default=False,
     )
 
@@ -142,7 +142,7 @@ class _ToFile(_Export):
 
 
 class PRIMDIFFUSION_OT_export_mesh(_ToFile, bpy.types.Operator):
-    """Export the selected person as a textured mesh with their armature"""
+    """Export the selected human as a textured mesh with its armature"""
 
     bl_idname = "primdiffusion.export_mesh"
     bl_label = "Export Mesh"
@@ -175,7 +175,7 @@ class PRIMDIFFUSION_OT_export_mesh(_ToFile, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_add_proxy(_Export, bpy.types.Operator):
-    """Add a textured mesh of the selected person that follows the armature: fast in any viewport and engine"""
+    """Add a textured mesh of the selected human that follows the armature: fast in any viewport and engine"""
 
     bl_idname = "primdiffusion.add_proxy"
     bl_label = "Add Mesh Proxy"
@@ -197,14 +197,14 @@ class PRIMDIFFUSION_OT_add_proxy(_Export, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_show_proxy(_Export, bpy.types.Operator):
-    """Choose how the selected person is shown: as volumes or as the mesh proxy"""
+    """Choose how the selected human is shown: as volumes or as the mesh proxy"""
 
     bl_idname = "primdiffusion.show_proxy"
     bl_label = "Show Volumes or Mesh"
     bl_options = {"UNDO"}
 
     shown: bpy.props.EnumProperty(
-        name="Show", translation_context=CONTEXT, description="How the person is shown", items=SHOWN
+        name="Show", translation_context=CONTEXT, description="How the human is shown", items=SHOWN
     )
 
     def run(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
@@ -215,7 +215,7 @@ class PRIMDIFFUSION_OT_show_proxy(_Export, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_remove_proxy(_Export, bpy.types.Operator):
-    """Remove the mesh proxy of the selected person and show the volumes"""
+    """Remove the mesh proxy of the selected human and show the volumes"""
 
     bl_idname = "primdiffusion.remove_proxy"
     bl_label = "Remove Mesh Proxy"
@@ -232,7 +232,7 @@ class PRIMDIFFUSION_OT_remove_proxy(_Export, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_export_gaussians(_ToFile, bpy.types.Operator):
-    """Export the selected person in the current pose as 3D Gaussians for splat viewers"""
+    """Export the selected human in the current pose as 3D Gaussians for splat viewers"""
 
     bl_idname = "primdiffusion.export_gaussians"
     bl_label = "Export Gaussians"
@@ -253,7 +253,7 @@ class PRIMDIFFUSION_OT_export_gaussians(_ToFile, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_export_vdb_sequence(_Export, bpy.types.Operator):
-    """Export the selected person as one volume file for each frame, for any renderer that reads OpenVDB"""
+    """Export the selected human as one volume file for each frame, for any renderer that reads OpenVDB"""
 
     bl_idname = "primdiffusion.export_vdb_sequence"
     bl_label = "Export VDB Sequence"
@@ -287,7 +287,7 @@ class PRIMDIFFUSION_OT_export_vdb_sequence(_Export, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_export_human(_ToFile, bpy.types.Operator):
-    """Export the selected person as a .human file that can be dropped into another scene"""
+    """Export the selected human as a .human file that can be dropped into another scene"""
 
     bl_idname = "primdiffusion.export_human"
     bl_label = "Export Human File"
@@ -309,7 +309,7 @@ class PRIMDIFFUSION_OT_export_human(_ToFile, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_import_human(Reporting, bpy.types.Operator):
-    """Add the person of a .human file to the scene"""
+    """Add the human of a .human file to the scene"""
 
     bl_idname = "primdiffusion.import_human"
     bl_label = "Import Human File"

@@ -9,7 +9,7 @@ from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
 
 
 class PRIMDIFFUSION_PT_export(SidebarPanel, bpy.types.Panel):
-    """Files of people, out and in."""
+    """Files of humans, out and in."""
 
     bl_label = "Export"
     bl_order = 6
@@ -86,7 +86,7 @@ class PRIMDIFFUSION_FH_human(bpy.types.FileHandler):
     """.human files."""
 
     bl_idname = "PRIMDIFFUSION_FH_human"
-    bl_label = "Person"
+    bl_label = "Human"
     bl_import_operator = "primdiffusion.import_human"
     bl_file_extensions = ".human;.safetensors"
 

@@ -40,7 +40,7 @@ def last_seed(seed: int, count: int) -> int:
 STEPS_AND_SAMPLER = {"DRAFT": (8, "dpmpp_2m"), "STANDARD": (30, "ddim"), "HIGH": (60, "ddim")}
 CUSTOM = "CUSTOM"
 ITEMS = [
-    ("DRAFT", "Draft", "8 steps of DPM-Solver++: quick and softer; the same seed sometimes gives another person"),
+    ("DRAFT", "Draft", "8 steps of DPM-Solver++: quick and softer; the same seed sometimes gives another human"),
     ("STANDARD", "Standard", "30 steps of DDIM"),
     ("HIGH", "High", "60 steps of DDIM: twice the time of Standard for a little more detail"),
     (CUSTOM, "Custom", "Steps and sampler as chosen below"),
@@ -78,16 +78,16 @@ class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
 
     seed: bpy.props.IntProperty(
         name="Seed",
-        description="Another seed gives another person; the same seed gives the same person",
+        description="Another seed gives another human; the same seed gives the same human",
         default=7,
         min=0,
     )
     keep_seed: bpy.props.BoolProperty(
-        name="Lock Seed", description="Keep the seed; otherwise it is set to a new random one after each person"
+        name="Lock Seed", description="Keep the seed; otherwise it is set to a new random one after each human"
     )
     count: bpy.props.IntProperty(
         name="Count",
-        description="How many people: from this seed and the following ones, placed side by side",
+        description="How many humans: from this seed and the following ones, placed side by side",
         default=1,
         min=1,
         max=1000,
@@ -223,13 +223,13 @@ class PRIMDIFFUSION_OT_use_generate_preset(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_generate(GenerateOptions, bpy.types.Operator):
-    """Generate people from the seed and add them to the scene with armatures, side by side"""
+    """Generate humans from the seed and add them to the scene with armatures, side by side"""
 
     bl_idname = "primdiffusion.generate"
     bl_label = "Generate Human"
 
     count: bpy.props.IntProperty(
-        name="Count", default=0, min=0, max=1000, description="How many people; 0: the panel's", options={"SKIP_SAVE"}
+        name="Count", default=0, min=0, max=1000, description="How many humans; 0: the panel's", options={"SKIP_SAVE"}
     )
 
     def act(self, context: bpy.types.Context) -> set[str]:

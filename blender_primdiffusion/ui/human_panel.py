@@ -23,7 +23,7 @@ class _Find:
     directory: bpy.props.StringProperty(
         name="Folder",
         description="Where to look too, and in the folders inside. Empty: beside this file, where it was last saved "
-        "and in the folders of other people",
+        "and in the folders of other humans",
         subtype="DIR_PATH",
         options={"SKIP_SAVE"},
     )
@@ -49,7 +49,7 @@ class _Find:
             done = repaired or copied or restored
             self.report({"WARNING" if done else "ERROR"}, "; ".join(left))
             return {"FINISHED"} if done else {"CANCELLED"}
-        message = f"{repaired + copied} files found" if lost else "No files of people are missing"
+        message = f"{repaired + copied} files found" if lost else "No files of humans are missing"
         self.report({"INFO"}, message)
         return {"FINISHED"}
 
@@ -83,14 +83,14 @@ class _Find:
 
 
 class PRIMDIFFUSION_OT_find_missing_volumes(_Find, bpy.types.Operator):
-    """Find missing files of people, and restore those that cannot be found"""
+    """Find missing files of humans, and restore those that cannot be found"""
 
     bl_idname = "primdiffusion.find_missing_volumes"
     bl_label = "Find Missing Volumes"
 
 
 class PRIMDIFFUSION_OT_find_volumes_in_folder(_Find, bpy.types.Operator):
-    """Choose a folder to search for missing files of people"""
+    """Choose a folder to search for missing files of humans"""
 
     bl_idname = "primdiffusion.find_volumes_in_folder"
     bl_label = "Find Volumes in Folder"
@@ -103,7 +103,7 @@ class PRIMDIFFUSION_OT_find_volumes_in_folder(_Find, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_generate_again(OnPerson, bpy.types.Operator):
-    """Generate this person again from their seed, when all of their files are lost"""
+    """Generate this human again from its seed, when all of its files are lost"""
 
     bl_idname = "primdiffusion.generate_again"
     bl_label = "Generate Again"
@@ -119,7 +119,7 @@ class PRIMDIFFUSION_OT_generate_again(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_collect_files(Reporting, bpy.types.Operator):
-    """Copy the files of all people next to this .blend, so that it can be moved or sent with one folder"""
+    """Copy the files of all humans next to this .blend, so that it can be moved or sent with one folder"""
 
     bl_idname = "primdiffusion.collect_files"
     bl_label = "Collect Files"
@@ -135,7 +135,7 @@ class PRIMDIFFUSION_OT_collect_files(Reporting, bpy.types.Operator):
             size = f"{done.files} files, {done.size / 1e6:.1f} MB"
             self.report({"INFO"}, f"{done.volumes} volumes are in {where!r} now ({size} copied); save this file")
         else:
-            self.report({"INFO"}, f"All files of people are in {where!r} already")
+            self.report({"INFO"}, f"All files of humans are in {where!r} already")
         return {"FINISHED"}
 
 
@@ -179,7 +179,7 @@ def draw_missing(layout: bpy.types.UILayout) -> None:
 
 
 class PRIMDIFFUSION_OT_select_human(OnPerson, bpy.types.Operator):
-    """Make the armature of this person the active object, and the only one selected"""
+    """Make the armature of this human the active object, and the only one selected"""
 
     bl_idname = "primdiffusion.select_human"
     bl_label = "Select Human"
@@ -191,7 +191,7 @@ class PRIMDIFFUSION_OT_select_human(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_frame_human(OnPerson, bpy.types.Operator):
-    """Select this person and frame it in the view"""
+    """Select this human and frame it in the view"""
 
     bl_idname = "primdiffusion.frame_human"
     bl_label = "Frame Human"
@@ -209,7 +209,7 @@ class PRIMDIFFUSION_OT_frame_human(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_duplicate_human(OnPerson, bpy.types.Operator):
-    """Duplicate this person, with a separate armature and body but the same files"""
+    """Duplicate this human, with a separate armature and body but the same files"""
 
     bl_idname = "primdiffusion.duplicate_human"
     bl_label = "Duplicate Human"
@@ -231,7 +231,7 @@ class PRIMDIFFUSION_OT_duplicate_human(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_delete_human(OnPerson, bpy.types.Operator):
-    """Remove this person from the scene; their files stay on disk for Undo, until Remove Unused Files"""
+    """Remove this human from the scene; its files stay on disk for Undo, until Remove Unused Files"""
 
     bl_idname = "primdiffusion.delete_human"
     bl_label = "Delete Human"
@@ -242,7 +242,7 @@ class PRIMDIFFUSION_OT_delete_human(OnPerson, bpy.types.Operator):
             title = f"Delete {self.person(context).name}?"
         except ValueError:
             return self.execute(context)
-        message = "Their files stay on disk for Undo: Files > Remove Unused Files deletes them"
+        message = "The files stay on disk for Undo: Files > Remove Unused Files deletes them"
         return context.window_manager.invoke_confirm(self, event, title=title, message=message)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
@@ -252,7 +252,7 @@ class PRIMDIFFUSION_OT_delete_human(OnPerson, bpy.types.Operator):
         from ..scene.volumes import free_unused_grids
 
         if person.library is not None:
-            raise ValueError(f"the person {person.name!r} is linked: remove them in the Outliner with Unlink")
+            raise ValueError(f"the human {person.name!r} is linked: remove it in the Outliner with Unlink")
         leave_mode(context)
         remove_human(person)
         context.view_layer.update()  # evaluated data holds grids too
@@ -261,12 +261,12 @@ class PRIMDIFFUSION_OT_delete_human(OnPerson, bpy.types.Operator):
 
 
 def select(context: bpy.types.Context, person: bpy.types.Collection) -> None:
-    """Make a person's armature active. Raises ValueError for one that cannot be selected in this view layer."""
+    """Make a human's armature active. Raises ValueError for one that cannot be selected in this view layer."""
     from ..scene.edit import leave_mode  # needs numpy
 
     armature = armature_of(person)
     if context.view_layer.objects.get(armature.name) != armature:
-        raise ValueError(f"the armature of {person.name!r} is not in this view layer: enable their collection first")
+        raise ValueError(f"the armature of {person.name!r} is not in this view layer: enable its collection first")
     leave_mode(context)
     for obj in context.view_layer.objects.selected:
         obj.select_set(False)
@@ -284,9 +284,9 @@ def _viewport(context: bpy.types.Context) -> dict[str, object] | None:
 
 
 class PRIMDIFFUSION_MT_people(bpy.types.Menu):
-    """The people of the scene"""
+    """The humans of the scene"""
 
-    bl_label = "People"
+    bl_label = "Humans"
 
     def draw(self, context: bpy.types.Context) -> None:
         for person in humans(context.scene):

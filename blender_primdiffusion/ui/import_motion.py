@@ -134,7 +134,7 @@ class _BoneMap:
 
 
 class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper, bpy.types.Operator):
-    """Apply the motion of an AMASS .npz, a pose file or a .bvh to the person"""
+    """Apply the motion of an AMASS .npz, a pose file or a .bvh to the human"""
 
     bl_idname = "primdiffusion.import_motion"
     bl_label = "Import Motion"
@@ -173,7 +173,7 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
     )
     fit_stride: bpy.props.BoolProperty(
         name="Fit Stride",
-        description="Scale the path to the length of this person's legs, so that the feet do not slide",
+        description="Scale the path to the length of this human's legs, so that the feet do not slide",
         default=True,
     )
     ground: bpy.props.BoolProperty(
@@ -269,10 +269,10 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
 
 
 class PRIMDIFFUSION_FH_motion(bpy.types.FileHandler):
-    """AMASS .npz and .bvh onto the person under the cursor, else the selected one."""
+    """AMASS .npz and .bvh onto the human under the cursor, else the selected one."""
 
     bl_idname = "PRIMDIFFUSION_FH_motion"
-    bl_label = "Motion for a Person"
+    bl_label = "Motion for a Human"
     bl_import_operator = "primdiffusion.import_motion"
     bl_file_extensions = ".npz;.bvh"
 

@@ -25,7 +25,7 @@ _BUILT_IN = [
 
 
 class PRIMDIFFUSION_OT_use_action(Reporting, bpy.types.Operator):
-    """Use another action of this file for the person"""
+    """Use another action of this file for the human"""
 
     bl_idname = "primdiffusion.use_action"
     bl_label = "Use Motion"
@@ -42,7 +42,7 @@ class PRIMDIFFUSION_OT_use_action(Reporting, bpy.types.Operator):
         if action is None:
             raise ValueError(f"there is no action {self.action!r} in this file")
         if not moves_bones(action):
-            raise ValueError(f"the action {self.action!r} does not animate the bones of a person")
+            raise ValueError(f"the action {self.action!r} does not animate the bones of a human")
         animation = armature.animation_data_create()
         animation.action = action
         if action_curves(armature) is None:
@@ -62,14 +62,14 @@ def moves_bones(action: bpy.types.Action) -> bool:
 
 
 class PRIMDIFFUSION_OT_add_motion(OnArmature, WhereTo, bpy.types.Operator):
-    """Apply a built-in motion to the person"""
+    """Apply a built-in motion to the human"""
 
     bl_idname = "primdiffusion.add_motion"
     bl_label = "Add Motion"
     bl_options = {"REGISTER", "UNDO"}
 
     motion: bpy.props.EnumProperty(
-        name="Motion", translation_context=CONTEXT, description="What the person does", items=_BUILT_IN
+        name="Motion", translation_context=CONTEXT, description="What the human does", items=_BUILT_IN
     )
     rounds: bpy.props.IntProperty(name="Rounds", description="Number of repetitions", default=2, min=1, max=500)
     speed: bpy.props.FloatProperty(name="Speed", description="2 is twice as fast", default=1.0, min=0.1, max=10.0)
@@ -89,7 +89,7 @@ class PRIMDIFFUSION_OT_add_motion(OnArmature, WhereTo, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_clear_motion(OnArmature, bpy.types.Operator):
-    """Remove the motion from the person; the action stays in the file, the person returns to the rest pose"""
+    """Remove the motion from the human; the action stays in the file, the human returns to the rest pose"""
 
     bl_idname = "primdiffusion.clear_motion"
     bl_label = "Clear Motion"
@@ -128,7 +128,7 @@ class PRIMDIFFUSION_OT_loop_motion(OnArmature, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operator):
-    """Write the person's motion as an AMASS .npz file: axis angles, translations and shape, z up"""
+    """Write the human's motion as an AMASS .npz file: axis angles, translations and shape, z up"""
 
     bl_idname = "primdiffusion.export_motion"
     bl_label = "Export Motion"

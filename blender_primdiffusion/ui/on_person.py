@@ -17,12 +17,12 @@ class OnPerson(Reporting):
     """Base of operators on one human, which it finds; subclasses define `run`."""
 
     human: bpy.props.StringProperty(
-        name="Person", description="Name of the person's collection; empty: the selected person", options=SKIP
+        name="Human", description="Name of the human's collection; empty: the selected human", options=SKIP
     )
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("There is no person in the scene: generate one first")
+        cls.poll_message_set("There is no human in the scene: generate one first")
         return bool(humans(context.scene))
 
     def act(self, context: bpy.types.Context) -> set[str]:
@@ -42,7 +42,7 @@ FACTS = "primdiffusion_motion"
 
 
 def target_armature(context: bpy.types.Context, person: str = "") -> bpy.types.Object:
-    """The armature of the person named, else the active armature if it has SMPL's joints, else the selected person's.
+    """The armature of the human named, else the active armature if it has SMPL's joints, else the selected human's.
 
     Raises ValueError; for an active armature with some of SMPL's bones it names the first one missing.
     """
@@ -73,15 +73,15 @@ class OnArmature(Reporting):
     """Base of operators on one armature, which it finds; subclasses define `on`."""
 
     person: bpy.props.StringProperty(
-        name="Person",
-        description="Name of the person's collection; empty: the active armature or the selected person",
+        name="Human",
+        description="Name of the human's collection; empty: the active armature or the selected human",
         options={"SKIP_SAVE"},
     )
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         active = context.view_layer.objects.active
-        cls.poll_message_set("There is no person in the scene: generate one, or select an armature with SMPL's joints")
+        cls.poll_message_set("There is no human in the scene: generate one, or select an armature with SMPL's joints")
         return bool(humans(context.scene)) or (active is not None and active.type == "ARMATURE")
 
     def act(self, context: bpy.types.Context) -> set[str]:
@@ -100,9 +100,9 @@ class WhereTo:
         name="Root Motion",
         description="What happens to the path through space",
         items=[
-            ("ORIGIN", "From the Person", "The path begins where the person is"),
+            ("ORIGIN", "From the Human", "The path begins where the human is"),
             ("KEEP", "As It Is", "The path stays as in the file, maybe metres away"),
-            ("PLACE", "In Place", "The person stays in place; only the height of the path is used"),
+            ("PLACE", "In Place", "The human stays in place; only the height of the path is used"),
         ],
     )
     into: bpy.props.EnumProperty(
@@ -110,7 +110,7 @@ class WhereTo:
         description="Where the keys go",
         items=[
             ("NEW", "New Action", "A new action; the previous one stays in the file"),
-            ("APPEND", "Append", "After the last key of the person's current action"),
+            ("APPEND", "Append", "After the last key of the human's current action"),
             ("STRIP", "NLA Strip", "A strip on a new track of the nonlinear animation"),
         ],
     )

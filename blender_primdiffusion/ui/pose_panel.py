@@ -158,7 +158,7 @@ class _Posing(OnArmature):
 
 
 class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
-    """Apply the chosen pose of the library to the person"""
+    """Apply the chosen pose of the library to the human"""
 
     bl_idname = "primdiffusion.apply_pose"
     bl_label = "Apply Pose"
@@ -208,7 +208,7 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_mirror_pose(_Posing, bpy.types.Operator):
-    """Swap left and right of the person's pose"""
+    """Swap left and right of the human's pose"""
 
     bl_idname = "primdiffusion.mirror_pose"
     bl_label = "Mirror Pose"
@@ -223,7 +223,7 @@ class PRIMDIFFUSION_OT_mirror_pose(_Posing, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_reset_pose(_Posing, bpy.types.Operator):
-    """Reset the person to the rest pose"""
+    """Reset the human to the rest pose"""
 
     bl_idname = "primdiffusion.reset_pose"
     bl_label = "Reset to Rest"
@@ -235,7 +235,7 @@ class PRIMDIFFUSION_OT_reset_pose(_Posing, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_key_pose(OnArmature, bpy.types.Operator):
-    """Set keyframes of the person's pose on the current frame"""
+    """Set keyframes of the human's pose on the current frame"""
 
     bl_idname = "primdiffusion.key_pose"
     bl_label = "Key Pose"
@@ -249,7 +249,7 @@ class PRIMDIFFUSION_OT_key_pose(OnArmature, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
-    """Save the person's pose in the library, for this and other files"""
+    """Save the human's pose in the library, for this and other files"""
 
     bl_idname = "primdiffusion.save_pose"
     bl_label = "Save Pose"

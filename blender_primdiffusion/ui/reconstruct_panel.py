@@ -15,7 +15,7 @@ _CAMERAS_FILE = "cameras.json"
 
 
 def subjects_in(folder: Path) -> list[str]:
-    """Names of the people in a dataset of captures; none where the folder is one subject's own, or cannot be read."""
+    """Names of the humans in a dataset of captures; none where the folder is one subject's own, or cannot be read."""
     from ..formats.capture_layout import LIST_FILE  # needs numpy
 
     try:
@@ -49,13 +49,13 @@ class PRIMDIFFUSION_PG_reconstruct(bpy.types.PropertyGroup):
     )
     frame: bpy.props.IntProperty(
         name="Frame",
-        description="Which captured pose to use; 0 is near the T-pose, which shows most of a person",
+        description="Which captured pose to use; 0 is near the T-pose, which shows most of a human",
         default=0,
         min=0,
     )
     views: bpy.props.IntProperty(
         name="Views",
-        description="How many cameras, spread around the person; all if there are fewer",
+        description="How many cameras, spread around the human; all if there are fewer",
         default=CAPTURE_VIEWS,
         min=1,
         soft_max=36,
@@ -63,7 +63,7 @@ class PRIMDIFFUSION_PG_reconstruct(bpy.types.PropertyGroup):
 
 
 class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
-    """Reconstruct a person from pictures taken from several sides, and add it to the scene with an armature"""
+    """Reconstruct a human from pictures taken from several sides, and add it to the scene with an armature"""
 
     bl_idname = "primdiffusion.human_from_captures"
     bl_label = "Human from Captures"

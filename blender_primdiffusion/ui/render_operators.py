@@ -1,4 +1,4 @@
-"""Operators on the selected person: attachment, merging, density gain."""
+"""Operators on the selected human: attachment, merging, density gain."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MOST_FRAMES = 10_000
 
 
 class PRIMDIFFUSION_OT_set_attachment(OnPerson, bpy.types.Operator):
-    """Choose how the selected person's volumes follow the body"""
+    """Choose how the selected human's volumes follow the body"""
 
     bl_idname = "primdiffusion.set_attachment"
     bl_label = "Set Attachment"
@@ -60,7 +60,7 @@ class _Merging(OnPerson):
 
 
 class PRIMDIFFUSION_OT_merge(_Merging, bpy.types.Operator):
-    """Merge the selected person's volumes, in the current pose, into one that Cycles renders much faster"""
+    """Merge the selected human's volumes, in the current pose, into one that Cycles renders much faster"""
 
     bl_idname = "primdiffusion.merge"
     bl_label = "Merge Pose"
@@ -73,7 +73,7 @@ class PRIMDIFFUSION_OT_merge(_Merging, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_merge_frames(_Merging, bpy.types.Operator):
-    """Merge the person's volumes into one volume for each frame of the scene's range, in the background"""
+    """Merge the human's volumes into one volume for each frame of the scene's range, in the background"""
 
     bl_idname = "primdiffusion.merge_frames"
     bl_label = "Merge Frame Range"
@@ -95,7 +95,7 @@ class PRIMDIFFUSION_OT_merge_frames(_Merging, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_unmerge(OnPerson, bpy.types.Operator):
-    """Show the person's own volumes again and remove the merged one"""
+    """Show the human's own volumes again and remove the merged one"""
 
     bl_idname = "primdiffusion.unmerge"
     bl_label = "Unmerge"
@@ -113,7 +113,7 @@ class PRIMDIFFUSION_OT_unmerge(OnPerson, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_fit_density_gain(OnPerson, bpy.types.Operator):
-    """Find the density gain with which Cycles shows the selected person as opaque as the PrimDiffusion engine does"""
+    """Find the density gain with which Cycles shows the selected human as opaque as the PrimDiffusion engine does"""
 
     bl_idname = "primdiffusion.fit_density_gain"
     bl_label = "Fit Density Gain"
@@ -132,7 +132,7 @@ def _moment(person: bpy.types.Collection, graph: bpy.types.Depsgraph) -> Moment:
 
 
 def _moments(context: bpy.types.Context, person: bpy.types.Collection, frames: range) -> list[Moment]:
-    """The person in each frame; the scene is at its own frame again afterwards."""
+    """The human in each frame; the scene is at its own frame again afterwards."""
     scene, now = context.scene, context.scene.frame_current
     moments = []
     try:

@@ -133,7 +133,7 @@ def _set_gain(person: bpy.types.Collection, gain: float) -> None:
 
 
 def gain_property() -> bpy.props.FloatProperty:
-    """`collection.primdiffusion_density_gain` of a person's collection."""
+    """`collection.primdiffusion_density_gain` of a human's collection."""
     return bpy.props.FloatProperty(
         name="Density Gain",
         description="Factor on the density in Cycles, which absorbs exponentially while the PrimDiffusion "
@@ -166,7 +166,7 @@ class PRIMDIFFUSION_OT_set_up_engine(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_set_up_cycles(Reporting, bpy.types.Operator):
-    """Render with Cycles: people are approximate; shadows and light on other objects are correct"""
+    """Render with Cycles: humans are approximate; shadows and light on other objects are correct"""
 
     bl_idname = "primdiffusion.set_up_cycles"
     bl_label = "Cycles (Approximate)"
@@ -188,7 +188,7 @@ class PRIMDIFFUSION_OT_set_up_cycles(Reporting, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_add_camera(Reporting, bpy.types.Operator):
-    """Add a camera that frames the selected person, or all people, and a sun for other objects"""
+    """Add a camera that frames the selected human, or all humans, and a sun for other objects"""
 
     bl_idname = "primdiffusion.add_camera"
     bl_label = "Add Camera and Light"
@@ -213,7 +213,7 @@ class PRIMDIFFUSION_OT_add_camera(Reporting, bpy.types.Operator):
 
 
 def _plain_colours(scene: bpy.types.Scene) -> None:
-    """Other transforms change the colours that people were made with."""
+    """Other transforms change the colours that humans were made with."""
     scene.view_settings.view_transform = "Standard"
     scene.view_settings.look = "None"
 
@@ -294,17 +294,17 @@ class PRIMDIFFUSION_PT_cycles_look(_OfPerson, bpy.types.Panel):
         from ..scene.cycles import overlap_warning  # numpy, which Blender starts without
 
         if density_gain(person) is None:
-            draw_lines(self.layout, "The person's material has no node Density Gain", "INFO")
+            draw_lines(self.layout, "The human's material has no node Density Gain", "INFO")
         else:
             self.layout.prop(person, "primdiffusion_density_gain")
         draw_job(self.layout, "fit_gain", "primdiffusion.fit_density_gain", "MOD_OPACITY")
         warning = overlap_warning(person)
         if warning is not None and attachment_of(person) != "MERGED":
-            draw_lines(self.layout, sentence(f"{warning}, or merge the person"), "ERROR")
+            draw_lines(self.layout, sentence(f"{warning}, or merge the human"), "ERROR")
 
 
 class PRIMDIFFUSION_PT_memory(_OfPerson, bpy.types.Panel):
-    """What the person takes."""
+    """What the human takes."""
 
     bl_label = "Memory"
     bl_options = {"DEFAULT_CLOSED"}
@@ -319,7 +319,7 @@ class PRIMDIFFUSION_PT_memory(_OfPerson, bpy.types.Panel):
 
 
 def outdated(person: bpy.types.Collection, scene: bpy.types.Scene) -> bool:
-    """Whether the merged volume shows another pose, shape or person than the armature as it is now."""
+    """Whether the merged volume shows another pose, shape or human than the armature as it is now."""
     # needs numpy
     from ..jobs.merge import Moment
     from ..scene.merged import merged_of, merged_state

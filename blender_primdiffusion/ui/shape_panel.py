@@ -1,4 +1,4 @@
-"""The sub-panels Shape and Details of the selected person."""
+"""The sub-panels Shape and Details of the selected human."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class _Shape(OnPerson):
 
 
 class PRIMDIFFUSION_OT_reshape(_Shape, bpy.types.Operator):
-    """Set the body shape of the selected person: shape parameters, or a height and a weight"""
+    """Set the body shape of the selected human: shape parameters, or a height and a weight"""
 
     bl_idname = "primdiffusion.reshape"
     bl_label = "Reshape Human"
@@ -67,7 +67,7 @@ class PRIMDIFFUSION_OT_reshape(_Shape, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_reset_shape(_Shape, bpy.types.Operator):
-    """Reset the selected person to the shape of the last edit, or of generation"""
+    """Reset the selected human to the shape of the last edit, or of generation"""
 
     bl_idname = "primdiffusion.reset_shape"
     bl_label = "Reset Shape"
@@ -79,7 +79,7 @@ class PRIMDIFFUSION_OT_reset_shape(_Shape, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_random_shape(_Shape, bpy.types.Operator):
-    """Give the selected person a random body shape; the same seed gives the same shape"""
+    """Give the selected human a random body shape; the same seed gives the same shape"""
 
     bl_idname = "primdiffusion.random_shape"
     bl_label = "Random Shape"
@@ -106,13 +106,13 @@ class PRIMDIFFUSION_OT_random_shape(_Shape, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_copy_shape(_Shape, bpy.types.Operator):
-    """Copy the body shape of the other person to the selected person"""
+    """Copy the body shape of the other human to the selected human"""
 
     bl_idname = "primdiffusion.copy_shape"
     bl_label = "Copy Shape"
 
     source: bpy.props.StringProperty(
-        name="Source", description="Name of the other person. Not given: the panel's", options=SKIP
+        name="Source", description="Name of the other human. Not given: the panel's", options=SKIP
     )
 
     def betas_for(self, context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
@@ -120,10 +120,10 @@ class PRIMDIFFUSION_OT_copy_shape(_Shape, bpy.types.Operator):
 
         picked = context.scene.primdiffusion_edit.other
         if not self.source and picked is None:
-            raise ValueError("choose the other person in the panel first")
+            raise ValueError("choose the other human in the panel first")
         other = named_person(context, self.source or picked.name)
         if other == person:
-            raise ValueError(f"{person.name!r} cannot be the other person too: choose another one")
+            raise ValueError(f"{person.name!r} cannot be the other human too: choose another one")
         if len(shape_model_of(other).template) != len(shape_model_of(person).template):
             raise ValueError(
                 f"{other.name!r} stands on another body than {person.name!r}: their shape parameters are not comparable"

@@ -21,7 +21,7 @@ def person_of(armature: bpy.types.Object) -> bpy.types.Collection:
     for collection in armature.users_collection:
         if MARK in collection:
             return collection
-    raise ValueError(f"the object {armature.name!r} is not the armature of a person: select one")
+    raise ValueError(f"the object {armature.name!r} is not the armature of a human: select one")
 
 
 def measures_of(armature: bpy.types.Object) -> BodyMeasures:
@@ -111,7 +111,7 @@ class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
     """`armature.primdiffusion_human`."""
 
     person: bpy.props.StringProperty(
-        name="Name", description="Name of the person's collection and its objects", get=_name, set=_rename
+        name="Name", description="Name of the human's collection and its objects", get=_name, set=_rename
     )
     betas: bpy.props.FloatVectorProperty(
         name="Shape",

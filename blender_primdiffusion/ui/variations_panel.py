@@ -22,18 +22,18 @@ from .generate_panel import LARGEST_SEED, STEPS_AND_SAMPLER, GenerateOptions, la
 if TYPE_CHECKING:
     from ..jobs.variations import VariationsJob
 
-COUNT_ITEMS = [(str(count), str(count), f"{count} people") for count in (4, 8, 12, 16)]
+COUNT_ITEMS = [(str(count), str(count), f"{count} humans") for count in (4, 8, 12, 16)]
 
 
 class PRIMDIFFUSION_PG_variations(bpy.types.PropertyGroup):
     """`scene.primdiffusion_variations`."""
 
     count: bpy.props.EnumProperty(
-        name="Count", description="How many people to choose from", items=COUNT_ITEMS, default="8"
+        name="Count", description="How many humans to choose from", items=COUNT_ITEMS, default="8"
     )
     seeds: bpy.props.EnumProperty(
         name="Seeds",
-        description="Seeds of the people",
+        description="Seeds of the humans",
         items=[
             ("CONSECUTIVE", "From Seed On", "The seed of the panel Generate and the following ones"),
             ("RANDOM", "Random", "New random seeds each time"),
@@ -42,20 +42,20 @@ class PRIMDIFFUSION_PG_variations(bpy.types.PropertyGroup):
     )
     quality: bpy.props.EnumProperty(
         name="Quality",
-        description="People are built exactly as shown here, in this quality",
+        description="Humans are built exactly as shown here, in this quality",
         items=[
             ("PANEL", "As Generate", "Steps and sampler of the panel Generate: no refining needed"),
             (
                 "DRAFT",
                 "Draft",
                 "8 steps of DPM-Solver++: quicker and softer. Generating the seed again with more steps refines the "
-                "person, but sometimes gives another one",
+                "human, but sometimes gives another one",
             ),
         ],
     )
     amount: bpy.props.FloatProperty(
         name="Difference",
-        description="How much More Like This differs from the chosen person: 0 not at all, 1 completely",
+        description="How much More Like This differs from the chosen human: 0 not at all, 1 completely",
         default=AMOUNT,
         min=0.05,
         max=1.0,
@@ -65,7 +65,7 @@ class PRIMDIFFUSION_PG_variations(bpy.types.PropertyGroup):
 
 _SELECTED = "Index from 0; -1: the selected ones"
 _SKIP = {"SKIP_SAVE"}
-_BUILD_ALL = "Add all of these people to the scene, side by side"
+_BUILD_ALL = "Add all of these humans to the scene, side by side"
 
 
 class _OnSheet(Reporting):
@@ -81,7 +81,7 @@ class _Variations(GenerateOptions):
     """Base of the operators that fill the sheet."""
 
     count: bpy.props.IntProperty(
-        name="Count", default=0, min=0, max=64, description="How many people; 0: the panel's", options=_SKIP
+        name="Count", default=0, min=0, max=64, description="How many humans; 0: the panel's", options=_SKIP
     )
 
     def seeds(self, context: bpy.types.Context, first: int) -> tuple[int, ...]:
@@ -101,7 +101,7 @@ class _Variations(GenerateOptions):
 
 
 class PRIMDIFFUSION_OT_variations(_Variations, bpy.types.Operator):
-    """Show several people to choose from before building them"""
+    """Show several humans to choose from before building them"""
 
     bl_idname = "primdiffusion.variations"
     bl_label = "Show Variations"
@@ -116,7 +116,7 @@ class PRIMDIFFUSION_OT_variations(_Variations, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_more_like_variation(_OnSheet, _Variations, bpy.types.Operator):
-    """Show variations of the selected person, with the same body, instead of these"""
+    """Show variations of the selected human, with the same body, instead of these"""
 
     bl_idname = "primdiffusion.more_like_variation"
     bl_label = "More Like This"
@@ -140,7 +140,7 @@ class PRIMDIFFUSION_OT_more_like_variation(_OnSheet, _Variations, bpy.types.Oper
 
 
 class PRIMDIFFUSION_OT_select_variation(_OnSheet, bpy.types.Operator):
-    """Select this person, or not"""
+    """Select this human, or not"""
 
     bl_idname = "primdiffusion.select_variation"
     bl_label = "Select Variation"
@@ -156,13 +156,13 @@ class PRIMDIFFUSION_OT_select_variation(_OnSheet, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_build_variation(_OnSheet, bpy.types.Operator):
-    """Add the selected people to the scene, exactly as shown, side by side"""
+    """Add the selected humans to the scene, exactly as shown, side by side"""
 
     bl_idname = "primdiffusion.build_variation"
     bl_label = "Build Selected"
 
     index: bpy.props.IntProperty(name="Index", default=-1, min=-1, description=_SELECTED, options=_SKIP)
-    build_all: bpy.props.BoolProperty(name="All", description="Build all people of the sheet", options=_SKIP)
+    build_all: bpy.props.BoolProperty(name="All", description="Build all humans of the sheet", options=_SKIP)
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
@@ -178,7 +178,7 @@ class PRIMDIFFUSION_OT_build_variation(_OnSheet, bpy.types.Operator):
         if built:
             bpy.ops.ed.undo_push(message="Build Variation" if len(built) == 1 else f"Build {len(built)} Variations")
         if failure:
-            self.report({"ERROR"}, f"{len(built)} of {len(wanted)} people were built. {failure}")
+            self.report({"ERROR"}, f"{len(built)} of {len(wanted)} humans were built. {failure}")
             return {"FINISHED"} if built else {"CANCELLED"}
         for person in built:
             if warning := overlap_warning_in(context.scene, person):
@@ -187,7 +187,7 @@ class PRIMDIFFUSION_OT_build_variation(_OnSheet, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_use_variation_seed(_OnSheet, bpy.types.Operator):
-    """Set the seed of the panel Generate to that of the selected person and lock it"""
+    """Set the seed of the panel Generate to that of the selected human and lock it"""
 
     bl_idname = "primdiffusion.use_variation_seed"
     bl_label = "Use Seed"
@@ -200,14 +200,14 @@ class PRIMDIFFUSION_OT_use_variation_seed(_OnSheet, bpy.types.Operator):
         if len(wanted) > 1:
             raise ValueError(f"{len(wanted)} variations are selected: select one")
         if sheet.around:
-            raise ValueError("variants of a person cannot be generated from a seed alone: build them instead")
+            raise ValueError("variants of a human cannot be generated from a seed alone: build them instead")
         settings = context.scene.primdiffusion
         settings.seed, settings.keep_seed = wanted[0].seed, True
         return {"FINISHED"}
 
 
 class PRIMDIFFUSION_OT_clear_variations(_OnSheet, bpy.types.Operator):
-    """Clear the sheet and delete its files; people in the scene stay"""
+    """Clear the sheet and delete its files; humans in the scene stay"""
 
     bl_idname = "primdiffusion.clear_variations"
     bl_label = "Clear Variations"

@@ -75,7 +75,7 @@ def test_a_damaged_motion_is_rejected_with_a_sentence(saved, damage):
     human = with_motion(read_tensors(saved), motion)
     if damage == "fps":
         human.metadata["motion"] = '{"fps": "fast"}'
-    with pytest.raises(ValueError, match="export the person again"):
+    with pytest.raises(ValueError, match="export the human again"):
         motion_in(human)
 
 

@@ -119,7 +119,7 @@ def test_the_panels_job_runs_from_a_cold_start_to_its_files(start):
     messages = follow(request)
     assert request.state == "done", request.message
     assert messages[0] == "Starting the backend"
-    assert {"Reading the pictures", "Reconstructing", "Writing the person"} <= set(messages)
+    assert {"Reading the pictures", "Reconstructing", "Writing the human"} <= set(messages)
     assert request.fraction == 1.0
     assert Path(request.result["human"]).exists()
     assert request.result["warnings"][0] == "only one view: the sides that it does not show are guessed"

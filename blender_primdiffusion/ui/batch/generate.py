@@ -1,4 +1,4 @@
-"""`blender -c primdiffusion generate`: people in folders, without a window.
+"""`blender -c primdiffusion generate`: humans in folders, without a window.
 
 OUT/settings.json, report.json
 OUT/person_000007/person.human.safetensors, human.npz, front.png, side.png, depth.png

@@ -30,7 +30,7 @@ class Movement:
     still: bool
 
     def apply(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
-        """Pose the person, or key a motion from frame 1 on and set the scene to its length and rate."""
+        """Pose the human, or key a motion from frame 1 on and set the scene to its length and rate."""
         armature, motion = armature_of(person), self.motion
         if self.still:
             pose_from_joint_rotations(armature, motion.rotations[0], np.zeros(3))

@@ -1,4 +1,4 @@
-"""`blender -c primdiffusion render`: pictures of .blend files and of people, without a window.
+"""`blender -c primdiffusion render`: pictures of .blend files and of humans, without a window.
 
 OUT/pictures.json, report.json
 OUT/NAME.png                    one picture
@@ -62,12 +62,12 @@ class RenderSource:
 
     @property
     def is_blend(self) -> bool:
-        """Whether it is a .blend; else a person's file."""
+        """Whether it is a .blend; else a human's file."""
         return self.path.suffix == ".blend"
 
     @property
     def has_npz(self) -> bool:
-        """Whether the person's folder may hold what Blender needs of it."""
+        """Whether the human's folder may hold what Blender needs of it."""
         return self.path.name == PERSON_FILE
 
 
@@ -77,13 +77,13 @@ def sources(path: Path) -> list[RenderSource]:
     if path.is_dir():
         found = sorted(_in_folder(path), key=lambda source: source.name)
         if not found:
-            raise ValueError(f"{path} contains no people: name a folder that `generate` wrote, or of .human files")
+            raise ValueError(f"{path} contains no humans: name a folder that `generate` wrote, or of .human files")
         return found
     if path.suffix == ".blend":
         return [RenderSource(path.stem, path)]
     if path.name.endswith(PERSON_ENDINGS):
         return [RenderSource(path.parent.name if path.name == PERSON_FILE else _stem(path), path)]
-    raise ValueError(f"{path} is neither a .blend nor a person (.human, .human.safetensors): name one of these")
+    raise ValueError(f"{path} is neither a .blend nor a human (.human, .human.safetensors): name one of these")
 
 
 def _in_folder(folder: Path) -> Iterator[RenderSource]:
@@ -231,7 +231,7 @@ class _Drawing:
             look_from(scene, self._options.yaw or 0.0, moving_extent(scene))
 
     def _build(self, source: RenderSource) -> None:
-        """The person of a file, in an empty .blend; the volumes lie in a temporary folder."""
+        """The human of a file, in an empty .blend; the volumes lie in a temporary folder."""
         new_file()
         shutil.rmtree(humans_folder(""), ignore_errors=True)
         with tempfile.TemporaryDirectory(dir=bpy.app.tempdir or None) as folder:

@@ -46,7 +46,7 @@ def parse_generate(argv: Sequence[str]) -> argparse.Namespace:
     if options.blend is not None and not options.blend.endswith(".blend"):
         options.blend += ".blend"
     if (options.pose or options.motion) and options.blend is None:
-        raise UsageError("--pose and --motion move people in .blend files: add --blend")
+        raise UsageError("--pose and --motion move humans in .blend files: add --blend")
     _check_files(options, "checkpoint", "pose", "motion")
     return options
 
@@ -55,12 +55,12 @@ def parse_render(argv: Sequence[str]) -> argparse.Namespace:
     """The options of `render`. Raises UsageError; SystemExit after --help."""
     made = _parser("render", "Render a .blend, a human's file, or all humans in a folder.")
     add = made.add_argument
-    add("source", type=Path, metavar="SOURCE", help=".blend, .human, .human.safetensors, or a folder of people")
+    add("source", type=Path, metavar="SOURCE", help=".blend, .human, .human.safetensors, or a folder of humans")
     add("--out", type=Path, required=True, help="folder for the pictures; those that are there stay")
-    add("--engine", choices=ENGINES, help="default: the .blend's own; primdiffusion for people")
+    add("--engine", choices=ENGINES, help="default: the .blend's own; primdiffusion for humans")
     add("--frames", type=_frames, metavar="A..B", help="default: the frame the .blend is at; all of a --motion")
-    add("--size", type=_size, metavar="WxH", help="pixels; default: the .blend's own; 512x512 for people")
-    add("--yaw", type=float, help="degrees that a new camera stands to people's left of the front")
+    add("--size", type=_size, metavar="WxH", help="pixels; default: the .blend's own; 512x512 for humans")
+    add("--yaw", type=float, help="degrees from the front towards the humans' left, for a new camera")
     add("--turntable", type=_whole(2), metavar="N", help="N views all round")
     _add_motion(made)
     add("--transparent", action="store_true", help="no background")

@@ -39,7 +39,7 @@ class Known:
 
 
 def known() -> Known:
-    """Which Python would run the backend, in the order in which it is searched; whether Blender can show people."""
+    """Which Python would run the backend, in the order in which it is searched; whether Blender can show humans."""
     if lacking := missing_packages():
         return Known("lacking", False, sentence(lacking))
     if named := preference("backend_python"):

@@ -241,7 +241,7 @@ class PRIMDIFFUSION_OT_repair_backend(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_remove_backend(bpy.types.Operator):
-    """Delete the private environment and the caches; people in your files stay as they are"""
+    """Delete the private environment and the caches; humans in your files stay as they are"""
 
     bl_idname = "primdiffusion.remove_backend"
     bl_label = "Remove"
@@ -267,7 +267,7 @@ class PRIMDIFFUSION_OT_remove_backend(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_test_backend(bpy.types.Operator):
-    """Start the backend and generate a test person in a few steps"""
+    """Start the backend and generate a test human in a few steps"""
 
     bl_idname = "primdiffusion.test_backend"
     bl_label = "Test"

@@ -78,7 +78,7 @@ _WIDTH = 90
 """Characters in a line of the preferences window at its default size."""
 _COMPUTE = (
     ("AUTOMATIC", "Automatic", "NVIDIA where there is a driver that is new enough, else the processor"),
-    ("CPU", "CPU", "Smallest download; a person takes seconds instead of fractions of one"),
+    ("CPU", "CPU", "Smallest download; a human takes seconds instead of fractions of one"),
     ("CUDA", "NVIDIA (CUDA)", "Large download; needs an NVIDIA card and driver"),
     ("APPLE", "Apple", "For Apple Silicon; computes on its processor"),
 )

@@ -375,7 +375,7 @@ def test_a_renamed_collection_and_a_blend_saved_elsewhere_keep_their_person(stag
 def test_a_missing_file_is_one_error_that_names_person_and_file(stage):
     folder = next(stage.out.parent.glob("shot_humans/Human"))
     shutil.move(folder / "person.human.safetensors", stage.out.parent)
-    with pytest.raises(RuntimeError, match=r"person 'Human' is missing: .*person\.human\.safetensors") as caught:
+    with pytest.raises(RuntimeError, match=r"human 'Human' is missing: .*person\.human\.safetensors") as caught:
         render_png(stage.out)
     assert str(caught.value).count("Error:") == 1
     assert not stage.out.exists()

@@ -161,7 +161,7 @@ def test_the_built_in_poses_become_a_library_and_the_open_file_stays(addon, tmp_
 
 def test_what_cannot_be_an_asset_is_reported(addon, tmp_path):
     for operator in (ops.mark_human_as_asset, ops.mark_pose_as_asset, ops.unmark_human_asset):
-        with pytest.raises(RuntimeError, match=r"poll\(\) .*no person in the scene"):
+        with pytest.raises(RuntimeError, match=r"poll\(\) .*no human in the scene"):
             operator()
     ops.generate(seed=7, steps=1)
     (tmp_path / "text.png").write_text("no picture")
@@ -179,7 +179,7 @@ def test_what_cannot_be_an_asset_is_reported(addon, tmp_path):
     (person,) = humans(addon.scene)
     assert person.asset_data is None
     person_file(person).unlink()
-    with pytest.raises(RuntimeError, match="file of the person 'Human' is missing"):
+    with pytest.raises(RuntimeError, match="file of the human 'Human' is missing"):
         ops.mark_human_as_asset()
 
 

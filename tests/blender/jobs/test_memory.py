@@ -92,7 +92,7 @@ def test_a_busy_child_is_never_idle(addon):
 
 
 def test_the_device_line_shows_what_is_known(addon):
-    assert memory.device_line() == "starts with the first person"
+    assert memory.device_line() == "starts with the first human"
     queue.info = {"device_name": "H200", "device_memory_gb": 139.8, "device_memory_free_gb": 120.04}
     assert memory.device_line() == "H200, 139.8 GB, 120.0 GB free at its start"
     queue.info = {"device_name": "CPU", "device_memory_gb": None, "memory_gb": 16.0, "memory_free_gb": None}

@@ -151,7 +151,7 @@ def test_a_human_without_any_file_left_is_generated_again(person, tmp_path):
     [
         ({"edits": [{"edit": "vary"}]}, "was edited"),
         ({"seed": None}, "not generated from a seed"),
-        ({"checkpoint": "another"}, "another person"),
+        ({"checkpoint": "another"}, "another human"),
     ],
 )
 def test_humans_that_no_seed_reproduces_are_rejected(person, tmp_path, changes, sentence):

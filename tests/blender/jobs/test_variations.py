@@ -93,7 +93,7 @@ def test_build_all_builds_all_in_edit_mode_too(addon, shown_people):
 
 def test_whom_files_are_missing_of_is_not_built_and_those_before_stay(addon, shown_people):
     sheet.variations[1].human.unlink()
-    with pytest.raises(RuntimeError, match="1 of 4 people were built"):
+    with pytest.raises(RuntimeError, match="1 of 4 humans were built"):
         ops.build_variation(build_all=True)
     assert len(humans(addon.scene)) == 1
 
@@ -162,7 +162,7 @@ def test_the_panel_shows_the_sheet_and_what_can_be_done_with_those_selected(addo
     ops.select_variation(index=1)
     texts = shown(variations_panel.PRIMDIFFUSION_PT_variations, addon)
     assert texts.count("primdiffusion.select_variation") == 4
-    assert {"primdiffusion.build_variation", "primdiffusion.more_like_variation", "New people: 4"} <= set(texts)
+    assert {"primdiffusion.build_variation", "primdiffusion.more_like_variation", "New humans: 4"} <= set(texts)
 
 
 @pytest.mark.parametrize(("width", "columns"), [(300, 2), (420, 3), (2000, 8), (50, 2)])
@@ -208,7 +208,7 @@ def test_a_person_cleared_before_its_turn_is_named(addon, shown_people):
     queue.add(addon, VariationsJob((1,), 1, "ddim", person=str(sheet.variations[0].person)))
     ops.clear_variations()
     drive()
-    assert "the person to vary was cleared" in error_of("variations").lower()
+    assert "the human to vary was cleared" in error_of("variations").lower()
 
 
 def test_a_disk_that_is_full_keeps_the_former_sheet(addon, shown_people, monkeypatch):

@@ -98,5 +98,5 @@ def test_the_camera_frames_a_posed_person_from_every_side(saved_scene, tmp_path)
 
 
 def test_an_empty_scene_has_no_human_to_frame(empty_scene):
-    with pytest.raises(ValueError, match="no person in the scene"):
+    with pytest.raises(ValueError, match="no human in the scene"):
         setup_cycles_preview(bpy.context.scene)

@@ -84,7 +84,7 @@ def test_a_missing_or_damaged_file_is_named_with_what_to_do(person):
     whole = path.read_bytes()
     read_body_file.cache_clear()
     path.write_bytes(whole[:1000])
-    with pytest.raises(ValueError, match=r"body_.*damaged.*generate the person again"):
+    with pytest.raises(ValueError, match=r"body_.*damaged.*generate the human again"):
         shape_model_of(person)
     path.unlink()
     with pytest.raises(FileNotFoundError, match=r"missing.*body_.*put it back"):

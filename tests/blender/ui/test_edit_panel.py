@@ -274,8 +274,8 @@ def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(addon, tm
     refused = {
         "select the one you mean": lambda: ops.vary(),
         "'Eve' is not in the scene: choose from 'Human', 'Human.001'": lambda: ops.vary(human="Eve"),
-        "choose the other person in the panel first": lambda: ops.blend(human="Human"),
-        "'Human' cannot be the other person too": lambda: ops.blend(human="Human", other="Human"),
+        "choose the other human in the panel first": lambda: ops.blend(human="Human"),
+        "'Human' cannot be the other human too": lambda: ops.blend(human="Human", other="Human"),
         "is not name=value": lambda: ops.vary(human="Human", attributes="tall"),
         "no part of the body is chosen": lambda: ops.redress(human="Human", parts=set()),
     }
@@ -284,7 +284,7 @@ def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(addon, tm
             edit()
         assert not queue.busy
     person_file(humans(addon.scene)[0]).unlink()
-    with pytest.raises(RuntimeError, match="file of the person 'Human' is missing"):
+    with pytest.raises(RuntimeError, match="file of the human 'Human' is missing"):
         ops.vary(human="Human")
 
 

@@ -117,8 +117,8 @@ def test_sliders_of_a_human_without_a_shape_do_nothing_and_the_panel_explains_wh
 
 def test_humans_of_earlier_versions_have_to_be_generated_again(addon, tmp_path):
     build_human(addon, synthetic.write(tmp_path / "old.npz", 8))
-    assert "generate the person again" in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
-    with pytest.raises(RuntimeError, match="generate the person again"):
+    assert "generate the human again" in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
+    with pytest.raises(RuntimeError, match="generate the human again"):
         ops.random_shape()
 
 
@@ -164,7 +164,7 @@ def test_a_shape_is_copied_from_the_other_person(person, other):
 
 @pytest.mark.parametrize(
     ("given", "sentence"),
-    [({}, "choose the other person"), ({"source": "Human"}, "cannot be the other"), ({"source": "Eve"}, "not in the")],
+    [({}, "choose the other human"), ({"source": "Human"}, "cannot be the other"), ({"source": "Eve"}, "not in the")],
 )
 def test_copying_without_another_human_is_rejected(person, given, sentence):
     with pytest.raises(RuntimeError, match=sentence):
@@ -203,9 +203,9 @@ def test_an_empty_name_is_rejected_and_a_taken_one_gets_a_number(person, other, 
 
 
 def test_choosing_a_person_makes_their_armature_active(person, other, addon):
-    with pytest.raises(RuntimeError, match="2 people are in the scene"):
+    with pytest.raises(RuntimeError, match="2 humans are in the scene"):
         ops.select_human()
-    assert "2 people are in the scene: select" in shown(PRIMDIFFUSION_PT_human, addon)
+    assert "2 humans are in the scene: select" in shown(PRIMDIFFUSION_PT_human, addon)
     assert shown(PRIMDIFFUSION_MT_people, addon).count("primdiffusion.select_human") == 2
     ops.select_human(human="Ötzi")
     assert addon.view_layer.objects.active == armature_of(other)
@@ -298,7 +298,7 @@ def test_deleting_leaves_the_twin_the_files_and_nothing_else(person, addon):
     assert not bpy.data.armatures
     assert not bpy.data.volumes
     assert sorted((files[0].parent).rglob("*")) == files
-    with pytest.raises(RuntimeError, match="no person in the scene"):
+    with pytest.raises(RuntimeError, match="no human in the scene"):
         ops.delete_human()
 
 

@@ -272,7 +272,7 @@ def test_any_armature_with_smpls_joints_can_be_moved(addon, tmp_path):
 
 
 def test_a_scene_without_humans_is_reported(addon, tmp_path):
-    with pytest.raises(RuntimeError, match="no person in the scene"):
+    with pytest.raises(RuntimeError, match="no human in the scene"):
         ops.import_motion(filepath=amass(tmp_path / "m.npz"))
 
 

@@ -267,7 +267,7 @@ def test_a_camera_is_added_that_sees_the_whole_person(person):
 
 
 def test_a_scene_without_humans_is_rejected(addon):
-    with pytest.raises(RuntimeError, match="no person in the scene"):
+    with pytest.raises(RuntimeError, match="no human in the scene"):
         ops.add_camera()
     assert not ops.merge.poll()
     assert not bpy.data.cameras

@@ -160,7 +160,7 @@ def test_what_is_no_source_is_named(addon, tmp_path, out, capfd):
     for source, sentence in (
         ("nobody", "there is no"),
         ("photo.jpg", "is neither a .blend nor"),
-        ("empty", "no people"),
+        ("empty", "no humans"),
     ):
         assert render(tmp_path / source, out) == UNUSABLE
         assert sentence in capfd.readouterr().err
