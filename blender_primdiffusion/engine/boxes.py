@@ -30,7 +30,7 @@ class Boxes:
     """Local to world [K, 3, 3]; columns T, B, N."""
     half_extent: NDArray[np.float64]
     """Half sides along T, B, N with the delta scale [K, 3]."""
-    density_scale: float
+    density_scale: float = 1.0
     """Factor on the payload's density: a larger object is thinner, so that its opacity does not depend on size."""
 
 

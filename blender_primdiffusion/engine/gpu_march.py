@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import gpu_shaders
+from .boxes import Boxes
 from .gpu_shaders import ACROSS, BOXES_A_ROW, ENTRIES_A_ROW, TEXELS, TILE, VOXELS, WIDER
 from .view import PinholeView
 
@@ -53,20 +54,6 @@ class GpuPayload:
         parts = values.reshape(self.rows, ACROSS, 4, VOXELS, VOXELS, VOXELS)
         self.texture = _texture(parts.transpose(3, 0, 4, 1, 5, 2).reshape(VOXELS, self.rows * VOXELS, -1, 4), "RGBA16F")
         self.bounds = _content(values[: self.count, 3] > 0)
-
-
-@dataclasses.dataclass(frozen=True)
-class Boxes:
-    """Where a human's boxes are; backend axes, metres."""
-
-    position: NDArray
-    """Centres [K, 3]."""
-    rotation: NDArray
-    """[K, 3, 3], columns T, B, N."""
-    half_extent: NDArray
-    """[K, 3]."""
-    density_scale: float = 1.0
-    """Factor on the densities: 1 / scale for a scaled human."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -133,15 +133,21 @@ def posed_humans(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | 
     Raises FileNotFoundError for a human whose file is missing, and ValueError for a shape that is no list of numbers or
     a pose that holds NaN.
     """
+    return [pose_of(obj, matrix, owner) for _, obj, matrix, owner in visible_armatures(depsgraph, space)]
+
+
+def visible_armatures(
+    depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None
+) -> Iterator[tuple[bpy.types.Object, bpy.types.Object, NDArray[np.float64], bpy.types.Collection]]:
+    """The object that shows a human (its armature, or what instances it), the evaluated armature, its world matrix
+    [4, 4] and the human's collection; see `posed_humans`. The evaluated armature is valid until the next one."""
     owners = dict(_armatures())
-    found = []
     for instance in visible_instances(depsgraph, space):
         obj = instance.object
         owner = owners.get(obj.original) if obj.type == "ARMATURE" else None
         matrix = np.array(instance.matrix_world, np.float64)
         if owner is not None and not abs(np.linalg.det(matrix[:3, :3])) < SMALLEST_SCALE**3:
-            found.append(pose_of(obj, matrix, owner))
-    return found
+            yield (instance.parent or obj).original, obj, matrix, owner
 
 
 def _armatures() -> Iterator[tuple[bpy.types.Object, bpy.types.Collection]]:

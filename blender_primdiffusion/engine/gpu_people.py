@@ -1,0 +1,50 @@
+"""People of the scene for the marcher on the GPU: their payloads, uploaded once, and their boxes where they are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+from ..scene.human_file import FileVersion, file_version, read_payload
+from .boxes import Boxes, boxes_of
+from .gpu_march import GpuPayload
+from .picture import PosedHuman
+
+PAYLOADS_KEPT = 4
+"""Of people who are drawn no longer; 4 MB each."""
+
+
+class GpuPeople:
+    """Payloads on the GPU, by file."""
+
+    def __init__(self) -> None:
+        self._payloads: dict[FileVersion, GpuPayload] = {}
+        """The latest used last."""
+
+    def placed(self, human: PosedHuman) -> tuple[GpuPayload, Boxes]:
+        """Payload and boxes of one human. Raises OSError or ValueError for files, as `read_payload` and `boxes_of`."""
+        version, boxes = file_version(human.file), boxes_of(human)
+        payload = self._payloads.pop(version, None)
+        if payload is None:
+            tensors = read_payload(human.file)
+            payload = GpuPayload(tensors.rgb, tensors.density)
+        self._payloads[version] = payload
+        return payload, boxes
+
+    def keep_only(self, drawn: Iterable[PosedHuman]) -> None:
+        """Free the payloads of others, but for the latest PAYLOADS_KEPT."""
+        files = {human.file for human in drawn}
+        others = [version for version in self._payloads if version.path not in files]
+        for version in others[:-PAYLOADS_KEPT]:
+            del self._payloads[version]
+
+
+def step_for(people: Iterable[PosedHuman], step: float) -> float:
+    """The distance between samples where a human of natural size has `step`: less for small people, by powers of two.
+
+    Small boxes would fall between coarser samples; the backend's `settings_for` does the same.
+    """
+    volumes = [abs(float(np.linalg.det(human.object_to_world[:, :3]))) for human in people]
+    return step * 2.0 ** min((round(math.log2(volume) / 3) for volume in volumes if volume > 0), default=0)
