@@ -64,7 +64,7 @@ class BoxRig:
         betas = own if human.betas is None else np.array(human.betas, np.float64)
         extent = self._model.rest_half_extent if payload.rest_half_extent is None else payload.rest_half_extent
         if extent is None or len(extent) != len(payload.delta_scale) or len(extent) != len(self._model.face):
-            raise ValueError(f"the body's file does not fit {human.file.name!r}: generate the person again")
+            raise ValueError(f"the body's file does not fit {human.file.name!r}: generate the human again")
         flat = np.abs(np.linalg.det(human.joints[:, :, :3])) < SMALLEST_SCALE**3
         if flat.any():
             name = JOINT_NAMES[int(flat.argmax())]
@@ -128,7 +128,7 @@ def boxes_of(human: PosedHuman) -> Boxes:
     version, and as `BoxRig.place`.
     """
     if human.body is None:
-        raise ValueError(f"the person of {human.file.name!r} was made by an earlier version: generate the person again")
+        raise ValueError(f"the human of {human.file.name!r} was made by an earlier version: generate the human again")
     return _rig(read_body_file(human.body)).place(human, read_sizes(file_version(human.file)))
 
 
