@@ -172,7 +172,7 @@ def names_with_two_meanings(modules: list[Module]) -> list[str]:
 
 
 def tests_without_source() -> list[str]:
-    """Test files whose path names no source file.
+    """Test files whose path names no source file or package.
 
     `render/test_march.py` is the test of `render/march.py`, `render/test_march_gradients.py` of one aspect of it.
     """
@@ -181,8 +181,8 @@ def tests_without_source() -> list[str]:
         for path in sorted(folder.rglob("test_*.py")):
             words = path.stem.split("_")[1:]
             beside = PROGRAMS[program] / path.parent.relative_to(folder)
-            names = ("_".join(words[:count]) for count in range(len(words), 0, -1))
-            if not any((beside / f"{name}.py").is_file() for name in names):
+            names = ["_".join(words[:count]) for count in range(len(words), 0, -1)]
+            if not any((beside / f"{name}.py").is_file() or (beside / name).is_dir() for name in names):
                 found.append(str(path.relative_to(ROOT)))
     return found
 

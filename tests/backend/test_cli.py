@@ -79,14 +79,14 @@ def test_a_batch_is_asked_for_and_written_together(checkpoint, tmp_path, capsys)
         assert (meta["seed"], meta["attributes"]) == (seed, {"outfit": "suit", "height": 1.8})
     capsys.readouterr()
     line[line.index(str(out))] = str(tmp_path / "none")
-    for wrong, said in (
+    for wrong, message in (
         ("outfit=robe", "jeans, suit"),
         ("robe", "NAME=VALUE"),
         ("beard=full", "outfit, height, weight"),
     ):
         code, error = fails(capsys, *line, "--attributes", wrong)
         assert code == 1
-        assert said in error
+        assert message in error
     assert fails(capsys, *line, "--attributes", "height=1.7", "height=1.8")[0] == 1
     assert "batch is 0" in fails(capsys, *line, "--batch", "0")[1]
     assert not any(path.is_dir() for path in (tmp_path / "none").glob("*"))

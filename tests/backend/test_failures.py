@@ -1,4 +1,4 @@
-"""What users are told of exceptions."""
+"""What users read about exceptions."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""People on disk: whole, exact, and refused with a sentence where they are not."""
+"""People on disk: whole, exact, and rejected with a sentence where they are not."""
 
 import dataclasses
 import json
@@ -72,7 +72,7 @@ def damage(path, human, how):
 
 
 @pytest.mark.parametrize(
-    ("how", "told"),
+    ("how", "message"),
     [
         ("truncated", "truncated"),
         ("cut in its header", "truncated"),
@@ -86,24 +86,24 @@ def damage(path, human, how):
         ("giant", "largest beta is 6"),
     ],
 )
-def test_a_damaged_file_is_rejected_by_name_with_its_damage(human, tmp_path, how, told):
+def test_a_damaged_file_is_rejected_by_name_with_its_damage(human, tmp_path, how, message):
     path = tmp_path / "bad.human.safetensors"
     damage(path, human, how)
     with pytest.raises(HumanFileError, match=r"bad\.human\.safetensors") as error:
         load_human(path)
-    assert told in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("version", "told"),
+    ("version", "message"),
     [("3", "newer PrimDiffusion"), ("10", "newer PrimDiffusion"), ("one", "format version 'one'"), ("0", "'0'")],
 )
-def test_a_file_of_another_version_is_rejected_with_what_to_do(human, tmp_path, version, told):
+def test_a_file_of_another_version_is_rejected_with_what_to_do(human, tmp_path, version, message):
     path = tmp_path / "other.human.safetensors"
     save_human(path, human)
     safetensors.torch.save_file(safetensors.torch.load_file(path), path, {**META, "format_version": version})
-    with pytest.raises(HumanFileError, match=told):
+    with pytest.raises(HumanFileError, match=message):
         load_human(path)
 
 
@@ -124,7 +124,7 @@ def test_a_file_of_the_first_release_is_read(human, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("provenance", "told"),
+    ("provenance", "message"),
     [
         ("{", "provenance is not JSON"),
         ("[" * 100_000, "provenance is not JSON"),
@@ -139,13 +139,13 @@ def test_a_file_of_the_first_release_is_read(human, tmp_path):
         ('{"edits": [{"amount": 0.5}]}', "'edits'"),
     ],
 )
-def test_a_provenance_of_the_wrong_kind_is_rejected_by_its_entry(human, tmp_path, provenance, told):
+def test_a_provenance_of_the_wrong_kind_is_rejected_by_its_entry(human, tmp_path, provenance, message):
     path = tmp_path / "odd.human.safetensors"
     save_human(path, human)
     safetensors.torch.save_file(safetensors.torch.load_file(path), path, {**META, "provenance": provenance})
     with pytest.raises(HumanFileError, match=r"odd\.human\.safetensors") as error:
         load_human(path)
-    assert told in str(error.value)
+    assert message in str(error.value)
     assert len(str(error.value)) < 300 + len(str(tmp_path))
 
 
@@ -157,11 +157,11 @@ def test_unknown_entries_of_the_provenance_are_saved(human, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [({"betas": torch.full((10,), -5.5)}, "betas"), ({"provenance": {"edits": "many"}}, "edits")],
 )
-def test_what_could_not_be_read_again_is_not_written(human, tmp_path, change, told):
-    with pytest.raises(ValueError, match=told):
+def test_what_could_not_be_read_again_is_not_written(human, tmp_path, change, message):
+    with pytest.raises(ValueError, match=message):
         save_human(tmp_path / "file", dataclasses.replace(human, **change))
     assert list(tmp_path.iterdir()) == []
 

@@ -78,5 +78,5 @@ def test_a_public_class_name_in_two_modules_has_two_meanings(tree):
 
 def test_a_test_is_found_by_the_path_of_its_source(tree):
     tree({"ours/render/march.py": "", "tests/render/test_march.py": "", "tests/render/test_march_gradients.py": "",
-          "tests/test_march.py": "", "tests/render/test_marching.py": ""})  # fmt: skip
+          "tests/test_march.py": "", "tests/render/test_marching.py": "", "tests/test_render.py": ""})  # fmt: skip
     assert house.tests_without_source() == ["tests/render/test_marching.py", "tests/test_march.py"]

@@ -1,17 +1,25 @@
-"""A Python for the child that is found without being tried."""
+"""This interpreter as the child's Python, found without being tried."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+import sys
+from collections.abc import Generator
+from pathlib import Path
 
+import pytest
+
+from blender_primdiffusion import places
 from blender_primdiffusion.backend.environment import BackendPython
 
 
-def found(python: BackendPython) -> Callable[..., Generator[None, None, BackendPython]]:
-    """In the place of `environment.search`."""
+def use_this_python(patch: pytest.MonkeyPatch, backend: Path | None = None) -> None:
+    """The child runs on this interpreter; `backend` holds the package that it imports, by default the real one."""
+    version = "0-fake" if backend else "0"
 
     def search(*_: object, **__: object) -> Generator[None, None, BackendPython]:
         yield
-        return python
+        return BackendPython(Path(sys.executable), "the test", version, "0", "3")
 
-    return search
+    patch.setattr("blender_primdiffusion.backend.environment.search", search)
+    if backend:
+        patch.setattr(places, "backend_module_path", lambda: backend)

@@ -38,13 +38,13 @@ class PaintedPerson:
         uv = mesh.uv_layers.new(name="UVMap")
         rest = body.rest(self.betas)[0][kept]
         uv.data.foreach_set("uv", (rest[self.faces.ravel(), :2] / 2 + 0.5).astype(np.float32).ravel())
-        thing = bpy.data.objects.new("painted", mesh)
-        context.scene.collection.objects.link(thing)
+        obj = bpy.data.objects.new("painted", mesh)
+        context.scene.collection.objects.link(obj)
         for joint, name in enumerate(JOINT_NAMES):
-            group = thing.vertex_groups.new(name=name)
+            group = obj.vertex_groups.new(name=name)
             for vertex in np.flatnonzero(body.skin_weights[kept, joint] > 0):
                 group.add([int(vertex)], float(body.skin_weights[kept[vertex], joint]), "REPLACE")
-        self.objects = [thing]
+        self.objects = [obj]
         self.vertices = rest
 
     @staticmethod
@@ -119,14 +119,14 @@ def _few_faces() -> tuple[np.ndarray, np.ndarray]:
     body = read_body()
     mesh = bpy.data.meshes.new("whole")
     mesh.from_pydata(body.template.tolist(), [], body.faces.tolist())
-    thing = bpy.data.objects.new("whole", mesh)
-    bpy.context.scene.collection.objects.link(thing)
-    thing.modifiers.new("fewer", "DECIMATE").ratio = FACES / len(body.faces)
-    fewer = thing.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
+    obj = bpy.data.objects.new("whole", mesh)
+    bpy.context.scene.collection.objects.link(obj)
+    obj.modifiers.new("fewer", "DECIMATE").ratio = FACES / len(body.faces)
+    fewer = obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
     points = np.empty(3 * len(fewer.vertices), np.float32)
     fewer.vertices.foreach_get("co", points)
     faces = np.array([tuple(polygon.vertices) for polygon in fewer.polygons])
     nearest = np.array([((body.template - point) ** 2).sum(-1).argmin() for point in points.reshape(-1, 3)])
-    bpy.data.objects.remove(thing)
+    bpy.data.objects.remove(obj)
     bpy.data.meshes.remove(mesh)
     return nearest, faces

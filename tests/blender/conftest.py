@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -62,19 +61,38 @@ def saved_scene(empty_scene, tmp_path):
 def addon(saved_scene, tmp_path, monkeypatch):
     """The add-on registered from the checkout, on an interpreter that runs the fake child."""
     import synthetic
-    from backend_python import found
+    from backend_python import use_this_python
 
     import blender_primdiffusion
-    from blender_primdiffusion import places
-    from blender_primdiffusion.backend.environment import BackendPython
     from blender_primdiffusion.jobs.queue import queue
 
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic.write(tmp_path / "prepared.npz", 8)))
-    python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", found(python))
-    monkeypatch.setattr(places, "backend_module_path", lambda: Path(__file__).parent / "fake_backend")
+    use_this_python(monkeypatch, Path(__file__).parent / "fake_backend")
     queue.outcomes.clear()
     queue.info = {}
+    blender_primdiffusion.register()
+    yield saved_scene
+    blender_primdiffusion.unregister()
+
+
+@pytest.fixture
+def real_child(saved_scene, tmp_path, monkeypatch):
+    """The add-on registered from the checkout, with the real child and the checkpoint of a small model."""
+    from backend_python import use_this_python
+    from tiny_model import save_tiny_checkpoint
+
+    import blender_primdiffusion
+    from blender_primdiffusion.backend.client import BackendClient
+    from blender_primdiffusion.jobs import queue
+
+    checkpoint = save_tiny_checkpoint(tmp_path / "tiny.safetensors")
+    use_this_python(monkeypatch)
+    monkeypatch.setattr(queue, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
+    # With a cache in Blender's temporary folder the child would compile its marcher anew for each test.
+    monkeypatch.setattr(
+        "blender_primdiffusion.backend.client.BackendClient",
+        lambda python, module, cache_dir: BackendClient(python, module),
+    )
     blender_primdiffusion.register()
     yield saved_scene
     blender_primdiffusion.unregister()

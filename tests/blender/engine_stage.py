@@ -6,10 +6,13 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
 import numpy as np
+
+from blender_primdiffusion.scene.build import build_human
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = os.environ.get("PRIMDIFFUSION_PYTHON", sys.executable)
@@ -36,6 +39,17 @@ class Oracle:
         self._process.stdin.flush()
         assert self._process.stdout.readline().strip() == "{}"
 
+    def make(self, folder: Path, seed: int = 1, betas: Sequence[float] = (0.0,) * 10) -> Path:
+        """Write the files of a human to a folder; few.npz has few primitives, so that building is quick."""
+        self.ask({"make": str(folder), "seed": seed, "betas": list(betas)})
+        with np.load(folder / "human.npz") as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        count = len(arrays["position"])
+        for name in (name for name, array in arrays.items() if array.ndim and len(array) == count):
+            arrays[name] = arrays[name][:PRIMITIVES_IN_BLENDER]
+        np.savez(folder / "few.npz", **arrays)
+        return folder
+
     def picture(
         self, people: list[dict], camera: dict, size: tuple[int, int], step: float = STEP
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -50,16 +64,24 @@ class Oracle:
         self._process.wait()
 
 
-def thinned(npz: Path) -> Path:
-    """A copy of a human.npz with few primitives, so that building is quick."""
-    with np.load(npz) as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    count = len(arrays["position"])
-    for name in (name for name, array in arrays.items() if array.ndim and len(array) == count):
-        arrays[name] = arrays[name][:PRIMITIVES_IN_BLENDER]
-    target = npz.with_name("few.npz")
-    np.savez(target, **arrays)
-    return target
+def add_human(folder: Path) -> bpy.types.Collection:
+    """Build the human of `Oracle.make`, with few of its volumes."""
+    return build_human(bpy.context, folder / "few.npz", keep=[folder / "person.human.safetensors"])
+
+
+def set_up_render(
+    scene: bpy.types.Scene, size: tuple[int, int], location: Sequence[float], rotation: Sequence[float]
+) -> bpy.types.Object:
+    """The engine, a transparent film, colours as they are, and a new camera."""
+    scene.render.engine = "PRIMDIFFUSION"
+    scene.render.resolution_x, scene.render.resolution_y = size
+    scene.render.film_transparent = True
+    scene.render.dither_intensity = 0
+    scene.view_settings.view_transform = "Standard"
+    scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.camera.location, scene.camera.rotation_euler = location, rotation
+    scene.collection.objects.link(scene.camera)
+    return scene.camera
 
 
 def cube(name="cube", centre=(0.0, 0.0, 1.0), half=0.2) -> bpy.types.Object:
@@ -68,10 +90,10 @@ def cube(name="cube", centre=(0.0, 0.0, 1.0), half=0.2) -> bpy.types.Object:
     corners = [(x, y, z) for x in (-half, half) for y in (-half, half) for z in (-half, half)]
     faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     mesh.from_pydata(corners, [], faces)
-    thing = bpy.data.objects.new(name, mesh)
-    thing.location = centre
-    bpy.context.scene.collection.objects.link(thing)
-    return thing
+    obj = bpy.data.objects.new(name, mesh)
+    obj.location = centre
+    bpy.context.scene.collection.objects.link(obj)
+    return obj
 
 
 def material(colour, name="paint") -> bpy.types.Material:

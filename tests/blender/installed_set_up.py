@@ -37,7 +37,7 @@ if not wheels:
     started = time.perf_counter()
     report["generated"] = sorted(bpy.ops.primdiffusion.generate(seed=3, steps=3))
     report["seconds_generate"] = round(time.perf_counter() - started, 1)
-    report["bones"] = [len(thing.data.bones) for thing in bpy.data.objects if thing.type == "ARMATURE"]
+    report["bones"] = [len(obj.data.bones) for obj in bpy.data.objects if obj.type == "ARMATURE"]
 started = time.perf_counter()
 repair = press if wheels else bpy.ops.primdiffusion.repair_backend  # without a network, from the folder again
 report["repaired"] = sorted(repair())

@@ -19,7 +19,7 @@ def drive(seconds: float = 60.0) -> None:
 
 
 def until_running(seconds: float = 60.0) -> None:
-    """Until the child has told of progress."""
+    """Until the child has reported progress."""
     end = time.monotonic() + seconds
     while queue.request is None or queue.request.state != "running":
         assert time.monotonic() < end

@@ -92,8 +92,8 @@ def static(body: Body, vertices: np.ndarray, picture: bpy.types.Image | None = N
     corners = np.asarray(body.faces).ravel()
     front = vertices[corners][:, :2] * 0.4 + 0.5
     layer.data.foreach_set("uv", front.astype(np.float32).ravel())
-    thing = bpy.data.objects.new("person", mesh)
-    bpy.context.scene.collection.objects.link(thing)
+    obj = bpy.data.objects.new("person", mesh)
+    bpy.context.scene.collection.objects.link(obj)
     material = bpy.data.materials.new("skin")
     if material.node_tree is None:
         material.use_nodes = True
@@ -103,7 +103,7 @@ def static(body: Body, vertices: np.ndarray, picture: bpy.types.Image | None = N
         node.image = picture
         material.node_tree.links.new(node.outputs["Color"], shader.inputs["Base Color"])
     mesh.materials.append(material)
-    return thing
+    return obj
 
 
 def checker(path: Path) -> bpy.types.Image:
@@ -122,9 +122,9 @@ def checker(path: Path) -> bpy.types.Image:
 
 def move(things: list[bpy.types.Object], matrix: np.ndarray) -> None:
     """Move everything without a parent by `matrix` [4, 4]."""
-    for thing in things:
-        if thing.parent is None:
-            thing.matrix_world = Matrix(matrix.tolist()) @ thing.matrix_world
+    for obj in things:
+        if obj.parent is None:
+            obj.matrix_world = Matrix(matrix.tolist()) @ obj.matrix_world
     bpy.context.view_layer.update()
 
 
@@ -145,8 +145,8 @@ def evaluated(things: list[bpy.types.Object]) -> np.ndarray:
     """Deformed vertices [V, 3] in the world, y up, as Blender draws them."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     clouds = []
-    for thing in things:
-        seen = thing.evaluated_get(depsgraph)
+    for obj in things:
+        seen = obj.evaluated_get(depsgraph)
         matrix = np.array(seen.matrix_world)
         local = np.array([vertex.co for vertex in seen.data.vertices])
         clouds.append(local @ matrix[:3, :3].T + matrix[:3, 3])

@@ -37,16 +37,14 @@ def operators() -> list[str]:
 
 def everything() -> dict[str, set[str]]:
     kinds = [prop.identifier for prop in bpy.data.bl_rna.properties if prop.type == "COLLECTION"]
-    return {
-        kind: {thing.name_full for thing in getattr(bpy.data, kind)} for kind in kinds if kind not in _BLENDER_LISTS
-    }
+    return {kind: {obj.name_full for obj in getattr(bpy.data, kind)} for kind in kinds if kind not in _BLENDER_LISTS}
 
 
 def state() -> tuple:
-    """What a refusal must leave as it was."""
+    """What a rejected operator must leave as it was."""
     active = bpy.context.view_layer.objects.active
-    selected = sorted(thing.name for thing in bpy.context.view_layer.objects.selected)
-    places = {thing.name: [list(row) for row in thing.matrix_basis] for thing in bpy.data.objects}
+    selected = sorted(obj.name for obj in bpy.context.view_layer.objects.selected)
+    places = {obj.name: [list(row) for row in obj.matrix_basis] for obj in bpy.data.objects}
     paths = {volume.name: volume.filepath for volume in bpy.data.volumes}
     marks = {c.name: {key: str(c[key]) for key in c.keys()} for c in bpy.data.collections}  # noqa: SIM118
     return everything(), active and (active.name, active.mode), selected, places, paths, marks
@@ -63,11 +61,11 @@ def fault(name: str) -> str:
             return f"{name}: {text.splitlines()[-1]}\n{text}"
         if "context is incorrect" in text:
             return f"{name}: poll without a reason"
-        said = re.sub(r"^(Error: |Operator bpy\.ops\.primdiffusion\.\w+\.poll\(\) )", "", text)
-        if "\n" in said or len(said.split()) < 3:
-            return f"{name}: no sentence: {said!r}"
+        message = re.sub(r"^(Error: |Operator bpy\.ops\.primdiffusion\.\w+\.poll\(\) )", "", text)
+        if "\n" in message or len(message.split()) < 3:
+            return f"{name}: no sentence: {message!r}"
         changes = [(a, b) for a, b in zip(before, state(), strict=True) if a != b]
-        return f"{name}: refused ({said}) after changing {changes}" if changes else ""
+        return f"{name}: rejected ({message}) after changing {changes}" if changes else ""
     if answer != {"FINISHED"}:
         return f"{name}: {answer} without a word"
     changes = [(a, b) for a, b in zip(before, state(), strict=True) if a != b] if name in ELSEWHERE else []
@@ -80,13 +78,13 @@ def empty(_person) -> None:
 
 def nothing_active(_person) -> None:
     bpy.context.view_layer.objects.active = None
-    for thing in bpy.context.view_layer.objects:
-        thing.select_set(False)
+    for obj in bpy.context.view_layer.objects:
+        obj.select_set(False)
 
 
-def _enter(thing: bpy.types.Object, mode: str) -> None:
-    thing.hide_viewport = False
-    bpy.context.view_layer.objects.active = thing
+def _enter(obj: bpy.types.Object, mode: str) -> None:
+    obj.hide_viewport = False
+    bpy.context.view_layer.objects.active = obj
     bpy.ops.object.mode_set(mode=mode)
 
 

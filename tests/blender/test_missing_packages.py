@@ -28,11 +28,9 @@ for name in [name for name in sys.modules if name.partition(".")[0] in ("numpy",
     sys.modules[name] = None  # importing it fails
 sys.path.insert(0, str(root / "tests" / "blender"))
 import blender_primdiffusion
-from blender_primdiffusion import places
-from blender_primdiffusion.backend import environment
-from backend_python import found
-environment.search = found(environment.BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3"))
-places.backend_module_path = lambda: root / "tests" / "blender" / "fake_backend"
+import pytest
+from backend_python import use_this_python
+use_this_python(pytest.MonkeyPatch(), root / "tests" / "blender" / "fake_backend")
 blender_primdiffusion.register()
 from blender_primdiffusion.ui.batch import execute
 words = ["generate", "--out", out, "--steps", "1", "--pictures", "16"]

@@ -1,10 +1,17 @@
-"""What enabling the extension costs at each start of Blender."""
+"""Enabling and disabling the extension: what it imports, what it leaves, and people in files without it."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
+
+import bpy
+import psutil
+
+import blender_primdiffusion
 
 ROOT = Path(__file__).parents[2]
 MOST_MODULES = 120
@@ -16,6 +23,11 @@ LATE = (
     "ui.motion_placing",
 )  # fmt: skip
 """Modules of ours that registering must not import: they bring others along, or numpy."""
+OWNERS = (
+    "Scene", "Object", "Collection", "WindowManager", "Armature", "Volume", "Material", "World", "Action", "PoseBone",
+    "Mesh", "Screen", "Preferences", "AddonPreferences", "RenderSettings", "ViewLayer", "Camera", "Bone", "Text",
+)  # fmt: skip
+"""Types of Blender that may get properties of ours."""
 CHILD = """
 import bpy, sys
 for name in [name for name in sys.modules if name.partition(".")[0] == "numpy"]:
@@ -40,3 +52,112 @@ def test_registering_imports_few_modules_and_no_backend():
     assert len(ours) <= MOST_MODULES
     assert not ours & set(LATE)
     assert not modules & {"numpy", "torch", "openvdb", "scipy", "primdiffusion"}
+
+
+def _handlers() -> Iterator[str]:
+    for name in dir(bpy.app.handlers):
+        functions = getattr(bpy.app.handlers, name)
+        if isinstance(functions, list):
+            yield from (f"handler {name} {function.__module__}.{function.__qualname__}" for function in functions)
+
+
+def _drawn_into() -> Iterator[str]:
+    """Functions that were appended to Blender's menus, panels and headers."""
+    for kind in (bpy.types.Menu, bpy.types.Panel, bpy.types.Header):
+        for cls in kind.__subclasses__():
+            drawn = getattr(cls.__dict__.get("draw", None), "_draw_funcs", ())
+            yield from (f"{cls.__name__} draws {function.__module__}.{function.__qualname__}" for function in drawn)
+            engines = () if cls.__name__.startswith("PRIMDIFFUSION_") else getattr(cls, "COMPAT_ENGINES", ())
+            yield from (f"{cls.__name__} for {engine}" for engine in engines if "PRIM" in engine)
+
+
+def _keymaps() -> Iterator[str]:
+    configurations = bpy.context.window_manager.keyconfigs
+    for configuration in (configurations.addon, configurations.user, configurations.default):
+        for keymap in configuration.keymaps if configuration else ():
+            yield from (f"key {keymap.name} {item.idname}" for item in keymap.keymap_items if "primdiff" in item.idname)
+
+
+def traces() -> set[str]:
+    """What of ours, or of anybody's, Blender knows now."""
+    found = {*_handlers(), *_drawn_into(), *_keymaps()}
+    found |= {f"type {name}" for name in dir(bpy.types) if "primdiffusion" in name.lower()}
+    found |= {f"operator {name}" for name in dir(bpy.ops.primdiffusion)}
+    for owner in OWNERS:
+        names = getattr(bpy.types, owner).bl_rna.properties.keys()
+        found |= {f"property {owner}.{name}" for name in names if "primdiffusion" in name}
+    found |= {f"manual {function.__module__}" for function in bpy.utils._manual_map}
+    found |= {f"preview {number}" for number in map(id, getattr(bpy.utils.previews, "_previews", {}).values())}
+    found |= {f"thread {thread.name}" for thread in threading.enumerate()}
+    found |= {f"child {child.pid}" for child in psutil.Process().children()}
+    for handler in bpy.types.FileHandler.__subclasses__():
+        if handler.is_registered:
+            found.add(f"file handler {handler.__name__}")
+    words = ("Generate Human", "Human", "Captures")
+    found |= {f"{language}: {word}" for language in ("de_DE", "fr_FR") for word in words if _translated(word, language)}
+    return found
+
+
+def _translated(word: str, language: str) -> bool:
+    view = bpy.context.preferences.view
+    before = view.language
+    try:
+        view.language = language
+    except TypeError:  # this Blender has no languages
+        return False
+    try:
+        return bpy.app.translations.pgettext_iface(word) != word
+    finally:
+        view.language = before
+
+
+def test_register_and_unregister_twice_leave_no_trace(empty_scene):
+    blender_primdiffusion.register()  # what only the first import brings: modules, and Blender's own caches
+    blender_primdiffusion.unregister()
+    before = traces()
+    assert not [trace for trace in before if "primdiffusion" in trace.lower()]
+    for _ in range(2):
+        blender_primdiffusion.register()
+        during = traces()
+        assert {"operator generate", "type PRIMDIFFUSION_PT_generate", "property Scene.primdiffusion"} <= during
+        blender_primdiffusion.unregister()
+        assert traces() == before
+
+
+def test_people_survive_the_extensions_absence(saved_scene, tmp_path):
+    import synthetic
+
+    from blender_primdiffusion.scene.build import build_human
+    from blender_primdiffusion.scene.human import humans
+
+    blender_primdiffusion.register()
+    build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 4))
+    bpy.context.scene.primdiffusion.seed = 41
+    bpy.ops.wm.save_mainfile()
+    blender_primdiffusion.unregister()
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    bpy.ops.wm.save_mainfile()
+    blender_primdiffusion.register()
+    try:
+        bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+        assert len(humans(bpy.context.scene)) == 1
+        assert bpy.context.scene.primdiffusion.seed == 41
+    finally:
+        blender_primdiffusion.unregister()
+
+
+def test_disabling_after_blender_has_cleared_handlers_and_timers(empty_scene):
+    blender_primdiffusion.register()
+    kept = {}
+    for name in dir(bpy.app.handlers):
+        functions = getattr(bpy.app.handlers, name)
+        if isinstance(functions, list):
+            kept[name] = [one for one in functions if not one.__module__.startswith("blender_primdiffusion")]
+            functions.clear()
+    try:
+        blender_primdiffusion.unregister()
+    finally:
+        for name, functions in kept.items():
+            getattr(bpy.app.handlers, name)[:] = functions
+    blender_primdiffusion.register()
+    blender_primdiffusion.unregister()

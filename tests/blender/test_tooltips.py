@@ -1,4 +1,4 @@
-"""Words in the interface: every label a title, every tooltip a sentence, every refusal with its reason."""
+"""Words in the interface: every label a title, every tooltip a sentence, every error with its reason."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def test_every_tooltip_is_a_sentence_without_a_full_stop(addon):
 
 
 def test_no_tooltip_repeats_its_label(addon):
-    said = {where: prop.name.lower() for where, prop in properties()}
-    assert not [where for where, text in tooltips() if text.strip().lower() == said.get(where)]
+    label_of = {where: prop.name.lower() for where, prop in properties()}
+    assert not [where for where, text in tooltips() if text.strip().lower() == label_of.get(where)]
 
 
 def test_operators_that_are_greyed_out_say_why(addon):
@@ -54,9 +54,9 @@ def test_operators_that_are_greyed_out_say_why(addon):
         operator = getattr(bpy.ops.primdiffusion, cls.bl_idname.partition(".")[2])
         if "INTERNAL" in cls.bl_options or operator.poll():
             continue
-        with pytest.raises(RuntimeError) as refused:
+        with pytest.raises(RuntimeError) as error:
             operator()
-        if "context is incorrect" in str(refused.value):
+        if "context is incorrect" in str(error.value):
             silent.append(cls.__name__)
     assert not silent, f"poll without poll_message_set: {silent}"
 

@@ -140,7 +140,7 @@ def test_drawing_needs_no_checkpoint(request_for):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"width": 0}, "0 x 64"),
         ({"region": [0, 0, 48, 0]}, "region"),
@@ -151,10 +151,10 @@ def test_drawing_needs_no_checkpoint(request_for):
         ({"colour": 1}, "'colour'"),
     ],
 )
-def test_wrong_parameters_are_one_sentence(child, request_for, changes, said):
+def test_wrong_parameters_are_one_sentence(child, request_for, changes, message):
     answer, _ = ask(child, {**request_for(), **changes})
     assert answer["error"]["code"] == INVALID_PARAMS
-    assert said in answer["error"]["message"]
+    assert message in answer["error"]["message"]
     assert "\n" not in answer["error"]["message"]
 
 
@@ -163,7 +163,7 @@ def test_wrong_files_are_one_sentence_and_the_conversation_goes_on(child, reques
     missing = {**params["people"][0], "human": str(tmp_path / "nobody.human.safetensors")}
     flat = {**params["people"][0], "object": [[0.0] * 4] * 3}
     Path(tmp_path / "text.npz").write_text("no arrays")
-    for changes, kind, said in (
+    for changes, kind, message in (
         ({"frame": str(tmp_path / "none.frame")}, "missing_file", "none.frame"),
         ({"width": 49}, "bad_input", "49 x 64 pixels need 62720"),
         ({"people": [missing]}, "missing_file", "nobody.human"),
@@ -172,7 +172,7 @@ def test_wrong_files_are_one_sentence_and_the_conversation_goes_on(child, reques
     ):
         answer, _ = ask(child, {**params, **changes})
         assert (answer["error"]["code"], answer["error"]["data"]["kind"]) == (DOMAIN_ERROR, kind)
-        assert said in answer["error"]["message"]
+        assert message in answer["error"]["message"]
         assert "\n" not in answer["error"]["message"]
     assert "result" in ask(child, params)[0]
 

@@ -61,11 +61,11 @@ def outside(path, other, region) -> bool:
 @pytest.mark.parametrize("method", EDITS)
 def test_an_edit_reports_its_steps_and_leaves_whole_files(child, people, asked, method):
     child.send(1, method, **asked, **parameters(method, people))
-    told = []
+    reports = []
     while "method" in (message := child.until(lambda m: m.get("method") == "progress" or m.get("id") == 1)):
-        told.append(message["params"])
-    assert [stage["stage"] for stage in told if stage["stage"] != "sample"] == ["load", "write", "write"]
-    sampled = [(stage["step"], stage["total"]) for stage in told if stage["stage"] == "sample"]
+        reports.append(message["params"])
+    assert [stage["stage"] for stage in reports if stage["stage"] != "sample"] == ["load", "write", "write"]
+    sampled = [(stage["step"], stage["total"]) for stage in reports if stage["stage"] == "sample"]
     assert [step for step, _ in sampled] == list(range(len(sampled)))
     assert sampled[-1][0] == sampled[-1][1], "the last step is the total"
     result = message["result"]
@@ -143,7 +143,7 @@ def test_a_cancel_ends_an_edit_within_a_step_and_leaves_nothing(child, people, a
 
 
 @pytest.mark.parametrize(
-    ("method", "wrong", "code", "kind", "told"),
+    ("method", "wrong", "code", "kind", "sentence"),
     [
         ("vary", {"person": "/nobody.human.safetensors"}, DOMAIN_ERROR, "missing_file", "there is no human file"),
         ("vary", {"attributes": {"species": "cat"}}, DOMAIN_ERROR, "bad_input", "knows no attribute 'species'"),
@@ -169,10 +169,10 @@ def test_a_cancel_ends_an_edit_within_a_step_and_leaves_nothing(child, people, a
         ("transfer", {"source": "/nobody.human.safetensors"}, DOMAIN_ERROR, "missing_file", "there is no human file"),
     ],
 )
-def test_an_error_names_what_was_wrong_and_leaves_nothing(child, people, asked, method, wrong, code, kind, told):
+def test_an_error_names_what_was_wrong_and_leaves_nothing(child, people, asked, method, wrong, code, kind, sentence):
     error = child.ask(10, method, **{**asked, **parameters(method, people), **wrong})["error"]
     assert error["code"] == code
-    assert told in error["message"]
+    assert sentence in error["message"]
     assert "\n" not in error["message"]
     assert (error.get("data") or {}).get("kind") == kind
     assert not Path(asked["out_dir"]).parent.exists()

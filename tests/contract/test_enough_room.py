@@ -1,4 +1,4 @@
-"""A full disk is told in a sentence before anything is installed (scripts/enough_room.sh)."""
+"""A full disk is reported in a sentence before anything is installed (scripts/enough_room.sh)."""
 
 from __future__ import annotations
 

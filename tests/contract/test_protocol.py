@@ -139,10 +139,10 @@ def test_a_second_generate_is_rejected_while_one_runs_and_cancel_stops_the_first
 ):
     first, second = tmp_path / "first", tmp_path / "second"
     child.busy(70, first, checkpoint)
-    refusal = child.ask(71, "generate", seed=1, out_dir=str(second), checkpoint=str(checkpoint))["error"]
-    assert refusal["code"] == DOMAIN_ERROR
-    assert refusal["data"]["kind"] == "busy"
-    assert "70" in refusal["message"]
+    error = child.ask(71, "generate", seed=1, out_dir=str(second), checkpoint=str(checkpoint))["error"]
+    assert error["code"] == DOMAIN_ERROR
+    assert error["data"]["kind"] == "busy"
+    assert "70" in error["message"]
     assert not second.exists()
 
     assert child.ask(72, "cancel", id=999)["result"] == {"cancelled": False}

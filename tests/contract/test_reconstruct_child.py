@@ -59,7 +59,7 @@ def test_reconstruct_reports_its_stages_and_leaves_whole_files(child, asked):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "code", "kind", "told"),
+    ("wrong", "code", "kind", "sentence"),
     [
         ({"subject": "nobody"}, DOMAIN_ERROR, "bad_input", "there is no subject 'nobody'"),
         ({"subject": None}, DOMAIN_ERROR, "bad_input", "several subjects: name one of them (person_000000"),
@@ -70,10 +70,10 @@ def test_reconstruct_reports_its_stages_and_leaves_whole_files(child, asked):
         ({"views": "all"}, INVALID_PARAMS, None, "reconstruct.views"),
     ],
 )
-def test_an_error_names_what_was_wrong_and_leaves_nothing(child, asked, wrong, code, kind, told):
+def test_an_error_names_what_was_wrong_and_leaves_nothing(child, asked, wrong, code, kind, sentence):
     error = child.ask(2, "reconstruct", **{**asked, **wrong})["error"]
     assert error["code"] == code
-    assert told in error["message"]
+    assert sentence in error["message"]
     assert (error.get("data") or {}).get("kind") == kind
     assert not Path(asked["out_dir"]).parent.exists()
 

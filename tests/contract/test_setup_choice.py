@@ -30,9 +30,9 @@ BOTH = ("cpu", "cuda")
     ],
 )
 def test_what_is_computed_on_follows_the_machine_and_the_wish(machine, wish, chosen, note):
-    compute, said = chosen_compute(machine, wish, BOTH)
+    compute, message = chosen_compute(machine, wish, BOTH)
     assert compute == chosen
-    assert note in said
+    assert note in message
 
 
 def test_an_nvidia_card_without_locked_packages_falls_back_and_says_so():
@@ -46,7 +46,7 @@ def test_an_apple_computer_takes_its_own_packages():
 
 
 @pytest.mark.parametrize(
-    ("machine", "wish", "available", "said"),
+    ("machine", "wish", "available", "message"),
     [
         (Machine("macos_arm64", (3, 11), 13, False, None), "automatic", ["apple"], "needs macOS 14 or newer"),
         (
@@ -59,8 +59,8 @@ def test_an_apple_computer_takes_its_own_packages():
         (LINUX, "apple", BOTH, "there are no packages for Apple Silicon here, but for CPU, NVIDIA"),
     ],
 )
-def test_what_cannot_be_is_rejected_in_a_sentence(machine, wish, available, said):
-    with pytest.raises(ValueError, match=said):
+def test_what_cannot_be_is_rejected_in_a_sentence(machine, wish, available, message):
+    with pytest.raises(ValueError, match=message):
         chosen_compute(machine, wish, available)
 
 

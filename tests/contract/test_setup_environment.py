@@ -186,9 +186,9 @@ def test_a_python_that_cannot_make_an_environment_is_named(place, tmp_path, monk
     host.write_text('#!/bin/sh\necho "No module named venv"\nexit 1\n')
     host.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(host))
-    said = failed(place.from_folder())
-    assert str(host) in said
-    assert "python3-venv" in said
+    message = failed(place.from_folder())
+    assert str(host) in message
+    assert "python3-venv" in message
     assert state_of(place.folder)[0] == "absent"
     assert "No module named venv" in place.folder.log.read_text()
 

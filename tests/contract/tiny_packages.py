@@ -53,8 +53,8 @@ def write_lock(path: Path, wheels: list[Path], size: int | None = None) -> Path:
     for wheel in wheels:
         name, version = wheel.name.split("-")[:2]
         digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
-        told = size or wheel.stat().st_size
-        lines.append(f"{name}=={version} --hash=sha256:{digest}  # {told} bytes, 1000 installed")
+        listed = size or wheel.stat().st_size
+        lines.append(f"{name}=={version} --hash=sha256:{digest}  # {listed} bytes, 1000 installed")
     path.write_text("\n".join(lines) + "\n")
     return path
 

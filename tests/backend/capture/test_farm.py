@@ -16,9 +16,9 @@ def test_people_whose_worker_or_renderer_is_killed_are_finished_by_another_witho
     (tmp_path / "anna.2.trouble").write_text("kill worker")
     (tmp_path / "carl.4.trouble").write_text("kill itself")
     (tmp_path / "dora.1.trouble").write_text("fail")
-    told = []
+    reports = []
     outcomes = render_on(
-        Farm(workers=2), [sys.executable, str(RENDERER), str(tmp_path)], lambda *progress: told.append(progress)
+        Farm(workers=2), [sys.executable, str(RENDERER), str(tmp_path)], lambda *progress: reports.append(progress)
     )
     assert [(outcome.subject, outcome.exit_code) for outcome in outcomes] == [
         ("anna", 0),
@@ -27,7 +27,7 @@ def test_people_whose_worker_or_renderer_is_killed_are_finished_by_another_witho
         ("dora", 1),
     ]
     assert "no texture" in outcomes[-1].error
-    assert [(done, total) for _, done, total in told] == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert [(done, total) for _, done, total in reports] == [(1, 4), (2, 4), (3, 4), (4, 4)]
     rendered = sorted((tmp_path / "log").read_text().splitlines())
     wanted = [f"{name} {view}" for name in ("anna", "bert", "carl") for view in range(6)]
     assert rendered == sorted([*wanted, "dora 0"])

@@ -84,9 +84,9 @@ def as_released(root):
     """What the authors' files are: no dataset.json, no plain twin, no other passes."""
     (root / capture_layout.DATASET_FILE).unlink()
     for name in (root / capture_layout.LIST_FILE).read_text().split():
-        for thing in (root / name).iterdir():
-            if thing.name not in ("img", "mask", "cameras.json", capture_layout.SMPL_FOLDER):
-                shutil.rmtree(thing) if thing.is_dir() else thing.unlink()
+        for path in (root / name).iterdir():
+            if path.name not in ("img", "mask", "cameras.json", capture_layout.SMPL_FOLDER):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
         (root / name / capture_layout.SMPL_FOLDER / capture_layout.SMPL_PLAIN_FILE).unlink()
 
 

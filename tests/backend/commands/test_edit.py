@@ -65,8 +65,8 @@ def same(one, two, where=slice(None)) -> bool:
 def test_each_command_writes_a_whole_person_who_tells_what_was_done(line, tmp_path, capsys, command, edit):
     cli.main(line(*command))
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
-    told = load_human(tmp_path / "out" / "person.human.safetensors").provenance["edits"][-1]
-    assert {name: told[name] for name in edit} == edit
+    last = load_human(tmp_path / "out" / "person.human.safetensors").provenance["edits"][-1]
+    assert {name: last[name] for name in edit} == edit
     assert capsys.readouterr().out.startswith(f"{tmp_path / 'out'}  {edit['edit']}, ")
 
 
@@ -103,7 +103,7 @@ def test_a_transfer_needs_no_checkpoint(line, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("command", "code", "told"),
+    ("command", "code", "sentence"),
     [
         (["vary", "--seed", "seven"], 2, "seven"),
         (["vary", "--seed", "-1"], 1, "seed -1"),
@@ -126,12 +126,12 @@ def test_a_transfer_needs_no_checkpoint(line, tmp_path):
         (["transfer", "--source", "bob.human.safetensors", "--region", "top", "--harmonise", "2"], 1, "harmonise is 2"),
     ],
 )
-def test_bad_input_is_one_sentence_and_nothing_is_written(line, tmp_path, capsys, command, code, told):
+def test_bad_input_is_one_sentence_and_nothing_is_written(line, tmp_path, capsys, command, code, sentence):
     with pytest.raises(SystemExit) as end:
         cli.main(line(*command))
     stderr = capsys.readouterr().err
     assert end.value.code == code
-    assert told in stderr
+    assert sentence in stderr
     assert code == 2 or stderr.splitlines()[-1].startswith("primdiffusion: ")
     assert "Traceback" not in stderr
     assert not (tmp_path / "out").exists()

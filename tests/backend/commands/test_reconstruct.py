@@ -59,9 +59,9 @@ def failure(capsys, line, *more) -> str:
     with pytest.raises(SystemExit) as end:
         cli.main([*line, *(str(word) for word in more)])
     assert end.value.code == 1
-    told = capsys.readouterr().err.splitlines()
+    lines = capsys.readouterr().err.splitlines()
     assert not Path(line[line.index("--out") + 1]).exists()
-    return told[-1]
+    return lines[-1]
 
 
 def test_the_command_writes_what_generate_writes_and_says_where_it_comes_from(dataset, line, tmp_path, capsys):
@@ -124,8 +124,8 @@ def test_a_dataset_in_the_released_layout_gives_the_same_person(dataset, line, t
 
 def test_one_view_works_with_a_warning_that_the_rest_is_guessed(dataset, line, tmp_path, capsys):
     cli.main([*line, "--capture", str(dataset / FIRST), "--views", "1"])
-    told = "primdiffusion: warning: only one view: the sides that it does not show are guessed\n"
-    assert capsys.readouterr().err == told
+    warning = "primdiffusion: warning: only one view: the sides that it does not show are guessed\n"
+    assert capsys.readouterr().err == warning
     assert (tmp_path / "out" / "human.npz").exists()
 
 
@@ -179,10 +179,10 @@ def test_a_missing_folder_picture_or_dataset_is_named(dataset, line, tmp_path, c
 def test_a_missing_damaged_or_foreign_checkpoint_is_named(dataset, checkpoint, tmp_path, capsys):
     cut, other = tmp_path / "cut.safetensors", save_tiny_checkpoint(tmp_path / "diffusion.safetensors")
     cut.write_bytes(checkpoint.read_bytes()[:-100])
-    for path, told in ((cut, "is truncated"), (other, "of format"), (tmp_path / "none", "there is no encoder at")):
+    for path, fault in ((cut, "is truncated"), (other, "of format"), (tmp_path / "none", "there is no encoder at")):
         line = ["reconstruct", "--capture", dataset / FIRST, "--checkpoint", path, "--out", tmp_path / "out"]
         sentence = failure(capsys, [str(word) for word in line])
-        assert told in sentence
+        assert fault in sentence
         assert str(path) in sentence
 
 

@@ -1,4 +1,4 @@
-"""What is wrong with a request to draw is said in one sentence, before any work."""
+"""One sentence says what is wrong with a request to draw, before any work."""
 
 import copy
 import math
@@ -44,7 +44,7 @@ BROKEN = [[1.0, 0.0, 0.0, 0.0], [0.0, math.nan, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"width": 0}, "0 x 48"),
         ({"height": -3}, "64 x -3"),
@@ -80,9 +80,9 @@ BROKEN = [[1.0, 0.0, 0.0, 0.0], [0.0, math.nan, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
         ({"people": None}, "people"),
     ],
 )
-def test_wrong_values_are_named_in_one_sentence(changes, said):
+def test_wrong_values_are_named_in_one_sentence(changes, message):
     with pytest.raises(ValueError) as error:
         read(**changes)
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 300

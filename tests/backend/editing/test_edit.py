@@ -322,11 +322,11 @@ def test_steps_are_counted_to_their_total_and_can_be_stopped_at_each(human, othe
         pass
 
     for name, edit in edits.items():
-        told = []
-        edit(on_step=told.append)
-        assert [step.index for step in told] == list(range(told[0].total)), name
+        steps = []
+        edit(on_step=steps.append)
+        assert [step.index for step in steps] == list(range(steps[0].total)), name
 
-        for end in range(len(told)):
+        for end in range(len(steps)):
             count = itertools.count()
 
             def stop(_, count=count, end=end):

@@ -1,4 +1,4 @@
-"""The encoder's file: what comes back, and what is refused."""
+"""The encoder's file: what comes back, and what is rejected."""
 
 import dataclasses
 import json
@@ -53,7 +53,7 @@ def test_a_truncated_file_is_rejected(saved, tmp_path, kept):
 
 
 @pytest.mark.parametrize(
-    ("metadata", "said"),
+    ("metadata", "message"),
     [
         ({"format": "pt"}, "format 'pt'"),
         ({"format_version": "9"}, "format version 9"),
@@ -65,8 +65,8 @@ def test_a_truncated_file_is_rejected(saved, tmp_path, kept):
         ({"config": json.dumps(dataclasses.asdict(TINY) | {"stem": 3})}, "does not match its own description"),
     ],
 )
-def test_a_file_that_is_something_else_is_rejected_in_one_line(saved, tmp_path, metadata, said):
-    with pytest.raises(CheckpointError, match=said) as error:
+def test_a_file_that_is_something_else_is_rejected_in_one_line(saved, tmp_path, metadata, message):
+    with pytest.raises(CheckpointError, match=message) as error:
         load_encoder(changed(saved, tmp_path / "other", **metadata))
     assert "\n" not in str(error.value)
     assert str(tmp_path / "other") in str(error.value)

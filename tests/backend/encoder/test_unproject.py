@@ -294,10 +294,12 @@ def test_what_the_marcher_draws_of_a_voxel_is_found_at_this_voxel():
     assert (cell - wanted)[:, inner, inner].abs().max() < 0.03
 
 
-# What is refused.
+# What is rejected.
 
 
-def refused(message: str, views: Views | None = None, vertices=POSED, frames: Frames | None = None, body=None) -> None:
+def assert_rejected(
+    message: str, views: Views | None = None, vertices=POSED, frames: Frames | None = None, body=None
+) -> None:
     views = person_views() if views is None else views
     look_up = (lambda: unproject_texels(views, vertices, 2, body)) if frames is None else (
         lambda: unproject_voxels(views, vertices, frames, 2)
@@ -308,20 +310,22 @@ def refused(message: str, views: Views | None = None, vertices=POSED, frames: Fr
 
 def test_views_that_are_none_batched_or_no_bytes_are_rejected():
     views = person_views()
-    refused(r"uint8 \[v, H, W, 4\], v > 0", Views(views.rgba[:0], views.camera, views.pose))
-    refused(r"\(1, 4, 40, 40, 4\): give one person's", Views(views.rgba[None], views.camera, views.pose))
-    refused("torch.float32", Views(views.rgba / 255, views.camera, views.pose))
+    assert_rejected(r"uint8 \[v, H, W, 4\], v > 0", Views(views.rgba[:0], views.camera, views.pose))
+    assert_rejected(r"\(1, 4, 40, 40, 4\): give one person's", Views(views.rgba[None], views.camera, views.pose))
+    assert_rejected("torch.float32", Views(views.rgba / 255, views.camera, views.pose))
 
 
 def test_cameras_that_do_not_go_with_the_pictures_are_rejected():
     views = person_views()
-    refused("40 x 20 pixels, but their cameras 40 x 40", Views(views.rgba[:, :20], views.camera, views.pose))
-    refused("give one for each picture", Views(views.rgba[:2], views.camera, views.pose))
+    assert_rejected("40 x 20 pixels, but their cameras 40 x 40", Views(views.rgba[:, :20], views.camera, views.pose))
+    assert_rejected("give one for each picture", Views(views.rgba[:2], views.camera, views.pose))
 
 
 def test_bodies_that_are_broken_or_others_are_rejected():
-    refused("NaN", vertices=POSED * torch.nan)
-    refused("of the same body", vertices=POSED[:-1])
-    refused("of the same body", vertices=POSED[None])
-    refused("no UV", vertices=plates(0.0).template, body=BodyModel(**{**vars(plates(0.0)), "uv": torch.zeros(0, 2)}))
-    refused("give one person's 1024", frames=FRAMES.map(lambda tensor: tensor[:5]))
+    assert_rejected("NaN", vertices=POSED * torch.nan)
+    assert_rejected("of the same body", vertices=POSED[:-1])
+    assert_rejected("of the same body", vertices=POSED[None])
+    assert_rejected(
+        "no UV", vertices=plates(0.0).template, body=BodyModel(**{**vars(plates(0.0)), "uv": torch.zeros(0, 2)})
+    )
+    assert_rejected("give one person's 1024", frames=FRAMES.map(lambda tensor: tensor[:5]))

@@ -215,7 +215,7 @@ def test_an_imported_file_that_contradicts_itself_is_rejected(copied):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ("truncated", "truncated"),
         ("stage 1", "stage 1, the encoder, which is not imported"),
@@ -226,7 +226,7 @@ def test_an_imported_file_that_contradicts_itself_is_rejected(copied):
         ("unknown tensor", "'diffusion.label_emb.weight'"),
     ],
 )
-def test_what_cannot_be_imported_is_rejected_in_a_sentence_and_nothing_written(tmp_path, capsys, change, told):
+def test_what_cannot_be_imported_is_rejected_in_a_sentence_and_nothing_written(tmp_path, capsys, change, message):
     prepared(tmp_path)
     weights, smpl, uv = (tmp_path / name for name in ("primdiffusion.pt", "SMPL_NEUTRAL.pkl", "smpl_uv.obj"))
     if change == "truncated":
@@ -244,7 +244,7 @@ def test_what_cannot_be_imported_is_rejected_in_a_sentence_and_nothing_written(t
         cli.main(line(tmp_path))
     error = capsys.readouterr().err.strip()
     assert end.value.code == 1
-    assert told in error
+    assert message in error
     assert "\n" not in error
     assert not (tmp_path / "imported.safetensors").exists()
 

@@ -1,4 +1,4 @@
-"""The authors' checkpoints: what a file must hold, tensor by tensor, and what is refused."""
+"""The authors' checkpoints: what a file must hold, tensor by tensor, and what is rejected."""
 
 import os
 import pickle
@@ -133,7 +133,7 @@ class Hostile:
 
 
 def bad_file(path, kind):
-    """Writes a file and returns what the refusal must say."""
+    """Writes a file and returns what the error must say."""
     if kind == "hostile torch file":
         torch.save({"model_state_dict": {"betas": Hostile()}}, path)
         return "nothing was executed"

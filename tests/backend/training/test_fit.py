@@ -61,11 +61,11 @@ def test_a_run_leaves_settings_versions_metrics_pictures_state_and_encoder(captu
     assert not (ROOT / ".git").exists() or about["starts"][0]["commit"]
     (picture,) = (config.run / PICTURES).iterdir()
     assert Image.open(picture).size == (5 * 24, 2 * 24)
-    told = [row for row in rows(config.run) if "rgb" in row]
-    assert [row["step"] for row in told] == [1, 2, 3, 4]
+    logged = [row for row in rows(config.run) if "rgb" in row]
+    assert [row["step"] for row in logged] == [1, 2, 3, 4]
     terms = {"rgb", "silhouette", "volume", "gradient"}
     times = {"seconds_data", "seconds_forward", "seconds_march", "seconds_backward", "seconds"}
-    assert told[0].keys() == {"step"} | terms | times
+    assert logged[0].keys() == {"step"} | terms | times
     measured = [row for row in rows(config.run) if "psnr_train" in row]
     assert [row["step"] for row in measured] == [2, 4]
     assert all(np.isfinite([row["psnr_train"], row["psnr_held"]]).all() for row in measured)

@@ -45,10 +45,10 @@ PRIVATE = ("anna", "Müller", "Secret", "Kunde", "server7", "freigabe")
     ],
 )
 def test_no_way_of_writing_a_path_reveals_a_user(path, written):
-    said = redact(written(path), NAMES)
+    redacted = redact(written(path), NAMES)
     for secret in PRIVATE:
-        assert secret.lower() not in said.lower()
-        assert quote(secret).lower() not in said.lower()
+        assert secret.lower() not in redacted.lower()
+        assert quote(secret).lower() not in redacted.lower()
 
 
 def test_what_helps_to_find_the_fault_stays():

@@ -38,7 +38,7 @@ def write_scan(path: Path, matrix: np.ndarray | None = None, **parameters: objec
 
 
 @pytest.mark.parametrize(
-    ("ending", "matrix", "told"),
+    ("ending", "matrix", "note"),
     [
         (".obj", np.eye(3), ""),
         (".glb", np.eye(3), ""),
@@ -48,9 +48,9 @@ def write_scan(path: Path, matrix: np.ndarray | None = None, **parameters: objec
         (".glb", np.eye(3) * 0.1, "scaled by 10: it is ten times too small"),
     ],
 )
-def test_a_static_scan_is_posed_as_the_body_is(tmp_path, empty_scene, ending, matrix, told):
+def test_a_static_scan_is_posed_as_the_body_is(tmp_path, empty_scene, ending, matrix, note):
     scan = load(write_scan(tmp_path / f"anna{ending}", matrix))
-    assert not told or told in scan.notes
+    assert not note or note in scan.notes
     np.testing.assert_allclose(scan.betas, BETAS)
     joints = scan.pose(ROTATIONS, MOVE)
     vertices, expected, _ = BODY.pose(BETAS, ROTATIONS, MOVE)

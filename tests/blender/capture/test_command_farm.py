@@ -48,10 +48,10 @@ def test_a_killed_workers_person_is_finished_by_another_and_no_view_is_lost_or_d
             blender = next(child for child in psutil.process_iter() if _renders(child, killed))
             os.kill(blender.ppid(), signal.SIGKILL)
         time.sleep(0.02)
-    told = process.stdout.read()
-    assert process.returncode == 0, told
+    output = process.stdout.read()
+    assert process.returncode == 0, output
     assert killed in NAMES
-    assert sorted(line.split()[1] for line in told.splitlines() if "/3 " in line) == sorted(NAMES)
+    assert sorted(line.split()[1] for line in output.splitlines() if "/3 " in line) == sorted(NAMES)
     assert verify(out) == {}
     assert len(list(out.glob("*/img/*/*.jpg"))) == 3 * 2 * 4
     assert all(path.stat().st_ino == inode for path, inode in written.items()), "a whole view was rendered again"

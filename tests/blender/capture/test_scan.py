@@ -69,10 +69,10 @@ def test_units_and_axes_that_were_corrected_are_reported(tmp_path, empty_scene):
     _, armature = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
     scan_fixtures.move([armature], quarter(0) @ np.diag([10.0, 10, 10, 1]))
     scan = load(scan_fixtures.save(tmp_path / "anna.glb"))
-    told = "; ".join(scan.notes)
-    assert "scaled by 0.1: it is ten times too large" in told
-    assert "-y was up after import: turned upright" in told
-    assert "bones as Mixamo names them" in told
+    notes = "; ".join(scan.notes)
+    assert "scaled by 0.1: it is ten times too large" in notes
+    assert "-y was up after import: turned upright" in notes
+    assert "bones as Mixamo names them" in notes
 
 
 def test_bounds_are_those_of_what_blender_draws(tmp_path, empty_scene):
@@ -142,7 +142,7 @@ def test_a_lamp_and_a_mesh_that_nothing_moves_are_left_out_and_reported(tmp_path
     scan = load(scan_fixtures.save(tmp_path / "anna.glb"))
     assert len(scan.objects) == 1
     assert "left out, as no bone moves it: Cube" in scan.notes
-    assert not any(thing.type == "LIGHT" for thing in bpy.data.objects)
+    assert not any(obj.type == "LIGHT" for obj in bpy.data.objects)
 
 
 def test_unknown_bones_are_named(tmp_path, empty_scene):

@@ -116,8 +116,8 @@ def test_a_texture_is_chosen_by_its_name(scan, pictures, chosen):
     assert (found.name if found else None) == chosen
 
 
-def base_image(thing: bpy.types.Object) -> str:
-    nodes = thing.material_slots[0].material.node_tree.nodes
+def base_image(obj: bpy.types.Object) -> str:
+    nodes = obj.material_slots[0].material.node_tree.nodes
     shader = next(node for node in nodes if node.type == "BSDF_PRINCIPLED")
     return Path(shader.inputs["Base Color"].links[0].from_node.image.filepath).name
 

@@ -50,8 +50,8 @@ def put(stage: Stage, frame: int = 1, **materials) -> PaintedPerson:
     with stage.entered() as own:
         person = PaintedPerson(own, read_body(), materials.get("paint") or plain((0.5, 0.25, 0.1)))
         person.pose(POSES.rotations[frame], POSES.translations[frame])
-        for thing in person.objects:
-            mark_parts(thing, person.joint_of_group)
+        for obj in person.objects:
+            mark_parts(obj, person.joint_of_group)
         prepare_materials(person.objects, unlit=True)
     return person
 
@@ -62,10 +62,10 @@ def sphere(stage: Stage, centre, radius: float, paint: bpy.types.Material) -> bp
         mesh = bpy.data.meshes.new("ball")
         mesh.from_pydata(ball.vertices.tolist(), [], ball.faces.tolist())
         mesh.materials.append(paint)
-        thing = bpy.data.objects.new("ball", mesh)
-        thing.location = points_to_blender(np.asarray(centre))
-        own.scene.collection.objects.link(thing)
-    return thing
+        obj = bpy.data.objects.new("ball", mesh)
+        obj.location = points_to_blender(np.asarray(centre))
+        own.scene.collection.objects.link(obj)
+    return obj
 
 
 def cast(person: PaintedPerson, view: View) -> tuple[np.ndarray, np.ndarray]:

@@ -14,11 +14,10 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 import pytest
-from backend_python import found
-from engine_stage import pixels
+from backend_python import use_this_python
+from engine_stage import pixels, set_up_render
 
 import blender_primdiffusion
-from blender_primdiffusion import places
 from blender_primdiffusion.backend.environment import BackendPython
 from blender_primdiffusion.engine import final, studio
 from blender_primdiffusion.engine.frames import CHANNELS, SharedFrames
@@ -34,24 +33,18 @@ COLOUR = np.round(255 * np.array([0.5372549, 0.7372549, 0.88235295, 1.0]))
 @pytest.fixture
 def stage(saved_scene, tmp_path, monkeypatch):
     """The engine on the fake child, with a camera."""
-    python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", found(python))
-    monkeypatch.setattr(places, "backend_module_path", lambda: FAKE)
+    use_this_python(monkeypatch, FAKE)
     blender_primdiffusion.register()
     scene = saved_scene.scene
-    scene.render.engine = "PRIMDIFFUSION"
-    scene.render.resolution_x, scene.render.resolution_y = SIZE
-    scene.render.dither_intensity = 0
-    scene.view_settings.view_transform = "Standard"
+    set_up_render(scene, SIZE, (0, 0, 0), (0, 0, 0))
+    scene.render.film_transparent = False
     scene.render.filepath = str(tmp_path / "picture.png")
-    scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-    scene.collection.objects.link(scene.camera)
     yield SimpleNamespace(scene=scene, out=tmp_path / "picture.png")
     blender_primdiffusion.unregister()
 
 
 class Engine:
-    """Stands in for Blender's side of a render: counts what it is told, and stops when asked to."""
+    """Stands in for Blender's side of a render: records messages and progress, and stops when asked to."""
 
     camera_override = None
     resolution_x, resolution_y = SIZE
@@ -250,15 +243,10 @@ def test_blender_exits_while_the_engine_is_the_active_one():
 EXIT_WHILE_DRAWING = """
 import sys, os, threading, time
 from pathlib import Path
-import bpy, blender_primdiffusion as b
-from blender_primdiffusion import places
-from blender_primdiffusion.backend import environment
-from blender_primdiffusion.backend.environment import BackendPython
-def search(*_, **__):
-    yield
-    return BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-environment.search = search
-places.backend_module_path = lambda: Path(sys.argv[1])
+import bpy, blender_primdiffusion as b, pytest
+sys.path.insert(0, str(Path(sys.argv[1]).parent))
+from backend_python import use_this_python
+use_this_python(pytest.MonkeyPatch(), Path(sys.argv[1]))
 b.register()
 from blender_primdiffusion.engine import studio
 frame = studio.frames.take("view", 8, 8)

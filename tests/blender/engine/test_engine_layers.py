@@ -7,54 +7,25 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 import pytest
-from engine_stage import PYTHON, Oracle, cube, material, pixels, render_exr, thinned
-
-import blender_primdiffusion
-from blender_primdiffusion.scene.build import build_human
+from engine_stage import add_human, cube, material, pixels, render_exr, set_up_render
 
 SIDE = 96
 BEFORE, BEHIND, TORSO = (37, 48), (37, 60), (44, 43)
 """Pixels (row, column) of the cube before the person, of the one behind that looks out beside it, of bare torso."""
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """Of a person."""
-    folder = tmp_path_factory.mktemp("people")
-    oracle = Oracle(folder)
-    oracle.ask({"make": str(folder), "seed": 1, "betas": [0.0] * 10})
-    oracle.close()
-    thinned(folder / "human.npz")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def extension():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PRIMDIFFUSION_PYTHON", PYTHON)
-        blender_primdiffusion.register()
-        yield
-        blender_primdiffusion.unregister()
-
-
 @pytest.fixture
 def shot(extension, saved_scene, folder, tmp_path):
     """Two scenes with the same person, a red cube before, a blue one behind: one for Cycles, one for the engine."""
     solid = saved_scene.scene
-    person = build_human(bpy.context, folder / "few.npz", keep=[folder / "person.human.safetensors"])
+    person = add_human(folder)
     cube("before", (0.0, -0.6, 1.2), 0.1).data.materials.append(material((0.8, 0.05, 0.05)))
     cube("behind", (0.15, 0.6, 1.2), 0.3).data.materials.append(material((0.05, 0.05, 0.8), "blue"))
     lamp = bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "SUN"))
-    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-    camera.location, camera.rotation_euler = (0.0, -4.0, 1.0), (np.pi / 2, 0, 0)
     lamp.rotation_euler = (0.9, 0, 0.3)
-    for thing in (lamp, camera):
-        solid.collection.objects.link(thing)
-    solid.camera, solid.name = camera, "Solid"
-    solid.render.resolution_x = solid.render.resolution_y = SIDE
-    solid.render.dither_intensity = 0
-    solid.view_settings.view_transform = "Standard"
-    solid.render.engine = "CYCLES"
+    solid.collection.objects.link(lamp)
+    set_up_render(solid, (SIDE, SIDE), (0.0, -4.0, 1.0), (np.pi / 2, 0, 0))
+    solid.name, solid.render.engine, solid.render.film_transparent = "Solid", "CYCLES", False
     solid.cycles.samples, solid.cycles.device, solid.cycles.seed = 4, "CPU", 1
     bpy.ops.scene.new(type="LINK_COPY")
     people = bpy.context.scene
@@ -118,7 +89,7 @@ def test_depth_of_solids_is_cycles_to_a_centimetre(shot):
     for name, turn in (("before", (0.3, 0.2, 0.5)), ("behind", (0.1, 0.4, -0.6))):
         bpy.data.objects[name].rotation_euler = turn
     shot.people.primdiffusion_render.solids = "SHADED"
-    next(thing for thing in shot.people.objects if thing.type == "ARMATURE").hide_render = True
+    next(obj for obj in shot.people.objects if obj.type == "ARMATURE").hide_render = True
     _, given = layers(shot, shot.people)
     _, cycles = layers(shot, shot.solid)
     both = (given < 1e9) & (cycles < 1e9)

@@ -11,23 +11,20 @@ import numpy as np
 import pytest
 import synthetic
 from engine_stage import (
-    PYTHON,
     STEP,
     Z_UP,
-    Oracle,
+    add_human,
     camera_by_hand,
     eight_bit,
     pixels,
     read_layers,
     render_exr,
     render_png,
-    thinned,
+    set_up_render,
 )
 from mathutils import Euler, Matrix
 
-import blender_primdiffusion
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of, remove_human
 
 SIZE = (120, 90)
@@ -35,52 +32,22 @@ REST = np.tile(np.eye(3), (24, 1, 1))
 
 
 @pytest.fixture(scope="module")
-def backend(tmp_path_factory):
+def backend(oracle, folder, tmp_path_factory):
     """The oracle, and the folders of two people it has made."""
-    folder = tmp_path_factory.mktemp("people")
-    oracle = Oracle(folder)
-    folders = [folder / "first", folder / "second"]
-    oracle.ask({"make": str(folders[0]), "seed": 1, "betas": [0.0] * 10})
-    oracle.ask({"make": str(folders[1]), "seed": 2, "betas": [1.5, -1.0, 0.5] + [0.0] * 7})
-    for person in folders:
-        thinned(person / "human.npz")
-    yield SimpleNamespace(oracle=oracle, folders=folders)
-    oracle.close()
-
-
-@pytest.fixture(scope="module")
-def extension():
-    """Registered once: the child is kept warm between the tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PRIMDIFFUSION_PYTHON", PYTHON)
-        blender_primdiffusion.register()
-        yield
-        blender_primdiffusion.unregister()
+    second = oracle.make(tmp_path_factory.mktemp("second"), 2, [1.5, -1.0, 0.5] + [0.0] * 7)
+    return SimpleNamespace(oracle=oracle, folders=[folder, second])
 
 
 @pytest.fixture
 def stage(extension, saved_scene, backend, tmp_path):
     """One person before a camera, transparent film, colours as they are."""
     scene = saved_scene.scene
-    scene.render.engine = "PRIMDIFFUSION"
-    scene.render.resolution_x, scene.render.resolution_y = SIZE
-    scene.render.resolution_percentage = 100
-    scene.render.film_transparent = True
-    scene.render.dither_intensity = 0
-    scene.view_settings.view_transform = "Standard"
+    camera = set_up_render(scene, SIZE, (0.5, -3.0, 1.2), (math.radians(84), 0, math.radians(9)))
     scene.primdiffusion_render.step = STEP
-    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-    scene.collection.objects.link(camera)
-    scene.camera = camera
-    camera.location, camera.rotation_euler = (0.5, -3.0, 1.2), (math.radians(84), 0, math.radians(9))
-    person = add_person(saved_scene, backend.folders[0])
+    person = add_human(backend.folders[0])
     return SimpleNamespace(
         scene=scene, camera=camera, person=person, armature=armature_of(person), out=tmp_path / "picture.png"
     )
-
-
-def add_person(context, folder):
-    return build_human(context, folder / "few.npz", keep=[folder / "person.human.safetensors"])
 
 
 def as_asked(folder, armature, rotations=REST, translation=(0, 0, 0)) -> dict:
@@ -192,8 +159,8 @@ def test_a_posed_scaled_and_rotated_armature_renders_as_posed(stage, backend, se
 def test_constraints_parents_and_drivers_reach_the_picture(stage, backend):
     target = bpy.data.objects.new("target", None)
     parent = bpy.data.objects.new("parent", None)
-    for thing in (target, parent):
-        stage.scene.collection.objects.link(thing)
+    for obj in (target, parent):
+        stage.scene.collection.objects.link(obj)
     parent.location, parent.rotation_euler = (0.1, 0.4, 0.0), (0.0, 0.0, 0.5)
     stage.armature.parent = parent
     turn = synthetic.axis_angle(np.array([0.0, 0.0, 0.9]))
@@ -231,7 +198,7 @@ def test_every_frame_of_an_animation_has_its_own_pose(stage, backend, tmp_path):
 
 
 def test_two_people_share_one_picture_and_the_hidden_are_left_out(stage, backend):
-    second = add_person(bpy.context, backend.folders[1])
+    second = add_human(backend.folders[1])
     armature_of(second).location.x += 0.35
     armature_of(second).location.y += 0.3
     bpy.context.view_layer.update()

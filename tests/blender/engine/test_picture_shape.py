@@ -9,11 +9,9 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
-from engine_stage import PYTHON, STEP, Z_UP, Oracle, camera_by_hand, eight_bit, render_png, thinned
+from engine_stage import STEP, Z_UP, add_human, camera_by_hand, eight_bit, render_png, set_up_render
 
-import blender_primdiffusion
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.shape import betas_of
 
@@ -21,29 +19,12 @@ SIZE = (120, 90)
 
 
 @pytest.fixture
-def stage(saved_scene, tmp_path, monkeypatch):
+def stage(extension, saved_scene, oracle, folder, tmp_path):
     """A person of the backend before a camera."""
-    monkeypatch.setenv("PRIMDIFFUSION_PYTHON", PYTHON)
-    blender_primdiffusion.register()
-    oracle, folder = Oracle(tmp_path), tmp_path / "person"
-    oracle.ask({"make": str(folder), "seed": 1, "betas": [0.0] * 10})
-    person = build_human(saved_scene, thinned(folder / "human.npz"), keep=[folder / "person.human.safetensors"])
-    scene = saved_scene.scene
-    scene.render.engine = "PRIMDIFFUSION"
-    scene.render.resolution_x, scene.render.resolution_y = SIZE
-    scene.render.resolution_percentage = 100
-    scene.render.film_transparent = True
-    scene.render.dither_intensity = 0
-    scene.view_settings.view_transform = "Standard"
-    scene.primdiffusion_render.step = STEP
-    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-    scene.collection.objects.link(camera)
-    scene.camera = camera
-    camera.location, camera.rotation_euler = (0.5, -3.4, 1.2), (math.radians(84), 0, math.radians(9))
-    yield SimpleNamespace(person=person, camera=camera, oracle=oracle, folder=folder, out=tmp_path / "picture.png")
-    oracle.close()
-    scene.render.engine = "CYCLES"
-    blender_primdiffusion.unregister()
+    camera = set_up_render(saved_scene.scene, SIZE, (0.5, -3.4, 1.2), (math.radians(84), 0, math.radians(9)))
+    saved_scene.scene.primdiffusion_render.step = STEP
+    person = add_human(folder)
+    return SimpleNamespace(person=person, camera=camera, oracle=oracle, folder=folder, out=tmp_path / "picture.png")
 
 
 def test_the_engine_draws_a_reshaped_posed_person_as_the_backend_does(stage):

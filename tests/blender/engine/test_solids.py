@@ -7,47 +7,16 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 import pytest
-from engine_stage import PYTHON, Oracle, cube, material, render_exr, render_png, thinned
+from engine_stage import add_human, cube, material, render_exr, render_png, set_up_render
 
-import blender_primdiffusion
 from blender_primdiffusion.engine.solids import base_colour, changed_by, scene_solids, stored
-from blender_primdiffusion.scene.build import build_human
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """Of a person."""
-    folder = tmp_path_factory.mktemp("people")
-    oracle = Oracle(folder)
-    oracle.ask({"make": str(folder), "seed": 1, "betas": [0.0] * 10})
-    oracle.close()
-    thinned(folder / "human.npz")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def extension():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PRIMDIFFUSION_PYTHON", PYTHON)
-        blender_primdiffusion.register()
-        yield
-        blender_primdiffusion.unregister()
 
 
 @pytest.fixture
 def stage(extension, saved_scene, tmp_path):
     """A camera at (0, -4, 1) that looks along y; 96 x 96 pixels, transparent."""
-    scene = saved_scene.scene
-    scene.render.engine = "PRIMDIFFUSION"
-    scene.render.resolution_x = scene.render.resolution_y = 96
-    scene.render.film_transparent = True
-    scene.render.dither_intensity = 0
-    scene.view_settings.view_transform = "Standard"
-    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-    scene.collection.objects.link(camera)
-    camera.location, camera.rotation_euler = (0.0, -4.0, 1.0), (np.pi / 2, 0, 0)
-    scene.camera = camera
-    return SimpleNamespace(scene=scene, out=tmp_path / "picture.png")
+    set_up_render(saved_scene.scene, (96, 96), (0.0, -4.0, 1.0), (np.pi / 2, 0, 0))
+    return SimpleNamespace(scene=saved_scene.scene, out=tmp_path / "picture.png")
 
 
 def solids_now():
@@ -97,8 +66,8 @@ def test_curves_texts_metaballs_and_instances_count(stage):
     ball.elements.new()
     counts = []
     for data in (curve, text, ball):
-        thing = bpy.data.objects.new(data.name, data)
-        stage.scene.collection.objects.link(thing)
+        obj = bpy.data.objects.new(data.name, data)
+        stage.scene.collection.objects.link(obj)
         counts.append(len(solids_now().corners))
     assert 0 < counts[0] < counts[1] < counts[2]
     group = bpy.data.collections.new("group")
@@ -114,23 +83,23 @@ def test_curves_texts_metaballs_and_instances_count(stage):
 
 
 def test_a_persons_own_body_is_left_out_even_when_shown(stage, folder):
-    person = build_human(bpy.context, folder / "few.npz", keep=[folder / "person.human.safetensors"])
-    body = next(thing for thing in person.objects if thing.type == "MESH")
+    person = add_human(folder)
+    body = next(obj for obj in person.objects if obj.type == "MESH")
     body.hide_render = body.hide_viewport = False
     assert len(solids_now().corners) == 0
 
 
 def test_objects_hidden_in_renders_or_from_the_camera_are_not_rendered(stage):
-    thing = cube()
+    obj = cube()
     assert render_png(stage.out)[..., 3].any()
-    thing.hide_render = True
+    obj.hide_render = True
     assert not render_png(stage.out).any()
-    thing.hide_render, thing.visible_camera = False, False
+    obj.hide_render, obj.visible_camera = False, False
     assert not render_png(stage.out).any()
 
 
 def test_only_changes_that_affect_solids_make_them_read_again(stage, folder):
-    thing = cube()
+    obj = cube()
     seen = []
     handler = lambda _scene, depsgraph: seen.append(changed_by(depsgraph))  # noqa: E731
     bpy.app.handlers.depsgraph_update_post.append(handler)
@@ -139,8 +108,8 @@ def test_only_changes_that_affect_solids_make_them_read_again(stage, folder):
         seen.clear()
         for change in (
             lambda: setattr(stage.scene.camera, "location", (0, -3, 1)),
-            lambda: setattr(thing, "location", (0.1, 0, 1)),
-            lambda: thing.data.vertices[0].co.__setitem__(0, 0.5) or thing.data.update(),
+            lambda: setattr(obj, "location", (0.1, 0, 1)),
+            lambda: obj.data.vertices[0].co.__setitem__(0, 0.5) or obj.data.update(),
         ):
             change()
             bpy.context.view_layer.update()
@@ -172,7 +141,7 @@ def test_a_mesh_with_nan_is_an_error_that_names_the_object(stage):
 @pytest.fixture
 def pair(stage, folder):
     """A person at the origin and a cube at the height of the chest."""
-    build_human(bpy.context, folder / "few.npz", keep=[folder / "person.human.safetensors"])
+    add_human(folder)
     box = cube(centre=(0.0, 0.0, 1.2), half=0.1)
     box.data.materials.append(material((0.9, 0.02, 0.02)))
     return stage, box

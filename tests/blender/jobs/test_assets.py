@@ -97,7 +97,7 @@ def test_another_file_finds_the_volumes_of_a_person_it_appends_or_links(person, 
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
     (person,) = humans(bpy.context.scene)
-    volumes = [thing.data for thing in person.all_objects if thing.type == "VOLUME"]
+    volumes = [obj.data for obj in person.all_objects if obj.type == "VOLUME"]
     assert len(volumes) == 8
     assert all(volume_path(volume).is_file() for volume in volumes)
     assert person_file(person).is_file()
@@ -166,13 +166,13 @@ def test_what_cannot_be_an_asset_is_reported(addon, tmp_path):
     ops.generate(seed=7, steps=1)
     (tmp_path / "text.png").write_text("no picture")
     (tmp_path / "file").write_text("")
-    refused = {
+    rejected = {
         "cannot be read as a picture": lambda: ops.mark_human_as_asset(picture=str(tmp_path / "text.png")),
         "cannot be read as a picture:": lambda: ops.mark_pose_as_asset(picture="/nowhere.png"),
         "'Eve' is not in the scene": lambda: ops.mark_human_as_asset(human="Eve"),
         "Not a directory|File exists": lambda: ops.make_pose_assets(directory=str(tmp_path / "file" / "deeper")),
     }
-    for sentence, call in refused.items():
+    for sentence, call in rejected.items():
         with pytest.raises(RuntimeError, match=sentence):
             call()
     assert not bpy.data.actions

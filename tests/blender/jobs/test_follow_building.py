@@ -49,7 +49,7 @@ def files_of_people(folder: Path) -> list[Path]:
 
 
 def check_whole(person: bpy.types.Collection) -> None:
-    shown = [volume_path(thing.data) for thing in person.all_objects if thing.type == "VOLUME"]
+    shown = [volume_path(obj.data) for obj in person.all_objects if obj.type == "VOLUME"]
     assert len(shown) == COUNT
     assert all(path.is_file() and path.parent == folder_of(person) for path in shown)
     assert person_file(person).parent == folder_of(person)

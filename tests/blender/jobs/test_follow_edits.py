@@ -61,7 +61,7 @@ def until_read(seconds: float = 30.0) -> None:
 
 
 def shown(person) -> dict[str, Path]:
-    return {thing.name: volume_path(thing.data) for thing in person.all_objects if thing.type == "VOLUME"}
+    return {obj.name: volume_path(obj.data) for obj in person.all_objects if obj.type == "VOLUME"}
 
 
 def on_disk(folder: Path) -> list[str]:
@@ -72,7 +72,7 @@ def check_whole(person, count: int = COUNT) -> None:
     files = shown(person).values()
     assert len(files) == count
     assert all(path.is_file() for path in files)
-    assert all(thing.data.grids.load() for thing in person.all_objects if thing.type == "VOLUME")
+    assert all(obj.data.grids.load() for obj in person.all_objects if obj.type == "VOLUME")
     assert person_file(person).parent == next(iter(files)).parent
     assert not list(person_file(person).parent.glob(".writing_*"))
 
@@ -81,7 +81,7 @@ def check_drawn(person) -> None:
     """Blender has the grids of all volumes in what it draws, also of those that it has missed."""
     bpy.context.view_layer.update()
     graph = bpy.context.evaluated_depsgraph_get()
-    drawn = [thing.evaluated_get(graph).data for thing in person.all_objects if thing.type == "VOLUME"]
+    drawn = [obj.evaluated_get(graph).data for obj in person.all_objects if obj.type == "VOLUME"]
     assert [(len(volume.grids), volume.grids.error_message) for volume in drawn] == [(2, "")] * COUNT
 
 
@@ -163,7 +163,7 @@ def test_undo_that_makes_the_person_another_meanwhile_rejects_the_result(person,
 
 
 def test_volumes_deleted_and_brought_back_meanwhile_show_what_they_should(person, monkeypatch):
-    removed = next(thing for thing in person.all_objects if thing.type == "VOLUME").name
+    removed = next(obj for obj in person.all_objects if obj.type == "VOLUME").name
     before = shown(person)
     bpy.data.objects.remove(bpy.data.objects[removed])
     bpy.ops.ed.undo_push(message="a volume deleted")
@@ -179,14 +179,14 @@ def test_volumes_deleted_and_brought_back_meanwhile_show_what_they_should(person
 
 
 def test_a_volume_deleted_meanwhile_stays_so(varied):
-    bpy.data.objects.remove(next(thing for thing in varied.all_objects if thing.type == "VOLUME"))
+    bpy.data.objects.remove(next(obj for obj in varied.all_objects if obj.type == "VOLUME"))
     drive()
     assert "11 of 11 volumes of Human changed" in notice_of("vary")
     check_whole(varied, COUNT - 1)
 
 
 def test_a_person_reshaped_meanwhile_keeps_that_shape(varied):
-    armature = next(thing for thing in varied.objects if thing.type == "ARMATURE")
+    armature = next(obj for obj in varied.objects if obj.type == "ARMATURE")
     armature.primdiffusion_human.betas[0] = 1.25
     drive()
     assert armature.primdiffusion_human.betas[0] == pytest.approx(1.25)
@@ -314,7 +314,7 @@ def lost(person, monkeypatch):
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
     (person,) = humans(bpy.context.scene)
     bpy.context.view_layer.update()
-    assert not all(thing.data.grids.load() for thing in person.all_objects if thing.type == "VOLUME")  # seen by Blender
+    assert not all(obj.data.grids.load() for obj in person.all_objects if obj.type == "VOLUME")  # seen by Blender
     queue.add(bpy.context, RestoreJob(HumanTarget.of(person), str(person_file(person))))
     until_read()
     return person
@@ -352,7 +352,7 @@ def test_a_person_generated_again_is_written_in_the_thread(person, monkeypatch):
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
     (person,) = humans(bpy.context.scene)
     bpy.context.view_layer.update()
-    assert not any(thing.data.grids.load() for thing in person.all_objects if thing.type == "VOLUME")
+    assert not any(obj.data.grids.load() for obj in person.all_objects if obj.type == "VOLUME")
     queue.add(bpy.context, RegenerateJob(HumanTarget.of(person), made))
     until_read()
     drive()

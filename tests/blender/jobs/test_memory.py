@@ -42,9 +42,9 @@ def ended(pid: int, seconds: float = 3.0) -> bool:
 
 def test_release_ends_the_child_reports_the_freed_memory_and_the_next_job_starts_another(addon):
     pid = started_and_idle()
-    said = memory.release()
-    assert said.startswith("1 process ended, 0.")
-    assert "GB of memory" in said  # of the process; then what Blender gave back, where tests before left grids
+    message = memory.release()
+    assert message.startswith("1 process ended, 0.")
+    assert "GB of memory" in message  # of the process; then what Blender gave back, where tests before left grids
     assert ended(pid)
     assert memory.release() == "nothing to release: the backend is not running"
     assert ops.release_memory() == {"FINISHED"}

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
-from backend_python import found
 
-import blender_primdiffusion
-from blender_primdiffusion.backend.client import BackendClient
-from blender_primdiffusion.backend.environment import BackendPython
-from blender_primdiffusion.jobs import queue
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import attachment_of, set_attachment
 from blender_primdiffusion.scene.human import armature_of, humans, sequence_files, volume_path
@@ -25,24 +19,9 @@ ops = bpy.ops.primdiffusion
 
 
 @pytest.fixture
-def person(saved_scene, tmp_path, monkeypatch):
-    from tiny_model import save_tiny_checkpoint
-
-    checkpoint = save_tiny_checkpoint(tmp_path / "tiny.safetensors")
-    python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", found(python))
-    monkeypatch.setattr(queue, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
-    # With a cache in Blender's temporary folder the child would compile its marcher anew for each test.
-    monkeypatch.setattr(
-        "blender_primdiffusion.backend.client.BackendClient",
-        lambda python, module, cache_dir: BackendClient(python, module),
-    )
-    blender_primdiffusion.register()
-    try:
-        ops.generate(seed=1, steps=2)
-        yield humans(saved_scene.scene)[0]
-    finally:
-        blender_primdiffusion.unregister()
+def person(real_child):
+    ops.generate(seed=1, steps=2)
+    return humans(real_child.scene)[0]
 
 
 def filled_box(path: Path) -> np.ndarray:

@@ -48,7 +48,7 @@ def reopened(path: Path | str = ""):
 
 
 def whole(person) -> bool:
-    volumes = {thing.data for thing in person.all_objects if thing.type == "VOLUME"}
+    volumes = {obj.data for obj in person.all_objects if obj.type == "VOLUME"}
     assert len(volumes) == COUNT
     return all(volume.grids.load() for volume in volumes) and person_file(person).is_file() and not missing_files()
 

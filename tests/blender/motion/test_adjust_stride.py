@@ -99,8 +99,8 @@ def test_a_fast_camera_that_trembles_by_a_millimetre_gives_nearly_the_same():
     assert stride_ratio(shaken, longer_legs(1.15)) == pytest.approx(1.15, abs=0.04)
 
 
-@pytest.mark.parametrize(("fit_stride", "way", "told"), [(True, 1.15, "x 1.1"), (False, 1.0, "as in the file")])
-def test_an_amass_walk_on_longer_legs_goes_as_far_as_they_step(saved_scene, tmp_path, walk, fit_stride, way, told):
+@pytest.mark.parametrize(("fit_stride", "way", "fact"), [(True, 1.15, "x 1.1"), (False, 1.0, "as in the file")])
+def test_an_amass_walk_on_longer_legs_goes_as_far_as_they_step(saved_scene, tmp_path, walk, fit_stride, way, fact):
     write_amass(tmp_path / "walk.npz", walk, np.zeros(10))
     armature = build_armature("long", points_to_blender(longer_legs(1.15)))
     saved_scene.scene.collection.objects.link(armature)
@@ -111,4 +111,4 @@ def test_an_amass_walk_on_longer_legs_goes_as_far_as_they_step(saved_scene, tmp_
         saved_scene.scene.frame_set(frame)
         ends.append(np.array(armature.pose.bones["pelvis"].head))
     assert np.linalg.norm((ends[1] - ends[0])[:2]) == pytest.approx(way * STEPS / 2 * 1.28, rel=0.03)
-    assert json.loads(armature.animation_data.action[FACTS])["Stride"].startswith(told)
+    assert json.loads(armature.animation_data.action[FACTS])["Stride"].startswith(fact)

@@ -243,3 +243,16 @@ def test_the_panel_shows_pictures_and_offers_to_delete_only_own_poses(addon, arm
     ops.save_pose(pose_name="mine")
     assert "primdiffusion.delete_pose" in buttons()
     assert "mine" in [item[0] for item in pose_panel.pose_items(None, addon)]
+
+
+def test_a_hand_keyed_pose_is_where_it_was(addon, armature):
+    armature.pose.bones["head"].rotation_mode = "XYZ"
+    armature.pose.bones["head"].rotation_euler = (0.3, 0.1, 0)
+    wanted = current_pose(armature)[0][15]
+    addon.scene.frame_set(7)
+    armature.pose.bones["head"].rotation_euler = (0.3, 0.1, 0)
+    assert ops.key_pose() == {"FINISHED"}
+    addon.scene.frame_set(9)
+    np.testing.assert_allclose(current_pose(armature)[0][15], wanted, atol=1e-6)
+    assert len(action_curves(armature)) == 24 * 4 + 3
+    np.testing.assert_allclose(from_axis_angle(to_axis_angle(wanted)), wanted, atol=1e-6)

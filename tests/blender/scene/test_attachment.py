@@ -172,7 +172,7 @@ def test_two_people_share_the_nodes_and_keep_to_their_own_bodies(person, tmp_pat
     pose_from_joint_rotations(armature_of(other), *strong_pose(1))
     rest = on_the_surface(person[0], person[1], np.tile(np.eye(3), (24, 1, 1)), np.zeros(3))
     found = shown()
-    own = [thing[0].name for _, thing in sorted(volumes_of(person[0]).items())]
+    own = [volume[0].name for _, volume in sorted(volumes_of(person[0]).items())]
     np.testing.assert_allclose(np.array([found[name] for name in own])[:, :3, 3], rest[:, :3, 3], atol=1e-5)
 
 

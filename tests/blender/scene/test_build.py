@@ -25,7 +25,7 @@ KINDS = ("objects", "collections", "volumes", "meshes", "armatures", "materials"
 
 
 def datablocks() -> dict[str, list[str]]:
-    return {kind: sorted(thing.name for thing in getattr(bpy.data, kind)) for kind in KINDS}
+    return {kind: sorted(obj.name for obj in getattr(bpy.data, kind)) for kind in KINDS}
 
 
 def volume_files() -> list[str]:

@@ -78,7 +78,7 @@ def test_volumes_are_counted_once_for_each_shape(person, monkeypatch):
 
 def test_volumes_that_blender_has_not_read_are_not_read_to_be_counted(person, monkeypatch):
     reshape(person, small(person))
-    next(thing for thing in person.all_objects if thing.type == "VOLUME").hide_viewport = True
+    next(obj for obj in person.all_objects if obj.type == "VOLUME").hide_viewport = True
     bpy.context.view_layer.update()
     monkeypatch.setattr(cycles, "max_overlap", lambda *_: 1 / 0)
     assert current_overlap(person) == json.loads(person[MARK])["most_overlapping"]
@@ -87,7 +87,7 @@ def test_volumes_that_blender_has_not_read_are_not_read_to_be_counted(person, mo
 def test_volumes_whose_files_are_missing_are_not_counted(person):
     noted = json.loads(person[MARK])["most_overlapping"]
     reshape(person, small(person))
-    volume = next(thing.data for thing in person.all_objects if thing.type == "VOLUME")
+    volume = next(obj.data for obj in person.all_objects if obj.type == "VOLUME")
     volume.filepath = "//nowhere/prim_0000_0123456789ab.vdb"
     bpy.context.view_layer.update()
     assert current_overlap(person) == noted

@@ -182,8 +182,8 @@ def test_a_duplicate_that_shares_volumes_is_not_edited_with_the_original(person,
     twin = bpy.data.collections.new("Twin")
     saved_scene.scene.collection.children.link(twin)
     twin[MARK] = person[MARK]
-    for thing in list(person.all_objects):
-        twin.objects.link(thing.copy())
+    for obj in list(person.all_objects):
+        twin.objects.link(obj.copy())
     before = {o.name: o.data.filepath for o in twin.objects if o.type == "VOLUME"}
     bones = [list(bone.head_local) for bone in armature_of(twin).data.bones]
     replace(person, *reshaped(tmp_path, 3))
@@ -269,8 +269,8 @@ def test_every_part_of_a_human_leads_to_it_and_other_objects_do_not(person, save
     hat = bpy.data.objects.new("hat", None)
     hat.parent = armature_of(person)
     cube = bpy.data.objects.new("cube", None)
-    for thing in (hat, cube):
-        saved_scene.scene.collection.objects.link(thing)
-    assert {human_of(thing, saved_scene.scene) for thing in [*person.all_objects, hat]} == {person}
+    for obj in (hat, cube):
+        saved_scene.scene.collection.objects.link(obj)
+    assert {human_of(obj, saved_scene.scene) for obj in [*person.all_objects, hat]} == {person}
     assert human_of(cube, saved_scene.scene) is None
     assert human_of(None, saved_scene.scene) is None

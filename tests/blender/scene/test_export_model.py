@@ -60,9 +60,9 @@ def imported(path, kind):
         bpy.ops.import_scene.fbx(filepath=str(path), anim_offset=0.0)
     else:
         bpy.ops.wm.usd_import(filepath=str(path))
-    new = [thing for thing in bpy.data.objects if thing not in before]
-    armature = next(thing for thing in new if thing.type == "ARMATURE")
-    mesh = next(thing for thing in new if thing.type == "MESH" and thing.vertex_groups)
+    new = [obj for obj in bpy.data.objects if obj not in before]
+    armature = next(obj for obj in new if obj.type == "ARMATURE")
+    mesh = next(obj for obj in new if obj.type == "MESH" and obj.vertex_groups)
     return armature, mesh
 
 
@@ -99,9 +99,9 @@ def test_exporting_leaves_the_scene_as_it_was(moving, store, tmp_path):
     armature.hide_viewport, armature.data.pose_position = True, "REST"
     bpy.context.scene.frame_set(2)
     kinds = ("scenes", "objects", "meshes", "armatures", "actions", "materials", "images", "collections")
-    before = {kind: {thing.name for thing in getattr(bpy.data, kind)} for kind in kinds}
+    before = {kind: {obj.name for obj in getattr(bpy.data, kind)} for kind in kinds}
     write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", FrameRange(1, 4))
-    assert {kind: {thing.name for thing in getattr(bpy.data, kind)} for kind in kinds} == before
+    assert {kind: {obj.name for obj in getattr(bpy.data, kind)} for kind in kinds} == before
     assert bpy.context.scene.frame_current == 2
     assert armature.hide_viewport
     assert armature.data.pose_position == "REST"

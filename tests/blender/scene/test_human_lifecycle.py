@@ -1,4 +1,4 @@
-"""People are whole after whatever happens to a .blend: volumes in their places, files where the engine finds them."""
+"""People are whole after undo and edits, in linked and appended files, and after Blender's own copies."""
 
 from __future__ import annotations
 
@@ -10,79 +10,13 @@ import bpy
 import numpy as np
 import psutil
 import pytest
-import synthetic
 import synthetic_shape
-from exporting import write_person
-from oracle import evaluated_matrices
+from human_stage import COUNT, named, places, whole
 
-from blender_primdiffusion.engine.picture import posed_humans
-from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.collect import collect_files
-from blender_primdiffusion.scene.human import (
-    MARK,
-    VolumeWriteError,
-    armature_of,
-    folder_of,
-    humans,
-    humans_folder,
-    person_file,
-    volume_path,
-)
-from blender_primdiffusion.scene.missing import missing_files
+from blender_primdiffusion.scene.human import MARK, armature_of, humans, person_file
 
 ops = bpy.ops.primdiffusion
-COUNT = 6
-ODD = 'Ä ö\' "x" 100%s 年'
-
-
-@pytest.fixture
-def source(addon, tmp_path, monkeypatch):
-    folder = tmp_path / "source"
-    folder.mkdir()
-    npz = synthetic_shape.write(folder / "human.npz", COUNT)
-    monkeypatch.setenv("FAKE_HUMAN", str(npz))
-    write_person(folder / "person.human.safetensors", synthetic_shape.arrays(COUNT)["betas"])
-    return folder
-
-
-def made(source, name="Anna"):
-    person = build_human(bpy.context, source / "human.npz", name, [source / "person.human.safetensors"])
-    rotations = synthetic.axis_angle(np.random.default_rng(3).normal(0, 0.5, (24, 3)))
-    pose_from_joint_rotations(armature_of(person), rotations)
-    bpy.context.view_layer.objects.active = armature_of(person)
-    bpy.context.view_layer.update()
-    return person
-
-
-@pytest.fixture
-def person(source):
-    anna = made(source)
-    bpy.ops.wm.save_mainfile()
-    return anna
-
-
-def named(name="Anna"):
-    return bpy.data.collections[name]
-
-
-def places(person) -> np.ndarray:
-    bpy.context.view_layer.update()
-    return evaluated_matrices(person)
-
-
-def whole(person, where=None) -> bool:
-    """Files, grids and the engine's idea of a person; and their volumes' places, where these are given."""
-    volumes = {thing.data for thing in person.all_objects if thing.type == "VOLUME"}
-    assert len([thing for thing in person.all_objects if thing.type == "VOLUME"]) == COUNT
-    assert not [one.summary() for one in missing_files()]
-    assert all(volume.grids.load() for volume in volumes)
-    assert person_file(person).is_file()
-    files = [one.file.resolve() for one in posed_humans(bpy.context.evaluated_depsgraph_get())]
-    assert person_file(person).resolve() in files
-    if where is not None:
-        np.testing.assert_allclose(places(person), where, atol=1e-6)
-    return True
 
 
 def step(name: str) -> None:
@@ -127,96 +61,6 @@ def test_a_human_generated_after_a_deletion_leaves_the_file_of_the_deleted(sourc
     person = humans(bpy.context.scene)[0]
     assert whole(person)
     assert json.loads(person_file(person).read_bytes())["seed"] == 7
-
-
-def test_saving_and_loading(person):
-    where = places(person)
-    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-    assert whole(named(), where)
-
-
-def test_saved_under_another_name_elsewhere_and_then_collected(person, tmp_path):
-    where, elsewhere = places(person), tmp_path / ODD
-    elsewhere.mkdir()
-    bpy.ops.wm.save_as_mainfile(filepath=str(elsewhere / "b.blend"))
-    assert whole(named(), where)
-    bpy.ops.wm.open_mainfile(filepath=str(elsewhere / "b.blend"))
-    assert whole(named(), where)
-    assert not (elsewhere / "b_humans").exists()
-    assert ops.collect_files() == {"FINISHED"}
-    bpy.ops.wm.save_mainfile()
-    sent = tmp_path / "sent"
-    shutil.move(elsewhere, sent)
-    shutil.rmtree(tmp_path / "shot_humans")
-    bpy.ops.wm.open_mainfile(filepath=str(sent / "b.blend"))
-    assert whole(named(), where)
-    assert person_file(named()).resolve().is_relative_to(sent)
-
-
-@pytest.mark.parametrize("with_folder", [True, False])
-def test_a_blend_that_is_renamed(person, tmp_path, with_folder):
-    where = places(person)
-    shutil.move(tmp_path / "shot.blend", tmp_path / "final.blend")
-    if with_folder:
-        shutil.move(tmp_path / "shot_humans", tmp_path / "final_humans")
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "final.blend"))
-    if with_folder:
-        assert missing_files()
-        ops.find_missing_volumes()
-    assert whole(named(), where)
-
-
-@pytest.mark.parametrize("with_folder", [True, False])
-def test_a_blend_that_is_moved(person, tmp_path, with_folder):
-    where, elsewhere = places(person), tmp_path / ODD
-    elsewhere.mkdir()
-    shutil.move(tmp_path / "shot.blend", elsewhere)
-    if with_folder:
-        shutil.move(tmp_path / "shot_humans", elsewhere)
-    bpy.ops.wm.open_mainfile(filepath=str(elsewhere / "shot.blend"))
-    if not with_folder:
-        assert missing_files()
-        ops.find_missing_volumes()
-    assert whole(named(), where)
-
-
-def test_a_file_never_saved_and_then_saved(source, tmp_path):
-    bpy.ops.wm.read_homefile(use_empty=True)
-    anna = made(source)
-    where, berta = places(anna), made(source, "Berta")
-    temporary = folder_of(anna)
-    assert temporary.is_relative_to(bpy.app.tempdir)
-    folder = tmp_path / ODD
-    folder.mkdir()
-    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "neu.blend"))
-    assert whole(anna, where)
-    assert whole(berta)
-    shutil.rmtree(temporary.parent)
-    bpy.ops.wm.open_mainfile(filepath=str(folder / "neu.blend"))
-    assert whole(named(), where)
-    assert not list(folder.rglob(".*"))
-
-
-def test_files_of_a_blender_that_crashed_before_the_first_save_come_along(source, tmp_path):
-    bpy.ops.wm.read_homefile(use_empty=True)
-    anna = made(source)
-    crashed = tmp_path / "blender_a1b2c3" / "primdiffusion_humans"
-    shutil.move(humans_folder(""), crashed)
-    for volume in bpy.data.volumes:
-        volume.filepath = str(crashed / "Anna" / volume_path(volume).name)
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "recovered.blend"))
-    assert whole(anna)
-    assert person_file(anna).is_relative_to(tmp_path / "recovered_humans")
-
-
-def test_a_copy_in_a_temporary_folder_finds_the_people_of_the_original(person, tmp_path):
-    where, other = places(person), tmp_path / "tmp" / "deep"
-    other.mkdir(parents=True)
-    shutil.copy(tmp_path / "shot.blend", other / "shot_autosave.blend")
-    bpy.ops.wm.open_mainfile(filepath=str(other / "shot_autosave.blend"))
-    assert missing_files()
-    assert ops.find_missing_volumes() == {"FINISHED"}
-    assert whole(named(), where)
 
 
 def test_appended_people_are_whole_and_can_be_edited_and_collected(person, tmp_path):
@@ -285,19 +129,19 @@ def test_made_local(person, tmp_path):
 
 def test_blenders_own_duplicate_of_all_parts(person):
     where = places(person)
-    for thing in list(person.all_objects):
-        thing.hide_viewport = False
-        thing.select_set(True)
+    for obj in list(person.all_objects):
+        obj.hide_viewport = False
+        obj.select_set(True)
     bpy.ops.object.duplicate()
-    copies = [thing for thing in bpy.context.selected_objects if thing.type == "VOLUME"]
+    copies = [obj for obj in bpy.context.selected_objects if obj.type == "VOLUME"]
     assert len(copies) == COUNT
-    (armature,) = {thing.parent for thing in copies}
+    (armature,) = {obj.parent for obj in copies}
     assert armature != armature_of(person) or len(copies) == COUNT
-    assert all(thing.data.grids.load() for thing in copies)
-    originals = [thing for thing in person.all_objects if thing.type == "VOLUME" and thing not in copies]
+    assert all(obj.data.grids.load() for obj in copies)
+    originals = [obj for obj in person.all_objects if obj.type == "VOLUME" and obj not in copies]
     bpy.context.view_layer.update()
-    assert np.isfinite([list(row) for thing in originals for row in thing.matrix_world]).all()
-    bpy.data.batch_remove([thing for thing in bpy.context.selected_objects])
+    assert np.isfinite([list(row) for obj in originals for row in obj.matrix_world]).all()
+    bpy.data.batch_remove([obj for obj in bpy.context.selected_objects])
     assert whole(person, where)
 
 
@@ -335,9 +179,9 @@ def test_two_scenes_share_a_person(person):
 def test_names_and_collections_of_parts_may_change(person):
     where = [list(row) for row in places(person)]
     person.name = "Wer?"
-    order = sorted((thing for thing in person.all_objects if thing.type == "VOLUME"), key=lambda thing: thing.name)
-    for number, thing in enumerate(order):
-        thing.name = f"x{number}"
+    order = sorted((obj for obj in person.all_objects if obj.type == "VOLUME"), key=lambda obj: obj.name)
+    for number, obj in enumerate(order):
+        obj.name = f"x{number}"
     armature_of(person).name = "Rig"
     bpy.ops.wm.save_mainfile()
     assert whole(named("Wer?"), where)
@@ -355,65 +199,6 @@ def test_the_armature_turned_and_scaled_in_a_scene_of_centimetres(person):
     moved = np.array(armature.matrix_world) @ np.linalg.inv(old)
     np.testing.assert_allclose(places(person), moved @ before, atol=1e-4)
     assert whole(person)
-
-
-def test_purging_and_packing_take_nothing_away(person):
-    where = places(person)
-    bpy.ops.outliner.orphans_purge(do_recursive=True)
-    bpy.ops.file.pack_all()
-    bpy.ops.wm.save_mainfile()
-    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-    assert whole(named(), where)
-
-
-def test_a_full_disk_while_saving_or_collecting_leaves_people_as_they_are(person, tmp_path, monkeypatch):
-    import errno
-
-    from blender_primdiffusion.scene import human
-
-    where, other = places(person), tmp_path / "other"
-    other.mkdir()
-    bpy.ops.wm.save_as_mainfile(filepath=str(other / "b.blend"))
-    before = {volume.name: volume.filepath for volume in bpy.data.volumes}
-    copy, copied = shutil.copyfile, []
-
-    def full(source, destination):
-        if len(copied) == 3:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        copied.append(copy(source, destination))
-
-    monkeypatch.setattr(human.shutil, "copyfile", full)
-    with pytest.raises(VolumeWriteError, match="free space"):
-        collect_files()
-    copied.clear()
-    with pytest.raises(RuntimeError, match="No space left"):
-        ops.collect_files()
-    assert {volume.name: volume.filepath for volume in bpy.data.volumes} == before
-    assert not [path for path in (other / "b_humans").rglob("*") if path.is_file()]
-    assert whole(named(), where)
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_read_only_folder_is_reported(person, tmp_path):
-    other = tmp_path / "other"
-    other.mkdir()
-    bpy.ops.wm.save_as_mainfile(filepath=str(other / "b.blend"))
-    other.chmod(0o500)
-    with pytest.raises(RuntimeError, match="write permission"):
-        ops.collect_files()
-    assert whole(named())
-
-
-def test_a_path_as_long_as_blender_takes(source, tmp_path):
-    folder = tmp_path
-    while len(str(folder)) < 780:
-        folder /= "langer_name_" * 8
-    folder.mkdir(parents=True)
-    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "a.blend"))
-    made(source)
-    bpy.ops.wm.save_mainfile()
-    bpy.ops.wm.open_mainfile(filepath=str(folder / "a.blend"))
-    assert whole(named())
 
 
 def test_memory_of_deleted_people_is_given_back_and_undo_shows_them_again(person):

@@ -1,4 +1,4 @@
-"""human.npz: what is wrong with a file is said in a sentence."""
+"""human.npz: a sentence says what is wrong with a file."""
 
 from __future__ import annotations
 

@@ -34,12 +34,12 @@ def on_disk(folder) -> list[str]:
 
 
 def volumes_in_order(person) -> list[str]:
-    return sorted(volume_path(thing.data).name for thing in person.all_objects if thing.type == "VOLUME")
+    return sorted(volume_path(obj.data).name for obj in person.all_objects if obj.type == "VOLUME")
 
 
 def state(person):
     """What distinguishes people, and no names."""
-    armature = next(thing for thing in person.objects if thing.type == "ARMATURE")
+    armature = next(obj for obj in person.objects if obj.type == "ARMATURE")
     at = {volume_path(t.data).name: t.matrix_world.copy().freeze() for t in person.all_objects if t.type == "VOLUME"}
     return at, armature["primdiffusion_betas"].to_list(), person["primdiffusion_human"], armature.location.copy()
 
@@ -175,7 +175,7 @@ def test_grids_read_before_are_there_when_volumes_show_them_and_nothing_else_is(
     assert not bpy.data.volumes
     person = build_written(saved_scene, written, "Anna")
     saved_scene.view_layer.update()
-    volume = next(thing.data for thing in person.all_objects if thing.type == "VOLUME")
+    volume = next(obj.data for obj in person.all_objects if obj.type == "VOLUME")
     assert volume.grids.load()
     assert {grid.name for grid in volume.grids} == {"density", "Cd"}
 

@@ -215,9 +215,9 @@ def test_a_duplicate_s_gain_is_its_own(person):
 
 def test_a_material_without_the_factor_is_rejected(person):
     other = bpy.data.materials.new("Smoke")
-    for thing in person.all_objects:
-        if thing.type == "VOLUME":
-            thing.data.materials[0] = other
+    for obj in person.all_objects:
+        if obj.type == "VOLUME":
+            obj.data.materials[0] = other
     assert density_gain(person) is None
     with pytest.raises(ValueError, match=r"Smoke.*Density Gain"):
         set_density_gain(person, 1.5)

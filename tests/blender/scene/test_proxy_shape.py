@@ -34,8 +34,8 @@ def person(saved_scene, tmp_path):
     return person
 
 
-def places(thing) -> np.ndarray:
-    return np.array([vertex.co for vertex in thing.data.vertices])
+def places(obj) -> np.ndarray:
+    return np.array([vertex.co for vertex in obj.data.vertices])
 
 
 def surface(betas) -> np.ndarray:

@@ -136,11 +136,11 @@ def test_mode_selection_scenes_and_objects_stay_as_they_were(person, saved_scene
     armature = armature_of(person)
     saved_scene.view_layer.objects.active = armature
     bpy.ops.object.mode_set(mode="POSE")
-    before = [thing.name for kind in (bpy.data.objects, bpy.data.scenes, bpy.data.armatures) for thing in kind]
+    before = [obj.name for kind in (bpy.data.objects, bpy.data.scenes, bpy.data.armatures) for obj in kind]
     reshape(person, SHAPE)
     assert armature.mode == "POSE"
     assert saved_scene.view_layer.objects.active == armature
-    assert [thing.name for kind in (bpy.data.objects, bpy.data.scenes, bpy.data.armatures) for thing in kind] == before
+    assert [obj.name for kind in (bpy.data.objects, bpy.data.scenes, bpy.data.armatures) for obj in kind] == before
 
 
 def test_files_on_disk_stay_as_they_are(person, tmp_path):

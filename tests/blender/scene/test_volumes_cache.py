@@ -24,13 +24,13 @@ def test_grids_of_deleted_volumes_are_given_back_and_shown_ones_stay(saved_scene
     gone = build_human(saved_scene, synthetic.write(tmp_path / "other.npz", 64, seed=3), "Gone")
     saved_scene.view_layer.update()
     grown = _resident_mb()
-    for thing in list(gone.all_objects):
-        bpy.data.objects.remove(thing)
+    for obj in list(gone.all_objects):
+        bpy.data.objects.remove(obj)
     bpy.ops.outliner.orphans_purge(do_recursive=True)
     free_unused_grids()
     assert grown - before > 30, "a grid takes about 0.9 MB"
     assert _resident_mb() - before < 0.35 * (grown - before)
-    assert all(thing.data.grids.load() for thing in kept.all_objects if thing.type == "VOLUME")
+    assert all(obj.data.grids.load() for obj in kept.all_objects if obj.type == "VOLUME")
 
 
 def test_grids_of_people_who_are_shown_are_given_back_and_read_again(saved_scene, tmp_path):
@@ -47,28 +47,28 @@ def test_grids_of_people_who_are_shown_are_given_back_and_read_again(saved_scene
     saved_scene.view_layer.update()
     assert _resident_mb() - before < 0.35 * read, "posing reads no voxels"
     assert _boxes(person) == boxes
-    for thing in person.all_objects:
-        thing.update_tag()
-        if thing.type == "VOLUME":
-            thing.data.update_tag()
+    for obj in person.all_objects:
+        obj.update_tag()
+        if obj.type == "VOLUME":
+            obj.data.update_tag()
     saved_scene.view_layer.update()
     assert _boxes(person) == boxes
 
 
 def _boxes(person: bpy.types.Collection) -> dict[str, list[tuple[float, ...]]]:
     graph = bpy.context.evaluated_depsgraph_get()
-    volumes = [thing for thing in person.all_objects if thing.type == "VOLUME"]
-    return {thing.name: [tuple(corner) for corner in thing.evaluated_get(graph).bound_box] for thing in volumes}
+    volumes = [obj for obj in person.all_objects if obj.type == "VOLUME"]
+    return {obj.name: [tuple(corner) for corner in obj.evaluated_get(graph).bound_box] for obj in volumes}
 
 
 def test_reading_headers_leaves_the_blend_as_it_was(saved_scene, tmp_path):
     person = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 8), "Shown")
     was_dirty = bpy.data.is_dirty
-    read_headers([volume_path(thing.data) for thing in person.all_objects if thing.type == "VOLUME"])
+    read_headers([volume_path(obj.data) for obj in person.all_objects if obj.type == "VOLUME"])
     assert bpy.data.is_dirty == was_dirty
     assert len(bpy.data.volumes) == 8
     saved_scene.view_layer.update()
-    assert not any(thing.data.grids.error_message for thing in person.all_objects if thing.type == "VOLUME")
+    assert not any(obj.data.grids.error_message for obj in person.all_objects if obj.type == "VOLUME")
 
 
 def test_the_users_preferences_are_as_before(empty_scene):

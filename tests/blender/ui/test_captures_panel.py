@@ -49,14 +49,14 @@ def write_person(path: Path) -> None:
     mesh.materials.append(chequers())
     uv = mesh.uv_layers.new(name="UVMap")
     uv.data.foreach_set("uv", (vertices[kept][faces.ravel(), :2] / 2 + 0.5).astype(np.float32).ravel())
-    thing = bpy.data.objects.new("skin", mesh)
-    bpy.context.scene.collection.objects.link(thing)
+    obj = bpy.data.objects.new("skin", mesh)
+    bpy.context.scene.collection.objects.link(obj)
     for joint, name in enumerate(JOINT_NAMES):
-        group = thing.vertex_groups.new(name=name)
+        group = obj.vertex_groups.new(name=name)
         for vertex in np.flatnonzero(body.skin_weights[kept, joint] > 0):
             group.add([int(vertex)], float(body.skin_weights[kept[vertex], joint]), "REPLACE")
-    thing.parent = armature
-    thing.modifiers.new("armature", "ARMATURE").object = armature
+    obj.parent = armature
+    obj.modifiers.new("armature", "ARMATURE").object = armature
     path.parent.mkdir(parents=True)
     bpy.ops.export_scene.gltf(filepath=str(path), export_format="GLB", export_animations=False)
 
@@ -169,21 +169,21 @@ def test_a_batch_continues_past_a_broken_scan_reports_it_and_exits_with_1(people
 
 
 def test_a_wrong_command_line_exits_with_2_and_an_error(tmp_path):
-    for words, said in (
+    for words, message in (
         (["--people", str(tmp_path)], "--out"),
         (["--out", str(tmp_path), "--cameras", "none"], "--cameras"),
         (["--out", str(tmp_path / "a"), "--people", str(tmp_path), "--shard", "4/4"], "no shard"),
     ):
         done = command(*words)
         assert done.returncode == UNUSABLE
-        assert said in done.stderr
+        assert message in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1
 
 
 def test_shards_are_named_without_rendering(people, tmp_path):
     for shard, name in (("0/2", "person_000000"), ("1/2", "person_000001")):
-        told = command("--people", str(people), "--out", str(tmp_path / "a"), "--list", "--shard", shard).stdout
-        assert [line for line in told.splitlines() if "color_management" not in line] == [name]  # 5.2's own line
+        output = command("--people", str(people), "--out", str(tmp_path / "a"), "--list", "--shard", shard).stdout
+        assert [line for line in output.splitlines() if "color_management" not in line] == [name]  # 5.2's own line
     assert not (tmp_path / "a").exists()
 
 

@@ -35,7 +35,7 @@ def person(addon):
 
 
 def paths(person) -> list[str]:
-    return [thing.data.filepath for thing in sorted(person.all_objects, key=lambda o: o.name) if thing.type == "VOLUME"]
+    return [obj.data.filepath for obj in sorted(person.all_objects, key=lambda o: o.name) if obj.type == "VOLUME"]
 
 
 def sent(person) -> dict:
@@ -109,7 +109,7 @@ def test_a_blend_moves_the_body_where_the_betas_differ(person):
 def test_any_part_of_a_person_selects_it_and_a_script_may_name_it(person):
     other = humans(bpy.context.scene)[1]
     before = paths(person)
-    volume = next(thing for thing in other.all_objects if thing.type == "VOLUME")
+    volume = next(obj for obj in other.all_objects if obj.type == "VOLUME")
     bpy.context.view_layer.objects.active = volume
     ops.vary(seed=FINE, steps=1)
     assert paths(person) == before
@@ -243,8 +243,8 @@ def test_a_result_that_comes_in_edit_mode_leaves_it_and_can_be_undone(person, pa
     cube = bpy.data.objects.new("cube", bpy.data.meshes.new("cube"))
     bpy.context.scene.collection.objects.link(cube)
     body_of(person).hide_viewport = False
-    thing = {"armature": armature_of(person), "body": body_of(person), "cube": cube}[part]
-    bpy.context.view_layer.objects.active = thing
+    obj = {"armature": armature_of(person), "body": body_of(person), "cube": cube}[part]
+    bpy.context.view_layer.objects.active = obj
     bpy.ops.ed.undo_push(message="before")
     before = paths(person)
     start(person)
@@ -258,9 +258,9 @@ def test_a_result_that_comes_in_edit_mode_leaves_it_and_can_be_undone(person, pa
 
 
 def test_locked_hidden_people_are_edited(person):
-    for thing in list(person.all_objects):
-        thing.lock_location = thing.lock_rotation = thing.lock_scale = (True, True, True)
-        thing.hide_select = thing.hide_viewport = True
+    for obj in list(person.all_objects):
+        obj.lock_location = obj.lock_rotation = obj.lock_scale = (True, True, True)
+        obj.hide_select = obj.hide_viewport = True
     before = paths(person)
     assert ops.blend(human="Human", other="Human.001", steps=1) == {"FINISHED"}
     assert not set(paths(person)) & set(before)
@@ -271,7 +271,7 @@ def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(addon, tm
     for _ in range(2):
         ops.generate(seed=7, steps=1)
     addon.view_layer.objects.active = None
-    refused = {
+    rejected = {
         "select the one you mean": lambda: ops.vary(),
         "'Eve' is not in the scene: choose from 'Human', 'Human.001'": lambda: ops.vary(human="Eve"),
         "choose the other human in the panel first": lambda: ops.blend(human="Human"),
@@ -279,7 +279,7 @@ def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(addon, tm
         "is not name=value": lambda: ops.vary(human="Human", attributes="tall"),
         "no part of the body is chosen": lambda: ops.redress(human="Human", parts=set()),
     }
-    for sentence, edit in refused.items():
+    for sentence, edit in rejected.items():
         with pytest.raises(RuntimeError, match=sentence):
             edit()
         assert not queue.busy

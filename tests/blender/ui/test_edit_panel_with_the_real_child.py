@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
-from backend_python import found
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 
-import blender_primdiffusion
-from blender_primdiffusion.backend.client import BackendClient
-from blender_primdiffusion.backend.environment import BackendPython
-from blender_primdiffusion.jobs import queue
 from blender_primdiffusion.scene.human import MARK, armature_of, body_of, humans, person_file
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
@@ -23,30 +17,15 @@ ops = bpy.ops.primdiffusion
 
 
 @pytest.fixture
-def people(saved_scene, tmp_path, monkeypatch):
+def people(real_child):
     """Two people of a small model."""
-    from tiny_model import save_tiny_checkpoint
-
-    checkpoint = save_tiny_checkpoint(tmp_path / "tiny.safetensors")
-    python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", found(python))
-    monkeypatch.setattr(queue, "preference", lambda name: str(checkpoint) if name == "checkpoint" else "")
-    # With a cache in Blender's temporary folder the child would compile its marcher anew for each test.
-    monkeypatch.setattr(
-        "blender_primdiffusion.backend.client.BackendClient",
-        lambda python, module, cache_dir: BackendClient(python, module),
-    )
-    blender_primdiffusion.register()
-    try:
-        ops.generate(seed=1, steps=2, attributes="outfit=suit", sampler="dpmpp_2m")
-        ops.generate(seed=2, steps=2)
-        yield humans(saved_scene.scene)
-    finally:
-        blender_primdiffusion.unregister()
+    ops.generate(seed=1, steps=2, attributes="outfit=suit", sampler="dpmpp_2m")
+    ops.generate(seed=2, steps=2)
+    return humans(real_child.scene)
 
 
 def files(person) -> dict[int, str]:
-    paths = [Path(thing.data.filepath).name for thing in person.all_objects if thing.type == "VOLUME"]
+    paths = [Path(obj.data.filepath).name for obj in person.all_objects if obj.type == "VOLUME"]
     return {int(name[5:9]): name for name in paths}
 
 
@@ -125,12 +104,12 @@ def test_vary_transfer_and_blend_follow_one_another_and_undo_goes_back_through_t
 
 
 def test_what_the_child_rejects_is_one_sentence(people):
-    refused = {
+    rejected = {
         "1 steps were requested": lambda: ops.blend(human="Human", other="Human.001", steps=1),
         "knows no attribute 'wings'": lambda: ops.redress(human="Human", attributes="wings=two", steps=2),
     }
     before = files(people[0])
-    for sentence, edit in refused.items():
+    for sentence, edit in rejected.items():
         with pytest.raises(RuntimeError, match=sentence):
             edit()
     bpy.context.scene.objects["Human_body"].vertex_groups.new(name="dot").add([0], 0.1, "REPLACE")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import bpy
@@ -11,8 +10,9 @@ import exporting
 import numpy as np
 import pytest
 import synthetic
-from backend_python import found
+from backend_python import use_this_python
 
+import blender_primdiffusion
 from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.human import BETAS, armature_of, humans
 from blender_primdiffusion.scene.human_file import read_tensors
@@ -25,17 +25,11 @@ OPERATORS = bpy.ops.primdiffusion
 @pytest.fixture
 def store(saved_scene, tmp_path, monkeypatch):
     """The add-on registered on an interpreter that runs the child of this file."""
-    import blender_primdiffusion
-    from blender_primdiffusion import places
-    from blender_primdiffusion.backend.environment import BackendPython
-
     folder = tmp_path / "store"
     folder.mkdir()
     exporting.write_store(folder)
     monkeypatch.setenv("EXPORT_FOLDER", str(folder))
-    python = BackendPython(Path(sys.executable), "the test", "0-fake", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", found(python))
-    monkeypatch.setattr(places, "backend_module_path", lambda: Path(__file__).parents[1] / "export_backend")
+    use_this_python(monkeypatch, Path(__file__).parents[1] / "export_backend")
     blender_primdiffusion.register()
     yield folder
     blender_primdiffusion.unregister()
@@ -64,10 +58,10 @@ def moving(person):
 
 def everything():
     kinds = ("scenes", "objects", "meshes", "materials", "images", "collections", "volumes", "actions")
-    return {kind: {thing.name for thing in getattr(bpy.data, kind)} for kind in kinds}
+    return {kind: {obj.name for obj in getattr(bpy.data, kind)} for kind in kinds}
 
 
-def refused(sentence, operator, **properties):
+def assert_rejected(sentence, operator, **properties):
     with pytest.raises(RuntimeError, match=sentence):
         operator(**properties)
 
@@ -84,7 +78,7 @@ def test_a_mesh_is_exported_and_nothing_stays_in_the_scene(anna, out, name):
 def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
     before = everything()
     monkeypatch.setenv("EXPORT_FAILS", "1")
-    refused("too thin", OPERATORS.export_mesh, filepath=str(out / "a.glb"))
+    assert_rejected("too thin", OPERATORS.export_mesh, filepath=str(out / "a.glb"))
     assert everything() == before
     assert not list(out.iterdir())
 
@@ -108,12 +102,12 @@ def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
 )
 def test_an_impossible_export_is_reported_in_a_sentence(anna, out, operator, properties, sentence):
     given = {name: v.replace("OUT", str(out)) if isinstance(v, str) else v for name, v in properties.items()}
-    refused(sentence, getattr(OPERATORS, operator), **given)
+    assert_rejected(sentence, getattr(OPERATORS, operator), **given)
     assert not list(out.iterdir())
 
 
 def test_without_a_human_there_is_nothing_to_export(store, out):
-    refused("poll", OPERATORS.export_mesh, filepath=str(out / "a.glb"))
+    assert_rejected("poll", OPERATORS.export_mesh, filepath=str(out / "a.glb"))
 
 
 def test_a_missing_persons_file_is_named(anna, out):
@@ -121,7 +115,7 @@ def test_a_missing_persons_file_is_named(anna, out):
         if "store" not in path.parts:
             path.unlink()
     for operator, file in ((OPERATORS.export_mesh, "a.glb"), (OPERATORS.export_human, "a.human")):
-        refused("is missing", operator, filepath=str(out / file))
+        assert_rejected("is missing", operator, filepath=str(out / file))
 
 
 def test_a_proxy_follows_the_armature_and_is_shown_in_its_place(anna):
@@ -213,7 +207,7 @@ def test_a_file_that_holds_no_person_is_rejected_before_any_work(store, out, dam
     whole = path.read_bytes()
     path.write_bytes({"short": b"abc", "text": b"not a person at all", "cut": whole[:-8], "other": whole.replace(
         b"primdiffusion.human", b"primdiffusion.model")}[damage])  # fmt: skip
-    refused("contains no human", OPERATORS.import_human, filepath=str(path))
+    assert_rejected("contains no human", OPERATORS.import_human, filepath=str(path))
     assert not humans(bpy.context.scene)
 
 

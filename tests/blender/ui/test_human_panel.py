@@ -188,7 +188,7 @@ def test_a_new_name_is_the_collections_and_its_parts_but_not_of_those_renamed_by
     assert person.name == settings(person).person == "Jürgen"
     assert armature_of(person).name == armature_of(person).data.name == "Jürgen"
     assert hat.name == "Skin"
-    assert {thing.name[:12] for thing in person.all_objects if thing.type == "VOLUME"} == {"Jürgen_prim_"}
+    assert {obj.name[:12] for obj in person.all_objects if obj.type == "VOLUME"} == {"Jürgen_prim_"}
     assert person.children[0].name == "Jürgen_primitives"
     assert person_file(person).parent == files[0].parent
     assert sorted(files[0].parent.iterdir()) == files
@@ -251,8 +251,8 @@ def test_a_duplicate_is_a_person_of_their_own_on_the_same_files(person, addon):
     assert surface(person) == before
     np.testing.assert_array_equal(world(person), places)
     assert body_of(twin).modifiers[0].object == armature_of(twin)
-    assert {thing.data for thing in twin.all_objects if thing.type == "VOLUME"} == {
-        thing.data for thing in person.all_objects if thing.type == "VOLUME"
+    assert {obj.data for obj in twin.all_objects if obj.type == "VOLUME"} == {
+        obj.data for obj in person.all_objects if obj.type == "VOLUME"
     }
     assert person_file(twin) == person_file(person)
 
@@ -261,7 +261,7 @@ def test_a_duplicate_on_the_posed_surface_follows_its_own_body(person, addon):
     set_attachment(person, "SURFACE")
     ops.duplicate_human()
     twin = bpy.data.collections["Human.001"]
-    nodes = next(one for thing in twin.all_objects for one in thing.modifiers if one.type == "NODES")
+    nodes = next(one for obj in twin.all_objects for one in obj.modifiers if one.type == "NODES")
     pointed = {value for value in node_inputs(nodes).values() if isinstance(value, bpy.types.ID)}
     assert body_of(twin) in pointed
     assert pointed <= {*twin.all_objects, *twin.children_recursive}

@@ -20,14 +20,14 @@ def test_diagnostics_hold_versions_and_the_error_but_no_folder_or_name(addon, tm
     monkeypatch.setenv("USER", "annabel")
     with pytest.raises(RuntimeError):
         ops.generate(seed=FAILS, steps=1)
-    told = jobs_panel.diagnostics()
+    text = jobs_panel.diagnostics()
     for part in (bpy.app.version_string, "0-fake", "fake device", "seed 2", "CheckpointError", "checkpoint is damaged"):
-        assert part in told
-    assert str(tmp_path) not in told
-    assert str(Path.home()) not in told
-    assert "annabel" not in told
+        assert part in text
+    assert str(tmp_path) not in text
+    assert str(Path.home()) not in text
+    assert "annabel" not in text
     assert ops.copy_diagnostics() == {"FINISHED"}
-    assert bpy.data.texts[jobs_panel.TEXT].as_string().strip() == told.strip()
+    assert bpy.data.texts[jobs_panel.TEXT].as_string().strip() == text.strip()
     ops.copy_diagnostics()
     assert len(bpy.data.texts) == 1
 

@@ -49,15 +49,15 @@ def test_without_a_browser_the_file_is_named(addon, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("thing", "section"),
+    ("doc_id", "section"),
     [
         ("primdiffusion.generate", "generate"),
         ("PRIMDIFFUSION_OT_render_captures.people", "render_captures"),
         ("PRIMDIFFUSION_PG_settings.seed", "primdiffusion_pg_settings"),
     ],
 )
-def test_f1_on_what_is_ours_leads_to_its_section(addon, opened, thing, section):
-    assert bpy.ops.wm.doc_view_manual(doc_id=thing) == {"FINISHED"}
+def test_f1_on_what_is_ours_leads_to_its_section(addon, opened, doc_id, section):
+    assert bpy.ops.wm.doc_view_manual(doc_id=doc_id) == {"FINISHED"}
     assert opened[0].endswith(f"/docs/manual/api.md#{section}")
     assert f"### {section}" in manual.page_file("api").read_text().lower()
 

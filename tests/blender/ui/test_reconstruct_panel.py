@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import bpy
 import pytest
-from backend_python import found
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
-import blender_primdiffusion
-from blender_primdiffusion.backend.environment import BackendPython
 from blender_primdiffusion.jobs import generate
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import folder_of, humans
@@ -46,7 +42,7 @@ def test_the_operator_builds_a_human_from_the_chosen_captures(addon, captures):
     asked = {"directory": f"{captures}/", "subject": "anna", "frame": 2, "views": 5}
     assert bpy.ops.primdiffusion.human_from_captures(**asked) == {"FINISHED"}
     (person,) = humans(addon.scene)
-    assert sum(thing.type == "VOLUME" for thing in person.all_objects) == 8
+    assert sum(obj.type == "VOLUME" for obj in person.all_objects) == 8
     sent = asked_of_the_child(person)
     assert Path(sent.pop("capture")) == captures
     assert Path(sent.pop("out_dir")).name.startswith("reconstruct_")
@@ -153,27 +149,21 @@ def test_the_search_offers_subjects_that_hold_what_was_typed(captures):
 
 
 @pytest.mark.slow
-def test_the_real_child_makes_a_person_of_real_captures(saved_scene, tmp_path, monkeypatch):
+def test_the_real_child_makes_a_person_of_real_captures(real_child, tmp_path, monkeypatch):
     from capture_scenes import captured
     from tiny_encoder import save_tiny_encoder
 
     encoder = save_tiny_encoder(tmp_path / "encoder.safetensors")
     folder = captured(tmp_path / "made", people=2, frames=1, passes=("img", "mask"))
-    python = BackendPython(Path(sys.executable), "the test", "0", "0", "3")
-    monkeypatch.setattr("blender_primdiffusion.backend.environment.search", found(python))
     monkeypatch.setattr(
         "blender_primdiffusion.jobs.queue.preference", lambda name: str(encoder) if name == "encoder" else ""
     )
-    blender_primdiffusion.register()
-    try:
-        with pytest.raises(RuntimeError, match=r"contains several subjects: name one of them \(person_000000"):
-            bpy.ops.primdiffusion.human_from_captures(directory=str(folder))
-        asked = {"directory": str(folder), "subject": "person_000001", "views": 3}
-        assert bpy.ops.primdiffusion.human_from_captures(**asked) == {"FINISHED"}
-        (person,) = humans(saved_scene.scene)
-        about = json.loads(person["primdiffusion_human"])
-        assert (about["reconstructed_from"], about["checkpoint"]) == ("person_000001", "tiny encoder")
-        assert len(about["views"]) == 3
-        assert sum(thing.type == "VOLUME" for thing in person.all_objects) > 500
-    finally:
-        blender_primdiffusion.unregister()
+    with pytest.raises(RuntimeError, match=r"contains several subjects: name one of them \(person_000000"):
+        bpy.ops.primdiffusion.human_from_captures(directory=str(folder))
+    asked = {"directory": str(folder), "subject": "person_000001", "views": 3}
+    assert bpy.ops.primdiffusion.human_from_captures(**asked) == {"FINISHED"}
+    (person,) = humans(real_child.scene)
+    about = json.loads(person["primdiffusion_human"])
+    assert (about["reconstructed_from"], about["checkpoint"]) == ("person_000001", "tiny encoder")
+    assert len(about["views"]) == 3
+    assert sum(obj.type == "VOLUME" for obj in person.all_objects) > 500

@@ -1,3 +1,3 @@
-"""Stands in for the backend: merges and fits what it is told."""
+"""Replaces the backend in tests: merges and fits on request."""
 
 __version__ = "0-fake"

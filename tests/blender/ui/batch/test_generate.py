@@ -103,7 +103,7 @@ def test_a_blend_holds_the_person_moved_and_finds_its_files_where_the_folder_is(
     scene = bpy.context.scene
     (person,) = humans(scene)
     assert person.name == "person_000007"
-    assert all(volume_path(thing.data).is_file() for thing in person.all_objects if thing.type == "VOLUME")
+    assert all(volume_path(obj.data).is_file() for obj in person.all_objects if obj.type == "VOLUME")
     assert person_file(person).is_relative_to(moved)
     assert (scene.frame_start, scene.frame_end, scene.render.engine) == (1, 3, "PRIMDIFFUSION")
     bone = armature_of(person).pose.bones["left_shoulder"]
@@ -167,9 +167,9 @@ def _no_backend(*_, **__):
 def test_a_folder_that_cannot_be_is_a_sentence(addon, tmp_path, capfd):
     (tmp_path / "file").write_text("")
     assert generate(tmp_path / "file" / "people") == UNUSABLE
-    said = capfd.readouterr().err
-    assert f"nothing can be written to {tmp_path / 'file' / 'people'} (" in said
-    assert "choose another folder with --out" in said
+    errors = capfd.readouterr().err
+    assert f"nothing can be written to {tmp_path / 'file' / 'people'} (" in errors
+    assert "choose another folder with --out" in errors
 
 
 @pytest.mark.parametrize(

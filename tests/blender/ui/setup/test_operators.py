@@ -82,7 +82,7 @@ class Layout:
         return self
 
     @property
-    def said(self) -> str:
+    def text(self) -> str:
         return " ".join(self.texts)
 
 
@@ -90,7 +90,7 @@ def draw_preferences() -> Layout:
     layout = Layout()
     fake = type("Preferences", (), {"layout": layout})()
     fake._draw_backend = lambda box: preferences.PRIMDIFFUSION_AP_preferences._draw_backend(fake, box)
-    fake._draw_buttons = lambda box, *told: preferences.PRIMDIFFUSION_AP_preferences._draw_buttons(fake, box, *told)
+    fake._draw_buttons = lambda box, *words: preferences.PRIMDIFFUSION_AP_preferences._draw_buttons(fake, box, *words)
     preferences.PRIMDIFFUSION_AP_preferences.draw(fake, bpy.context)
     return layout
 
@@ -98,8 +98,8 @@ def draw_preferences() -> Layout:
 def test_from_no_backend_to_a_backend_and_back(wheels):
     layout = Layout()
     assert not preferences.draw_set_up(layout)
-    assert "The backend is not set up yet" in layout.said
-    assert "Downloads" in layout.said
+    assert "The backend is not set up yet" in layout.text
+    assert "Downloads" in layout.text
     assert "primdiffusion.set_up_backend" in layout.buttons
 
     assert press.install_from_folder(directory=str(wheels)) == {"FINISHED"}
@@ -108,10 +108,10 @@ def test_from_no_backend_to_a_backend_and_back(wheels):
     layout = Layout()
     assert preferences.draw_set_up(layout)
     assert not layout.texts
-    said = draw_preferences()
-    assert "Ready: torch 0-tiny" in said.said
-    assert str(places.set_up_folder().environment)[:40] in said.said
-    assert {"primdiffusion.repair_backend", "primdiffusion.remove_backend"} <= set(said.buttons)
+    layout = draw_preferences()
+    assert "Ready: torch 0-tiny" in layout.text
+    assert str(places.set_up_folder().environment)[:40] in layout.text
+    assert {"primdiffusion.repair_backend", "primdiffusion.remove_backend"} <= set(layout.buttons)
 
     assert press.set_up_backend() == {"FINISHED"}  # nothing to do
     assert press.test_backend() == {"FINISHED"}
@@ -135,7 +135,7 @@ def test_without_online_access_set_up_is_rejected_with_the_remedy(wheels):
         press.set_up_backend()
     layout = Layout()
     preferences.draw_set_up(layout)
-    assert "Allow Online Access" in layout.said
+    assert "Allow Online Access" in layout.text
     assert not places.set_up_folder().root.exists()
 
 
@@ -144,8 +144,8 @@ def test_a_failure_raises_and_stays_in_the_panel(online):
         press.set_up_backend()
     layout = Layout()
     preferences.draw_set_up(layout)
-    assert "cannot be reached" in layout.said
-    assert "Half installed" in layout.said
+    assert "cannot be reached" in layout.text
+    assert "Half installed" in layout.text
     assert "wm.path_open" in draw_preferences().buttons
 
 
@@ -239,7 +239,7 @@ def test_a_machine_without_packages_gets_an_error_with_a_remedy(online, monkeypa
         press.set_up_backend()
     layout = Layout()
     preferences.draw_set_up(layout)
-    assert "There are no packages for" in layout.said
+    assert "There are no packages for" in layout.text
 
 
 def test_set_up_is_rejected_while_a_person_is_made(online, monkeypatch):
@@ -260,10 +260,10 @@ def test_disabling_the_extension_ends_a_set_up(online, monkeypatch):
 
 
 def test_the_preferences_show_what_was_found_and_what_it_costs(wheels):
-    said = draw_preferences()
-    assert re.search(r"Found: .*Python 3\.\d+", said.said)
-    assert re.search(r"Downloads \d+ MB, takes \d+ MB on disk, about \d+ min", said.said)
-    assert {"compute", "backend_python", "checkpoint", "encoder", "idle_minutes"} <= set(said.props)
+    layout = draw_preferences()
+    assert re.search(r"Found: .*Python 3\.\d+", layout.text)
+    assert re.search(r"Downloads \d+ MB, takes \d+ MB on disk, about \d+ min", layout.text)
+    assert {"compute", "backend_python", "checkpoint", "encoder", "idle_minutes"} <= set(layout.props)
 
 
 def test_the_zip_holds_the_locks_and_asks_for_the_network():

@@ -1,0 +1,49 @@
+"""A human in the scene with files on the disk, and whether it is whole."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import synthetic
+from oracle import evaluated_matrices
+
+from blender_primdiffusion.engine.picture import posed_humans
+from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.human import armature_of, person_file
+from blender_primdiffusion.scene.missing import missing_files
+
+COUNT = 6
+
+
+def build_posed(source, name="Anna"):
+    """A human in the scene in a pose, with its armature active; from the folder of its files."""
+    person = build_human(bpy.context, source / "human.npz", name, [source / "person.human.safetensors"])
+    rotations = synthetic.axis_angle(np.random.default_rng(3).normal(0, 0.5, (24, 3)))
+    pose_from_joint_rotations(armature_of(person), rotations)
+    bpy.context.view_layer.objects.active = armature_of(person)
+    bpy.context.view_layer.update()
+    return person
+
+
+def named(name="Anna"):
+    return bpy.data.collections[name]
+
+
+def places(person) -> np.ndarray:
+    bpy.context.view_layer.update()
+    return evaluated_matrices(person)
+
+
+def whole(person, where=None) -> bool:
+    """Files, grids and the engine's idea of a person; and their volumes' places, where these are given."""
+    volumes = {obj.data for obj in person.all_objects if obj.type == "VOLUME"}
+    assert len([obj for obj in person.all_objects if obj.type == "VOLUME"]) == COUNT
+    assert not [one.summary() for one in missing_files()]
+    assert all(volume.grids.load() for volume in volumes)
+    assert person_file(person).is_file()
+    files = [one.file.resolve() for one in posed_humans(bpy.context.evaluated_depsgraph_get())]
+    assert person_file(person).resolve() in files
+    if where is not None:
+        np.testing.assert_allclose(places(person), where, atol=1e-6)
+    return True

@@ -1,0 +1,16 @@
+"""A synthetic human for the tests of its panels."""
+
+from __future__ import annotations
+
+import bpy
+import pytest
+import synthetic
+
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.human import armature_of
+
+
+@pytest.fixture
+def armature(addon, tmp_path) -> bpy.types.Object:
+    """Of a human with the name Ann."""
+    return armature_of(build_human(addon, synthetic.write(tmp_path / "p.npz", 8), "Ann"))

@@ -1,0 +1,236 @@
+"""Import Motion: timing, root, bones, what is rejected, and what the file browser shows."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import bpy
+import numpy as np
+import pytest
+import synthetic
+from amass_files import feet, write_amass
+from blender_primdiffusion.formats.joints import JOINT_NAMES
+from bvh_files import motion_of, write_bvh
+
+from blender_primdiffusion.motion.files import read_motion
+from blender_primdiffusion.motion.pose_library import current_pose
+from blender_primdiffusion.motion.rotation import about_axis
+from blender_primdiffusion.motion.skeleton import REST_JOINTS
+from blender_primdiffusion.scene.actions import action_curves
+from blender_primdiffusion.scene.armature import build_armature
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.convention import points_to_blender
+from blender_primdiffusion.scene.human import armature_of
+from blender_primdiffusion.ui.import_motion import PRIMDIFFUSION_OT_import_motion, look_at, nearest_to
+
+ops = bpy.ops.primdiffusion
+
+
+def test_amass_comes_in_at_the_scenes_rate_on_the_floor_from_where_the_person_is(addon, armature, tmp_path):
+    addon.scene.render.fps, addon.scene.render.fps_base = 24, 1.001
+    path = write_amass(tmp_path / "läufer 1.npz", frames=241)
+    assert ops.import_motion(filepath=path, start=10) == {"FINISHED"}
+    action = armature.animation_data.action
+    assert action.name == "läufer 1"
+    keys = action_curves(armature)[0].keyframe_points
+    assert (keys[0].co[0], len(keys)) == (10, int(2 * 24 / 1.001) + 1)
+    addon.scene.frame_set(10)
+    assert current_pose(armature)[1][[0, 2]] == pytest.approx([0, 0], abs=1e-6)
+    assert feet(armature).min() == pytest.approx(0, abs=0.05)
+    addon.scene.frame_set(34)
+    moved = read_motion(path)
+    assert current_pose(armature)[1][0] == pytest.approx(0.5, abs=0.01)
+    np.testing.assert_allclose(
+        current_pose(armature)[0][4], moved.rotations[round(24 * 1.001 / 24 * 120)][4], atol=0.02
+    )
+    assert addon.scene.frame_end >= 34
+
+
+def test_every_source_frame_can_be_kept_and_the_rate_corrected(addon, armature, tmp_path):
+    addon.scene.render.fps = 24
+    ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), timing="SOURCE", fps=48.0, start=1)
+    keys = action_curves(armature)[0].keyframe_points
+    assert len(keys) == 31
+    assert keys[1].co[0] == pytest.approx(1.5)
+
+
+def test_part_of_a_file_and_every_second_frame(addon, armature, tmp_path):
+    ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), timing="SOURCE", first=11, last=20, stride=3)
+    assert len(action_curves(armature)[0].keyframe_points) == 4
+    with pytest.raises(RuntimeError, match="frames 40 to 31 in 31"):
+        ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), first=40)
+
+
+def test_root_motion_can_be_kept_or_left_out_and_scaled(addon, armature, tmp_path):
+    path = write_amass(tmp_path / "m.npz")
+    ops.import_motion(filepath=path, root="KEEP", ground=False, scale=2.0, start=1)
+    addon.scene.frame_set(1)
+    np.testing.assert_allclose(current_pose(armature)[1], 2 * read_motion(path).translations[0], atol=1e-4)
+    ops.import_motion(filepath=path, root="PLACE")
+    for frame in (1, 4):
+        addon.scene.frame_set(frame)
+        assert current_pose(armature)[1][[0, 2]] == pytest.approx([0, 0], abs=1e-6)
+
+
+def test_the_up_axis_can_be_given(addon, armature, tmp_path):
+    np.savez(tmp_path / "p.npz", pose=np.zeros((2, 72)))
+    ops.import_motion(filepath=str(tmp_path / "p.npz"), up="Z")
+    addon.scene.frame_set(1)
+    np.testing.assert_allclose(current_pose(armature)[0][0], about_axis(0, -np.pi / 2), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "sentence"),
+    [
+        ({"poses": np.array([{"a": 1}], object)}, "pickled Python objects"),
+        ({"trans": np.full((31, 3), np.nan)}, "NaN"),
+        ({"poses": np.zeros((31, 71))}, "72 axis-angle numbers"),
+    ],
+)
+def test_bad_files_are_rejected_in_a_sentence_and_leave_nothing(addon, armature, tmp_path, arrays, sentence):
+    path = write_amass(tmp_path / "bad.npz", **arrays)
+    with pytest.raises(RuntimeError, match=sentence):
+        ops.import_motion(filepath=path)
+    assert len(bpy.data.actions) == 0
+    assert look_at(path).error
+
+
+def test_an_npz_that_is_something_else_is_rejected(addon, armature, tmp_path):
+    with pytest.raises(RuntimeError, match="holds no poses"):
+        ops.import_motion(filepath=str(synthetic.write(tmp_path / "human.npz", 4)))
+    with pytest.raises(RuntimeError, match="no file was chosen"):
+        ops.import_motion()
+
+
+def test_edit_mode_renamed_bones_and_linked_armatures_are_rejected_by_name(addon, armature, tmp_path):
+    path = write_amass(tmp_path / "m.npz")
+    addon.view_layer.objects.active = armature
+    bpy.ops.object.mode_set(mode="EDIT")
+    with pytest.raises(RuntimeError, match="Edit Mode"):
+        ops.import_motion(filepath=path)
+    bpy.ops.object.mode_set(mode="OBJECT")
+    armature.data.bones["left_knee"].name = "Knie"
+    with pytest.raises(RuntimeError, match="no bone 'left_knee'"):
+        ops.import_motion(filepath=path)
+    armature.data.bones["Knie"].name = "left_knee"
+    bpy.data.libraries.write(str(tmp_path / "lib.blend"), {armature})
+    with bpy.data.libraries.load(str(tmp_path / "lib.blend"), link=True) as (source, target):
+        target.objects = source.objects
+    linked = next(obj for obj in target.objects if obj.type == "ARMATURE")
+    addon.scene.collection.objects.link(linked)
+    addon.view_layer.objects.active = linked
+    with pytest.raises(RuntimeError, match="linked from another file"):
+        ops.import_motion(filepath=path)
+
+
+def test_any_armature_with_smpls_joints_can_be_moved(addon, tmp_path):
+    other = build_armature("SMPL", points_to_blender(synthetic.joints()))
+    addon.scene.collection.objects.link(other)
+    addon.view_layer.objects.active = other
+    assert ops.import_motion(filepath=write_amass(tmp_path / "m.npz")) == {"FINISHED"}
+    assert other.animation_data.action is not None
+
+
+def test_a_scene_without_humans_is_reported(addon, tmp_path):
+    with pytest.raises(RuntimeError, match="no human in the scene"):
+        ops.import_motion(filepath=write_amass(tmp_path / "m.npz"))
+
+
+def test_of_two_people_the_named_one_moves(addon, armature, tmp_path):
+    other = build_human(addon, synthetic.write(tmp_path / "q.npz", 8), "Bob")
+    ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), person="Bob")
+    assert armature.animation_data is None or armature.animation_data.action is None
+    assert armature_of(other).animation_data.action is not None
+    with pytest.raises(RuntimeError, match="'Eve' is not in the scene"):
+        ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), person="Eve")
+
+
+def test_bones_can_be_chosen_for_an_unknown_rig(addon, armature, tmp_path):
+    names = {name: f"b{number}" for number, name in enumerate(JOINT_NAMES)}
+    rotations, moves = motion_of(0.2)
+    path = write_bvh(tmp_path / "m.bvh", REST_JOINTS, rotations, REST_JOINTS[0] + moves, names, frame_time="0.0416667")
+    with pytest.raises(RuntimeError, match="no bone is known to be"):
+        ops.import_motion(filepath=str(path))
+    assert "b3" in look_at(str(path)).bones
+    chosen = {f"bone_{joint}": bone for joint, bone in names.items()}
+    ops.import_motion(filepath=str(path), bones="CHOSEN", start=1, timing="SOURCE", **chosen)
+    addon.scene.frame_set(3)
+    np.testing.assert_allclose(current_pose(armature)[0][16], rotations[2, 16], atol=1e-3)
+    with pytest.raises(RuntimeError, match="'nose' for head"):
+        ops.import_motion(filepath=str(path), bones="CHOSEN", **{**chosen, "bone_head": "nose"})
+    with pytest.raises(RuntimeError, match="no bone for 'left_knee'"):
+        ops.import_motion(filepath=str(path), bones="CHOSEN", **{**chosen, "bone_left_knee": ""})
+
+
+def test_one_undo_takes_an_imported_motion_back(addon, armature, tmp_path):
+    assert "UNDO" in PRIMDIFFUSION_OT_import_motion.bl_options
+    bpy.ops.ed.undo_push(message="before")
+    ops.import_motion(filepath=write_amass(tmp_path / "m.npz"))
+    bpy.ops.ed.undo_push(message="Import Motion")
+    bpy.ops.ed.undo()
+    assert not bpy.data.actions
+
+
+def test_a_scaled_armature_and_other_units_change_nothing_in_its_own_space(addon, armature, tmp_path):
+    addon.scene.unit_settings.scale_length = 0.01
+    armature.scale = (2, 2, 2)
+    ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), timing="SOURCE", fps=24.0, start=1)
+    addon.scene.frame_set(31)
+    assert current_pose(armature)[1][0] == pytest.approx(1.0, abs=1e-4)
+
+
+def test_every_one_of_fifteen_hundred_frames_is_keyed(addon, armature, tmp_path):
+    path = write_amass(tmp_path / "long.npz", frames=1500)
+    ops.import_motion(filepath=path, timing="SOURCE")
+    assert {len(curve.keyframe_points) for curve in action_curves(armature)} == {1500}
+    assert len(action_curves(armature)) == 24 * 4 + 3
+
+
+def test_facts_are_stored_with_the_action(addon, armature, tmp_path):
+    ops.import_motion(filepath=write_amass(tmp_path / "m.npz"))
+    assert json.loads(armature.animation_data.action["primdiffusion_motion"])["Frame Rate"] == "120"
+
+
+def test_the_person_under_the_mouse_is_whose_joints_surround_it():
+    seen = {
+        "Ann": np.array([[100, 100], [140, 300]]),
+        "Bob": np.array([[130, 100], [170, 300]]),
+        "Behind": np.zeros((0, 2)),
+    }
+    assert nearest_to((102, 110), seen) == "Ann"
+    assert nearest_to((168, 280), seen) == "Bob"
+    assert nearest_to((600, 110), seen) == ""
+
+
+def test_files_are_dropped_onto_the_import(addon):
+    handler = bpy.types.PRIMDIFFUSION_FH_motion
+    assert handler.bl_import_operator == PRIMDIFFUSION_OT_import_motion.bl_idname
+    assert set(handler.bl_file_extensions.split(";")) == {".npz", ".bvh"}
+    assert handler.poll_drop(SimpleNamespace(area=SimpleNamespace(type="VIEW_3D")))
+    assert not handler.poll_drop(SimpleNamespace(area=SimpleNamespace(type="IMAGE_EDITOR")))
+
+
+def test_the_import_shows_what_it_finds_before_anything_is_done(addon, armature, tmp_path):
+    def drawn(path: str, **settings) -> tuple[list[str], list[str]]:
+        layout = MagicMock()
+        layout.box.return_value.column.return_value = layout
+        layout.split.return_value = layout.column.return_value = layout
+        values = {"filepath": path, "person": "", "into": "NEW", "bones": "AUTO", **settings}
+        operator = SimpleNamespace(layout=layout, axis=lambda: "", **values)
+        operator._draw_found = lambda *a: PRIMDIFFUSION_OT_import_motion._draw_found(operator, *a)
+        PRIMDIFFUSION_OT_import_motion.draw(operator, addon)
+        labels = [call.kwargs["text"] for call in layout.label.call_args_list]
+        return labels, [call.args[1] for call in layout.prop.call_args_list]
+
+    labels, settings = drawn(write_amass(tmp_path / "m.npz"))
+    assert {"Ann", "SMPL-H", "120", "z"} <= set(labels)
+    assert "bones" not in settings
+    (tmp_path / "bad.bvh").write_text("HIERARCHY")
+    assert "is not a BVH file" in " ".join(drawn(str(tmp_path / "bad.bvh"))[0])  # lines break where the path ends
+    assert drawn("")[0] == ["Ann"]
+    path = write_bvh(
+        tmp_path / "m.bvh", REST_JOINTS, *motion_of(), {name: f"x{i}" for i, name in enumerate(JOINT_NAMES)}
+    )
+    assert "bone_left_knee" in drawn(str(path), bones="CHOSEN")[1]
