@@ -51,9 +51,9 @@ def prepare(human: Path, destination: Destination) -> tuple[WrittenHuman, dict[s
     written = write_now(human, destination)
     figures = {"write_ms": 1000 * (time.perf_counter() - began)}
     parts, read = [], 0
-    while read < len(written.files):
+    while read < len(written.unread):
         began = time.perf_counter()
-        read += read_grids(written.files[read:], SLICE_S)
+        read += read_grids(written.unread[read:], SLICE_S)
         parts.append(1000 * (time.perf_counter() - began))
     return written, figures | {"read_ms": sum(parts), "longest_read_ms": max(parts)}
 

@@ -1,14 +1,13 @@
 """Follow jobs to their end: by a timer while there is a window, by waiting in background mode.
 
-A result's volumes are written and loaded in slices of time before the operator runs, so that it returns quickly.
+A result is read, and volumes that viewports show are written and loaded, in slices of time before the operator runs, so
+that it returns quickly. Other volumes are written afterwards (`late_volumes`).
 """
 
 from __future__ import annotations
 
-import contextlib
 import time
 import traceback
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +15,12 @@ import bpy
 
 from ..backend.requests import sentence
 from ..places import missing_packages
+from .late_volumes import keep_writing
 from .memory import release_when_idle
 from .pictures import so_far
 from .queue import GONE, Entry, Job, JobOutcome, queue
 from .remedies import error_before_the_scene
+from .windows import in_the_way, redraw, window_of
 
 if TYPE_CHECKING:
     from ..scene.human_npz import Destination, VolumeWriter, WrittenHuman
@@ -51,9 +52,9 @@ class Building:
         if not self._writing.over:
             return _WRITING * self._writing.fraction
         written = self._writing.result
-        if written is None or not written.files:
+        if written is None or not written.unread:
             return 1.0
-        return _WRITING + (1 - _WRITING) * self._read / len(written.files)
+        return _WRITING + (1 - _WRITING) * self._read / len(written.unread)
 
     @property
     def busy(self) -> bool:
@@ -61,7 +62,7 @@ class Building:
         if self._writing is None:
             return False
         written = self._writing.result
-        return not self._writing.over or (written is not None and self._read < len(written.files))
+        return not self._writing.over or (written is not None and self._read < len(written.unread))
 
     def moved(self) -> bool:
         """Whether the bar has advanced a step since the last call."""
@@ -90,7 +91,7 @@ class Building:
                 self._writing.work(SLICE_S)
             return self.busy
         written = self._writing.result
-        if written is None or self._read == len(written.files):
+        if written is None or self._read == len(written.unread):
             return False  # after a failure the operator tries again and reports it
         if may_work:
             from ..scene.volumes import free_unused_grids, read_grids, read_headers  # needs numpy
@@ -98,9 +99,9 @@ class Building:
             if self._read == 0:
                 if not self._entry.job.new_person:  # the old ones; freed later, the new ones would be read twice
                     free_unused_grids()
-                read_headers(path for path in written.files if path.is_file())
-            self._read += read_grids(written.files[self._read :], SLICE_S)
-        return self._read < len(written.files)
+                read_headers(path for path in written.unread if path.is_file())
+            self._read += read_grids(written.unread[self._read :], SLICE_S)
+        return self._read < len(written.unread)
 
     def take(self, human: Path) -> WrittenHuman | None:
         """The written human of this human.npz, whose files are the caller's from now on; None if not written."""
@@ -125,21 +126,6 @@ building = Building()
 """One, as there is one queue."""
 
 
-_IN_THE_WAY = {"UNDO", "BLOCKING", "GRAB_CURSOR", "GRAB_CURSOR_X", "GRAB_CURSOR_Y"}
-"""Options of modal operators that block the scene or the mouse; others (screencasts) may run for ever."""
-
-
-def in_the_way() -> str:
-    """What a result has to wait for, as shown in panels; empty for nothing."""
-    if bpy.app.is_job_running("RENDER"):
-        return "the render"
-    windows = bpy.context.window_manager.windows
-    for modal in (modal for window in windows for modal in window.modal_operators):
-        if _IN_THE_WAY & modal.bl_options:
-            return modal.name
-    return ""
-
-
 def enter() -> None:
     """Run the operator that puts the result into the scene it was requested for."""
     entry = queue.current
@@ -148,35 +134,12 @@ def enter() -> None:
         queue.fail(error_before_the_scene(GONE.format(entry.scene)))
         return
     try:
-        with _shown(scene):
+        with window_of(scene):
             bpy.ops.primdiffusion.take_result()
     except RuntimeError as error:  # the timer must continue, whatever state Blender is in
         traceback.print_exc()
         if queue.current is entry:
             queue.fail(error_before_the_scene(f"the result could not enter the scene: {error}"))
-
-
-@contextlib.contextmanager
-def _shown(scene: bpy.types.Scene | None) -> Iterator[None]:
-    """A context with this scene in a window: timers have none.
-
-    Where no window shows the scene, one switches to it for the block: operators crash in a context whose scene is not
-    the window's (4.5, 5.0).
-    """
-    windows = list(bpy.context.window_manager.windows)
-    window = next((window for window in windows if window.scene == scene), windows[0] if windows else None)
-    if window is None:
-        yield
-        return
-    before = window.scene
-    if scene is not None and before != scene:
-        window.scene = scene
-    try:
-        with bpy.context.temp_override(window=window):
-            yield
-    finally:
-        if window.scene != before:
-            window.scene = before
 
 
 class PRIMDIFFUSION_OT_take_result(bpy.types.Operator):
@@ -202,6 +165,7 @@ class PRIMDIFFUSION_OT_take_result(bpy.types.Operator):
             return {"CANCELLED"}
         if undo:
             bpy.ops.ed.undo_push(message=undo)
+            keep_writing()
         return {"FINISHED"}
 
 
@@ -295,18 +259,6 @@ def keep_watching() -> None:
     """Have Blender call `watch` from now on."""
     if not bpy.app.background and not bpy.app.timers.is_registered(watch):
         bpy.app.timers.register(watch, first_interval=WATCH_S, persistent=True)
-
-
-def redraw() -> None:
-    """Redraw the sidebars of all windows, which do not notice progress themselves.
-
-    Not the views beside them, which take long.
-    """
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            for region in area.regions if area.type == "VIEW_3D" else ():
-                if region.type == "UI":
-                    region.tag_redraw()
 
 
 def _wait_for(entry: Entry) -> JobOutcome:

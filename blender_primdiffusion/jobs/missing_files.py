@@ -8,7 +8,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..scene.human import any_humans
-from .follow import redraw
+from .windows import redraw
 
 SOON_S = 0.5
 OFTEN_S = 15.0

@@ -18,6 +18,7 @@ import bpy
 from ..backend.client import Died, Silent
 from ..backend.requests import Backend, ChildRequest, RequestError
 from ..places import new_backend, preference
+from ..scene.attachment import volumes_may_wait
 from .remedies import defect_in_the_scene, error_in_the_scene
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ class Job(abc.ABC):
         return False
 
     def place(self) -> Destination | None:
-        """Where the result's volumes go, which are written before `finish`; None for jobs that show no human.
+        """Where the result's volumes go, which are prepared before `finish`; None for jobs that show no human.
 
         Evaluated when the result has arrived. ValueError and OSError are ignored: `finish` raises them again."""
         if not self.new_person:
@@ -73,7 +74,7 @@ class Job(abc.ABC):
         from ..scene.build import next_folder
         from ..scene.human_npz import Destination
 
-        return Destination(next_folder(self.new_person))
+        return Destination(next_folder(self.new_person), later=volumes_may_wait())
 
 
 def chosen_checkpoint(name: str) -> str:

@@ -10,6 +10,11 @@ ATTACHMENT = "primdiffusion_attachment"
 """Custom property of a human's collection: one of MODES; ARMATURE where it is missing."""
 MODES = ("ARMATURE", "SURFACE", "MERGED")
 _BEFORE = "primdiffusion_attachment_before_merge"
+IN_VIEWPORT = "primdiffusion_volumes_in_viewport"
+"""Custom property of a human's collection: whether viewports show the volumes; they do where it is missing, in humans
+of earlier versions."""
+VOLUMES_IN_VIEWPORT = True
+"""For new humans."""
 
 
 def attachment_of(collection: bpy.types.Collection) -> str:
@@ -42,7 +47,29 @@ def set_attachment(collection: bpy.types.Collection, mode: str) -> None:
     collection[ATTACHMENT] = mode
     for part, shown in ((primitives, "ARMATURE"), (carrier, "SURFACE"), (merged, "MERGED")):
         if part is not None:
-            part.hide_viewport = part.hide_render = mode != shown
+            part.hide_render = mode != shown
+            part.hide_viewport = part.hide_render or not in_viewport(collection)
+
+
+def in_viewport(collection: bpy.types.Collection) -> bool:
+    """Whether viewports show the human's volumes; renders do in any case."""
+    return bool(collection.get(IN_VIEWPORT, True))
+
+
+def volumes_may_wait(collection: bpy.types.Collection | None = None) -> bool:
+    """Whether new volumes of a human, or of a new one, may be written after the scene shows it: viewports hide them,
+    and there is a window, whose timer writes them."""
+    hidden = not (VOLUMES_IN_VIEWPORT if collection is None else in_viewport(collection))
+    return hidden and not bpy.app.background
+
+
+def show_in_viewport(collection: bpy.types.Collection, shown: bool) -> None:
+    """Show the human's volumes in viewports, or hide them there: a thousand take a gigabyte once drawn.
+
+    Makes no undo step. Raises ValueError for a human that cannot be edited, or whose volumes have no collection.
+    """
+    collection[IN_VIEWPORT] = shown
+    set_attachment(collection, attachment_of(collection))
 
 
 def attachment_before_merge(collection: bpy.types.Collection) -> str:

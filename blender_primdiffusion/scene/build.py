@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
 from .armature import build_armature
+from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT
 from .convention import frames_to_blender, matrix_to_quaternion, points_to_blender
 from .human import (
     BETAS,
@@ -50,7 +51,7 @@ def build_human(
     Raises HumanNpzError or VolumeWriteError, and then leaves neither data nor files.
     """
     written = write_now(human_npz, Destination(next_folder(name)))
-    read_headers(written.files)
+    read_headers(written.unread)
     return build_written(context, written, name, keep)
 
 
@@ -92,6 +93,8 @@ def _build(context: bpy.types.Context, written: WrittenHuman, name: str, keep: S
         body = build_body_mesh(f"{label}_body", armature, vertices, human.faces, human.uv_corner, human.skin_weights)
         collection.objects.link(body)
         primitives = bpy.data.collections.new(f"{label}_primitives")
+        primitives.hide_viewport = not VOLUMES_IN_VIEWPORT
+        primitives.objects.link(armature)  # the Outliner then shows the volumes inside the armature's closed row
         collection.children.link(primitives)
         folder = folder_of(collection)
         copies = {available_name(path, folder, path.name): path for path in keep}
@@ -111,6 +114,7 @@ def _build(context: bpy.types.Context, written: WrittenHuman, name: str, keep: S
             )
             collection[MARK] = written.provenance
             collection[HOME] = str(folder)
+            collection[IN_VIEWPORT] = VOLUMES_IN_VIEWPORT
             for new_name, path in copies.items():
                 if new_name != path.name:  # the usual name belongs to a human that was deleted
                     collection[PERSON] = new_name
@@ -191,14 +195,14 @@ def attach_volumes(
     """
     hide_relationship_lines()
     quaternions = matrix_to_quaternion(rotation)
-    objects = []
-    for k, path in enumerate(files):
-        label = f"{name}_prim_{k:04d}"
-        volume = bpy.data.volumes.new(label)
-        volume.filepath = stored_path(path)
+    labels = [f"{name}_prim_{k:04d}" for k in range(len(files))]
+    volumes = [bpy.data.volumes.new(label) for label in labels]
+    objects = [bpy.data.objects.new(label, volume) for label, volume in zip(labels, volumes, strict=True)]
+    for k, primitive in enumerate(objects):  # a loop of its own: new data make these changes slow
+        volume = volumes[k]
+        volume.filepath = stored_path(files[k])
         volume.render.space = "WORLD"
         volume.materials.append(material)
-        primitive = bpy.data.objects.new(label, volume)
         primitive.parent = armature
         primitive.matrix_parent_inverse = Matrix.Identity(4)
         primitive.rotation_mode = "QUATERNION"
@@ -212,7 +216,6 @@ def attach_volumes(
             target.subtarget = JOINT_NAMES[joint]
             target.weight = weights[k, joint]
         collection.objects.link(primitive)
-        objects.append(primitive)
     return objects
 
 

@@ -21,6 +21,7 @@ from .human import (
     PERSON,
     PRIMITIVE_VDB,
     TEMPORARY,
+    UNWRITTEN_NPZ,
     VolumeWriteError,
     available_name,
     copy_file,
@@ -29,11 +30,13 @@ from .human import (
     person_file_name,
     sequence_files,
     stored_path,
+    unwritten_in,
     volume_path,
 )
 from .shape import BODY_FILE, BODY_NPZ, body_files
 
 _PERSON_FILES = re.compile(r"person(_[0-9a-f]{12})?\.human\.safetensors")
+_OURS = (PRIMITIVE_VDB, _PERSON_FILES, BODY_NPZ, MERGED_VDB, UNWRITTEN_NPZ)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +71,8 @@ def collect_files() -> Collected:
         raise ValueError("this file was never saved: save it first, which collects the files of its humans too")
     home = humans_folder()
     away = [volume for volume in _local() if not _inside(volume_path(volume), home)]
-    gone = [volume for volume in away if not volume_path(volume).is_file()]
+    present = _present(away)
+    gone = [volume for volume in away if volume not in present]
     if gone:
         raise FileNotFoundError(
             f"{len(gone)} volumes have lost their files, {str(volume_path(gone[0]))!r} among them: press Find Missing "
@@ -109,10 +113,12 @@ def unused(folder: Path) -> list[Path]:
         return []
     used = {path.resolve() for volume in bpy.data.volumes if volume.filepath for path in sequence_files(volume)}
     in_use = _person_files() | body_files()
+    later = {path.parent for path in used if not path.is_file()}
     found = []
     for path in sorted(folder.rglob("*")):
-        named_so = any(pattern.fullmatch(path.name) for pattern in (PRIMITIVE_VDB, _PERSON_FILES, BODY_NPZ, MERGED_VDB))
-        if named_so and path.name not in in_use and path.resolve() not in used:
+        named_so = any(pattern.fullmatch(path.name) for pattern in _OURS)
+        awaited = UNWRITTEN_NPZ.fullmatch(path.name) and path.parent.resolve() in later
+        if named_so and path.name not in in_use and path.resolve() not in used and not awaited:
             found.append(path)
     return found
 
@@ -136,12 +142,12 @@ def _local() -> list[bpy.types.Volume]:
 
 def _collect(blend_path: str, away: Iterable[bpy.types.Volume]) -> Collected:
     target = humans_folder(blend_path)
-    moved = {}
-    for volume in away:
-        source = volume_path(volume)
-        if source.is_file():
-            moved[volume] = target / source.parent.name / source.name
+    sources = _present(away)
+    moved = {volume: target / path.parent.name / path.name for volume, path in sources.items()}
     copies = {path: moved[volume].parent / path.name for volume in moved for path in sequence_files(volume)}
+    copies = {source: copy for source, copy in copies.items() if source.is_file()}
+    for folder in {path.parent for path in sources.values()}:
+        copies |= {path: target / folder.name / path.name for path in unwritten_in(folder)}
     names = {}
     for person in bpy.data.collections:
         if MARK in person and person.library is None:
@@ -190,6 +196,13 @@ def _of_person(
     if found is not None:
         copies[found] = target / body
     return copies
+
+
+def _present(volumes: Iterable[bpy.types.Volume]) -> dict[bpy.types.Volume, Path]:
+    """The paths of those volumes whose file exists or will be written."""
+    paths = {volume: volume_path(volume) for volume in volumes}
+    later = {folder for folder in {path.parent for path in paths.values()} if unwritten_in(folder)}
+    return {volume: path for volume, path in paths.items() if path.parent in later or path.is_file()}
 
 
 def _temporary(path: Path) -> bool:

@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from .attachment import volumes_may_wait
 from .human import (
     MARK,
     PERSON,
@@ -48,7 +49,8 @@ def edit_destination(collection: bpy.types.Collection) -> Destination:
     """Where `replace_person` wants the volumes of the edited human."""
     shown = volumes_of(collection)
     files = {volume_path(obj.data) for objects in shown.values() for obj in objects}
-    return Destination(home_of(collection), tuple(shown), frozenset(path for path in files if path.is_file()))
+    there = frozenset(path for path in files if path.is_file())
+    return Destination(home_of(collection), tuple(shown), there, volumes_may_wait(collection))
 
 
 def replace_person(collection: bpy.types.Collection, written: WrittenHuman, person: Path) -> Replaced:

@@ -33,6 +33,10 @@ MERGED_VDB = re.compile(r"merged_[0-9a-f]{12}(_\d{4,})?\.vdb")
 """File names of merged volumes; those of a sequence end in the frame, counted from 1."""
 
 
+UNWRITTEN_NPZ = re.compile(r"unwritten_[0-9a-f]{12}\.npz")
+"""File names of humans whose volumes are written later (see `unwritten`); the hash is of the volumes' names."""
+
+
 class VolumeWriteError(OSError):
     """Files of a human could not be written; nothing was left behind."""
 
@@ -74,6 +78,14 @@ def sequence_files(volume: bpy.types.Volume) -> list[Path]:
     if match is None or match[1] is None:
         return [path]
     return sorted(path.parent.glob(path.name.replace(match[1], "_*")))
+
+
+def unwritten_in(folder: Path) -> list[Path]:
+    """Files in a folder from which volumes are still to be written there; none where the folder cannot be read."""
+    try:
+        return sorted(folder / name for name in os.listdir(folder) if UNWRITTEN_NPZ.fullmatch(name))
+    except OSError:
+        return []
 
 
 def folder_of(collection: bpy.types.Collection) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
@@ -180,11 +181,13 @@ class Destination:
     """Primitives of a human in the scene that have volumes; None for a new human, where all are written."""
     shown: frozenset[Path] = frozenset()
     """Files that Blender has read already, since volumes show them."""
+    later: bool = False
+    """The volumes are hidden, and written after the human stands (see `unwritten`)."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class WrittenHuman:
-    """A human whose volumes are in their folder but not yet in the scene."""
+    """A human whose volumes, or the file to write them from, are in their folder but not yet in the scene."""
 
     human: HumanFile
     grids: Grids
@@ -192,13 +195,17 @@ class WrittenHuman:
     """JSON, for the custom property `human.MARK`."""
     folder: Path
     files: tuple[Path, ...]
-    """Volumes that Blender has not read; for a new human, one for each primitive."""
+    """What must be in the folder: volumes that Blender has not read, or the file to write them from."""
+    unread: tuple[Path, ...]
+    """Those of `files` that Blender will read as soon as the human is in the scene."""
     made: tuple[Path, ...]
     """Files, of volumes and the body, that did not exist before."""
     existing: Path
     """The innermost folder that existed before."""
     names: Mapping[int, str]
     """File names of the volumes that were asked for, by primitive."""
+    later: Mapping[str, Path]
+    """The file to write volumes from, by its name in their folder; empty where they are written."""
     began: float
     """time.monotonic() when writing began."""
 
@@ -222,14 +229,15 @@ class WrittenHuman:
     def files_in(self, folder: Path, which: Iterable[int], keep: Mapping[str, Path]) -> Iterator[dict[int, Path]]:
         """Paths in `folder` of the volumes `which`, by primitive.
 
-        When the block ends well, volumes that are not there (they were written elsewhere, or removed since) are
+        When the block ends well, files that are not there (they were written elsewhere, or removed since) are
         written again, and the files in `keep` copied there under the names given. Raises VolumeWriteError.
         """
         files = {k: folder / (self.names.get(k) or file_name(self.grids, k, bpy.app.version)) for k in which}
+        absent = [] if self.later else [k for k, path in files.items() if not path.is_file()]
         with staged(folder) as staging:
-            for _ in staging.write(self.grids, [k for k, path in files.items() if not path.is_file()]):
+            for _ in staging.write(self.grids, absent):
                 pass
-            staging.copy(keep)
+            staging.copy({**keep, **{name: path for name, path in self.later.items() if not (folder / name).is_file()}})
             yield files
 
     def discard(self, but: Path | None = None) -> None:
@@ -249,8 +257,9 @@ def write_volumes(human_npz: Path, destination: Destination) -> Generator[float,
     """Bake and write the volumes, and the body's file beside their folder, in steps of some milliseconds (baking takes
     longer); yields the fraction done.
 
-    For a human in the scene, volumes whose file exists are not written again. Raises HumanNpzError and
-    VolumeWriteError; then, and when it is closed early, no files are left.
+    Where the volumes may come later, a copy of `human_npz` is all that is written of them. For a human in the scene,
+    volumes whose file exists are not written again. Raises HumanNpzError and VolumeWriteError; then, and when it is
+    closed early, no files are left.
     """
     began, folder = time.monotonic(), destination.folder
     yield 0.0
@@ -262,20 +271,34 @@ def write_volumes(human_npz: Path, destination: Destination) -> Generator[float,
     yield 0.0
     count = len(grids.density)
     which = range(count) if destination.which is None else [k for k in destination.which if k < count]
-    names = {k: file_name(grids, k, bpy.app.version) for k in which}
+    every = file_names(grids, bpy.app.version)
+    names = {k: every[k] for k in which}
     files = {k: folder / name for k, name in names.items()}
     absent = [k for k, path in files.items() if destination.which is None or not path.is_file()]
+    later = {unwritten_name(every): human_npz} if destination.later and absent else {}
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     model = human.shape_model
     body = () if model is None else (folder.parent / body_file_name(model),)
     with contextlib.ExitStack() as undone:
         staging = undone.enter_context(staged(folder))
-        yield from staging.write(grids, absent)
+        yield from staging.write(grids, [] if later else absent)
+        staging.copy(later)
         made = tuple(path for path in (*staging.paths, *body) if not path.exists())
         if model is not None:
             undone.enter_context(saved_body_file(model, folder.parent))
-    unread = tuple(path for path in files.values() if path not in destination.shown)
-    return WrittenHuman(human, grids, provenance, folder, unread, made, existing, names, began)
+    unread = () if destination.later else tuple(path for path in files.values() if path not in destination.shown)
+    needed = tuple(folder / name for name in later) or unread
+    return WrittenHuman(human, grids, provenance, folder, needed, unread, made, existing, names, later, began)
+
+
+def file_names(grids: Grids, blender_version: tuple[int, ...]) -> list[str]:
+    """Names of all volumes of a human, as this version of Blender writes them."""
+    return [file_name(grids, k, blender_version) for k in range(len(grids.density))]
+
+
+def unwritten_name(names: Iterable[str]) -> str:
+    """The name of a file from which the volumes of these names are written."""
+    return f"unwritten_{hashlib.sha256(''.join(names).encode()).hexdigest()[:12]}.npz"
 
 
 def write_now(human_npz: str | Path, destination: Destination) -> WrittenHuman:

@@ -27,6 +27,7 @@ from .human import (
     humans_folder,
     person_file_name,
     stored_path,
+    unwritten_in,
     volume_path,
 )
 from .human_file import read_tensors
@@ -73,7 +74,7 @@ class MissingFiles:
 
     person: bpy.types.Collection
     volumes: tuple[bpy.types.Volume, ...]
-    """Volumes of primitives without their file."""
+    """Volumes of primitives without their file, if that is not yet to be written."""
     merged: tuple[bpy.types.Volume, ...]
     """Merged volumes without all of their files."""
     person_file: str
@@ -188,10 +189,11 @@ def _without_files(
     person: bpy.types.Collection, listing: Listing
 ) -> tuple[list[bpy.types.Volume], list[bpy.types.Volume]]:
     single, several = [], []
+    later = {folder for folder in folders_of(person)[:1] if unwritten_in(folder)}
     for volume in {obj.data: None for obj in person.all_objects if obj.type == "VOLUME"}:
         path = volume_path(volume)
         if PRIMITIVE_VDB.fullmatch(path.name) and path not in listing:
-            single.append(volume)
+            single += [] if path.parent in later else [volume]
         elif MERGED_VDB.fullmatch(path.name) and not {*_sequence_names(volume)} <= listing.names(path.parent):
             several.append(volume)
     return single, several

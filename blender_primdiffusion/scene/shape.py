@@ -402,7 +402,7 @@ def _write(path: Path, model: ShapeModel) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".writing_", suffix=".npz", delete=False) as file:
             unfinished = Path(file.name)
-            np.savez_compressed(file, **arrays)
+            np.savez(file, **arrays)  # compressing takes half a second, and Blender waits
         os.replace(unfinished, path)
     except OSError as error:
         if unfinished is not None:

@@ -131,9 +131,9 @@ class Staging:
         for number, k in enumerate(which):
             yield number / len(which)
             try:
-                self.names.append(_write_file(grids, k, self._hidden))
+                self.names.append(write_file(grids, k, self._hidden, bpy.app.version))
             except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
-                raise _write_error(self._folder, error) from error
+                raise write_error(self._folder, error) from error
 
     def copy(self, files: Mapping[str, Path]) -> None:
         """Add copies of `files` under the names given. Raises VolumeWriteError."""
@@ -142,7 +142,7 @@ class Staging:
                 shutil.copyfile(path, self._hidden / name)
                 self.names.append(name)
         except OSError as error:
-            raise _write_error(self._folder, error) from error
+            raise write_error(self._folder, error) from error
 
 
 @contextmanager
@@ -158,7 +158,7 @@ def staged(folder: Path) -> Iterator[Staging]:
         hidden = Path(tempfile.mkdtemp(prefix=".writing_", dir=folder))
     except OSError as error:
         remove_empty(folder, existing)
-        raise _write_error(folder, error) from error
+        raise write_error(folder, error) from error
     published: list[Path] = []
     try:
         staging = Staging(hidden, folder)
@@ -169,7 +169,7 @@ def staged(folder: Path) -> Iterator[Staging]:
             try:
                 os.replace(hidden / path.name, path)
             except OSError as error:
-                raise _write_error(folder, error) from error
+                raise write_error(folder, error) from error
     except BaseException:
         for path in published:
             path.unlink(missing_ok=True)
@@ -179,14 +179,18 @@ def staged(folder: Path) -> Iterator[Staging]:
         remove_empty(folder, existing)
 
 
-def _write_file(grids: Grids, k: int, folder: Path) -> str:
+def write_file(grids: Grids, k: int, folder: Path, blender_version: tuple[int, ...]) -> str:
+    """Write a primitive's volume into a folder under its `file_name`, which is returned.
+
+    Raises OSError, and RuntimeError when the disk is full.
+    """
     part = tuple(slice(first, last + 1) for first, last in zip(grids.first[k], grids.last[k], strict=True))
-    name = file_name(grids, k, bpy.app.version)
+    name = file_name(grids, k, blender_version)
     write_vdb(
         folder / name,
         grids.density[k][part],
         grids.colour[k][part],
-        index_to_local(grids.half_extent[k], bpy.app.version),
+        index_to_local(grids.half_extent[k], blender_version),
         tuple((grids.first[k] - PAD).tolist()),
         _ALL_ACTIVE,
     )
@@ -226,7 +230,8 @@ def openvdb() -> ModuleType:
     return openvdb
 
 
-def _write_error(folder: Path, error: BaseException) -> VolumeWriteError:
+def write_error(folder: Path, error: BaseException) -> VolumeWriteError:
+    """For errors of the system and of openvdb."""
     return VolumeWriteError(
         f"the volumes could not be written to {str(folder)!r} ({error}); save the .blend in a folder with "
         "write permission and free space"

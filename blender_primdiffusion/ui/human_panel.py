@@ -8,6 +8,7 @@ import bpy
 
 from ..backend.requests import sentence
 from ..jobs.follow import Reporting, submit
+from ..jobs.late_volumes import late_volumes
 from ..jobs.missing_files import look, state
 from ..jobs.target import HumanTarget, selected_person
 from ..scene.human import armature_of, check_editable, humans, humans_folder, person_file, remove_human
@@ -167,6 +168,8 @@ files that share the folder, may need them"""
 
 def draw_missing(layout: bpy.types.UILayout) -> None:
     """What is missing and what can be done about it; nothing when all files are there."""
+    if late_volumes.error:
+        draw_lines(layout, late_volumes.error, "ERROR")
     if not state.summary:
         return
     box = layout.box()

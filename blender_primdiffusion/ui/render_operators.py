@@ -9,8 +9,14 @@ import bpy
 from ..formats.requests import VOXEL
 from ..jobs.follow import submit
 from ..jobs.target import HumanTarget
-from ..scene.attachment import attachment_before_merge, attachment_of, set_attachment
-from ..scene.human import armature_of
+from ..scene.attachment import (
+    attachment_before_merge,
+    attachment_of,
+    in_viewport,
+    set_attachment,
+    show_in_viewport,
+)
+from ..scene.human import armature_of, humans
 from .on_person import SKIP, OnPerson
 
 if TYPE_CHECKING:
@@ -41,6 +47,32 @@ class PRIMDIFFUSION_OT_set_attachment(OnPerson, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         set_attachment(person, self.mode)
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_volumes_in_viewport(OnPerson, bpy.types.Operator):
+    """Show or hide the selected human's volumes in viewports; drawn, they take a gigabyte. Renders always have them"""
+
+    bl_idname = "primdiffusion.volumes_in_viewport"
+    bl_label = "Volumes in Viewport"
+    bl_options = {"UNDO"}
+
+    everyone: bpy.props.BoolProperty(name="All Humans", description="Do it for all humans of the scene", options=SKIP)
+
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        # needs numpy
+        from ..jobs.export import show, shown
+        from ..scene.proxy import proxy_of
+        from ..scene.unwritten import write_all_unwritten
+
+        visible = not in_viewport(person)
+        if visible:
+            write_all_unwritten()
+        for each in humans(context.scene) if self.everyone else [person]:
+            what = shown(each)
+            show_in_viewport(each, visible)
+            if proxy_of(each) is not None:
+                show(each, what)
         return {"FINISHED"}
 
 

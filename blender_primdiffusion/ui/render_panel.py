@@ -13,7 +13,7 @@ from ..engine.engine import ENGINE
 from ..formats.requests import DENSITY_GAIN, VOXEL
 from ..jobs.follow import Reporting
 from ..jobs.target import selected_person
-from ..scene.attachment import MODES, attachment_of
+from ..scene.attachment import MODES, attachment_of, in_viewport
 from ..scene.human import human_of, humans
 from ..scene.material import density_gain, set_density_gain
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
@@ -264,6 +264,8 @@ class PRIMDIFFUSION_PT_attachment(_OfPerson, bpy.types.Panel):
         for mode, label, _ in ATTACHMENT_ITEMS:
             if mode != MODES[2] or merged_of(person) is not None:
                 row.operator("primdiffusion.set_attachment", text=label, depress=mode == now).mode = mode
+        icon = "RESTRICT_VIEW_OFF" if in_viewport(person) else "RESTRICT_VIEW_ON"
+        self.layout.operator("primdiffusion.volumes_in_viewport", depress=in_viewport(person), icon=icon)
 
 
 class PRIMDIFFUSION_PT_merge(_OfPerson, bpy.types.Panel):

@@ -25,6 +25,7 @@ from ...engine.engine import ENGINE
 from ...formats.whole_files import replacing
 from ...scene.cycles import fit_cycles_to_volumes, new_camera
 from ...scene.human import NPZ_FILE, PERSON_FILE, humans, humans_folder, volume_path
+from ...scene.unwritten import write_all_unwritten
 from .people import (
     Movement,
     build_person,
@@ -269,6 +270,7 @@ class _Drawing:
 
 
 def _check_volumes(scene: bpy.types.Scene) -> None:
+    write_all_unwritten()
     volumes = {obj.data for person in humans(scene) for obj in person.all_objects if obj.type == "VOLUME"}
     missing = [path for path in (volume_path(volume) for volume in volumes if volume.filepath) if not path.is_file()]
     if missing:

@@ -7,6 +7,7 @@ import sys
 import bpy
 
 from ...backend.requests import sentence
+from ...jobs.late_volumes import keep_writing
 from ...jobs.queue import queue
 from ...places import EXTENSION, missing_packages, set_up_folder
 from ..drawing import draw_lines
@@ -82,6 +83,18 @@ _COMPUTE = (
     ("CUDA", "NVIDIA (CUDA)", "Large download; needs an NVIDIA card and driver"),
     ("APPLE", "Apple", "For Apple Silicon; computes on its processor"),
 )
+_VOLUMES = (
+    ("ALWAYS", "Always", "Volumes are written as soon as the human stands, so that any renderer has them"),
+    (
+        "WHEN_RENDERING",
+        "When Rendering",
+        "Volumes are written when another engine than PrimDiffusion renders for the first time",
+    ),
+)
+
+
+def _keep_writing(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
+    keep_writing()
 
 
 def _python_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
@@ -127,12 +140,19 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         soft_max=120,
     )
 
+    volumes: bpy.props.EnumProperty(
+        name="Write Volumes",
+        description="When the volumes that Cycles and EEVEE draw are written; 25 MB a human",
+        items=_VOLUMES,
+        update=_keep_writing,
+    )
+
     def draw(self, _context: bpy.types.Context) -> None:
         layout = self.layout
         self._draw_backend(layout.box())
         layout.use_property_split = True
         layout.use_property_decorate = False
-        for name in ("backend_python", "checkpoint", "encoder", "idle_minutes"):
+        for name in ("backend_python", "checkpoint", "encoder", "idle_minutes", "volumes"):
             layout.prop(self, name)
 
     def _draw_backend(self, box: bpy.types.UILayout) -> None:

@@ -59,8 +59,8 @@ def check_whole(person: bpy.types.Collection) -> None:
 
 def test_no_tick_writes_more_than_its_slice(addon, monkeypatch):
     monkeypatch.setattr("blender_primdiffusion.jobs.follow.SLICE_S", 0.0)
-    written, write_file, ticks = [], volumes._write_file, [0]
-    monkeypatch.setattr(volumes, "_write_file", lambda *args: written.append(ticks[0]) or write_file(*args))
+    written, write_file, ticks = [], volumes.write_file, [0]
+    monkeypatch.setattr(volumes, "write_file", lambda *args: written.append(ticks[0]) or write_file(*args))
     queue.add(addon, GenerateJob(7, 1))
     while follow() is not None:
         ticks[0] += 1

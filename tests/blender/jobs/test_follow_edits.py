@@ -87,8 +87,8 @@ def check_drawn(person) -> None:
 
 def test_an_edit_writes_its_volumes_in_slices(person, monkeypatch):
     monkeypatch.setattr(SLICE_SECONDS, 0.0)
-    written, write_file, ticks = [], volumes._write_file, [0]
-    monkeypatch.setattr(volumes, "_write_file", lambda *args: written.append(ticks[0]) or write_file(*args))
+    written, write_file, ticks = [], volumes.write_file, [0]
+    monkeypatch.setattr(volumes, "write_file", lambda *args: written.append(ticks[0]) or write_file(*args))
     vary(person)
     while follow() is not None:
         ticks[0] += 1
@@ -267,7 +267,7 @@ def test_a_full_disk_is_reported_and_leaves_scene_and_disk_as_they_were(person, 
         raise OSError("no space left on device")
 
     before, files = shown(person), on_disk(tmp_path)
-    monkeypatch.setattr(volumes, "_write_file", full)
+    monkeypatch.setattr(volumes, "write_file", full)
     vary(person)
     drive()
     assert "no space left" in error_of("vary")

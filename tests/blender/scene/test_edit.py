@@ -210,7 +210,7 @@ def test_a_full_disk_leaves_scene_and_disk_as_they_were(person, saved_scene, tmp
 
     before, files = paths(person), sorted(folder_of(person).iterdir())
     edited = redyed(tmp_path, 3)
-    monkeypatch.setattr(volumes, "_write_file", full)
+    monkeypatch.setattr(volumes, "write_file", full)
     with pytest.raises(VolumeWriteError, match="no space left"):
         replace(person, *edited)
     assert paths(person) == before

@@ -1,0 +1,149 @@
+"""Volumes written after their humans stand: by a timer while the user works, or at the latest for a render."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator
+from pathlib import Path
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..engine.engine import ENGINE
+from ..places import EXTENSION
+from ..scene.human import any_humans
+from .windows import in_the_way, redraw
+
+ALWAYS, WHEN_RENDERING = "ALWAYS", "WHEN_RENDERING"
+"""Values of the preference `volumes`."""
+PAUSE_S = 0.02
+"""Between two slices, at least."""
+SHORTEST_S, LONGEST_S = 0.05, 0.2
+"""Of a slice. In between, it is as long as the pause before it, in which Blender may have drawn."""
+BLOCKED_S = 0.25
+
+
+class LateVolumes:
+    """The one that is being written, in slices. All methods but `finish` are for Blender's main thread."""
+
+    def __init__(self) -> None:
+        self.error = ""
+        """Why volumes could not be written; empty when they could."""
+        self._source: Path | None = None
+        self._steps: Generator[None, None, None] | None = None
+        self._failed: set[Path] = set()
+        self._ended = 0.0
+
+    def work(self, seconds: float) -> bool:
+        """Write for about `seconds`, one step at least; whether more is left."""
+        from ..scene.unwritten import unwritten, write_unwritten  # needs numpy
+
+        left = [source for source in unwritten() if source not in self._failed]
+        if self._source not in left:  # written by a render, or the human is gone
+            self.stop()
+        if not left:
+            return False
+        if self._steps is None:
+            self._source, self._steps = left[0], write_unwritten(left[0])
+        end = time.monotonic() + seconds
+        try:
+            next(self._steps)
+            while time.monotonic() < end:
+                next(self._steps)
+        except StopIteration:
+            self.stop()
+        except (OSError, ValueError) as error:
+            self._fail(self._source, error)
+        return True
+
+    def finish(self) -> None:
+        """Write all that is left, with steps of its own: renders call it from another thread."""
+        from ..scene.unwritten import write_all_unwritten  # needs numpy
+
+        self._failed.clear()
+        self.error = ""
+        try:
+            write_all_unwritten()
+        except (OSError, ValueError) as error:
+            self.error = str(error)
+            print(f"PrimDiffusion: {error}")
+
+    def tick(self) -> float | None:
+        """The timer: a slice of writing, until all is written."""
+        if in_the_way():
+            return BLOCKED_S
+        drawing = time.monotonic() - self._ended - PAUSE_S
+        more = self.work(min(max(drawing, SHORTEST_S), LONGEST_S))
+        self._ended = time.monotonic()
+        return PAUSE_S if more else None
+
+    def stop(self) -> None:
+        """Stop writing; what is written stays, and the rest can be written later."""
+        if self._steps is not None:
+            self._steps.close()
+        self._source = self._steps = None
+
+    def _fail(self, source: Path, error: Exception) -> None:
+        self.stop()
+        self._failed.add(source)
+        self.error = str(error)
+        print(f"PrimDiffusion: {error}")
+        redraw()
+
+
+late_volumes = LateVolumes()
+"""One for all humans."""
+
+
+def preferred() -> str:
+    """When volumes are written: the preference, or ALWAYS."""
+    addon = bpy.context.preferences.addons.get(EXTENSION)
+    return getattr(addon.preferences, "volumes", ALWAYS) if addon is not None else ALWAYS
+
+
+def keep_writing() -> None:
+    """Have Blender write what is not written yet, unless the preference is to wait for a render."""
+    if bpy.app.background or preferred() != ALWAYS or not any_humans():
+        return
+    if not bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.register(_tick, first_interval=BLOCKED_S, persistent=True)
+
+
+def _tick() -> float | None:
+    return late_volumes.tick()
+
+
+@persistent
+def write_soon(*_: object) -> None:
+    """Handler of load_post, save_post, undo_post and redo_post: another .blend, or other folders."""
+    keep_writing()
+
+
+@persistent
+def stop_writing(*_: object) -> None:
+    """Handler of save_pre, which may copy the files elsewhere."""
+    late_volumes.stop()
+
+
+@persistent
+def write_before_rendering(scene: bpy.types.Scene, *_: object) -> None:
+    """Handler of render_init: every engine but PrimDiffusion draws the volumes."""
+    if scene.render.engine != ENGINE and any_humans():
+        late_volumes.finish()
+
+
+HANDLERS = (
+    ("load_post", write_soon),
+    ("save_pre", stop_writing),
+    ("save_post", write_soon),
+    ("undo_post", write_soon),
+    ("redo_post", write_soon),
+    ("render_init", write_before_rendering),
+)
+
+
+def unregister() -> None:
+    """Stop the timer."""
+    if bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.unregister(_tick)
+    late_volumes.stop()

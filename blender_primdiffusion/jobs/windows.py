@@ -1,0 +1,57 @@
+"""Blender's windows: what occupies them, redrawing, and a window for what a timer runs."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+import bpy
+
+_IN_THE_WAY = {"UNDO", "BLOCKING", "GRAB_CURSOR", "GRAB_CURSOR_X", "GRAB_CURSOR_Y"}
+"""Options of modal operators that block the scene or the mouse; others (screencasts) may run for ever."""
+
+
+def in_the_way() -> str:
+    """What a result has to wait for, as shown in panels; empty for nothing."""
+    if bpy.app.is_job_running("RENDER"):
+        return "the render"
+    windows = bpy.context.window_manager.windows
+    for modal in (modal for window in windows for modal in window.modal_operators):
+        if _IN_THE_WAY & modal.bl_options:
+            return modal.name
+    return ""
+
+
+@contextlib.contextmanager
+def window_of(scene: bpy.types.Scene | None) -> Iterator[None]:
+    """A context with this scene in a window: timers have none.
+
+    Where no window shows the scene, one switches to it for the block: operators crash in a context whose scene is not
+    the window's (4.5, 5.0).
+    """
+    windows = list(bpy.context.window_manager.windows)
+    window = next((window for window in windows if window.scene == scene), windows[0] if windows else None)
+    if window is None:
+        yield
+        return
+    before = window.scene
+    if scene is not None and before != scene:
+        window.scene = scene
+    try:
+        with bpy.context.temp_override(window=window):
+            yield
+    finally:
+        if window.scene != before:
+            window.scene = before
+
+
+def redraw() -> None:
+    """Redraw the sidebars of all windows, which do not notice progress themselves.
+
+    Not the views beside them, which take long.
+    """
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            for region in area.regions if area.type == "VIEW_3D" else ():
+                if region.type == "UI":
+                    region.tag_redraw()

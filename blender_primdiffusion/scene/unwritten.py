@@ -1,0 +1,61 @@
+"""Volumes that are written after their human stands.
+
+A human's volumes are objects with paths from the start. Where their files come later, the backend's human.npz is beside
+them as `unwritten_<hash>.npz`, the hash being that of the files' names. Any Blender can write them from it, in steps
+and after any interruption; it is removed with the last one.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Generator
+from pathlib import Path
+
+import bpy
+
+from .human import MARK, folders_of, unwritten_in
+from .human_npz import HumanNpzError, file_names, read_human, unwritten_name
+from .volumes import bake, write_error, write_file
+
+_VERSIONS = ((5, 0, 0), (4, 5, 0))
+"""Blender versions that write volumes differently."""
+
+
+def unwritten() -> list[Path]:
+    """Files from which volumes of this .blend's humans are still to be written."""
+    folders = {folders_of(person)[0] for person in bpy.data.collections if MARK in person}
+    return [path for folder in sorted(folders) for path in unwritten_in(folder)]
+
+
+def write_unwritten(source: Path) -> Generator[None, None, None]:
+    """Write the volumes of `source` beside it, a file a step, and then remove it; volumes that exist stay.
+
+    Several may write the same volumes, as a timer and a render do. Raises HumanNpzError and VolumeWriteError.
+    """
+    human = read_human(source)
+    yield
+    grids = bake(human.density, human.rgb, human.half_extent)
+    yield
+    named = {unwritten_name(file_names(grids, version)): version for version in _VERSIONS}
+    if source.name not in named:
+        raise HumanNpzError(f"{str(source)!r} was changed: press Find Missing Volumes after deleting it")
+    version = named[source.name]
+    paths = [source.parent / name for name in file_names(grids, version)]
+    yield
+    try:
+        for k, path in enumerate(paths):
+            if not path.is_file():
+                with tempfile.TemporaryDirectory(prefix=".writing_", dir=source.parent) as hidden:
+                    os.replace(Path(hidden, write_file(grids, k, Path(hidden), version)), path)
+                yield
+        source.unlink(missing_ok=True)
+    except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
+        raise write_error(source.parent, error) from error
+
+
+def write_all_unwritten() -> None:
+    """Write what `unwritten` lists, which takes seconds for each human. Raises as `write_unwritten`."""
+    for source in unwritten():
+        for _ in write_unwritten(source):
+            pass
