@@ -29,9 +29,11 @@ from .boxes import Boxes
 from .gpu_shaders import ACROSS, BOXES_A_ROW, ENTRIES_A_ROW, TEXELS, TILE, VOXELS, WIDER
 from .view import PinholeView
 
-STRIDES = (4, 2, 1)
+STRIDES = [1, 2, 4]
 SAMPLES_PER_VOXEL = 2.0
 """As the backend's `MarchSettings`."""
+MOST_DOUBLINGS = 16
+"""Of strides, for large humans beside small ones; as the backend's."""
 MOST_ENTRIES = 2**22
 """Of all tiles' lists; with more, boxes are listed for larger tiles."""
 _OPTICAL = 1e-2
@@ -91,7 +93,7 @@ class GpuMarch:
         self._shader, self._size, self._done = shaders["march"], size, 0
         self._columns, self._rows = -(-view.width // TILE), -(-view.height // TILE)
         self._atlas, self._ends = atlas, ends
-        base = int(records[0, 0, 1]) // STRIDES[0] * STRIDES[0] if len(records) else 0
+        base = records[0, 0, 1] // (stride := records[:, 0, 3].max()) * stride if len(records) else 0.0
         records[:, 0, :3] -= base
         self._boxes = _texture(_padded(records), "RGBA32F")
         fine = _tiles(records, view, TILE)
@@ -150,6 +152,12 @@ class GpuMarch:
             self._done += rows
         return self._done >= self._rows
 
+    def wait(self) -> None:
+        """Return when the GPU has finished what it was given."""
+        frame = gpu.types.GPUFrameBuffer(color_slots=self.colour)
+        with frame.bind():
+            frame.read_color(0, 0, 1, 1, 4, 0, "FLOAT")
+
 
 class GpuMarcher:
     """Compiled shaders, and the common atlas of the people that were marched last. Needs a GPU context."""
@@ -176,15 +184,16 @@ class GpuMarcher:
         step: float,
         ends: gpu.types.GPUTexture | None = None,
     ) -> GpuMarch:
-        """Prepare the picture of `people` from `view`, sampled every `step` metres; `advance` marches it.
+        """Prepare the picture of `people` from `view`; `advance` marches it. `step` is the distance in metres between
+        samples through large boxes of people of natural size.
 
         Overlapping boxes are mixed at lattice points, also those of several people. `ends` holds, as `GpuMarch.depth`
         does, where each pixel's ray ends at other objects.
         """
-        spacing = step / STRIDES[0]
+        spacing, strides = _lattice([boxes.density_scale for _, boxes in people], step)
         size = (ACROSS * VOXELS, max([payload.rows for payload, _ in people], default=1) * VOXELS)
         atlas_size = (*size, max(len(people), 1) * VOXELS)
-        records = _all_records(people, view, spacing, atlas_size[1] // VOXELS)
+        records = _all_records(people, view, spacing, strides, atlas_size[1] // VOXELS)
         return GpuMarch(self._shaders, self._common(people, atlas_size), atlas_size, records, view, spacing, ends)
 
     def _common(self, people: Sequence[tuple[GpuPayload, Boxes]], size: tuple[int, int, int]) -> gpu.types.GPUTexture:
@@ -215,12 +224,21 @@ def _content(solid: NDArray[np.bool_]) -> NDArray[np.float64]:
     return bounds / (VOXELS - 1) * 2 - 1
 
 
+def _lattice(density_scales: list[float], step: float) -> tuple[float, list[int]]:
+    """Spacing of lattice points and strides for humans of these scales, by powers of two as the backend's
+    `settings_for`: the lattice shrinks with the smallest, strides grow with the largest."""
+    powers = [round(-np.log2(scale)) for scale in density_scales] or [0]
+    doublings = min(max(powers) - min(powers), MOST_DOUBLINGS)
+    spacing = step / STRIDES[-1] * 2.0 ** (max(powers) - doublings)
+    return spacing, STRIDES + [STRIDES[-1] * 2**i for i in range(1, doublings + 1)]
+
+
 def _all_records(
-    people: Sequence[tuple[GpuPayload, Boxes]], view: PinholeView, spacing: float, rows: int
+    people: Sequence[tuple[GpuPayload, Boxes]], view: PinholeView, spacing: float, strides: list[int], rows: int
 ) -> NDArray[np.float64]:
     """Records [N, TEXELS, 4] of all boxes with content in the view, in the order of their first lattice points; `rows`
     is the height of an atlas layer in bricks."""
-    parts = [_records(payload, boxes, view, spacing) for payload, boxes in people]
+    parts = [_records(payload, boxes, view, spacing, strides) for payload, boxes in people]
     for number, (part, shown) in enumerate(parts):
         part[:, 6, 3] = number * rows * ACROSS + shown
     records = np.concatenate([part for part, _ in parts]) if parts else np.zeros((0, TEXELS, 4))
@@ -247,7 +265,7 @@ def _counts(reach: NDArray[np.int64], across: NDArray[np.int64]) -> NDArray[np.i
 
 
 def _records(
-    payload: GpuPayload, boxes: Boxes, view: PinholeView, spacing: float
+    payload: GpuPayload, boxes: Boxes, view: PinholeView, spacing: float, strides: list[int]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Records [N, TEXELS, 4] of the boxes with content in the view, and their indices."""
     solid = (payload.bounds[:, 0] < payload.bounds[:, 1]).all(1) & (boxes.half_extent > 0).all(1)
@@ -284,8 +302,8 @@ def _records(
     seen = (reach[:, :2] <= reach[:, 2:]).all(1) & (depth.max(1) >= view.clip[0]) & (depth.min(1) <= view.clip[1])
 
     voxel = (2 * half.min(1) / (VOXELS - 1)).astype(np.float32)
-    stride = np.full(len(shown), float(STRIDES[-1]))
-    for candidate in reversed(STRIDES):
+    stride = np.ones(len(shown))
+    for candidate in strides:
         stride[voxel >= np.float32(candidate * spacing * SAMPLES_PER_VOXEL)] = candidate
     whole = np.floor(pixel)
     record = np.zeros((len(shown), TEXELS, 4))

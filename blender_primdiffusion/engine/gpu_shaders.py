@@ -18,7 +18,7 @@ ENTRIES_A_ROW = 4096
 WIDER = 8
 """Tiles are listed out of lists of tiles that are as many times wider."""
 CHUNK = 16
-"""Lattice points that are composited together: a multiple of the largest stride."""
+"""Lattice points, of the finest in a tile, that are composited together."""
 
 _RECORDS = f"""
 vec4 record(int box, int texel)
@@ -54,7 +54,7 @@ void main()
   }}
   int begin = int(texelFetch(tiles, tile, 0).x);
   int place = begin + 1;
-  float finest = 4.0;
+  float finest = 1e6;
   for (int i = 0; i < int(span.y); i++) {{
     int box = tiling.w < 0 ? entry(int(span.x) + 1 + i) : i;
     vec4 reach = record(box, 8);

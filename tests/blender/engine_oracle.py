@@ -84,6 +84,7 @@ def draw(
     height: int,
     step: float,
     clip: list | None = None,
+    strides: list = (4, 2, 1),
 ) -> None:
     """Combined [h, w, 4] and depth along the optical axis [h, w], top row first; `clip` is along that axis."""
     primitives = Primitives.together(
@@ -93,7 +94,7 @@ def draw(
     camera = Camera(*matrices, width, height)
     cosine = camera.rays()[1] @ camera.world_to_camera[2, :3]
     span = None if clip is None else Span(clip[0] / cosine, clip[1] / cosine)
-    rendering = march(primitives, camera, MarchSettings(step=step), span=span)
+    rendering = march(primitives, camera, MarchSettings(step=step, strides=tuple(strides)), span=span)
     depth = (rendering.first_hit * cosine).numpy()
     depth[~np.isfinite(depth)] = 1e10
     np.savez(out, combined=np.concatenate([rendering.rgb, rendering.alpha[..., None]], -1), depth=depth)

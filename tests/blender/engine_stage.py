@@ -51,10 +51,10 @@ class Oracle:
         return folder
 
     def picture(
-        self, people: list[dict], camera: dict, size: tuple[int, int], step: float = STEP
+        self, people: list[dict], camera: dict, size: tuple[int, int], step: float = STEP, **more: object
     ) -> tuple[np.ndarray, np.ndarray]:
         """Combined [h, w, 4] and depth [h, w], top row first."""
-        draw = {"people": people, **camera, "width": size[0], "height": size[1], "step": step}
+        draw = {"people": people, **camera, "width": size[0], "height": size[1], "step": step, **more}
         self.ask({"draw": draw, "out": str(self._out)})
         with np.load(self._out) as answer:
             return answer["combined"], answer["depth"]

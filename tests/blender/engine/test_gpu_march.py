@@ -173,15 +173,32 @@ def test_parallel_views_are_as_the_backend_draws_them(marcher, backend, payload)
 
 
 def test_a_scaled_person_is_marched_with_its_density(marcher, backend, payload):
-    world = np.diag([1.5, 1.5, 1.5, 1.0])
+    world = np.diag([1.3, 1.3, 1.3, 1.0])
     fields, original = placed(backend, world=world), placed(backend)
-    assert np.allclose(fields["density"], original["density"] / 1.5)
+    assert np.allclose(fields["density"], original["density"] / 1.3)
     view = pinhole(fields["position"].mean(0), (0.0, 0.0, 4.0))
-    whole = Boxes(fields["position"], fields["rotation"], fields["half_extent"], 1 / 1.5)
+    whole = Boxes(fields["position"], fields["rotation"], fields["half_extent"], 1 / 1.3)
     scaled, _ = marched(marcher, [(payload, whole)], view)
     same, _ = marched(marcher, [(GpuPayload(fields["rgb"], fields["density"]), boxes_of(fields))], view)
     assert np.abs(scaled - same).max() < STEP_OF_8_BIT / 4
     assert_equal(marcher, backend, [(GpuPayload(fields["rgb"], fields["density"]), fields)], view)
+
+
+def test_small_boxes_are_sampled_finely_beside_large_ones(marcher, backend, payload):
+    """As the child does: half the spacing for a human of half the size, strides up to 8."""
+    small, large = np.diag([0.5, 0.5, 0.5, 1.0]), np.diag([2.2, 2.2, 2.2, 1.0])
+    large[0, 3] = 1.5
+    fields = [placed(backend, world=world) for world in (small, large)]
+    view = pinhole(np.array([0.8, 0.0, 0.0]), (0.0, 0.3, 6.0))
+    people = [
+        (payload, dataclasses.replace(boxes_of(one), density_scale=s))
+        for one, s in zip(fields, (2, 1 / 2.2), strict=True)
+    ]
+    combined, _ = marched(marcher, people, view)
+    camera = {"intrinsics": view.intrinsics.tolist(), "world_to_camera": view.world_to_camera.tolist()}
+    boxes = [{"boxes": one["file"]} for one in fields]
+    wanted, _ = backend.oracle.picture(boxes, camera, (view.width, view.height), 2 * STEP, strides=(16, 8, 4, 2, 1))
+    assert np.quantile(np.abs(combined - wanted), 0.999) <= STEP_OF_8_BIT
 
 
 def test_rays_end_at_other_objects(marcher, backend, payload):

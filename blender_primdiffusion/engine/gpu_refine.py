@@ -1,0 +1,148 @@
+"""Which picture a view marches on the GPU when: coarse ones while anything moves, finer ones at rest, then antialiased.
+
+Needs no Blender. `advance` is called while a view is drawn, where Blender gives a GPU context, and marches for about
+SLICE_S, so that a slow GPU does not stall the window.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from .refine import COARSENESS, FLUENT_S, REST_S
+from .view import PinholeView
+
+SLICE_S = 0.1
+SAMPLES = 8
+"""Pictures that are averaged when nothing moves, each with its rays elsewhere in the pixels."""
+_FIRST_ROWS = 4
+_GROWTH = 4.0
+
+
+class Pass(Protocol):
+    """One picture that is being marched, such as a `GpuMarch`."""
+
+    def advance(self, tile_rows: int) -> bool:
+        """March some rows of tiles; True when the picture is complete."""
+        ...
+
+    def wait(self) -> None:
+        """Return when the GPU has finished what it was given."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class MarchRequest:
+    """A picture that a view should show; compared by `key`."""
+
+    key: object
+    """Equal for equal pictures."""
+    view: PinholeView
+    """At the window's resolution."""
+    begin: Callable[[PinholeView], Pass]
+    """Starts a picture: from this view with fewer pixels, or with its rays elsewhere in the pixels."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ShownMarch:
+    """A finished picture."""
+
+    request: MarchRequest
+    coarseness: int
+    sample: int
+    """0 for rays through the pixels' centres; picture number n of those to be averaged."""
+    picture: Pass
+
+
+class GpuRefinement:
+    """Marches the newest request, one picture at a time."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic):
+        self._clock = clock
+        self._request: MarchRequest | None = None
+        self._changed_at = 0.0
+        self._pending: ShownMarch | None = None
+        self._seconds, self._pixel_seconds = 0.0, np.inf
+        """Of the pending picture so far, and of a pixel of the last one."""
+        self._rows = _FIRST_ROWS
+        self.shown: ShownMarch | None = None
+
+    def want(self, request: MarchRequest) -> None:
+        """Set the newest request; an equal one changes nothing."""
+        if self._request is not None and self._request.key == request.key:
+            return
+        self._request, self._changed_at = request, self._clock()
+        if self._pending is not None and self._pending.coarseness < self._moving(self._pending.request.view):
+            self._pending = None
+
+    @property
+    def resting(self) -> bool:
+        """Whether the newest request is drawn in full."""
+        return self._request is None or (self._pending is None and self._next() is None)
+
+    def advance(self) -> bool:
+        """March for about SLICE_S; True when there is a new picture in `shown`. Raises what `begin` raises."""
+        end = self._clock() + SLICE_S
+        news = False
+        while self._request is not None and self._clock() < end:
+            if self._pending is None and not self._begin(self._request):
+                break
+            if self._march(self._pending):
+                self.shown, self._pending, news = self._pending, None, True
+                break
+        return news
+
+    def _moving(self, view: PinholeView) -> int:
+        """How coarse pictures are while the scene moves, from the time of the last one."""
+        pixels = view.width * view.height
+        return next((c for c in COARSENESS[::-1] if pixels / c**2 * self._pixel_seconds <= FLUENT_S), COARSENESS[0])
+
+    def _next(self) -> tuple[int, int] | None:
+        """Coarseness and number of the picture after the shown one; None after the last."""
+        shown = self.shown
+        if shown is None or shown.request is not self._request:
+            return self._moving(self._request.view), 0
+        if shown.coarseness > 1:
+            return shown.coarseness // 2, 0
+        return (1, shown.sample + 1) if shown.sample + 1 < SAMPLES else None
+
+    def _begin(self, request: MarchRequest) -> bool:
+        following = self._next()
+        fresh = self.shown is None or self.shown.request is not request
+        if following is None or not (fresh or self._clock() - self._changed_at >= REST_S):
+            return False
+        coarseness, sample = following
+        view = request.view
+        view = view.scaled(-(-view.width // coarseness), -(-view.height // coarseness))
+        began = self._clock()
+        self._pending = ShownMarch(request, coarseness, sample, request.begin(jittered(view, sample)))
+        self._seconds = self._clock() - began
+        return True
+
+    def _march(self, pending: ShownMarch) -> bool:
+        """A slice of the pending picture; True when it is complete."""
+        began = self._clock()
+        done = pending.picture.advance(self._rows)
+        pending.picture.wait()
+        seconds = self._clock() - began
+        self._seconds += seconds
+        growth = SLICE_S / 2 / max(seconds, 1e-6)
+        self._rows = max(int(self._rows * min(max(growth, 1 / _GROWTH), _GROWTH)), 1)
+        if done:
+            view = pending.request.view
+            self._pixel_seconds = self._seconds * pending.coarseness**2 / (view.width * view.height)
+        return done
+
+
+def jittered(view: PinholeView, sample: int) -> PinholeView:
+    """The view with its rays elsewhere in the pixels: through the centres for sample 0."""
+    if sample == 0:
+        return view
+    right, down = (np.array([0.754877666, 0.569840291]) * sample + 0.5) % 1 - 0.5  # R2, a low-discrepancy sequence
+    intrinsics = view.intrinsics.copy()
+    intrinsics[:2, 2] += right, down
+    return dataclasses.replace(view, intrinsics=intrinsics)
