@@ -34,7 +34,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help demo test test-5.0 test-4.5 test-5.2 test-all lint setup clean
 
-## demo: generate a person in Blender, walk it, render it: see demo_out/
+## demo: generate a human in Blender, walk it, render it: see demo_out/
 demo: $(READY)
 	$(BIN)/python benchmarks/demo.py --out demo_out
 

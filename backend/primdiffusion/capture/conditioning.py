@@ -144,7 +144,7 @@ def conditioning_views(
         seen.append(as_camera(windowed_view(view, full_window(view), side)))
     views = Views(torch.from_numpy(np.stack(pictures)), stack(seen), person.smpl.pose(frame))
     if not views.mask.any():
-        raise ConditioningError(f"no mask of {subject} in frame {frame} shows a person: choose another frame or views")
+        raise ConditioningError(f"no mask of {subject} in frame {frame} shows a human: choose another frame or views")
     return views
 
 
@@ -179,7 +179,7 @@ def default_betas(subject: Subject) -> Float[Tensor, "10"]:
         ArrayFileError: joints.npz is damaged.
     """
     betas, components = torch.from_numpy(subject.smpl.betas), default_body().shape_basis.shape[-1]
-    remedy = "render the person again on the default body (primdiffusion captures, or Blender's without a body file)"
+    remedy = "render the human again on the default body (primdiffusion captures, or Blender's without a body file)"
     if len(betas) > components or not (betas.abs() <= LARGEST_BETA).all():
         raise ConditioningError(
             f"{subject.folder} has {len(betas)} betas of up to {float(betas.abs().max()):.3g}; there may be at most "

@@ -177,7 +177,7 @@ def _betas(glb: Glb) -> Float[np.ndarray, "n"]:
     if betas.ndim != 1 or len(betas) > components or not (np.abs(betas) <= LARGEST_BETA).all():
         raise GlbError(
             f"{glb.path} has betas of shape {betas.shape}; at most {components}, within {LARGEST_BETA:g} of 0, are "
-            "supported: make the person again"
+            "supported: make the human again"
         )
     return betas
 
@@ -188,13 +188,13 @@ def _parts(glb: Glb) -> tuple[TexturedPart, ...]:
         if "mesh" not in node:
             continue
         if "skin" not in node:
-            raise GlbError(f"{glb.path}: the mesh {node.get('name')!r} has no skin: make the person again")
+            raise GlbError(f"{glb.path}: the mesh {node.get('name')!r} has no skin: make the human again")
         joints = _joints(glb, node["skin"])
         for number, primitive in enumerate(glb.content["meshes"][node["mesh"]]["primitives"]):
             name = str(node.get("name", f"part {len(parts)}")) + (f" {number}" if number else "")
             parts.append(_part(glb, name, primitive, joints))
     if not parts:
-        raise GlbError(f"{glb.path} contains no mesh: make the person again")
+        raise GlbError(f"{glb.path} contains no mesh: make the human again")
     return tuple(parts)
 
 
@@ -211,7 +211,7 @@ def _part(glb: Glb, name: str, primitive: dict[str, Any], joints: Int[np.ndarray
     vertices = glb.array(attributes["POSITION"]).astype(np.float64)
     faces = glb.array(primitive["indices"]).astype(np.int64) if "indices" in primitive else np.arange(len(vertices))
     if primitive.get("mode", 4) != 4 or len(faces) % 3 or int(faces.max(initial=0)) >= len(vertices):
-        raise GlbError(f"{glb.path}: the faces of {name!r} are not triangles of its vertices: make the person again")
+        raise GlbError(f"{glb.path}: the faces of {name!r} are not triangles of its vertices: make the human again")
     faces = faces.reshape(-1, 3).astype(np.int32)
     uv = glb.array(attributes["TEXCOORD_0"]) if "TEXCOORD_0" in attributes else np.zeros((len(vertices), 2), np.float32)
     index = joints[glb.array(attributes["JOINTS_0"]).astype(np.int64)]
@@ -220,7 +220,7 @@ def _part(glb: Glb, name: str, primitive: dict[str, Any], joints: Int[np.ndarray
     if not (np.abs(vertices) < FARTHEST).all() or not (total > 0).all():
         raise GlbError(
             f"{glb.path}: {name!r} has vertices that are not finite, without joints, or {FARTHEST:g} m from "
-            "the origin: make the person again"
+            "the origin: make the human again"
         )
     return TexturedPart(
         name=name,

@@ -88,13 +88,13 @@ class RenderCaptures:
         for error in unread:
             print(f"poses  failed  {error}", flush=True)
         outcomes = Counter()
-        for outcome in tqdm(render(job, self.workers), total=len(names), unit="person", disable=None):
+        for outcome in tqdm(render(job, self.workers), total=len(names), unit="human", disable=None):
             outcomes[outcome.status] += 1
             print(f"{outcome.subject}  {outcome.status}  {outcome.error or f'{outcome.views} views'}", flush=True)
         if outcomes["failed"] or unread:
             poses_too = f" and {len(unread)} of {len(self.poses)} pose files" if unread else ""
             raise ValueError(
-                f"{outcomes['failed']} of {len(names)} people{poses_too} failed: {self.out / job.part}.json says why"
+                f"{outcomes['failed']} of {len(names)} humans{poses_too} failed: {self.out / job.part}.json says why"
             )
 
     def _poses(self) -> tuple[BodyPose, list[str]]:
@@ -190,7 +190,7 @@ class PackCaptures:
         from primdiffusion.capture.reader import open_captures
 
         captures = open_captures(self.root)
-        for packing in tqdm(pack(captures), total=len(captures.subjects), unit="person", disable=None):
+        for packing in tqdm(pack(captures), total=len(captures.subjects), unit="human", disable=None):
             print(
                 f"{packing.subject}  {'found' if packing.found else 'packed'}  {packing.gigabytes:.3f} GB", flush=True
             )
@@ -254,7 +254,7 @@ class FarmCaptures:
         outcomes = render_on(farm, self.command, show)
         failed = [outcome.subject for outcome in outcomes if outcome.exit_code]
         if failed:
-            raise FarmError(f"{len(failed)} of {len(outcomes)} people are not finished: {', '.join(failed[:5])}")
+            raise FarmError(f"{len(failed)} of {len(outcomes)} humans are not finished: {', '.join(failed[:5])}")
 
 
 Command = (

@@ -76,7 +76,7 @@ class EvaluateReconstruction:
         lpips = load_lpips(self.lpips) if self.lpips else None
         model = load_encoder(self.checkpoint, best_device())
         scores = []
-        with tqdm(total=len(names), unit="person", disable=None) as bar:
+        with tqdm(total=len(names), unit="human", disable=None) as bar:
             for score in evaluate(model, captures, settings, lpips):
                 bar.update(len({*names[: bar.n], score.subject}) - bar.n)
                 scores.append(score)
@@ -130,7 +130,7 @@ class EvaluateGeneration:
         """
         if self.count <= NEIGHBOURS:
             raise ValueError(
-                f"count is {self.count}: ask for more than {NEIGHBOURS} people, or nothing can be compared"
+                f"count is {self.count}: ask for more than {NEIGHBOURS} humans, or nothing can be compared"
             )
         train, held = split_people(find_people(self.people), self.holdout, self.seed)
         model = load_checkpoint(self.checkpoint, best_device())
@@ -140,13 +140,13 @@ class EvaluateGeneration:
             assets = open_assets(self.assets)
             trained_on, others = ([read_seed(path) for path in paths] for paths in (train, held))
             real = (mesh_sources(assets, trained_on, COLOURINGS), mesh_sources(assets, others, COLOURINGS))
-        with tqdm(unit="person", disable=None) as bar:
+        with tqdm(unit="human", disable=None) as bar:
 
             def report(done: int, total: int) -> None:
                 bar.update(1)
 
             reference = open_reference_set(*real, self.reference, report)
-        with tqdm(range(self.first_seed, self.first_seed + self.count), unit="person", disable=None) as seeds:
+        with tqdm(range(self.first_seed, self.first_seed + self.count), unit="human", disable=None) as seeds:
             made = made_gallery(place(generate(model, seed, self.steps)) for seed in seeds)
         rows = {
             "generated": compare(reference, features_of(reference.network, made)),

@@ -39,7 +39,7 @@ class MakePeople:
 
         people = PeopleSet(self.out, self.seed, self.count)
         assets = open_assets(self.assets, required_meshes())
-        with tqdm(total=self.count, unit="person", desc="people", disable=None) as bar:
+        with tqdm(total=self.count, unit="human", desc="people", disable=None) as bar:
             for done in make_people(assets, people, self.workers):
                 bar.update(done - bar.n)
         unknown = unknown_licences(self.out)
@@ -84,7 +84,7 @@ class MakePayloads:
         from primdiffusion.people.wardrobe import required_meshes
 
         assets = open_assets(self.assets, required_meshes())
-        with tqdm(total=self.count, unit="person", desc="payloads") as bar:
+        with tqdm(total=self.count, unit="human", desc="payloads") as bar:
 
             def report(done: int, total: int) -> None:
                 bar.update(done - bar.n)
@@ -138,13 +138,13 @@ class EncodePayloads:
         model = load_encoder(self.encoder, best_device())
         outcomes = Counter()
         work = encode_people(model, captures, self.out, settings, cards)
-        for outcome in tqdm(work, total=len(captures.subjects), unit="person", disable=None):
+        for outcome in tqdm(work, total=len(captures.subjects), unit="human", disable=None):
             outcomes[outcome.status] += 1
             unknown = self.people is not None and outcome.subject not in cards
             note = outcome.error or ("attributes unknown" if unknown else "")
             print(f"{outcome.subject}  {outcome.status}  {note}".rstrip(), flush=True)
         if outcomes["failed"]:
-            raise ValueError(f"{outcomes['failed']} of {len(captures.subjects)} people failed: see the lines above")
+            raise ValueError(f"{outcomes['failed']} of {len(captures.subjects)} humans failed: see the lines above")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,10 +165,10 @@ class PackPayloads:
         from primdiffusion.training.stored_people import find_people
 
         done = 0
-        with tqdm(total=len(find_people(self.folder)), unit="person", desc="pack", disable=None) as bar:
+        with tqdm(total=len(find_people(self.folder)), unit="human", desc="pack", disable=None) as bar:
             for done in pack_people(self.folder, self.out, self.people_each):
                 bar.update(done - bar.n)
-        print(f"{self.out}  {done} people")
+        print(f"{self.out}  {done} humans")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,7 +186,7 @@ class VerifyPayloads:
         for sentence in found:
             print(sentence)
         if found:
-            raise ValueError(f"{len(found)} shards of {self.folder} are damaged: pack the people again")
+            raise ValueError(f"{len(found)} shards of {self.folder} are damaged: pack the humans again")
         print(f"{self.folder}: nothing wrong")
 
 

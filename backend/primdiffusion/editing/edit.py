@@ -31,7 +31,7 @@ def match_density(model: DiffusionModel, human: Human) -> DiffusionModel:
 
     Raises ValueError if human and model use different bodies.
     """
-    check_correspondence("the person", human.body_setup, "the checkpoint's people", model.body_setup)
+    check_correspondence("the human", human.body_setup, "the checkpoint's humans", model.body_setup)
     own = human.provenance.get("full_density", model.full_density)
     if isinstance(own, bool) or not isinstance(own, int | float) or not (math.isfinite(own) and own > 0):
         raise ValueError(f"full_density is {own!r}, not a positive number of 1/m: generate this human again")

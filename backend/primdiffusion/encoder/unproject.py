@@ -87,7 +87,7 @@ def unproject_voxels(
     body = default_body() if body is None else body
     check(views, vertices, body)
     if tuple(frames.position.shape) != (K, 3):
-        raise ValueError(f"the boxes' positions have the shape {tuple(frames.position.shape)}: give one person's {K}")
+        raise ValueError(f"the boxes' positions have the shape {tuple(frames.position.shape)}: give one human's {K}")
     local = torch.linspace(-1, 1, S, dtype=vertices.dtype, device=vertices.device)
     t, b, n = (frames.rotation * frames.half_extent[:, None, :]).unbind(-1)
     columns = local[:, None, None] * b[:, None, None] + local[None, :, None] * t[:, None, None]  # k h w 3
@@ -130,7 +130,7 @@ def check(views: Views, vertices: Tensor, body: BodyModel) -> None:
     """Raise ValueError unless views, cameras and body match: compiled code does no bounds checks."""
     shape, camera = tuple(views.rgba.shape), views.camera
     if len(shape) != 4 or not shape[0] or shape[-1] != 4 or views.rgba.dtype != torch.uint8:
-        raise ValueError(f"views are {views.rgba.dtype} {shape}: give one person's, uint8 [v, H, W, 4], v > 0")
+        raise ValueError(f"views are {views.rgba.dtype} {shape}: give one human's, uint8 [v, H, W, 4], v > 0")
     if tuple(camera.world_to_camera.shape) != (shape[0], 3, 4) or tuple(camera.intrinsics.shape) != (shape[0], 3, 3):
         cameras = tuple(camera.world_to_camera.shape)
         raise ValueError(f"there are {shape[0]} pictures, but cameras of shape {cameras}: give one for each picture")
@@ -142,7 +142,7 @@ def check(views: Views, vertices: Tensor, body: BodyModel) -> None:
     if vertices.shape != body.template.shape:
         raise ValueError(
             f"the posed vertices have the shape {tuple(vertices.shape)}, the body {tuple(body.template.shape)}: "
-            "give one person's in one pose, of the same body"
+            "give one human's in one pose, of the same body"
         )
     if not torch.isfinite(vertices).all():
         raise ValueError("the posed vertices hold NaN or infinite values; check the pose and the betas they come from")

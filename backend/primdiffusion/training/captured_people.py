@@ -135,7 +135,7 @@ def read_cards(people: Path) -> dict[str, Mapping[str, Any]]:
             try:
                 cards[name] = dict(json.loads(card.read_text(encoding="utf-8")))
             except (ValueError, TypeError) as error:
-                raise ValueError(f"{card} is damaged ({error}): make the person again") from error
+                raise ValueError(f"{card} is damaged ({error}): make the human again") from error
     return cards
 
 

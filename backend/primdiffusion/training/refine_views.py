@@ -52,7 +52,7 @@ def scenes_of(human: Human, views: Sequence[Views]) -> list[PosedView]:
     components = default_body().shape_basis.shape[-1]
     if len(human.betas) > components:
         raise ValueError(
-            f"the person has {len(human.betas)} betas, the default body {components}: it was captured on another body"
+            f"the human has {len(human.betas)} betas, the default body {components}: it was captured on another body"
         )
     if not views or not any(record.rgba.shape[0] for record in views):
         raise ValueError("there are no views to refine from: give images of at least one view")

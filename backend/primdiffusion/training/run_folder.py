@@ -95,7 +95,7 @@ def _earlier(config: RunConfig, people: Sequence[str], saved: str, processes: in
     if known != list(people):
         raise ValueError(
             f"the run in {config.run} has another training set than {config.data} ({len(known)} and {len(people)} "
-            "people): give the same data, or a new folder"
+            "humans): give the same data, or a new folder"
         )
     if were != processes:
         log.warning("resuming on %d processes instead of %d: batches will differ", processes, were)

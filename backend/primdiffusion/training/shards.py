@@ -55,7 +55,7 @@ def pack_people(folder: Path, out: Path, people_each: int = PEOPLE_EACH) -> Iter
         OSError: there is no room; no index is written then.
     """
     if people_each < 1:
-        raise ValueError(f"{people_each} people per shard: choose 1 or more")
+        raise ValueError(f"{people_each} humans per shard: choose 1 or more")
     if (out / INDEX).exists():
         raise ShardError(f"{out} already contains shards: choose another folder, or remove it")
     people = PersonFolder(folder)
@@ -121,9 +121,9 @@ class PackedPeople:
             self._stored: Sequence[Mapping[str, Any]] = [dict(person["attributes"]) for person in people]
             self._firsts = [0, *itertools.accumulate(len(shard["people"]) for shard in index["shards"])]
         except (KeyError, TypeError, ValueError) as error:
-            raise ShardError(f"{folder / INDEX} is damaged ({error}): pack the people again") from error
+            raise ShardError(f"{folder / INDEX} is damaged ({error}): pack the humans again") from error
         if len(self.names) < 2:
-            raise FileNotFoundError(f"{folder / INDEX} lists {len(self.names)} people: training needs two or more")
+            raise FileNotFoundError(f"{folder / INDEX} lists {len(self.names)} humans: training needs two or more")
         self._open: dict[int, Any] = {}
 
     def known(self, index: int) -> tuple[Attributes, ...]:
@@ -147,9 +147,9 @@ class PackedPeople:
         """Check a shard against its SHA-256. Raises ShardError, FileNotFoundError."""
         path = self.paths[shard]
         if not path.is_file():
-            raise FileNotFoundError(f"there is no {path}, which {INDEX} names: pack the people again")
+            raise FileNotFoundError(f"there is no {path}, which {INDEX} names: pack the humans again")
         if digest_of(path) != self._digests[shard]:
-            raise ShardError(f"{path} is damaged: its SHA-256 differs from {INDEX}: pack the people again")
+            raise ShardError(f"{path} is damaged: its SHA-256 differs from {INDEX}: pack the humans again")
 
     def _rows(self, index: int) -> tuple[int, int, slice]:
         """Return the shard of a person, the index in it, and the rows."""
@@ -180,11 +180,11 @@ def _read_index(path: Path) -> dict[str, Any]:
     try:
         index = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise FileNotFoundError(f"there is no {path}: pack people with `primdiffusion payloads pack`") from None
+        raise FileNotFoundError(f"there is no {path}: pack humans with `primdiffusion payloads pack`") from None
     except ValueError as error:
-        raise ShardError(f"{path} is damaged ({error}): pack the people again") from error
+        raise ShardError(f"{path} is damaged ({error}): pack the humans again") from error
     if not isinstance(index, dict) or index.get("format") != FORMAT:
-        raise ShardError(f"{path} is not the index of packed people: choose another folder")
+        raise ShardError(f"{path} is not the index of packed humans: choose another folder")
     if index.get("version") != VERSION:
         raise ShardError(f"{path} has version {index.get('version')}, this program reads {VERSION}: pack again")
     return index

@@ -191,7 +191,7 @@ def find_people(folder: Path) -> list[Path]:
     paths = sorted(folder.glob("*.npz"))
     if len(paths) < 2:
         raise FileNotFoundError(
-            f"{folder} holds {len(paths)} people (*.npz): make some with `primdiffusion payloads --out {folder}`"
+            f"{folder} holds {len(paths)} humans (*.npz): make some with `primdiffusion payloads --out {folder}`"
         )
     return paths
 
@@ -200,6 +200,6 @@ def one_density(densities: Sequence[float]) -> float:
     """Return the common full density; ValueError if they differ."""
     if len(found := set(densities)) != 1:
         raise ValueError(
-            f"people with full densities {sorted(found)} cannot be trained together: regenerate them with one"
+            f"humans with full densities {sorted(found)} cannot be trained together: regenerate them with one"
         )
     return found.pop()

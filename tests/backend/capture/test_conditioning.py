@@ -129,7 +129,7 @@ def test_a_mask_of_another_size_is_named(folder):
 def test_empty_masks_are_rejected(folder):
     for camera in range(4):
         Image.new("L", (32, 32), 0).save(picture_path(folder / FIRST, "mask", camera, 0))
-    with pytest.raises(ConditioningError, match="shows a person"):
+    with pytest.raises(ConditioningError, match="shows a human"):
         captured_person(folder, FIRST)
 
 
@@ -141,7 +141,7 @@ def rewrite_betas(folder, betas) -> None:
 
 def test_more_betas_than_the_default_body_has_are_rejected(folder):
     rewrite_betas(folder, np.zeros(300))
-    with pytest.raises(ConditioningError, match=r"300 betas.* at most 10 of the default body.*render the person again"):
+    with pytest.raises(ConditioningError, match=r"300 betas.* at most 10 of the default body.*render the human again"):
         captured_person(folder, FIRST)
 
 

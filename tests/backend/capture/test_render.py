@@ -225,7 +225,7 @@ def test_files_of_poses_that_cannot_be_read_are_left_out_and_reported(tmp_path, 
     with pytest.raises(SystemExit) as end:
         cli.main([*line, str(tmp_path / "good.npy")])
     assert end.value.code == 1
-    assert "0 of 1 people and 1 of 2 pose files failed" in capsys.readouterr().err
+    assert "0 of 1 humans and 1 of 2 pose files failed" in capsys.readouterr().err
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["done"] == ["p0"]
     assert "nan.npy" in report["failed"][0]["why"]
@@ -269,7 +269,7 @@ def test_the_command_renders_a_shard_and_exits_with_1_on_failure(tmp_path, capsy
     with pytest.raises(SystemExit) as end:
         cli.main([*line, "--shard", "1/2"])
     assert end.value.code == 1
-    assert "1 of 2 people failed" in capsys.readouterr().err
+    assert "1 of 2 humans failed" in capsys.readouterr().err
     assert (tmp_path / "out" / capture_layout.RELEASED_REFERENCE / "complete.json").exists()
     assert {path.name for path in (tmp_path / "out").glob("report*")} == {"report-0-of-2.json", "report-1-of-2.json"}
 

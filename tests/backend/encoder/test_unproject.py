@@ -311,7 +311,7 @@ def assert_rejected(
 def test_views_that_are_none_batched_or_no_bytes_are_rejected():
     views = person_views()
     assert_rejected(r"uint8 \[v, H, W, 4\], v > 0", Views(views.rgba[:0], views.camera, views.pose))
-    assert_rejected(r"\(1, 4, 40, 40, 4\): give one person's", Views(views.rgba[None], views.camera, views.pose))
+    assert_rejected(r"\(1, 4, 40, 40, 4\): give one human's", Views(views.rgba[None], views.camera, views.pose))
     assert_rejected("torch.float32", Views(views.rgba / 255, views.camera, views.pose))
 
 
@@ -328,4 +328,4 @@ def test_bodies_that_are_broken_or_others_are_rejected():
     assert_rejected(
         "no UV", vertices=plates(0.0).template, body=BodyModel(**{**vars(plates(0.0)), "uv": torch.zeros(0, 2)})
     )
-    assert_rejected("give one person's 1024", frames=FRAMES.map(lambda tensor: tensor[:5]))
+    assert_rejected("give one human's 1024", frames=FRAMES.map(lambda tensor: tensor[:5]))

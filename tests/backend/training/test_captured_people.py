@@ -109,7 +109,7 @@ def test_one_who_fails_is_named_and_the_others_are_made(tmp_path, capsys):
     output = capsys.readouterr()
     assert f"{FIRST}  failed" in output.out
     assert "0000.png" in output.out
-    assert "1 of 2 people failed" in output.err
+    assert "1 of 2 humans failed" in output.err
     assert [path.name for path in (tmp_path / "out").iterdir()] == [f"{SECOND}.npz"]
 
 
@@ -133,7 +133,7 @@ def test_packing_and_verifying_on_the_command_line(tmp_path, capsys):
     cli.main(["payloads", "pack", str(tmp_path / "people"), "--out", str(tmp_path / "packed"), "--people-each", "2"])
     cli.main(["payloads", "verify", str(tmp_path / "packed")])
     output = capsys.readouterr().out.splitlines()
-    assert output == [f"{tmp_path / 'packed'}  3 people", f"{tmp_path / 'packed'}: nothing wrong"]
+    assert output == [f"{tmp_path / 'packed'}  3 humans", f"{tmp_path / 'packed'}: nothing wrong"]
     shard = tmp_path / "packed" / "shard_0000.safetensors"
     shard.write_bytes(shard.read_bytes()[:-1])
     with pytest.raises(SystemExit):

@@ -205,7 +205,7 @@ def test_a_damaged_shard_ends_the_run_and_is_named(people, tmp_path):
 
 def test_other_people_or_settings_in_the_same_folder_are_rejected(people, few, run):
     train(settings(people, run, minutes=0.0))
-    with pytest.raises(ValueError, match=r"another training set .*\(16 and 3 people\)"):
+    with pytest.raises(ValueError, match=r"another training set .*\(16 and 3 humans\)"):
         train(settings(few, run))
     with pytest.raises(ValueError, match=r"preset \(default, not paper\)"):
         train(settings(people, run, preset="paper"))

@@ -207,7 +207,7 @@ def test_other_settings_in_the_same_folder_are_named_and_limits_may_change(captu
 
 def test_other_people_in_the_same_folder_are_rejected(begun, tmp_path):
     others = captured(tmp_path / "others", people=3, frames=1, passes=("img", "mask"))
-    with pytest.raises(ValueError, match=r"another training set .*\(2 and 3 people\)"):
+    with pytest.raises(ValueError, match=r"another training set .*\(2 and 3 humans\)"):
         fit(settings(others, begun.run))
 
 

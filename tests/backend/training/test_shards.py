@@ -116,7 +116,7 @@ def test_an_index_that_cannot_be_used_is_rejected(copied, content, word):
 def test_shards_without_people_are_named(copied):
     index = json.loads((copied / INDEX).read_text())
     (copied / INDEX).write_text(json.dumps({**index, "shards": []}))
-    with pytest.raises(FileNotFoundError, match="lists 0 people"):
+    with pytest.raises(FileNotFoundError, match="lists 0 humans"):
         open_people(copied)
 
 
