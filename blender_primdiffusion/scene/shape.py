@@ -228,7 +228,7 @@ def betas_of_measures(
 def slider_names(model: ShapeModel) -> list[str]:
     """A name for each beta [10]: its effect where that is clear, else its number, from 1."""
     clear = _CLEAR if len(model.template) == DEFAULT_BODY_VERTICES else {}
-    return [clear.get(index, f"Shape {index + 1}") for index in range(BETA_COUNT)]
+    return [clear.get(index, str(index + 1)) for index in range(BETA_COUNT)]
 
 
 @functools.lru_cache(maxsize=64)

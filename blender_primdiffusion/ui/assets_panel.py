@@ -1,4 +1,4 @@
-"""The sub-panel Assets: the selected human, its pose and the built-in poses in the Asset Browser."""
+"""The panel Assets: the selected human, its pose and the built-in poses in the Asset Browser."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..backend.requests import sentence
 from ..jobs.follow import Reporting, submit
 from ..jobs.target import HumanTarget, selected_person
 from ..scene.human import humans
-from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
+from .drawing import OUTPUT, SidebarPanel, draw_job, draw_lines, property_columns
 from .on_person import SKIP, OnPerson
 from .translations import CONTEXT
 
@@ -96,8 +96,8 @@ class PRIMDIFFUSION_PT_assets(SidebarPanel, bpy.types.Panel):
 
     bl_label = "Assets"
     bl_translation_context = CONTEXT
-    bl_parent_id = "PRIMDIFFUSION_PT_human"
-    bl_order = 90
+    bl_category = OUTPUT
+    bl_order = 7
     bl_options = {"DEFAULT_CLOSED"}
     manual_page = "assets"
 

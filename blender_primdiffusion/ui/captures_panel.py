@@ -9,12 +9,13 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import bpy
+from bpy.app.translations import pgettext_iface
 from mathutils import Vector
 
 from ..jobs.follow import Reporting, redraw
 from .captures_session import Busy, captures
 from .captures_settings import words_of
-from .drawing import SidebarPanel, draw_lines, property_columns
+from .drawing import CAPTURES, SidebarPanel, draw_lines, property_columns
 
 if TYPE_CHECKING:
     import numpy as np
@@ -113,7 +114,8 @@ class PRIMDIFFUSION_OT_cancel_captures(bpy.types.Operator):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        cls.poll_message_set("No captures are being rendered")
+        if not captures.busy:
+            cls.poll_message_set("No captures are being rendered")
         return captures.busy
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
@@ -228,8 +230,8 @@ class PRIMDIFFUSION_PT_captures(SidebarPanel, bpy.types.Panel):
     """From where to where, the button, and how far it is."""
 
     bl_label = "Captures"
-    bl_order = 5
-    bl_options = {"DEFAULT_CLOSED"}
+    bl_category = CAPTURES
+    bl_order = 0
     manual_page = "captures"
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -255,12 +257,15 @@ def _sub_panel(name: str, label: str, content: Callable) -> type:
     class CapturesSubPanel(SidebarPanel, bpy.types.Panel):
         bl_idname = f"PRIMDIFFUSION_PT_captures_{name}"
         bl_label = label
+        bl_category = CAPTURES
         bl_parent_id = "PRIMDIFFUSION_PT_captures"
         bl_options = {"DEFAULT_CLOSED"}
         __doc__ = content.__doc__
 
         def draw(self, context: bpy.types.Context) -> None:
             layout = property_columns(self.layout)
+            if captures.busy:
+                draw_lines(layout, pgettext_iface("Wait for the captures, or cancel them"), "INFO")
             layout.enabled = not captures.busy
             content(layout, context.scene.primdiffusion_captures, context)
 

@@ -6,6 +6,7 @@ import re
 import textwrap
 
 import bpy
+from bpy.app.translations import pgettext_iface
 
 from ..backend.requests import RequestError
 from ..jobs.follow import building, in_the_way
@@ -15,6 +16,8 @@ from ..jobs.remedies import remedy_for
 from ..places import EXTENSION
 from .manual import draw_manual_button
 
+CREATE, HUMAN, OUTPUT, CAPTURES = (f"PrimDiffusion {task}" for task in ("Create", "Human", "Output", "Captures"))
+"""Tabs of the sidebar. Blender puts panels of equally named tabs together, and other add-ons have a tab Create."""
 _LINE = 34
 """Characters that fit a sidebar of default width, beside an icon."""
 _QUANTITY = re.compile(r"\d (s|min|mm|MB|GB)\b")
@@ -24,11 +27,11 @@ _MINUTES_FROM_S = 90.0
 
 
 class SidebarPanel:
-    """A panel in the sidebar tab PrimDiffusion."""
+    """A panel in the sidebar. The first panel of each tab has the order 0: Blender orders tabs as it orders panels."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
-    bl_category = "PrimDiffusion"
+    bl_category = CREATE
     manual_page = ""
     """Of the manual, opened by a button in the header."""
     manual_section = ""
@@ -45,16 +48,23 @@ def property_columns(layout: bpy.types.UILayout) -> bpy.types.UILayout:
     return layout
 
 
+def row_unless(layout: bpy.types.UILayout, reason: str) -> bpy.types.UILayout:
+    """A row for buttons; where there is a reason against them, it is greyed out and the line below says why."""
+    row = layout.row(align=True)
+    row.enabled = not reason
+    if reason:
+        draw_lines(layout, pgettext_iface(reason), "INFO")
+    return row
+
+
 def draw_job(
-    layout: bpy.types.UILayout, kind: str, operator_idname: str, icon: str, ready: bool = True
+    layout: bpy.types.UILayout, kind: str, operator_idname: str, icon: str, reason: str = ""
 ) -> bpy.types.OperatorProperties | None:
     """The button of an operator that submits jobs of `kind`, the progress of such a job, and how the last one ended.
 
-    The button is greyed out unless `ready`. Returns its properties, for the caller to set.
+    The button is greyed out where there is a `reason`. Returns its properties, for the caller to set.
     """
-    button = layout.row()
-    button.enabled = ready
-    props = button.operator(operator_idname, icon=icon)
+    props = row_unless(layout, reason).operator(operator_idname, icon=icon)
     if queue.current is not None and queue.current.job.kind == kind:
         if so_far.icon:
             layout.template_icon(icon_value=so_far.icon, scale=_PICTURE_SCALE)

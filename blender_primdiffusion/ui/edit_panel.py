@@ -1,4 +1,4 @@
-"""Edits of the selected human in place (Vary, Re-dress Region, Transfer Texture, Blend): sub-panels of Human."""
+"""Edits of the selected human in place: the panels Vary, Re-dress Region, Transfer Texture and Blend."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..jobs.follow import Reporting, submit
 from ..jobs.target import named_person, selected_person
 from ..scene.human import BODY_MARK, MARK, body_of, humans, person_file
 from .attributes import PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed, title
-from .drawing import SidebarPanel, draw_job, property_columns
+from .drawing import HUMAN, SidebarPanel, draw_job, property_columns
 from .on_person import PANELS, SKIP, OnPerson
 from .translations import CONTEXT
 
@@ -124,8 +124,10 @@ class PRIMDIFFUSION_OT_finish_painting(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("No region is being painted: press Paint Region first")
-        return painting(context)
+        now = painting(context)
+        if not now:
+            cls.poll_message_set("No region is being painted: press Paint Region first")
+        return now
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         from ..scene.edit import end_painting  # needs numpy
@@ -287,25 +289,26 @@ def _other(context: bpy.types.Context, person: bpy.types.Collection, name: str) 
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_edit", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_edit)),)
 
 
-def _sub_panel(name: str, label: str, order: int, content: Callable) -> type:
-    class EditSubPanel(SidebarPanel, bpy.types.Panel):
+def _panel(name: str, label: str, order: int, content: Callable) -> type:
+    class EditPanel(SidebarPanel, bpy.types.Panel):
         bl_idname = f"PRIMDIFFUSION_PT_edit_{name}"
         bl_label = label
-        bl_parent_id = "PRIMDIFFUSION_PT_human"
+        bl_category = HUMAN
         bl_order = order
         bl_options = {"DEFAULT_CLOSED"}
+        manual_page, manual_section = "editing", "edits"
         __doc__ = content.__doc__
 
         @classmethod
         def poll(cls, context: bpy.types.Context) -> bool:
-            return name == "files" or bool(humans(context.scene))
+            return bool(humans(context.scene))
 
         def draw(self, context: bpy.types.Context) -> None:
             property_columns(self.layout)
             content(self.layout, context.scene.primdiffusion_edit, context)
 
-    EditSubPanel.__name__ = EditSubPanel.bl_idname
-    return EditSubPanel
+    EditPanel.__name__ = EditPanel.bl_idname
+    return EditPanel
 
 
 def _draw_vary(layout: bpy.types.UILayout, settings, _context) -> None:
@@ -331,21 +334,18 @@ def _draw_transfer(layout: bpy.types.UILayout, settings, context) -> None:
     layout.prop(settings, "harmonise")
     if settings.harmonise > 0:
         layout.prop(settings, "seed")
-    draw_job(layout, "transfer", "primdiffusion.transfer_texture", "TEXTURE", settings.other is not None)
+    draw_job(layout, "transfer", "primdiffusion.transfer_texture", "TEXTURE", _reason(settings))
 
 
 def _draw_blend(layout: bpy.types.UILayout, settings, _context) -> None:
     """The other human, the fraction and the button."""
     layout.prop(settings, "other")
     layout.prop(settings, "fraction")
-    draw_job(layout, "interpolate", "primdiffusion.blend", "ARROW_LEFTRIGHT", settings.other is not None)
+    draw_job(layout, "interpolate", "primdiffusion.blend", "ARROW_LEFTRIGHT", _reason(settings))
 
 
-def _draw_files(layout: bpy.types.UILayout, _settings, _context) -> None:
-    """Human files on disk: beside the .blend, and those left by edits."""
-    layout.operator("primdiffusion.collect_files", icon="PACKAGE")
-    layout.operator("primdiffusion.find_volumes_in_folder", icon="VIEWZOOM")
-    layout.operator("primdiffusion.remove_unused_files", icon="TRASH")
+def _reason(settings: bpy.types.PropertyGroup) -> str:
+    return "" if settings.other is not None else "Choose the other human above"
 
 
 def _draw_region(layout: bpy.types.UILayout, settings, context: bpy.types.Context) -> None:
@@ -375,9 +375,8 @@ def _draw_parts(layout: bpy.types.UILayout, settings, parts: tuple[str, ...], co
 
 
 SUB_PANELS = (
-    _sub_panel("vary", "Vary", 20, _draw_vary),
-    _sub_panel("redress", "Re-dress Region", 21, _draw_redress),
-    _sub_panel("transfer", "Transfer Texture", 22, _draw_transfer),
-    _sub_panel("blend", "Blend", 23, _draw_blend),
-    _sub_panel("files", "Files", 91, _draw_files),
+    _panel("vary", "Vary", 20, _draw_vary),
+    _panel("redress", "Re-dress Region", 21, _draw_redress),
+    _panel("transfer", "Transfer Texture", 22, _draw_transfer),
+    _panel("blend", "Blend", 23, _draw_blend),
 )

@@ -1,32 +1,44 @@
-"""The sidebar panel Export, and .human files dropped onto the 3D view."""
+"""The sidebar panels Export and From File, and .human files dropped onto the 3D view."""
 
 from __future__ import annotations
 
 import bpy
 
 from ..jobs.target import selected_person
-from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
+from .drawing import OUTPUT, SidebarPanel, draw_job, draw_lines, property_columns
 
 
 class PRIMDIFFUSION_PT_export(SidebarPanel, bpy.types.Panel):
-    """Files of humans, out and in."""
+    """The selected human as a .human file."""
 
     bl_label = "Export"
+    bl_category = OUTPUT
     bl_order = 6
-    bl_options = {"DEFAULT_CLOSED"}
     manual_page = "export"
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = property_columns(self.layout), context.scene.primdiffusion_export
         layout.prop(settings, "motion")
         layout.operator("primdiffusion.export_human", icon="EXPORT")
-        draw_job(layout, "import_human", "primdiffusion.import_human", "IMPORT")
+
+
+class PRIMDIFFUSION_PT_from_file(SidebarPanel, bpy.types.Panel):
+    """Humans from .human files."""
+
+    bl_label = "From File"
+    bl_order = 2
+    bl_options = {"DEFAULT_CLOSED"}
+    manual_page, manual_section = "export", "human-files"
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        draw_job(self.layout, "import_human", "primdiffusion.import_human", "IMPORT")
 
 
 class PRIMDIFFUSION_PT_export_mesh(SidebarPanel, bpy.types.Panel):
     """The mesh proxy as a file, or in the scene."""
 
     bl_label = "Textured Mesh"
+    bl_category = OUTPUT
     bl_parent_id = "PRIMDIFFUSION_PT_export"
     bl_options = {"DEFAULT_CLOSED"}
 
@@ -67,6 +79,7 @@ class PRIMDIFFUSION_PT_export_volumes(SidebarPanel, bpy.types.Panel):
     """Gaussians and VDB sequences."""
 
     bl_label = "Gaussians and Volumes"
+    bl_category = OUTPUT
     bl_parent_id = "PRIMDIFFUSION_PT_export"
     bl_options = {"DEFAULT_CLOSED"}
 

@@ -10,13 +10,16 @@ import bpy
 from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
 
+from ..backend.requests import sentence
 from ..formats import requests
 from ..jobs.follow import Reporting, submit
 from ..jobs.memory import device_line
 from ..jobs.queue import queue
+from ..scene.human import humans
 from .attributes import CATEGORIES, SCALARS, PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
 from .manual import draw_manual_button
+from .render_panel import draw_engines
 from .setup.preferences import draw_set_up
 from .translations import CONTEXT
 
@@ -281,7 +284,7 @@ class PRIMDIFFUSION_PT_generate(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = property_columns(self.layout), context.scene.primdiffusion
-        ready = draw_set_up(layout)
+        reason = "" if draw_set_up(layout) else "Set up the backend first"
         column = layout.column()
         row = column.row(align=True)
         row.prop(settings, "seed")
@@ -293,8 +296,11 @@ class PRIMDIFFUSION_PT_generate(SidebarPanel, bpy.types.Panel):
         if settings.quality == "CUSTOM":
             column.prop(settings, "steps")
             column.prop(settings, "sampler")
-        draw_job(layout, "generate", "primdiffusion.generate", "OUTLINER_OB_ARMATURE", ready)
-        draw_lines(layout, f"Device: {device_line()}", "MEMORY")
+        draw_job(layout, "generate", "primdiffusion.generate", "OUTLINER_OB_ARMATURE", reason)
+        if queue.child_message:
+            draw_lines(layout, sentence(device_line()), "ERROR")
+        if humans(context.scene):
+            draw_engines(layout, context.scene)
 
 
 class PRIMDIFFUSION_PT_attributes(SidebarPanel, bpy.types.Panel):

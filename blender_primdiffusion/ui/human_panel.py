@@ -12,7 +12,7 @@ from ..jobs.late_volumes import late_volumes
 from ..jobs.missing_files import look, state
 from ..jobs.target import HumanTarget, selected_person
 from ..scene.human import armature_of, check_editable, humans, humans_folder, person_file, remove_human
-from .drawing import SidebarPanel, draw_job, draw_lines
+from .drawing import HUMAN, OUTPUT, SidebarPanel, draw_job, draw_lines
 from .on_person import OnPerson
 
 
@@ -189,9 +189,7 @@ class PRIMDIFFUSION_OT_select_human(OnPerson, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..scene.edit import select_human  # needs numpy
-
-        select_human(context, person)
+        select(context, person)
         return {"FINISHED"}
 
 
@@ -204,12 +202,10 @@ class PRIMDIFFUSION_OT_frame_human(OnPerson, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """In the viewport that the button was pressed in, else in the first one."""
-        from ..scene.edit import select_human  # needs numpy
-
         place = _viewport(context)
         if place is None:
             raise ValueError("no 3D viewport is open: open one")
-        select_human(context, person)
+        select(context, person)
         with context.temp_override(**place):
             bpy.ops.view3d.view_selected()
         return {"FINISHED"}
@@ -226,14 +222,14 @@ class PRIMDIFFUSION_OT_duplicate_human(OnPerson, bpy.types.Operator):
         # needs numpy
         from ..scene.build import stand_beside_others
         from ..scene.duplicate import duplicate_human
-        from ..scene.edit import leave_mode, select_human
+        from ..scene.edit import leave_mode
 
         check_editable(person)
         leave_mode(context)
         twin = duplicate_human(person)
         context.view_layer.update()
         stand_beside_others(context, twin)
-        select_human(context, twin)
+        select(context, twin)
         return {"FINISHED"}
 
 
@@ -249,7 +245,7 @@ class PRIMDIFFUSION_OT_delete_human(OnPerson, bpy.types.Operator):
             title = f"Delete {self.person(context).name}?"
         except ValueError:
             return self.execute(context)
-        message = "The files stay on disk for Undo: Files > Remove Unused Files deletes them"
+        message = "The files stay on disk for Undo: Output > Files > Remove Unused Files deletes them"
         return context.window_manager.invoke_confirm(self, event, title=title, message=message)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
@@ -265,6 +261,20 @@ class PRIMDIFFUSION_OT_delete_human(OnPerson, bpy.types.Operator):
         context.view_layer.update()  # evaluated data holds grids too
         free_unused_grids()
         return {"FINISHED"}
+
+
+def select(context: bpy.types.Context, person: bpy.types.Collection) -> None:
+    """Make a human's armature active. Raises ValueError for one that cannot be selected in this view layer."""
+    from ..scene.edit import leave_mode  # needs numpy
+
+    armature = armature_of(person)
+    if context.view_layer.objects.get(armature.name) != armature:
+        raise ValueError(f"the armature of {person.name!r} is not in this view layer: enable its collection first")
+    leave_mode(context)
+    for obj in context.view_layer.objects.selected:
+        obj.select_set(False)
+    armature.select_set(True)
+    context.view_layer.objects.active = armature
 
 
 def _viewport(context: bpy.types.Context) -> dict[str, object] | None:
@@ -291,7 +301,8 @@ class PRIMDIFFUSION_PT_human(SidebarPanel, bpy.types.Panel):
     """Who is selected, by name."""
 
     bl_label = "Human"
-    bl_order = 2
+    bl_category = HUMAN
+    bl_order = 0
     manual_page = "editing"
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -309,3 +320,19 @@ class PRIMDIFFUSION_PT_human(SidebarPanel, bpy.types.Panel):
         row.operator("primdiffusion.frame_human", text="", icon="ZOOM_SELECTED")
         row.operator("primdiffusion.duplicate_human", text="", icon="DUPLICATE")
         row.operator("primdiffusion.delete_human", text="", icon="TRASH")
+
+
+class PRIMDIFFUSION_PT_edit_files(SidebarPanel, bpy.types.Panel):
+    """Files of humans: beside the .blend, missing ones, and those left by edits."""
+
+    bl_label = "Files"
+    bl_category = OUTPUT
+    bl_order = 8
+    bl_options = {"DEFAULT_CLOSED"}
+    manual_page, manual_section = "editing", "undo-and-files-on-disk"
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.operator("primdiffusion.collect_files", icon="PACKAGE")
+        layout.operator("primdiffusion.find_volumes_in_folder", icon="VIEWZOOM")
+        layout.operator("primdiffusion.remove_unused_files", icon="TRASH")

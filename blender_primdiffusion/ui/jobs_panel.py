@@ -1,4 +1,4 @@
-"""The sidebar panel Jobs: queued and finished jobs, memory, diagnostics."""
+"""The sidebar panels Jobs, shown while there are any, and Backend: device, memory, diagnostics."""
 
 from __future__ import annotations
 
@@ -118,7 +118,8 @@ class PRIMDIFFUSION_OT_cancel(Reporting, bpy.types.Operator):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        cls.poll_message_set("No job is queued")
+        if not queue.busy:
+            cls.poll_message_set("No job is queued")
         return queue.busy
 
     def act(self, _context: bpy.types.Context) -> set[str]:
@@ -141,8 +142,10 @@ class PRIMDIFFUSION_OT_try_again(Reporting, bpy.types.Operator):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        cls.poll_message_set("No job has failed")
-        return any(outcome.error is not None for outcome in queue.outcomes.values())
+        failed = any(outcome.error is not None for outcome in queue.outcomes.values())
+        if not failed:
+            cls.poll_message_set("No job has failed")
+        return failed
 
     def act(self, context: bpy.types.Context) -> set[str]:
         outcome = queue.outcomes.get(self.kind) if self.kind else queue.last
@@ -171,21 +174,31 @@ class PRIMDIFFUSION_OT_release_memory(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_PT_jobs(SidebarPanel, bpy.types.Panel):
-    """Queued and finished jobs, and the device. Progress is shown below the button that started the job."""
+    """Queued jobs, and those that ended before. Progress is shown below the button that started the job."""
 
     bl_label = "Jobs"
-    bl_order = 9
+    bl_order = 8
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        return queue.busy or bool(queue.ended) or queue.child_pid is not None or bool(queue.child_message)
+        return queue.busy
 
     def draw(self, _context: bpy.types.Context) -> None:
-        layout = self.layout
-        draw_queue(layout)
-        draw_ended(layout)
-        draw_lines(layout, f"Device: {device_line()}", "MEMORY")
-        column = layout.column(align=True)
+        draw_queue(self.layout)
+        draw_ended(self.layout)
+
+
+class PRIMDIFFUSION_PT_backend(SidebarPanel, bpy.types.Panel):
+    """What computes, and what to do when it does not."""
+
+    bl_label = "Backend"
+    bl_order = 9
+    bl_options = {"DEFAULT_CLOSED"}
+    manual_page = "troubleshooting"
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        draw_lines(self.layout, f"Device: {device_line()}", "MEMORY")
+        column = self.layout.column(align=True)
         column.operator("primdiffusion.release_memory", icon="TRASH")
         column.operator("primdiffusion.copy_diagnostics", icon="COPYDOWN")
 

@@ -11,7 +11,7 @@ from bpy_extras.io_utils import ExportHelper
 from ..backend.requests import sentence
 from ..jobs.follow import Reporting
 from ..scene.actions import action_curves, end_repeat, loops, repeat
-from .drawing import SidebarPanel, draw_lines, property_columns
+from .drawing import HUMAN, SidebarPanel, draw_lines, property_columns
 from .export_operators import destination
 from .on_person import FACTS, OnArmature, WhereTo, scene_fps, target_armature
 from .translations import CONTEXT
@@ -160,6 +160,7 @@ class PRIMDIFFUSION_PT_motion(SidebarPanel, bpy.types.Panel):
     """Import and built-in motions, the current motion, and export."""
 
     bl_label = "Motion"
+    bl_category = HUMAN
     bl_order = 3
     bl_options = {"DEFAULT_CLOSED"}
     manual_page = "motion"
@@ -176,9 +177,9 @@ class PRIMDIFFUSION_PT_motion(SidebarPanel, bpy.types.Panel):
         self._draw_action(layout, armature)
         column = layout.column(align=True)
         column.operator("primdiffusion.key_pose", icon="KEY_HLT")
-        clear = column.row(align=True)
-        clear.enabled = bool(armature.animation_data and armature.animation_data.action)
-        clear.operator("primdiffusion.clear_motion", icon="X")
+        animation = armature.animation_data
+        if animation is not None and (animation.action is not None or animation.nla_tracks):
+            column.operator("primdiffusion.clear_motion", icon="X")
         layout.operator("primdiffusion.export_motion", icon="EXPORT")
 
     def _draw_action(self, layout: bpy.types.UILayout, armature: bpy.types.Object) -> None:

@@ -22,8 +22,10 @@ class OnPerson(Reporting):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("There is no human in the scene: generate one first")
-        return bool(humans(context.scene))
+        found = bool(humans(context.scene))
+        if not found:
+            cls.poll_message_set("There is no human in the scene: generate one first")
+        return found
 
     def act(self, context: bpy.types.Context) -> set[str]:
         return self.run(context, self.person(context))
@@ -81,8 +83,10 @@ class OnArmature(Reporting):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         active = context.view_layer.objects.active
+        if humans(context.scene) or (active is not None and active.type == "ARMATURE"):
+            return True
         cls.poll_message_set("There is no human in the scene: generate one, or select an armature with SMPL's joints")
-        return bool(humans(context.scene)) or (active is not None and active.type == "ARMATURE")
+        return False
 
     def act(self, context: bpy.types.Context) -> set[str]:
         return self.on(context, target_armature(context, self.person))

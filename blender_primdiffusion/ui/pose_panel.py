@@ -1,4 +1,4 @@
-"""The sub-panel Pose Library: apply, mirror, reset, key, save and delete poses."""
+"""The panel Pose Library: apply, mirror, reset, key, save and delete poses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bpy.utils import previews
 from ..formats.joints import JOINT_NAMES
 from ..motion.own_poses import delete_pose, load_pose, own_poses, picture_of, save_pose
 from ..places import own_folder
-from .drawing import SidebarPanel, property_columns
+from .drawing import HUMAN, SidebarPanel, property_columns
 from .on_person import OnArmature, warn_of_rest
 from .translations import CONTEXT
 
@@ -314,8 +314,8 @@ class PRIMDIFFUSION_PT_poses(SidebarPanel, bpy.types.Panel):
     """Poses with pictures."""
 
     bl_label = "Pose Library"
-    bl_parent_id = "PRIMDIFFUSION_PT_human"
-    bl_order = 1
+    bl_category = HUMAN
+    bl_order = 2
     bl_options = {"DEFAULT_CLOSED"}
     manual_page = "posing"
 

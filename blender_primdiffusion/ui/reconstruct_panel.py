@@ -1,4 +1,4 @@
-"""The sub-panel Human from Captures."""
+"""The panel Human from Captures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import bpy
 
 from ..formats.requests import CAPTURE_VIEWS
 from ..jobs.follow import Reporting, submit
-from .drawing import SidebarPanel, draw_job, property_columns
+from .drawing import CAPTURES, SidebarPanel, draw_job, property_columns
 
 _CAMERAS_FILE = "cameras.json"
 
@@ -99,7 +99,8 @@ class PRIMDIFFUSION_PT_human_from_captures(SidebarPanel, bpy.types.Panel):
     """Capture, subject, frame, views and the button; progress and errors."""
 
     bl_label = "Human from Captures"
-    bl_parent_id = "PRIMDIFFUSION_PT_captures"
+    bl_category = CAPTURES
+    bl_order = 1
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 
 import bpy
+from bpy.app.translations import pgettext_iface
 from mathutils import Euler, Vector
 
 from ..backend.requests import sentence
@@ -16,7 +17,7 @@ from ..jobs.target import selected_person
 from ..scene.attachment import MODES, attachment_of, in_viewport
 from ..scene.human import human_of, humans
 from ..scene.material import density_gain, set_density_gain
-from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
+from .drawing import OUTPUT, SidebarPanel, draw_job, draw_lines, property_columns
 from .render_operators import ATTACHMENT_ITEMS
 
 _FROM_EEVEE = frozenset(
@@ -218,23 +219,39 @@ def _plain_colours(scene: bpy.types.Scene) -> None:
     scene.view_settings.look = "None"
 
 
+SHOWN_BY = {
+    ENGINE: "Renders humans exactly, other objects with simple shading",
+    "CYCLES": "Renders humans approximately, with light and shadows",
+}
+OTHER_ENGINE = "This engine blurs humans: choose one above"
+
+
+def draw_engines(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
+    """A choice of engines for humans, and how the current one shows them."""
+    engine = scene.render.engine
+    row = layout.row(align=True)
+    row.operator("primdiffusion.set_up_engine", text="PrimDiffusion", depress=engine == ENGINE, icon="SHADING_RENDERED")
+    row.operator("primdiffusion.set_up_cycles", text="Cycles", depress=engine == "CYCLES", icon="SHADING_TEXTURE")
+    known = engine in SHOWN_BY
+    draw_lines(layout, pgettext_iface(SHOWN_BY.get(engine, OTHER_ENGINE)), "INFO" if known else "ERROR")
+
+
 class PRIMDIFFUSION_PT_render(SidebarPanel, bpy.types.Panel):
     """Which engine, and a camera."""
 
     bl_label = "Render"
-    bl_order = 4
-    bl_options = {"DEFAULT_CLOSED"}
+    bl_category = OUTPUT
+    bl_order = 0
     manual_page = "rendering"
 
     def draw(self, context: bpy.types.Context) -> None:
-        engine = context.scene.render.engine
-        column = self.layout.column(align=True)
-        column.operator("primdiffusion.set_up_engine", depress=engine == ENGINE, icon="SHADING_RENDERED")
-        column.operator("primdiffusion.set_up_cycles", depress=engine == "CYCLES", icon="SHADING_TEXTURE")
+        draw_engines(self.layout, context.scene)
         self.layout.operator("primdiffusion.add_camera", icon="CAMERA_DATA")
 
 
 class _OfPerson(SidebarPanel):
+    bl_category = OUTPUT
+    bl_options = {"DEFAULT_CLOSED"}
     bl_parent_id = "PRIMDIFFUSION_PT_render"
 
     @classmethod
@@ -290,7 +307,6 @@ class PRIMDIFFUSION_PT_cycles_look(_OfPerson, bpy.types.Panel):
     """What brings Cycles near the exact picture."""
 
     bl_label = "Look in Cycles"
-    bl_options = {"DEFAULT_CLOSED"}
 
     def draw_person(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
         from ..scene.cycles import overlap_warning  # numpy, which Blender starts without
@@ -309,7 +325,6 @@ class PRIMDIFFUSION_PT_memory(_OfPerson, bpy.types.Panel):
     """What the human takes."""
 
     bl_label = "Memory"
-    bl_options = {"DEFAULT_CLOSED"}
 
     def draw_person(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
         from ..scene.volumes import person_memory  # needs numpy

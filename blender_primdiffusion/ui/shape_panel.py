@@ -1,4 +1,4 @@
-"""The sub-panels Shape and Details of the selected human."""
+"""The panels Shape and Details of the selected human."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from bpy.app.translations import pgettext_iface
 
 from ..backend.requests import sentence
 from ..jobs.target import named_person, selected_person
-from ..scene.human import BETA_COUNT, BETAS, MARK, armature_of
-from .drawing import SidebarPanel, draw_lines, property_columns
+from ..scene.human import BETA_COUNT, BETAS, MARK, armature_of, humans
+from .drawing import HUMAN, SidebarPanel, draw_lines, property_columns
 from .on_person import SKIP, OnPerson
 from .translations import CONTEXT
 
@@ -137,7 +137,7 @@ _ANIMATED = "The shape is animated: the exact engine draws it in each frame; bon
 
 
 class _InHuman(SidebarPanel):
-    bl_parent_id = "PRIMDIFFUSION_PT_human"
+    bl_category = HUMAN
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -152,12 +152,13 @@ class PRIMDIFFUSION_PT_shape(_InHuman, bpy.types.Panel):
     """Height, weight and the sliders of the body's shape."""
 
     bl_label = "Shape"
-    bl_order = 0
+    bl_order = 1
+    manual_page, manual_section = "editing", "shape"
 
     def draw(self, context: bpy.types.Context) -> None:
         # needs numpy
         from ..scene.reshape import check_shapeable
-        from ..scene.shape import has_custom_shape, shape_model_of, slider_names
+        from ..scene.shape import shape_model_of, slider_names
 
         layout = property_columns(self.layout)
         person = selected_person(context)
@@ -173,21 +174,21 @@ class PRIMDIFFUSION_PT_shape(_InHuman, bpy.types.Panel):
         shown = in_the_scene(context.scene, armature, settings.height)
         if shown:
             layout.label(text=f"In the scene: {shown}", icon="BLANK1", translate=False)
-        column = layout.column(align=True)
-        for index, name in enumerate(names):
-            column.prop(settings, "betas", index=index, text=name, slider=True)
+        _draw_sliders(layout, settings, {index: name for index, name in enumerate(names) if not name.isdecimal()})
         row = layout.row(align=True)
         row.operator("primdiffusion.random_shape", text="Random", icon="FILE_REFRESH")
-        reset = row.row(align=True)
-        reset.enabled = has_custom_shape(person)
-        reset.operator("primdiffusion.reset_shape", text="Reset", icon="LOOP_BACK")
-        row = layout.row(align=True)
-        row.prop(context.scene.primdiffusion_edit, "other", text="Copy From")
-        copy = row.row(align=True)
-        copy.enabled = context.scene.primdiffusion_edit.other is not None
-        copy.operator("primdiffusion.copy_shape", text="", icon="PASTEDOWN")
+        row.operator("primdiffusion.reset_shape", text="Reset", icon="LOOP_BACK")
+        if len(humans(context.scene)) > 1:
+            row = layout.row(align=True)
+            row.prop(context.scene.primdiffusion_edit, "other", text="Copy From")
+            if context.scene.primdiffusion_edit.other is not None:
+                row.operator("primdiffusion.copy_shape", text="", icon="PASTEDOWN")
         if _animated(armature):
             draw_lines(layout, _ANIMATED, "INFO")
+        header, body = layout.panel("primdiffusion_more_sliders", default_closed=True)
+        header.label(text="More Sliders")
+        if body is not None:
+            _draw_sliders(body, settings, {index: name for index, name in enumerate(names) if name.isdecimal()})
 
 
 class PRIMDIFFUSION_PT_details(_InHuman, bpy.types.Panel):
@@ -202,6 +203,13 @@ class PRIMDIFFUSION_PT_details(_InHuman, bpy.types.Panel):
         column = self.layout.column(align=True)
         for name, value in details(person):
             column.label(text=f"{pgettext_iface(name)}: {value}", translate=False)
+
+
+def _draw_sliders(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, names: dict[int, str]) -> None:
+    """Sliders of some betas, by their index."""
+    column = layout.column(align=True)
+    for index, name in names.items():
+        column.prop(settings, "betas", index=index, text=name, slider=True)
 
 
 def details(person: bpy.types.Collection) -> list[tuple[str, str]]:

@@ -13,11 +13,10 @@ from bpy.app.translations import pgettext_iface, pgettext_tip
 from ..backend.requests import sentence
 from ..formats.requests import AMOUNT
 from ..jobs.follow import Reporting, redraw, submit
-from ..jobs.late_volumes import keep_writing
 from ..jobs.pictures import icons
 from ..jobs.queue import queue
 from ..jobs.variations import Variation, VariationsJob, sheet
-from .drawing import SidebarPanel, draw_job, property_columns
+from .drawing import SidebarPanel, draw_job, property_columns, row_unless
 from .generate_panel import LARGEST_SEED, STEPS_AND_SAMPLER, GenerateOptions, last_seed
 
 if TYPE_CHECKING:
@@ -74,7 +73,8 @@ class _OnSheet(Reporting):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        cls.poll_message_set("There are no variations: press Show Variations first")
+        if not sheet.variations:
+            cls.poll_message_set("There are no variations: press Show Variations first")
         return bool(sheet.variations)
 
 
@@ -232,7 +232,7 @@ def _targets(index: int) -> list[Variation]:
 
 def _build(context: bpy.types.Context, wanted: list[Variation]) -> tuple[list[bpy.types.Collection], str]:
     """The humans built, and what went wrong with the next one in a sentence; empty for nothing."""
-    from ..scene.build import build_human, stand_at_cursor  # needs numpy
+    from ..scene.build import build_human, stand_beside_others  # needs numpy
 
     built: list[bpy.types.Collection] = []
     context.window_manager.progress_begin(0, len(wanted))
@@ -240,13 +240,12 @@ def _build(context: bpy.types.Context, wanted: list[Variation]) -> tuple[list[bp
         for variation in wanted:
             person = build_human(context, variation.human, "Human", [variation.person])
             built.append(person)
-            stand_at_cursor(context, person)
+            stand_beside_others(context, person)
             context.window_manager.progress_update(len(built))
     except (ValueError, OSError) as error:
         return built, sentence(error)
     finally:
         context.window_manager.progress_end()
-        keep_writing()
     return built, ""
 
 
@@ -327,9 +326,7 @@ def _draw_picture(cell: bpy.types.UILayout, path: Path | None, units: float) -> 
 
 def _draw_choice(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
     number = sum(variation.chosen for variation in sheet.variations)
-    chosen = layout.row()
-    chosen.enabled = number > 0
-    chosen.operator(
+    row_unless(layout, "" if number else "Select the humans to build").operator(
         "primdiffusion.build_variation",
         text=f"{pgettext_iface('Build Selected')} ({number})",
         translate=False,
@@ -338,14 +335,11 @@ def _draw_choice(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) 
     row = layout.row(align=True)
     row.operator("primdiffusion.build_variation", text="Build All").build_all = True
     row.operator("primdiffusion.clear_variations", text="Clear", icon="TRASH")
-    column = layout.column()
-    column.enabled = number == 1
-    row = column.row(align=True)
+    row = row_unless(layout, "" if number == 1 else "Select a single one for these")
     row.operator("primdiffusion.more_like_variation", icon="DUPLICATE")
-    seed = row.row(align=True)
-    seed.enabled = not sheet.around
-    seed.operator("primdiffusion.use_variation_seed", icon="COPYDOWN")
-    column.prop(settings, "amount")
+    if not sheet.around:
+        row.operator("primdiffusion.use_variation_seed", icon="COPYDOWN")
+    layout.prop(settings, "amount")
 
 
 @persistent

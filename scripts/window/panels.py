@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import bpy
 from mathutils import Euler, Vector
 
-_OURS = "PrimDiffusion"
+_FIRST_TAB = "PrimDiffusion Create"
 _shown: set[str] | None = None
 """Panels to show; None: all."""
 
@@ -18,19 +18,19 @@ def view() -> tuple[bpy.types.Window, bpy.types.Area]:
     return window, next(area for area in window.screen.areas if area.type == "VIEW_3D")
 
 
-def sidebar() -> Iterator[float]:
-    """Show the extension's tab."""
+def sidebar(tab: str = _FIRST_TAB) -> Iterator[float]:
+    """Show a tab of the extension."""
     _, area = view()
     area.spaces.active.show_region_ui = True
     yield 1.0
     _, area = view()
     region = next(region for region in area.regions if region.type == "UI")
-    region.active_panel_category = _OURS
+    region.active_panel_category = tab
     yield 0.5
 
 
 def show(*names: str | None) -> Iterator[float]:
-    """Show only these panels, opened; with None, all of them.
+    """Show only these panels, opened, in the tab of the first one; with None, all of the first tab.
 
     Blender has no function to open and close panels. So the panels are registered again, open by default, and `poll` of
     the others returns False.
@@ -40,7 +40,7 @@ def show(*names: str | None) -> Iterator[float]:
     opened = bpy.types.PRIMDIFFUSION_PT_generate.__dict__.get("window_scenes")
     if not opened:
         _open_all()
-    yield from sidebar()
+    yield from sidebar(getattr(bpy.types, names[0]).bl_category if names[0] else _FIRST_TAB)
 
 
 def _open_all() -> None:
@@ -66,9 +66,7 @@ def _polled(cls: type, before) -> classmethod:
 
 
 def _is_ours(cls: type) -> bool:
-    return (
-        cls.__name__.startswith("PRIMDIFFUSION_PT_") and getattr(cls, "bl_category", "") == _OURS and cls.is_registered
-    )
+    return cls.__name__.startswith("PRIMDIFFUSION_PT_") and hasattr(cls, "bl_category") and cls.is_registered
 
 
 def wide_view() -> None:

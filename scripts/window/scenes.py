@@ -45,7 +45,7 @@ def set_up(module: str, python: str) -> Steps:
 
 
 def first_human(module: str, python: str) -> Steps:
-    """The sidebar as it opens, a real click on Generate Human, denoising, the person."""
+    """The sidebar as it opens, a real click on Generate Human, denoising, the human, the other tabs."""
     yield from begin(module, python)
     yield from sidebar()
     yield "first_sidebar"
@@ -64,6 +64,9 @@ def first_human(module: str, python: str) -> Steps:
     bpy.ops.wm.save_as_mainfile(filepath=str(people_file(module)))
     yield from rendered_view()
     yield "first_person"
+    for tab in ("Human", "Output", "Captures"):
+        yield from sidebar(f"PrimDiffusion {tab}")
+        yield f"first_{tab.lower()}"
 
 
 def generate(module: str, python: str) -> Steps:
@@ -128,7 +131,7 @@ def human(module: str, python: str) -> Steps:
     yield "human_shape_after"
     press("primdiffusion.reset_shape")
     yield 4.0
-    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_details", "PRIMDIFFUSION_PT_edit_files")
+    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_details")
     yield "human_details"
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_poses")
     bpy.context.scene.primdiffusion_motion.pose = "Waving"
@@ -136,7 +139,7 @@ def human(module: str, python: str) -> Steps:
     press("primdiffusion.apply_pose")
     yield 6.0
     yield "human_poses"
-    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_assets")
+    yield from show("PRIMDIFFUSION_PT_assets", "PRIMDIFFUSION_PT_edit_files")
     yield "human_assets"
 
 
@@ -282,10 +285,8 @@ def missing(module: str, python: str) -> Steps:
     try:
         bpy.ops.wm.open_mainfile(filepath=str(people_file(module)), load_ui=False)
         yield 2.0
-        yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_edit_files")
+        yield from show("PRIMDIFFUSION_PT_human")
         yield "missing_files"
-        yield from show(None)
-        yield "missing_all"
     finally:
         away.rename(folder)
 
@@ -368,10 +369,11 @@ def click_generate() -> Steps:
 
 
 TRANSLATED = {
-    "generate": ("generate", "attributes", "variations", "jobs"),
+    "generate": ("generate", "attributes", "variations", "from_file", "backend"),
     "human": ("human", "shape", "details", "poses"),
     "edits": ("human", "edit_redress", "edit_transfer"),
-    "assets": ("human", "edit_vary", "edit_blend", "assets", "edit_files", "motion"),
+    "changes": ("human", "edit_vary", "edit_blend", "motion"),
+    "files": ("assets", "edit_files"),
     "render": ("render", "attachment", "merge", "cycles_look", "memory", "export", "export_mesh", "export_volumes"),
     "captures": ("captures", *(f"captures_{name}" for name in ("input", "poses", "cameras", "cycles", "output"))),
 }

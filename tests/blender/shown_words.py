@@ -61,12 +61,14 @@ def tooltips() -> Iterator[tuple[str, str]]:
 ROOT = Path(__file__).resolve().parents[2] / "blender_primdiffusion"
 FOR_CONSOLES = ("ui/batch", "capture/command.py", "console.py")
 """Command lines and bug reports stay English."""
+_TRANSLATING = {"pgettext_iface", "pgettext_tip", "row_unless"}
 _SHOWN_KEYWORDS = {"text", "heading", "message", "title"}
 
 
 def said_by_blender() -> set[str]:
     """What Blender itself looks up: labels, tooltips, choices; constant words in panels."""
-    known = {label for _, label in labels()} | {text.strip() for _, text in tooltips()}
+    known = {cls.bl_category for cls in classes(bpy.types.Panel) if hasattr(cls, "bl_category")}
+    known |= {label for _, label in labels()} | {text.strip() for _, text in tooltips()}
     for _, prop in properties():
         known |= {item.description for item in getattr(prop, "enum_items_static", ())}
     for _, prop in filter(lambda pair: ours(pair[1]), properties()):
@@ -79,12 +81,14 @@ def said_by_blender() -> set[str]:
 
 
 def _constants_in_panels() -> Iterator[str]:
-    """Strings given as `text=` and the like; both branches of a condition."""
+    """Strings given as `text=` and the like, or translated; both branches of a condition."""
     for path in sorted(ROOT.rglob("*.py")):
         if path.relative_to(ROOT).as_posix().startswith(FOR_CONSOLES):
             continue
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Call):
+                if getattr(node.func, "id", "") in _TRANSLATING:
+                    yield from (text for argument in node.args for text in _strings(argument))
                 for keyword in node.keywords:
                     if keyword.arg in _SHOWN_KEYWORDS:
                         yield from _strings(keyword.value)

@@ -220,7 +220,8 @@ class PRIMDIFFUSION_OT_cancel_set_up(bpy.types.Operator):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Nothing is being set up")
+        if not session.busy:
+            cls.poll_message_set("Nothing is being set up")
         return session.busy
 
     def execute(self, context: bpy.types.Context) -> set[str]:

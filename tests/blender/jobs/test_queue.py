@@ -108,7 +108,7 @@ def test_a_child_that_dies_between_jobs_is_noticed(addon):
     while not queue.child_message:
         watch()
         time.sleep(0.01)
-    assert "killed by the system" in " ".join(shown(PRIMDIFFUSION_PT_jobs, addon))
+    assert "killed by the system" in " ".join(shown(PRIMDIFFUSION_PT_generate, addon))
     ask(12)
     drive()
     assert seeds() == [11, 12]

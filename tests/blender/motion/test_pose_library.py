@@ -238,7 +238,6 @@ def test_the_panel_shows_pictures_and_offers_to_delete_only_own_poses(addon, arm
         PRIMDIFFUSION_PT_poses.draw(SimpleNamespace(layout=layout), addon)
         return [call.args[0] for call in layout.operator.call_args_list]
 
-    assert PRIMDIFFUSION_PT_poses.bl_parent_id == "PRIMDIFFUSION_PT_human"
     assert "primdiffusion.delete_pose" not in buttons()
     ops.save_pose(pose_name="mine")
     assert "primdiffusion.delete_pose" in buttons()

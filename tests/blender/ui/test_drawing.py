@@ -1,12 +1,41 @@
-"""Text wrapped in panels."""
+"""The sidebar as it opens: tabs, panels, heights, reasons beside grey buttons; text wrapped in panels."""
 
 from __future__ import annotations
 
-import pytest
+import re
+import sys
+from pathlib import Path
+from unittest.mock import MagicMock
 
-from blender_primdiffusion.ui import drawing
+import bpy
+import pytest
+import synthetic_shape
+from shown_words import classes
+
+sys.path.insert(0, str(Path(__file__).parents[3] / "benchmarks"))
+import sidebar
+
+from blender_primdiffusion.jobs.queue import JobOutcome, queue
+from blender_primdiffusion.jobs.variations import Variation, sheet
+from blender_primdiffusion.scene import shape
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.ui import drawing, generate_panel
+from blender_primdiffusion.ui.captures_session import captures
 
 pytestmark = pytest.mark.any_blender
+SMALL_SCREEN_PX = 900
+
+
+@pytest.fixture
+def human(addon, tmp_path, monkeypatch):
+    """One human, whose sliders have names, after Generate Human."""
+    human = build_human(addon, synthetic_shape.write(tmp_path / "human.npz"))
+    vertices = len(shape.shape_model_of(human).template)
+    monkeypatch.setattr(shape, "DEFAULT_BODY_VERTICES", vertices)
+    monkeypatch.setattr(generate_panel, "draw_set_up", lambda _layout: True)
+    outcome = JobOutcome(MagicMock(), "Generated in 47.6 s, and after that built in 2.9 s.")
+    monkeypatch.setitem(queue.outcomes, "generate", outcome)
+    return human
 
 
 def test_numbers_keep_their_units_where_lines_break():
@@ -14,3 +43,76 @@ def test_numbers_keep_their_units_where_lines_break():
     assert not any(line.startswith(("s,", "s.")) for line in lines)
     assert " ".join(lines) == "Generated in 47.6 s, and after that built in 2.9 s."
     assert max(map(len, lines)) <= drawing._LINE
+
+
+def test_there_is_a_tab_for_each_task_and_one_for_captures_in_this_order(human):
+    names = ["PrimDiffusion Create", "PrimDiffusion Human", "PrimDiffusion Output", "PrimDiffusion Captures"]
+    assert list(sidebar.tabs(bpy.context)) == names
+
+
+def test_a_panel_is_in_the_tab_of_the_panel_around_it(addon):
+    panels = {getattr(cls, "bl_idname", cls.__name__): cls for cls in sidebar.panels()}
+    for cls in panels.values():
+        if parent := getattr(cls, "bl_parent_id", ""):
+            assert cls.bl_category == panels[parent].bl_category, cls.__name__
+
+
+def test_the_panels_open_at_first_are_those_of_the_first_steps(human):
+    names = [cls.__name__.removeprefix("PRIMDIFFUSION_PT_") for cls in sidebar.open_panels(bpy.context)]
+    assert sorted(names) == ["captures", "export", "generate", "human", "render", "shape"]
+
+
+def test_with_one_human_each_tab_fits_a_small_screen(human):
+    assert max(sidebar.tabs(bpy.context).values()) <= SMALL_SCREEN_PX
+    assert sidebar.figures(bpy.context)["panels_open"] == 2
+
+
+def test_heights_are_those_of_a_screenshot():
+    """Blender 5.2.2 at an interface scale of 1.05: 268 px from a field over ten sliders and a row to the next row."""
+    layout = sidebar.Layout()
+    layout.label()
+    column = layout.column(align=True)
+    for _ in range(10):
+        column.label()
+    layout.row().label()
+    layout.row().label()
+    assert (layout.height - sidebar.ROW) * 1.05 == pytest.approx(268, abs=2)
+
+
+@pytest.mark.parametrize("situation", ["no backend", "one human", "variations", "all variations", "captures"])
+def test_no_button_is_grey_without_a_reason_in_the_panel(human, monkeypatch, tmp_path, situation):
+    if situation == "no backend":
+        monkeypatch.setattr(generate_panel, "draw_set_up", lambda _layout: False)
+    if "variations" in situation:
+        monkeypatch.setattr("blender_primdiffusion.ui.variations_panel._draw_picture", lambda *_: None)
+        chosen = situation == "all variations"
+        monkeypatch.setattr(sheet, "variations", [Variation(seed, tmp_path, chosen) for seed in range(3)])
+    if situation == "captures":
+        monkeypatch.setattr(type(captures), "busy", True)
+    grey = set()
+    for cls in sidebar.panels():
+        layout = sidebar.draw(cls, bpy.context)
+        for button in layout.buttons:
+            if button.grey:
+                grey.add(button.idname.removeprefix("primdiffusion."))
+                assert any(re.match(r"(Set up|Choose|Select|Wait)", text) for text in layout.texts), cls.__name__
+    always = {"transfer_texture", "blend"}
+    more = {
+        "no backend": {"generate"},
+        "one human": set(),
+        "variations": {"build_variation", "more_like_variation", "use_variation_seed"},
+        "all variations": {"more_like_variation", "use_variation_seed"},
+        "captures": {"preview_rig", "verify_captures"},
+    }
+    assert grey == always | more[situation]
+
+
+def test_an_operator_gives_a_reason_only_where_it_is_disabled(human):
+    """Else Blender would show that reason on a button that is grey for another one."""
+    for cls in classes(bpy.types.Operator):
+        poll = getattr(cls, "poll", None)
+        if not getattr(poll, "__module__", "").startswith("blender_primdiffusion"):
+            continue
+        said: list[str] = []
+        allowed = poll.__func__(type("Stub", (), {"poll_message_set": staticmethod(said.append)}), bpy.context)
+        assert bool(said) != allowed, cls.__name__

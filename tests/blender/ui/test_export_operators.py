@@ -213,8 +213,6 @@ def test_a_file_that_holds_no_person_is_rejected_before_any_work(store, out, dam
 
 def test_the_panels_draw_in_the_sidebar_and_files_can_be_dropped(store):
     types = bpy.types
-    assert types.PRIMDIFFUSION_PT_export.bl_order == 6
-    assert types.PRIMDIFFUSION_PT_export.bl_category == "PrimDiffusion"
     for name in ("mesh", "volumes"):
         assert getattr(types, f"PRIMDIFFUSION_PT_export_{name}").bl_parent_id == "PRIMDIFFUSION_PT_export"
     assert types.PRIMDIFFUSION_FH_human.bl_import_operator == "primdiffusion.import_human"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
@@ -13,6 +14,7 @@ import synthetic_shape
 from jobs_driven import shown
 from oracle import evaluated_matrices
 
+from blender_primdiffusion.scene import shape
 from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.attachment import set_attachment
 from blender_primdiffusion.scene.build import build_human
@@ -355,4 +357,23 @@ def test_a_scaled_human_shows_its_height_in_the_scene(person, addon):
 
 
 def test_other_bodies_have_sliders_with_numbers(person):
-    assert slider_names(shape_model_of(person)) == [f"Shape {number}" for number in range(1, 11)]
+    assert slider_names(shape_model_of(person)) == [str(number) for number in range(1, 11)]
+
+
+def test_the_six_sliders_with_names_are_shown_and_the_others_folded(person, addon, monkeypatch):
+    monkeypatch.setattr(shape, "DEFAULT_BODY_VERTICES", len(shape_model_of(person).template))
+    drawn: list[tuple[str, str]] = []
+
+    def layout(fold: str) -> MagicMock:
+        made = MagicMock()
+        made.prop.side_effect = lambda _owner, name, text=None, **_: drawn.append((fold, text or name))
+        made.column.side_effect = lambda **_: layout(fold)
+        made.panel.side_effect = lambda _idname, default_closed: (
+            MagicMock(),
+            layout("folded" if default_closed else ""),
+        )
+        return made
+
+    PRIMDIFFUSION_PT_shape.draw(SimpleNamespace(layout=layout("")), addon)
+    named = ["height", "weight", "Stature", "Shoulders", "Waist", "Girth"]
+    assert drawn == [("", name) for name in named] + [("folded", number) for number in ("3", "5", "7", "8", "9", "10")]

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import bpy
 import pytest
+from jobs_driven import drive, shown
 
+from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.ui import jobs_panel
 
@@ -30,6 +32,19 @@ def test_diagnostics_hold_versions_and_the_error_but_no_folder_or_name(addon, tm
     assert bpy.data.texts[jobs_panel.TEXT].as_string().strip() == text.strip()
     ops.copy_diagnostics()
     assert len(bpy.data.texts) == 1
+
+
+def test_the_panel_jobs_is_shown_only_while_there_are_any(addon):
+    shows = jobs_panel.PRIMDIFFUSION_PT_jobs.poll
+    assert not shows(addon)
+    queue.add(addon, GenerateJob(11, 1))
+    assert shows(addon)
+    drive()
+    assert queue.ended
+    assert not shows(addon)
+    assert {"primdiffusion.release_memory", "primdiffusion.copy_diagnostics"} <= set(
+        shown(jobs_panel.PRIMDIFFUSION_PT_backend, addon)
+    )
 
 
 def test_diagnostics_can_be_copied_before_anything_was_done(addon):

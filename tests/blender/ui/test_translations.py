@@ -6,7 +6,6 @@ import bpy
 import pytest
 from shown_words import said_by_blender
 
-from blender_primdiffusion.scene.human import BETA_COUNT
 from blender_primdiffusion.ui import translations
 
 pytestmark = pytest.mark.any_blender
@@ -30,10 +29,12 @@ def composed() -> set[str]:
     from blender_primdiffusion.jobs.remedies import _REMEDIES
     from blender_primdiffusion.motion.poses import LIBRARY
     from blender_primdiffusion.ui.attributes import CATEGORIES, menu
+    from blender_primdiffusion.ui.render_panel import OTHER_ENGINE, SHOWN_BY
     from blender_primdiffusion.ui.shape_panel import _SHOWN
     from blender_primdiffusion.ui.variations_panel import _BUILD_ALL
 
-    sliders = {f"Shape {index + 1}" for index in range(BETA_COUNT)} | {"Stature", "Shoulders", "Waist", "Girth"}
+    sliders = {"Stature", "Shoulders", "Waist", "Girth"}
+    reasons = {"Set up the backend first", "Choose the other human above", *SHOWN_BY.values(), OTHER_ENGINE}
     facts = {"Rig", "Up Axis", "Frames", "Frame Rate", "Units", "Bones", "Stride"}
     facts |= {"Volumes", "Files", "Memory once drawn"} | {name.capitalize() for name in _SHOWN}
     menus = {item[1] for name in CATEGORIES for item in menu(name)} | set(LIBRARY)
@@ -41,6 +42,7 @@ def composed() -> set[str]:
     menus |= {"No preference", "A pose of your own", "A built-in pose"}
     return (
         sliders
+        | reasons
         | facts
         | menus
         | buttons
