@@ -26,7 +26,7 @@ def execute(argv: Sequence[str]) -> int:
     command, words = argv[:1], list(argv[1:])
     try:
         if command == ["generate"]:
-            from .generate import main
+            from .generate import main  # each command loads its own modules
         elif command == ["render"]:
             from .render import main  # needs numpy
         elif command == ["capture"]:
