@@ -11,11 +11,14 @@ from typing import Any
 import bpy
 
 from ..backend.requests import sentence
-from ..scene.build import build_written, next_folder, stand_beside_others
+from ..scene.build import build_written, next_folder, stand_at_cursor
 from ..scene.cycles import overlap_warning_in
+from ..scene.edit import select_human
+from ..scene.human import armature_of
 from ..scene.human_npz import Destination, write_now
 from .follow import building
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
+from .windows import bring_into_view
 
 
 def build_person(
@@ -29,7 +32,11 @@ def build_person(
     human = Path(result["human"])
     written = building.take(human) or write_now(human, Destination(next_folder(name)))
     collection = build_written(context, written, name, keep)
-    stand_beside_others(context, collection)
+    stand_at_cursor(context, collection)
+    context.view_layer.update()  # which does not hold the human before
+    if context.mode == "OBJECT":  # else the user is posing or painting
+        select_human(context, collection)
+        bring_into_view(armature_of(collection).location)
     warnings = list(result.get("warnings", ()))
     if overlap := overlap_warning_in(context.scene, collection):
         warnings.append(overlap)

@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Iterator
 
 import bpy
+from mathutils import Vector
 
 _IN_THE_WAY = {"UNDO", "BLOCKING", "GRAB_CURSOR", "GRAB_CURSOR_X", "GRAB_CURSOR_Y"}
 """Options of modal operators that block the scene or the mouse; others (screencasts) may run for ever."""
@@ -55,3 +56,22 @@ def redraw() -> None:
             for region in area.regions if area.type == "VIEW_3D" else ():
                 if region.type == "UI":
                     region.tag_redraw()
+
+
+def bring_into_view(point: Vector) -> None:
+    """Turn the first 3D viewport to the selection, unless one shows `point` [3] (world) or looks through a camera."""
+    if bpy.app.background:
+        return
+    windows = bpy.context.window_manager.windows
+    areas = [(window, area) for window in windows for area in window.screen.areas if area.type == "VIEW_3D"]
+    if areas and not any(_shows(area.spaces.active.region_3d, point) for _, area in areas):
+        window, area = areas[0]
+        region = next(region for region in area.regions if region.type == "WINDOW")
+        with bpy.context.temp_override(window=window, area=area, region=region):
+            bpy.context.view_layer.update()
+            bpy.ops.view3d.view_selected()
+
+
+def _shows(view: bpy.types.RegionView3D, point: Vector) -> bool:
+    x, y, _, w = view.perspective_matrix @ point.to_4d()
+    return view.view_perspective == "CAMERA" or (w > 0 and max(abs(x), abs(y)) < w)

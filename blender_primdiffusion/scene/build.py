@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
 from .armature import build_armature
-from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT
+from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT, volumes_may_wait
 from .convention import frames_to_blender, matrix_to_quaternion, points_to_blender
 from .human import (
     BETAS,
@@ -46,11 +46,11 @@ _KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions",
 def build_human(
     context: bpy.types.Context, human_npz: str | Path, name: str = "Human", keep: Sequence[Path] = ()
 ) -> bpy.types.Collection:
-    """Write the volumes of a human.npz and build it in the scene at once, which takes seconds; see `build_written`.
+    """Write the volumes of a human.npz, where they may not come later, and build it in the scene; see `build_written`.
 
     Raises HumanNpzError or VolumeWriteError, and then leaves neither data nor files.
     """
-    written = write_now(human_npz, Destination(next_folder(name)))
+    written = write_now(human_npz, Destination(next_folder(name), later=volumes_may_wait()))
     read_headers(written.unread)
     return build_written(context, written, name, keep)
 
@@ -227,6 +227,12 @@ def hide_relationship_lines() -> None:
             for space in area.spaces:
                 if space.type == "VIEW_3D":
                     space.overlay.show_relationship_lines = False
+
+
+def stand_at_cursor(context: bpy.types.Context, collection: bpy.types.Collection) -> None:
+    """Move a new human from the world's origin to the 3D cursor, or beside others there."""
+    armature_of(collection).location += context.scene.cursor.location
+    stand_beside_others(context, collection)
 
 
 def stand_beside_others(context: bpy.types.Context, collection: bpy.types.Collection) -> None:

@@ -221,3 +221,15 @@ def leave_mode(context: bpy.types.Context) -> None:
     active = context.view_layer.objects.active
     if active is not None and active.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def select_human(context: bpy.types.Context, person: bpy.types.Collection) -> None:
+    """Make a human's armature active. Raises ValueError for one that cannot be selected in this view layer."""
+    armature = armature_of(person)
+    if context.view_layer.objects.get(armature.name) != armature:
+        raise ValueError(f"the armature of {person.name!r} is not in this view layer: enable its collection first")
+    leave_mode(context)
+    for obj in context.view_layer.objects.selected:
+        obj.select_set(False)
+    armature.select_set(True)
+    context.view_layer.objects.active = armature

@@ -189,7 +189,9 @@ class PRIMDIFFUSION_OT_select_human(OnPerson, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        select(context, person)
+        from ..scene.edit import select_human  # needs numpy
+
+        select_human(context, person)
         return {"FINISHED"}
 
 
@@ -202,10 +204,12 @@ class PRIMDIFFUSION_OT_frame_human(OnPerson, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """In the viewport that the button was pressed in, else in the first one."""
+        from ..scene.edit import select_human  # needs numpy
+
         place = _viewport(context)
         if place is None:
             raise ValueError("no 3D viewport is open: open one")
-        select(context, person)
+        select_human(context, person)
         with context.temp_override(**place):
             bpy.ops.view3d.view_selected()
         return {"FINISHED"}
@@ -222,14 +226,14 @@ class PRIMDIFFUSION_OT_duplicate_human(OnPerson, bpy.types.Operator):
         # needs numpy
         from ..scene.build import stand_beside_others
         from ..scene.duplicate import duplicate_human
-        from ..scene.edit import leave_mode
+        from ..scene.edit import leave_mode, select_human
 
         check_editable(person)
         leave_mode(context)
         twin = duplicate_human(person)
         context.view_layer.update()
         stand_beside_others(context, twin)
-        select(context, twin)
+        select_human(context, twin)
         return {"FINISHED"}
 
 
@@ -261,20 +265,6 @@ class PRIMDIFFUSION_OT_delete_human(OnPerson, bpy.types.Operator):
         context.view_layer.update()  # evaluated data holds grids too
         free_unused_grids()
         return {"FINISHED"}
-
-
-def select(context: bpy.types.Context, person: bpy.types.Collection) -> None:
-    """Make a human's armature active. Raises ValueError for one that cannot be selected in this view layer."""
-    from ..scene.edit import leave_mode  # needs numpy
-
-    armature = armature_of(person)
-    if context.view_layer.objects.get(armature.name) != armature:
-        raise ValueError(f"the armature of {person.name!r} is not in this view layer: enable its collection first")
-    leave_mode(context)
-    for obj in context.view_layer.objects.selected:
-        obj.select_set(False)
-    armature.select_set(True)
-    context.view_layer.objects.active = armature
 
 
 def _viewport(context: bpy.types.Context) -> dict[str, object] | None:

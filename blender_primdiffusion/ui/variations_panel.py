@@ -13,6 +13,7 @@ from bpy.app.translations import pgettext_iface, pgettext_tip
 from ..backend.requests import sentence
 from ..formats.requests import AMOUNT
 from ..jobs.follow import Reporting, redraw, submit
+from ..jobs.late_volumes import keep_writing
 from ..jobs.pictures import icons
 from ..jobs.queue import queue
 from ..jobs.variations import Variation, VariationsJob, sheet
@@ -232,7 +233,7 @@ def _targets(index: int) -> list[Variation]:
 
 def _build(context: bpy.types.Context, wanted: list[Variation]) -> tuple[list[bpy.types.Collection], str]:
     """The humans built, and what went wrong with the next one in a sentence; empty for nothing."""
-    from ..scene.build import build_human, stand_beside_others  # needs numpy
+    from ..scene.build import build_human, stand_at_cursor  # needs numpy
 
     built: list[bpy.types.Collection] = []
     context.window_manager.progress_begin(0, len(wanted))
@@ -240,12 +241,13 @@ def _build(context: bpy.types.Context, wanted: list[Variation]) -> tuple[list[bp
         for variation in wanted:
             person = build_human(context, variation.human, "Human", [variation.person])
             built.append(person)
-            stand_beside_others(context, person)
+            stand_at_cursor(context, person)
             context.window_manager.progress_update(len(built))
     except (ValueError, OSError) as error:
         return built, sentence(error)
     finally:
         context.window_manager.progress_end()
+        keep_writing()
     return built, ""
 
 

@@ -17,7 +17,7 @@ from blender_primdiffusion.jobs import queue as queue_module
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.human import folder_of, humans
+from blender_primdiffusion.scene.human import armature_of, folder_of, humans
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_OT_generate, PRIMDIFFUSION_PT_generate
 
 DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
@@ -142,3 +142,26 @@ def test_an_interpreter_that_does_not_exist_is_named(saved_scene, monkeypatch):
             bpy.ops.primdiffusion.generate(seed=7, steps=1)
     finally:
         blender_primdiffusion.unregister()
+
+
+def test_a_new_human_stands_at_the_cursor_selected(addon):
+    addon.scene.cursor.location = (2.0, -1.0, 0.5)
+    assert bpy.ops.primdiffusion.generate(seed=7) == {"FINISHED"}
+    (person,) = humans(addon.scene)
+    armature = armature_of(person)
+    body = next(obj for obj in person.objects if obj.type == "MESH")
+    addon.view_layer.update()
+    assert tuple(armature.location)[:2] == (2.0, -1.0)
+    assert min((armature.matrix_world @ vertex.co).z for vertex in body.data.vertices) == pytest.approx(0.5, abs=1e-5)
+    assert addon.view_layer.objects.active == armature
+    assert list(addon.view_layer.objects.selected) == [armature]
+
+
+def test_who_is_being_posed_stays_selected_while_another_human_enters(addon):
+    assert bpy.ops.primdiffusion.generate(seed=7) == {"FINISHED"}
+    (first,) = humans(addon.scene)
+    bpy.ops.object.mode_set(mode="POSE")
+    assert bpy.ops.primdiffusion.generate(seed=8) == {"FINISHED"}
+    assert addon.view_layer.objects.active == armature_of(first)
+    assert addon.mode == "POSE"
+    bpy.ops.object.mode_set(mode="OBJECT")
