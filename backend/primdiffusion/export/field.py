@@ -120,20 +120,29 @@ def _in_box(field, k, x, y, z, value):  # pragma: no cover (compiled)
     c = m[2, 0] * dx + m[2, 1] * dy + m[2, 2] * dz
     if not (abs(a) < 1 and abs(b) < 1 and abs(c) < 1):
         return False
-    voxels = field.voxels[k]
+    _sample(field.voxels[k], a, b, c, value)
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _sample(voxels, a, b, c, value):  # pragma: no cover (compiled)
+    """Write colour and windowed density at (a, b, c) in [-1, 1]^3 to `value`, interpolated between voxels."""
     size = voxels.shape[0]
     half = 0.5 * (size - 1)
     fa, fb, fc = (a + 1) * half, (b + 1) * half, (c + 1) * half
-    ia, ib, ic = min(int(fa), size - 2), min(int(fb), size - 2), min(int(fc), size - 2)
+    ia, ib, ic = min(max(int(fa), 0), size - 2), min(max(int(fb), 0), size - 2), min(max(int(fc), 0), size - 2)
     ta, tb, tc = fa - ia, fb - ib, fc - ic
-    value[:] = 0
+    red, green, blue, density = 0.0, 0.0, 0.0, 0.0
     for corner in range(8):
         p, q, r = corner & 1, (corner >> 1) & 1, corner >> 2
         weight = (ta if p else 1 - ta) * (tb if q else 1 - tb) * (tc if r else 1 - tc)
-        for channel in range(4):
-            value[channel] += weight * voxels[ic + r, ib + q, ia + p, channel]
-    value[3] *= math.exp(-_SHARPNESS * (a**_POWER + b**_POWER + c**_POWER))
-    return True
+        voxel = voxels[ic + r, ib + q, ia + p]
+        red += weight * voxel[0]
+        green += weight * voxel[1]
+        blue += weight * voxel[2]
+        density += weight * voxel[3]
+    window = math.exp(-_SHARPNESS * (a**_POWER + b**_POWER + c**_POWER))
+    value[0], value[1], value[2], value[3] = red, green, blue, density * window
 
 
 @numba.njit(cache=True, nogil=True)
@@ -157,34 +166,68 @@ def _density(field, points):  # pragma: no cover (compiled)
 def _march(field, origins, directions, steps, step):  # pragma: no cover (compiled)
     rgb = np.zeros((len(origins), 3), np.float32)
     alpha = np.zeros(len(origins), np.float32)
-    value, mixed = np.empty(4), np.empty(3)
+    last_ray = np.full(len(field.position), -1)  # that met each box
+    boxes, met = np.empty((len(field.position), 9)), np.empty(len(field.position), np.int64)
+    value = np.empty(4)
     for n in range(len(origins)):
+        count, cell_before = 0, -1
+        for i in range(steps):
+            t = (i + 0.5) * step
+            x, y = origins[n, 0] + t * directions[n, 0], origins[n, 1] + t * directions[n, 1]
+            cell = _cell_of(field, x, y, origins[n, 2] + t * directions[n, 2])
+            if cell < 0 or cell == cell_before:
+                continue
+            cell_before = cell
+            for place in range(field.start[cell], field.start[cell + 1]):
+                k = field.box[place]
+                if last_ray[k] != n:
+                    last_ray[k] = n
+                    if _crossed(field, k, origins[n], directions[n], boxes[count]):
+                        met[count] = k
+                        count += 1
         seen, r, g, b = 0.0, 0.0, 0.0, 0.0
         for i in range(steps):
             t = (i + 0.5) * step
-            x, y, z = origins[n, 0] + t * directions[n, 0], origins[n, 1] + t * directions[n, 1], 0.0
-            z = origins[n, 2] + t * directions[n, 2]
-            cell = _cell_of(field, x, y, z)
-            if cell < 0:
-                continue
-            mixed[:] = 0
-            density = 0.0
-            for place in range(field.start[cell], field.start[cell + 1]):
-                if _in_box(field, field.box[place], x, y, z, value):
+            density, red, green, blue = 0.0, 0.0, 0.0, 0.0
+            for j in range(count):
+                box = boxes[j]
+                if box[6] < t < box[7]:
+                    a, b_, c = box[0] + t * box[3], box[1] + t * box[4], box[2] + t * box[5]
+                    _sample(field.voxels[met[j]], a, b_, c, value)
                     density += value[3]
-                    for channel in range(3):
-                        mixed[channel] += value[3] * value[channel]
+                    red += value[3] * value[0]
+                    green += value[3] * value[1]
+                    blue += value[3] * value[2]
             if density <= 0:
                 continue
             part = min(density * step, 1 - seen) / density
             seen += density * part
-            r, g, b = r + part * mixed[0], g + part * mixed[1], b + part * mixed[2]
+            r, g, b = r + part * red, g + part * green, b + part * blue
             if seen >= 1:
                 break
         alpha[n] = seen
         if seen > 0:
             rgb[n, 0], rgb[n, 1], rgb[n, 2] = r / seen, g / seen, b / seen
     return rgb, alpha
+
+
+@numba.njit(cache=True, nogil=True)
+def _crossed(field, k, origin, direction, box):  # pragma: no cover (compiled)
+    """Write a ray in the axes of box k to `box`: origin, direction, and where it enters and leaves; whether it does."""
+    box[6], box[7] = -np.inf, np.inf
+    for axis in range(3):
+        row = field.to_local[k, axis]
+        box[axis] = box[3 + axis] = 0.0
+        for i in range(3):
+            box[axis] += row[i] * (origin[i] - field.position[k, i])
+            box[3 + axis] += row[i] * direction[i]
+        if box[3 + axis] == 0:
+            if abs(box[axis]) >= 1:
+                return False
+            continue
+        one, other = (-1 - box[axis]) / box[3 + axis], (1 - box[axis]) / box[3 + axis]
+        box[6], box[7] = max(box[6], min(one, other)), min(box[7], max(one, other))
+    return box[6] < box[7] and box[7] > 0
 
 
 @numba.njit(cache=True, nogil=True)

@@ -15,7 +15,7 @@ from scipy import ndimage, sparse
 from torch import Tensor
 
 from primdiffusion.export.field import Field, march_rays, pack_field, weights_at
-from primdiffusion.export.simplify import simplified, unwrapped
+from primdiffusion.export.simplify import simplified_and_unwrapped
 from primdiffusion.export.surface import OuterSurface, outside_surface
 from primdiffusion.formats import requests
 from primdiffusion.formats.joints import JOINT_NAMES
@@ -102,19 +102,21 @@ class MeshProxy:
 def mesh_proxy(human: Human, settings: ProxySettings = DEFAULT_PROXY, on_stage: OnStage = lambda *_: None) -> MeshProxy:
     """Extract the outer surface, with colours rendered by the marcher from outside.
 
-    Exceptions raised by `on_stage` cancel. Raises NoSurface. Takes about ten seconds.
+    Exceptions raised by `on_stage` cancel. Raises NoSurface. Takes about ten seconds of processor time.
     """
     body, anchors = body_of(human)
     field = pack_field(place(human))
     on_stage("surface", 0, 3)
-
-    def on_wait() -> None:
-        on_stage("surface", 0, 3)
-
-    fine = outside_surface(field, settings.spacing, on_wait)
-    surface = OuterSurface(*run_in_process(simplified, *fine, settings.triangles, on_wait=on_wait))
+    fine = outside_surface(field, settings.spacing, lambda: on_stage("surface", 0, 3))
+    *coarse, corner_uv = run_in_process(
+        simplified_and_unwrapped,
+        *fine,
+        settings.triangles,
+        settings.texture_px,
+        on_wait=lambda: on_stage("unwrap", 1, 3),
+    )
+    surface = OuterSurface(*coarse)
     weights = skin_weights(field, surface, anchor_skin_weights(anchors, body))
-    corner_uv = run_in_process(unwrapped, *surface, settings.texture_px, on_wait=lambda: on_stage("unwrap", 1, 3))
     texture = bake_texture(field, surface, corner_uv, settings.texture_px, lambda: on_stage("texture", 2, 3))
     joints = body.shape(human.betas).joints.detach().double().numpy()
     skeleton = Skeleton(JOINT_NAMES, body.parents.tolist(), joints)

@@ -12,6 +12,14 @@ CHART_COST = 8.0
 """Maximum cost of a chart; xatlas's default of 2 cuts noisy surfaces into many more charts."""
 
 
+def simplified_and_unwrapped(
+    vertices: Float64[Array, "v 3"], faces: Int64[Array, "f 3"], triangles: int, texture_px: int
+) -> tuple[Float64[Array, "w 3"], Int64[Array, "g 3"], Float64[Array, "g 3 2"]]:
+    """Vertices, triangles and texture coordinates of the corners: `simplified`, then `unwrapped`."""
+    coarse = simplified(vertices, faces, triangles)
+    return (*coarse, unwrapped(*coarse, texture_px))
+
+
 class NoUnwrapping(ValueError):
     """xatlas is not available for this Python."""
 
