@@ -20,7 +20,7 @@ from ..scene.export_model import FrameRange, check_ready, scene_with_only, write
 from ..scene.human import armature_of, person_file
 from ..scene.human_file import HumanMotion, motion_in, read_tensors, reshaped, with_motion, write_tensors
 from ..scene.merged import MergedGrid, merged_of, read_grid, write_grid
-from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy
+from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy, show_textures_in_solid
 from ..scene.shape import BODY_FILE, betas_of, generated_betas, has_custom_shape, shape_model_of
 from ..scene.surface import carrier_of, primitives_of
 from .generate import build_person
@@ -124,6 +124,7 @@ class AddProxyJob(ProxyJob):
             remove_proxy(earlier)
         person.objects.link(proxy)
         show(person, "VIEWPORT")
+        show_textures_in_solid()
         return f"Mesh proxy of {result['triangles']} triangles for {person.name} in {result['seconds']:.1f} s"
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from mathutils import Color
 from mathutils.kdtree import KDTree
 from numpy.typing import NDArray
 
@@ -113,6 +114,15 @@ def show_betas(proxy: bpy.types.Object, betas: NDArray) -> None:
     proxy[PROXY_MARK] = json.dumps({**json.loads(proxy[PROXY_MARK]), "betas": _rounded(betas)})
 
 
+def show_textures_in_solid() -> None:
+    """Solid shading shows textures in all 3D viewports that show the colours of materials, Blender's default; objects
+    without a texture look the same. Another choice of the user stays."""
+    for screen in bpy.data.screens:
+        for space in (space for area in screen.areas for space in area.spaces if space.type == "VIEW_3D"):
+            if space.shading.type != "WIREFRAME" and space.shading.color_type == "MATERIAL":
+                space.shading.color_type = "TEXTURE"
+
+
 def remove_proxy(proxy: bpy.types.Object) -> None:
     """Remove a proxy from the .blend with its mesh, material and texture."""
     mesh = proxy.data
@@ -169,6 +179,10 @@ def _material(name: str, texture: Path) -> bpy.types.Material:
     picture.image = image
     picture.location = (shader.location.x - 300, shader.location.y)
     material.node_tree.links.new(picture.outputs["Color"], shader.inputs["Base Color"])
+    nodes.active = picture  # the texture that Solid shading shows
+    pixels = np.empty((*image.size, 4), np.float32)
+    image.pixels.foreach_get(pixels.ravel())
+    material.diffuse_color[:3] = Color(pixels[..., :3].mean((0, 1))).from_srgb_to_scene_linear()
     shader.inputs["Roughness"].default_value = 0.9
     shader.inputs["Metallic"].default_value = 0.0
     return material
