@@ -223,7 +223,7 @@ SHOWN_BY = {
     ENGINE: "Renders humans exactly, other objects with simple shading",
     "CYCLES": "Renders humans approximately, with light and shadows",
 }
-OTHER_ENGINE = "This engine blurs humans: choose one above"
+OTHER_ENGINE = "Renders humans blurred: choose an engine above"
 
 
 def draw_engines(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:

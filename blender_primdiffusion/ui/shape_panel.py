@@ -207,7 +207,7 @@ class PRIMDIFFUSION_PT_details(_InHuman, bpy.types.Panel):
 
 def _draw_sliders(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, names: dict[int, str]) -> None:
     """Sliders of some betas, by their index."""
-    column = layout.column(align=True)
+    column = layout.column(align=True) if names else layout  # an empty column leaves a gap
     for index, name in names.items():
         column.prop(settings, "betas", index=index, text=name, slider=True)
 

@@ -337,7 +337,7 @@ def _draw_choice(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) 
     row = layout.row(align=True)
     row.operator("primdiffusion.build_variation", text="Build All").build_all = True
     row.operator("primdiffusion.clear_variations", text="Clear", icon="TRASH")
-    row = row_unless(layout, "" if number == 1 else "Select a single one for these")
+    row = row_unless(layout, "" if number == 1 else "Select one human for these")
     row.operator("primdiffusion.more_like_variation", icon="DUPLICATE")
     if not sheet.around:
         row.operator("primdiffusion.use_variation_seed", icon="COPYDOWN")

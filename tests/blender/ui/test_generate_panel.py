@@ -185,3 +185,17 @@ def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_o
     texts = shown(generate_panel.PRIMDIFFUSION_PT_generate, addon)
     assert texts[0] == "not set up"
     assert {"primdiffusion.random_seed", "primdiffusion.generate"} <= set(texts)
+
+
+@pytest.mark.parametrize(
+    ("engine", "line"),
+    [("PRIMDIFFUSION", "humans exactly"), ("CYCLES", "approximately"), ("BLENDER_WORKBENCH", "choose an engine above")],
+)
+def test_beside_the_result_an_engine_is_chosen_and_a_line_says_how_it_shows_humans(addon, engine, line):
+    panel, choice = generate_panel.PRIMDIFFUSION_PT_generate, "primdiffusion.set_up_engine"
+    assert choice not in shown(panel, addon)
+    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    addon.scene.render.engine = engine
+    texts = shown(panel, addon)
+    assert {choice, "primdiffusion.set_up_cycles"} <= set(texts)
+    assert line in " ".join(texts)
