@@ -84,17 +84,23 @@ class GpuRefinement:
         """Whether the newest request is drawn in full."""
         return self._request is None or (self._pending is None and self._next() is None)
 
+    @property
+    def due(self) -> bool:
+        """Whether `advance` would march now: it waits for a while before it begins finer pictures."""
+        if self._request is None or self._pending is not None:
+            return self._pending is not None
+        fresh = self.shown is None or self.shown.request is not self._request
+        return self._next() is not None and (fresh or self._clock() - self._changed_at >= REST_S)
+
     def advance(self) -> bool:
         """March for about SLICE_S; True when there is a new picture in `shown`. Raises what `begin` raises."""
         end = self._clock() + SLICE_S
-        news = False
-        while self._request is not None and self._clock() < end:
-            if self._pending is None and not self._begin(self._request):
-                break
+        while self.due and self._clock() < end:
+            self._pending = self._pending or self._begin(self._request)
             if self._march(self._pending):
-                self.shown, self._pending, news = self._pending, None, True
-                break
-        return news
+                self.shown, self._pending = self._pending, None
+                return True
+        return False
 
     def _moving(self, view: PinholeView) -> int:
         """How coarse pictures are while the scene moves, from the time of the last one."""
@@ -110,18 +116,13 @@ class GpuRefinement:
             return shown.coarseness // 2, 0
         return (1, shown.sample + 1) if shown.sample + 1 < SAMPLES else None
 
-    def _begin(self, request: MarchRequest) -> bool:
-        following = self._next()
-        fresh = self.shown is None or self.shown.request is not request
-        if following is None or not (fresh or self._clock() - self._changed_at >= REST_S):
-            return False
-        coarseness, sample = following
-        view = request.view
-        view = view.scaled(-(-view.width // coarseness), -(-view.height // coarseness))
+    def _begin(self, request: MarchRequest) -> ShownMarch:
+        coarseness, sample = self._next()
+        view = request.view.scaled(*(-(-side // coarseness) for side in (request.view.width, request.view.height)))
         began = self._clock()
-        self._pending = ShownMarch(request, coarseness, sample, request.begin(jittered(view, sample)))
+        begun = ShownMarch(request, coarseness, sample, request.begin(jittered(view, sample)))
         self._seconds = self._clock() - began
-        return True
+        return begun
 
     def _march(self, pending: ShownMarch) -> bool:
         """A slice of the pending picture; True when it is complete."""

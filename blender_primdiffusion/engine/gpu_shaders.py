@@ -217,7 +217,7 @@ def list_shader() -> gpu.types.GPUShader:
     info.sampler(3, "UINT_2D", "entries")
     info.image(0, "R32UI", "UINT_2D", "entries_image", qualifiers={"WRITE"})
     info.push_constant("IVEC4", "tiling")
-    return _compiled(info, _LIST, (TILE, TILE))
+    return compiled(info, _LIST, (TILE, TILE))
 
 
 def march_shader() -> gpu.types.GPUShader:
@@ -240,7 +240,7 @@ def march_shader() -> gpu.types.GPUShader:
     info.push_constant("VEC3", "atlas_size")
     info.push_constant("IVEC2", "size")
     info.push_constant("IVEC3", "tiling")
-    return _compiled(info, _MARCH, (TILE, TILE))
+    return compiled(info, _MARCH, (TILE, TILE))
 
 
 def copy_shader() -> gpu.types.GPUShader:
@@ -249,10 +249,11 @@ def copy_shader() -> gpu.types.GPUShader:
     info.sampler(0, "FLOAT_3D", "one")
     info.image(0, "RGBA16F", "FLOAT_3D", "atlas_image", qualifiers={"WRITE"})
     info.push_constant("INT", "layer")
-    return _compiled(info, _COPY, (8, 8))
+    return compiled(info, _COPY, (8, 8))
 
 
-def _compiled(info: gpu.types.GPUShaderCreateInfo, source: str, group: tuple[int, int]) -> gpu.types.GPUShader:
+def compiled(info: gpu.types.GPUShaderCreateInfo, source: str, group: tuple[int, int]) -> gpu.types.GPUShader:
+    """A compute shader with groups of this size."""
     info.local_group_size(*group)
     info.compute_source(source)
     return gpu.shader.create_from_info(info)

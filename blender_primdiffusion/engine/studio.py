@@ -1,12 +1,18 @@
-"""What all pictures share: the child that draws, and the shared memory it draws into."""
+"""What all pictures share: the marcher on the GPU; the child that draws, and the shared memory it draws into."""
 
 from __future__ import annotations
 
 import atexit
+import functools
+from typing import TYPE_CHECKING
 
 from ..backend.drawing import IDLE_S, DrawingChild
 from ..places import new_backend, preference
 from .frames import SharedFrames
+
+if TYPE_CHECKING:
+    from .gpu_march import GpuMarcher
+    from .gpu_people import GpuPeople
 
 frames = SharedFrames()
 """For all renders and viewports."""
@@ -22,6 +28,25 @@ def drawing_child() -> DrawingChild:
         child = _children.setdefault(python, DrawingChild(new_backend(python), IDLE_S))
         _close([other for other in list(_children) if other != python])
     return child
+
+
+@functools.cache
+def gpu_marcher() -> GpuMarcher | str:
+    """The marcher on the GPU, or why there is none. Asked for while a view is drawn."""
+    from .gpu_march import GpuMarcher  # a render without a window has no GPU
+
+    try:
+        return GpuMarcher()
+    except RuntimeError as error:
+        return str(error)
+
+
+@functools.cache
+def gpu_people() -> GpuPeople:
+    """The humans on the GPU."""
+    from .gpu_people import GpuPeople  # as above
+
+    return GpuPeople()
 
 
 def advance() -> None:

@@ -1,7 +1,8 @@
-"""The 3D view in Rendered mode: requests pictures and draws the newest one, without waiting."""
+"""The 3D view in Rendered mode, marched on its GPU; where that cannot be, pictures of the child, without waiting."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import weakref
 from pathlib import Path
@@ -12,9 +13,11 @@ import numpy as np
 from gpu_extras.presets import draw_texture_2d
 
 from . import studio
-from .picture import SceneContent, scene_content, solids_file
+from .gpu_picture import GpuPicture, GpuScene, GpuSolids
+from .gpu_refine import GpuRefinement, MarchRequest
+from .picture import SceneContent, scene_content
 from .refine import Refinement, ShownPicture, ViewRequest
-from .solids import changed_by
+from .solids import SceneSolids, changed_by, scene_solids, stored
 from .view import view_from_matrices
 
 TICK_S = 1 / 60
@@ -24,7 +27,7 @@ _numbers = itertools.count()
 
 
 class Viewport:
-    """One region in Rendered mode. All methods are for Blender's main thread."""
+    """One region in Rendered mode. All methods are for Blender's main thread, `draw` for its drawing."""
 
     def __init__(self) -> None:
         number = next(_numbers)
@@ -33,74 +36,128 @@ class Viewport:
             lambda params: studio.drawing_child().draw(params),
             lambda turn, width, height: studio.frames.take(names[int(turn)], width, height),
         )
+        """The child's pictures, where the GPU cannot march."""
+        self._gpu = GpuRefinement()
+        self._gpu_scene: tuple[object, GpuScene] | None = None
+        """With what it shows, to be compared."""
         self._picture: SceneContent | None = None
-        self._solids: Path | None = None
+        self._solids: SceneSolids | None = None
+        self._solids_count = 0
+        """How often solids were read."""
+        self._solids_file: Path | None = None
+        self._gpu_solids: GpuSolids | None = None
         self._known: tuple[str, bool] | None = None
         """The solids setting and whether the view is local, as of the last reading of solids."""
         self._error = ""
-        self._texture: tuple[ShownPicture, gpu.types.GPUTexture] | None = None
+        self._no_gpu = ""
+        """Why the child draws."""
+        self._shown: ShownPicture | None = None
+        self._texture: tuple[gpu.types.GPUTexture, tuple[int, int, int, int] | None] | None = None
+        """What is drawn, and the part of the region that it fills."""
         _viewports.add(self)
         weakref.finalize(self, _release, self._refinement, names)
 
     def update(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """Read the changed scene while the dependency graph may be read."""
         space = context.space_data
-        current = (depsgraph.scene.primdiffusion_render.solids, space.local_view is not None)
+        mode = depsgraph.scene.primdiffusion_render.solids
+        current = (mode, space.local_view is not None)
         try:
             if current != self._known or changed_by(depsgraph):
-                self._solids, self._known = solids_file(depsgraph, studio.frames.folder, space), current
-            self._picture = scene_content(depsgraph, self._solids, space)
+                solids = None if mode == "IGNORED" else scene_solids(depsgraph, mode == "HOLDOUT", space)
+                self._solids = solids if solids is not None and len(solids.corners) else None
+                self._solids_count, self._known = self._solids_count + 1, current
+                self._solids_file = self._gpu_solids = None
+            self._picture = scene_content(depsgraph, None, space)
             self._error = ""
         except (ValueError, OSError) as error:
             self._picture, self._error = None, str(error)
 
     def draw(self, engine: bpy.types.RenderEngine, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
-        """Request what the region shows now, and draw the newest picture over all of it."""
+        """March what the region shows now, or request it from the child, and draw the newest picture."""
         if self._known is not None and self._known[1] != (context.space_data.local_view is not None):
             self.update(context, depsgraph)  # Blender reports no change
         if self._picture is not None:
-            self._refinement.want(_view_request(self._picture, context, depsgraph))
-            studio.advance()
-            self._refinement.advance()
-            if not self._refinement.resting:
+            try:
+                self._march(self._picture, context, depsgraph)
+            except (ValueError, OSError, RuntimeError) as error:
+                self._no_gpu = str(error)
+                self._ask_child(self._picture, context, depsgraph)
+            if not self.resting:
                 follow()
-        shown = self._refinement.shown
-        if shown is not None:
-            self._draw_picture(engine, shown, context, depsgraph)
+        if self._texture is not None:
+            self._draw_texture(engine, context, depsgraph, *self._texture)
         engine.update_stats("", self._status())
 
     @property
     def resting(self) -> bool:
         """Whether no new picture is expected."""
-        return self._refinement.resting
+        return self._refinement.resting if self._no_gpu else self._gpu.resting
 
     def advance(self) -> bool:
-        """Process the child's answers; True when there is something new to draw."""
-        return self._refinement.advance()
+        """Process the child's answers; True when there is something new to draw, or to march while drawing."""
+        return self._refinement.advance() if self._no_gpu else self._gpu.due
+
+    def _march(self, picture: SceneContent, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
+        """March for a moment. Raises ValueError, OSError or RuntimeError for what the GPU cannot draw."""
+        marcher = studio.gpu_marcher()
+        if isinstance(marcher, str):
+            raise RuntimeError(marcher)
+        if picture.shown != "colour":
+            raise ValueError("the GPU draws colours alone")
+        request = _view_request(picture, context, depsgraph)
+        scene = self._scene_on_gpu(picture)
+        view = request.view if request.region is None else request.view.part(request.region)
+        key = (request.key, self._solids_count, request.region)
+        self._gpu.want(MarchRequest(key, view, lambda view: GpuPicture(marcher, scene, view)))
+        self._no_gpu = ""
+        if self._gpu.advance():
+            shown, before = self._gpu.shown, self._texture
+            mean = before[0] if before is not None and shown.sample else None
+            self._texture = shown.picture.compose(mean, shown.sample), shown.request.key[-1]
+
+    def _scene_on_gpu(self, picture: SceneContent) -> GpuScene:
+        key = (repr(picture.params()), self._solids_count)
+        if self._gpu_scene is None or self._gpu_scene[0] != key:
+            if self._solids is not None and self._gpu_solids is None:
+                self._gpu_solids = GpuSolids(self._solids)
+            humans = [studio.gpu_people().placed(human) for human in picture.people]
+            studio.gpu_people().keep_only(picture.people)
+            self._gpu_scene = key, GpuScene(humans, self._gpu_solids, picture.background, picture.step)
+        return self._gpu_scene[1]
+
+    def _ask_child(self, picture: SceneContent, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
+        if self._solids is not None and self._solids_file is None:
+            self._solids_file = stored(self._solids, studio.frames.folder)
+        picture = dataclasses.replace(picture, solids=self._solids_file)
+        self._refinement.want(_view_request(picture, context, depsgraph))
+        studio.advance()
+        self._refinement.advance()
+        shown = self._refinement.shown
+        if shown is not None and shown is not self._shown:
+            frame, self._shown = shown.frame, shown
+            pixels = gpu.types.Buffer("FLOAT", len(frame.combined), frame.combined)
+            texture = gpu.types.GPUTexture((frame.width, frame.height), format="RGBA16F", data=pixels)
+            self._texture = texture, shown.request.region
 
     def _status(self) -> str:
         """The text in the corner of the region."""
-        if error := self._error or self._refinement.error:
+        if error := self._error or (self._refinement.error if self._no_gpu else ""):
             return f"PrimDiffusion: {error}"
-        return STARTING if self._refinement.starting else ""
+        return f"{STARTING}; {self._no_gpu}" if self._no_gpu and self._refinement.starting else ""
 
-    def _draw_picture(
+    def _draw_texture(
         self,
         engine: bpy.types.RenderEngine,
-        shown: ShownPicture,
         context: bpy.types.Context,
         depsgraph: bpy.types.Depsgraph,
+        texture: gpu.types.GPUTexture,
+        part: tuple[int, int, int, int] | None,
     ) -> None:
-        if self._texture is None or self._texture[0] is not shown:
-            frame = shown.frame
-            pixels = gpu.types.Buffer("FLOAT", len(frame.combined), frame.combined)
-            self._texture = shown, gpu.types.GPUTexture((frame.width, frame.height), format="RGBA16F", data=pixels)
-        x, y, width, height = 0, 0, context.region.width, context.region.height
-        if shown.request.region is not None:
-            x, y, width, height = shown.request.region
+        x, y, width, height = part or (0, 0, context.region.width, context.region.height)
         gpu.state.blend_set("ALPHA_PREMULT")
         engine.bind_display_space_shader(depsgraph.scene)
-        draw_texture_2d(self._texture[1], (x, y), width, height)
+        draw_texture_2d(texture, (x, y), width, height)
         engine.unbind_display_space_shader()
         gpu.state.blend_set("NONE")
 

@@ -12,6 +12,7 @@ from importlib import import_module
 from pathlib import Path
 
 import bpy
+from mathutils import Quaternion
 from panels import show, sidebar, view, wide_view
 from press import Steps, invoke, press, wait
 from stalls import Stalls
@@ -222,6 +223,36 @@ def render(module: str, python: str) -> Steps:
     yield "render_outdated"
 
 
+def rendered(module: str, python: str) -> Steps:
+    """The engine's view: a human among solids, turned step by step, from the side in parallel, cut by a border."""
+    yield from with_people(module, python, FIRST_SEED)
+    for location, size in (((0.5, -0.2, 0.4), 0.8), ((0.0, 0.0, 0.0), 0.1)):
+        bpy.ops.mesh.primitive_cube_add(size=size, location=location)
+    bpy.context.object.scale = (30.0, 30.0, 0.01)
+    yield from rendered_view()
+    yield "rendered_still"
+    _, area = view()
+    around = area.spaces.active.region_3d
+    for step in range(12):
+        around.view_rotation = Quaternion((0, 0, 1), 0.15) @ around.view_rotation
+        yield 0.3
+        if step in (0, 11):
+            yield f"rendered_turning_{step}"
+    yield 20.0
+    yield "rendered_turned"
+    around.view_perspective = "ORTHO"
+    space = area.spaces.active
+    space.use_render_border = True
+    space.render_border_min_x, space.render_border_max_x = 0.2, 0.7
+    space.render_border_min_y, space.render_border_max_y = 0.2, 0.8
+    yield 20.0
+    yield "rendered_parallel"
+    space.use_render_border = False
+    bpy.context.scene.primdiffusion_render.view = "ALPHA"
+    yield 30.0
+    yield "rendered_by_child"
+
+
 def captures(module: str, python: str) -> Steps:
     """Render Captures with its cameras, Human from Captures."""
     yield from begin(module, python)
@@ -390,6 +421,7 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "edits": edits,
     "motion": motion,
     "render": render,
+    "rendered": rendered,
     "captures": captures,
     "export": export,
     "cancelled": cancelled,

@@ -1,7 +1,8 @@
 """The backend by itself, in a process of its own: makes people and draws them with `place` and `march` alone.
 
 Speaks JSON, an object a line: {"make": folder, "seed": 0, "betas": [...]}, {"place": {...}, "out": npz} (a posed
-person's boxes) or {"draw": {...}, "out": npz}, where {"boxes": npz} may stand for a person; answers {}.
+person's boxes) or {"draw": {...}, "out": npz}, where {"boxes": npz} may stand for a person;
+"compose" instead of "draw" adds solids and a background; answers {}.
 Run by the backend's Python; Blender's tests compare the engine's pictures with it.
 """
 
@@ -14,6 +15,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.drawing.draw import draw as compose_scene
+from primdiffusion.drawing.scene import Scene, ViewSettings
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.human import Human, place
@@ -23,6 +26,7 @@ from primdiffusion.primitives.from_mesh import from_mesh
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.lattice import MarchSettings
 from primdiffusion.render.march import Span, march
+from primdiffusion.render.solids import Solids
 from primdiffusion.reshaping import reshaped
 
 
@@ -100,12 +104,27 @@ def draw(
     np.savez(out, combined=np.concatenate([rendering.rgb, rendering.alpha[..., None]], -1), depth=depth)
 
 
+def compose(
+    out: str, people: list, solids: dict, background: list | None, intrinsics: list, world_to_camera: list,
+    width: int, height: int, clip: list,
+) -> None:  # fmt: skip
+    """Combined [h, w, 4] and depth [h, w] of people among solids, as the child draws them."""
+    primitives = Primitives.together([boxes(person["boxes"]) for person in people])
+    matrices = (torch.tensor(matrix, dtype=torch.float32) for matrix in (intrinsics, world_to_camera))
+    arrays = (np.array(solids[name], dtype) for name, dtype in (("corners", "f4"), ("colour", "f4"), ("holdout", "?")))
+    look = ViewSettings("colour", None if background is None else tuple(background), tuple(clip))
+    picture = compose_scene(Scene(primitives, Solids(*arrays)), Camera(*matrices, width, height), look)
+    np.savez(out, combined=picture.combined, depth=picture.depth)
+
+
 for line in sys.stdin:
     request = json.loads(line)
     if "make" in request:
         make(Path(request["make"]), request["seed"], request["betas"])
     elif "place" in request:
         np.savez(request["out"], **{name: tensor.numpy() for name, tensor in vars(placed(**request["place"])).items()})
+    elif "compose" in request:
+        compose(request["out"], **request["compose"])
     else:
         draw(request["out"], **request["draw"])
     print("{}", flush=True)

@@ -1,14 +1,18 @@
-"""A human of the backend, and the extension registered once for a file of tests."""
+"""A human of the backend, the extension registered once for a file of tests, and a marcher on the GPU."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
+import gpu
 import pytest
 from engine_stage import PYTHON, Oracle
+from gpu_stage import placed
 
 import blender_primdiffusion
+from blender_primdiffusion.engine.gpu_march import GpuMarcher, GpuPayload
 
 
 @pytest.fixture(scope="module")
@@ -32,3 +36,26 @@ def extension() -> Iterator[None]:
         blender_primdiffusion.register()
         yield
         blender_primdiffusion.unregister()
+
+
+@pytest.fixture(scope="module")
+def marcher() -> GpuMarcher:
+    if not hasattr(gpu, "init"):
+        pytest.skip("without a window Blender has a GPU context from 5.2 on")
+    try:
+        gpu.init()
+        return GpuMarcher()
+    except (SystemError, RuntimeError) as error:
+        pytest.skip(f"no GPU context: {error}")
+
+
+@pytest.fixture(scope="module")
+def backend(marcher, oracle, folder) -> SimpleNamespace:
+    """The oracle, a human's folder, and numbers for the files of its poses."""
+    return SimpleNamespace(oracle=oracle, folder=folder, files=iter(range(1000)))
+
+
+@pytest.fixture(scope="module")
+def payload(backend) -> GpuPayload:
+    fields = placed(backend)
+    return GpuPayload(fields["rgb"], fields["density"])

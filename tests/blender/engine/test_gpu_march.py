@@ -3,81 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-from types import SimpleNamespace
 
 import gpu
 import numpy as np
 import pytest
-from engine_stage import STEP, Oracle
+from engine_stage import STEP
+from gpu_stage import boxes_of, pinhole, placed, read
 
 from blender_primdiffusion.engine import gpu_march
-from blender_primdiffusion.engine.gpu_march import Boxes, GpuMarcher, GpuPayload
-from blender_primdiffusion.engine.view import NO_SURFACE_M, PARALLEL_M, PinholeView, view_from_matrices
+from blender_primdiffusion.engine.gpu_march import Boxes, GpuPayload
+from blender_primdiffusion.engine.view import NO_SURFACE_M, PARALLEL_M, view_from_matrices
 from blender_primdiffusion.scene.convention import BLENDER_FROM_BACKEND
 
 STEP_OF_8_BIT = 1 / 255
 AT_EDGES = 3 / 255
 """Of single pixels: where a ray leaves or enters a box, float32 decides about a sample."""
-REST = np.tile(np.eye(3), (24, 1, 1))
-
-
-@pytest.fixture(scope="module")
-def marcher():
-    if not hasattr(gpu, "init"):
-        pytest.skip("without a window Blender has a GPU context from 5.2 on")
-    try:
-        gpu.init()
-        return GpuMarcher()
-    except (SystemError, RuntimeError) as error:
-        pytest.skip(f"no GPU context: {error}")
-
-
-@pytest.fixture(scope="module")
-def backend(marcher, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("people")
-    oracle = Oracle(folder)
-    oracle.ask({"make": str(folder), "seed": 1, "betas": [0.0] * 10})
-    yield SimpleNamespace(oracle=oracle, folder=folder, files=iter(range(1000)))
-    oracle.close()
-
-
-@pytest.fixture(scope="module")
-def payload(backend):
-    fields = placed(backend)
-    return GpuPayload(fields["rgb"], fields["density"])
-
-
-def placed(backend, rotations=REST, translation=(0.0, 0.0, 0.0), world=None) -> dict[str, np.ndarray]:
-    """A person's boxes, as the backend poses them, and the file that holds them."""
-    file = backend.folder / f"{next(backend.files)}.npz"
-    world = np.eye(4) if world is None else world
-    person = {"folder": str(backend.folder), "rotations": np.asarray(rotations).tolist()}
-    person |= {"translation": list(translation), "world": np.asarray(world).tolist()}
-    backend.oracle.ask({"place": person, "out": str(file)})
-    with np.load(file) as fields:
-        return {**fields, "file": str(file)}
-
-
-def boxes_of(fields: dict) -> Boxes:
-    return Boxes(fields["position"], fields["rotation"], fields["half_extent"])
-
-
-def pinhole(target, back, size=(64, 96), angle=0.6, clip=(0.01, 100.0)) -> PinholeView:
-    """A camera that looks at `target` from `back` of it; the picture's height sees `angle`."""
-    back = np.asarray(back, float)
-    eye, ahead = target + back, -back / np.linalg.norm(back)
-    right = np.cross(ahead, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    turn = np.stack([right, np.cross(ahead, right), ahead])
-    focal = size[1] / 2 / np.tan(angle / 2)
-    intrinsics = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
-    return PinholeView(intrinsics, np.concatenate([turn, -(turn @ eye)[:, None]], 1), clip, *size)
-
-
-def read(texture: gpu.types.GPUTexture, view: PinholeView) -> np.ndarray:
-    """Pixels [h, w, ...], top row first."""
-    values = np.array(texture.read()).reshape(view.height, view.width, -1)[::-1]
-    return values[..., 0] if texture.format == "R32F" else values
 
 
 def marched(marcher, people, view, **more) -> tuple[np.ndarray, np.ndarray]:
