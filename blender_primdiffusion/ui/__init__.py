@@ -14,7 +14,7 @@ from types import ModuleType
 
 import bpy
 
-from ..jobs import follow, late_volumes, missing_files
+from ..jobs import cycles_check, follow, late_volumes, missing_files
 from . import (
     assets_panel,
     attributes,
@@ -43,7 +43,7 @@ from .setup import operators as setup_operators
 from .setup import preferences
 
 MODULES = (
-    translations, setup_operators, preferences, follow, jobs_panel, attributes, generate_panel,
+    translations, setup_operators, preferences, follow, cycles_check, jobs_panel, attributes, generate_panel,
     variations_panel, human_panel, shape_settings, edit_panel, shape_panel, missing_files, late_volumes,
     import_motion, motion_panel, pose_panel, assets_panel, render_operators, render_panel, captures_settings,
     captures_panel, reconstruct_panel, export_operators, export_panel, batch, manual,

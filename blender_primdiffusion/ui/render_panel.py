@@ -12,6 +12,7 @@ from mathutils import Euler, Vector
 from ..backend.requests import sentence
 from ..engine.engine import ENGINE
 from ..formats.requests import DENSITY_GAIN, VOXEL
+from ..jobs import cycles_check
 from ..jobs.follow import Reporting
 from ..jobs.target import selected_person
 from ..scene.attachment import MODES, attachment_of, in_viewport
@@ -234,6 +235,8 @@ def draw_engines(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     row.operator("primdiffusion.set_up_cycles", text="Cycles", depress=engine == "CYCLES", icon="SHADING_TEXTURE")
     known = engine in SHOWN_BY
     draw_lines(layout, pgettext_iface(SHOWN_BY.get(engine, OTHER_ENGINE)), "INFO" if known else "ERROR")
+    if engine == "CYCLES" and cycles_check.volumes_are_empty():
+        draw_lines(layout, sentence(cycles_check.FAULT), "ERROR")
 
 
 class PRIMDIFFUSION_PT_render(SidebarPanel, bpy.types.Panel):

@@ -17,12 +17,13 @@ from pathlib import Path
 
 import bpy
 
-from ...backend.requests import Backend
+from ...backend.requests import Backend, sentence
 from ...capture.report import Report
 from ...console import Stop
 from ...engine import studio
 from ...engine.engine import ENGINE
 from ...formats.whole_files import replacing
+from ...jobs import cycles_check
 from ...scene.cycles import fit_cycles_to_volumes, new_camera
 from ...scene.human import NPZ_FILE, PERSON_FILE, humans, humans_folder, volume_path
 from ...scene.unwritten import write_all_unwritten
@@ -176,7 +177,7 @@ class _Drawing:
     ):
         self.say = say
         self._options, self._movement, self._backend, self._stop = options, movement, backend, stop
-        self._checked = False
+        self._checked = self._warned = False
 
     def draw(self, source: RenderSource) -> int:
         if source.is_blend:
@@ -256,6 +257,9 @@ class _Drawing:
             render.resolution_percentage = 100
         render.film_transparent = options.transparent or (options.source.suffix == ".blend" and render.film_transparent)
         if render.engine == "CYCLES":
+            if not self._warned and cycles_check.check():
+                self.say(sentence(cycles_check.FAULT))
+            self._warned = True
             if options.engine or options.samples:
                 fit_cycles_to_volumes(scene, options.samples or _SAMPLES)
             _check_volumes(scene)
