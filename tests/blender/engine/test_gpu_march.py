@@ -16,7 +16,7 @@ from blender_primdiffusion.engine.view import NO_SURFACE_M, PARALLEL_M, view_fro
 from blender_primdiffusion.scene.convention import BLENDER_FROM_BACKEND
 
 STEP_OF_8_BIT = 1 / 255
-AT_EDGES = 3 / 255
+AT_EDGES = 2 / 255
 """Of single pixels: where a ray leaves or enters a box, float32 decides about a sample."""
 
 
