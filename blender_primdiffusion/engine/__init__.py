@@ -6,11 +6,16 @@ import sys
 
 import bpy
 
+from ..scene.human import any_humans
 from .engine import ENGINE, PRIMDIFFUSION_RenderEngine
 from .settings import PRIMDIFFUSION_PG_render
 
 CHECK_S = 5.0
 """Between checks on a child that may be idle, which is stopped after a while."""
+SHADINGS = frozenset({"SOLID", "MATERIAL", "WIREFRAME"})
+"""Of 3D views, in which humans are drawn beside Blender's own objects."""
+_CHANGES = ("depsgraph_update_post", "frame_change_post", "undo_post", "redo_post", "load_post")
+_draw_handlers: list[object] = []
 CLASSES = (PRIMDIFFUSION_PG_render, PRIMDIFFUSION_RenderEngine)
 
 
@@ -20,19 +25,54 @@ def register() -> None:
         bpy.utils.register_class(cls)
     bpy.types.Scene.primdiffusion_render = bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_render)
     bpy.app.timers.register(_check_child, first_interval=CHECK_S, persistent=True)
+    if not bpy.app.background:
+        _draw_handlers.append(bpy.types.SpaceView3D.draw_handler_add(_draw_humans, (), "WINDOW", "POST_VIEW"))
+        _draw_handlers.append(bpy.types.SpaceView3D.draw_handler_add(_draw_error, (), "WINDOW", "POST_PIXEL"))
+        for name in _CHANGES:
+            getattr(bpy.app.handlers, name).append(_scene_changed)
 
 
 def unregister() -> None:
     """Undo `register` and stop the child; scenes that used the engine return to Blender's default."""
     if bpy.app.timers.is_registered(_check_child):
         bpy.app.timers.unregister(_check_child)
-    for module, ending in (("viewport", "stop"), ("studio", "close")):
+    while _draw_handlers:
+        bpy.types.SpaceView3D.draw_handler_remove(_draw_handlers.pop(), "WINDOW")
+    for name in _CHANGES:
+        if _scene_changed in getattr(bpy.app.handlers, name):
+            getattr(bpy.app.handlers, name).remove(_scene_changed)
+    for module, ending in (("overlay", "stop"), ("viewport", "stop"), ("studio", "close")):
         if (drawn := sys.modules.get(f"{__package__}.{module}")) is not None:  # imported by the first picture
             getattr(drawn, ending)()
     _reset_scenes()
     del bpy.types.Scene.primdiffusion_render
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)
+
+
+def shows_humans(context: bpy.types.Context) -> bool:
+    """Whether humans are drawn into this 3D view beside Blender's own objects."""
+    wanted = context.scene.primdiffusion_render.in_viewports and context.space_data.shading.type in SHADINGS
+    return wanted and any_humans()
+
+
+def _draw_humans() -> None:
+    if shows_humans(bpy.context):
+        from .overlay import overlay  # numpy, which Blender starts without
+
+        overlay.draw(bpy.context)
+
+
+def _draw_error() -> None:
+    module = sys.modules.get(f"{__package__}.overlay")
+    if module is not None and shows_humans(bpy.context):
+        module.draw_error(bpy.context)
+
+
+@bpy.app.handlers.persistent
+def _scene_changed(*_changed: object) -> None:
+    if (module := sys.modules.get(f"{__package__}.overlay")) is not None:
+        module.overlay.scene_changed()
 
 
 def _check_child() -> float:

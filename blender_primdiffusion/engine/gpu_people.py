@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
-
-import numpy as np
 
 from ..scene.human_file import FileVersion, file_version, read_payload
 from .boxes import Boxes, boxes_of
@@ -33,18 +30,13 @@ class GpuPeople:
         self._payloads[version] = payload
         return payload, boxes
 
+    def holds(self, human: PosedHuman) -> bool:
+        """Whether the human's payload is on the GPU already."""
+        return file_version(human.file) in self._payloads
+
     def keep_only(self, drawn: Iterable[PosedHuman]) -> None:
         """Free the payloads of others, but for the latest PAYLOADS_KEPT."""
         files = {human.file for human in drawn}
         others = [version for version in self._payloads if version.path not in files]
         for version in others[:-PAYLOADS_KEPT]:
             del self._payloads[version]
-
-
-def step_for(people: Iterable[PosedHuman], step: float) -> float:
-    """The distance between samples where a human of natural size has `step`: less for small people, by powers of two.
-
-    Small boxes would fall between coarser samples; the backend's `settings_for` does the same.
-    """
-    volumes = [abs(float(np.linalg.det(human.object_to_world[:, :3]))) for human in people]
-    return step * 2.0 ** min((round(math.log2(volume) / 3) for volume in volumes if volume > 0), default=0)

@@ -61,8 +61,11 @@ class ShownMarch:
 class GpuRefinement:
     """Marches the newest request, one picture at a time."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic):
-        self._clock = clock
+    def __init__(
+        self, clock: Callable[[], float] = time.monotonic, coarsest: int = COARSENESS[0], samples: int = SAMPLES
+    ):
+        """`coarsest`, a power of two, is the coarseness while anything moves; of `samples` pictures at rest."""
+        self._clock, self._coarsest, self._samples = clock, coarsest, samples
         self._request: MarchRequest | None = None
         self._changed_at = 0.0
         self._pending: ShownMarch | None = None
@@ -105,7 +108,10 @@ class GpuRefinement:
     def _moving(self, view: PinholeView) -> int:
         """How coarse pictures are while the scene moves, from the time of the last one."""
         pixels = view.width * view.height
-        return next((c for c in COARSENESS[::-1] if pixels / c**2 * self._pixel_seconds <= FLUENT_S), COARSENESS[0])
+        coarseness = 1
+        while coarseness < self._coarsest and pixels / coarseness**2 * self._pixel_seconds > FLUENT_S:
+            coarseness *= 2
+        return coarseness
 
     def _next(self) -> tuple[int, int] | None:
         """Coarseness and number of the picture after the shown one; None after the last."""
@@ -114,7 +120,7 @@ class GpuRefinement:
             return self._moving(self._request.view), 0
         if shown.coarseness > 1:
             return shown.coarseness // 2, 0
-        return (1, shown.sample + 1) if shown.sample + 1 < SAMPLES else None
+        return (1, shown.sample + 1) if shown.sample + 1 < self._samples else None
 
     def _begin(self, request: MarchRequest) -> ShownMarch:
         coarseness, sample = self._next()

@@ -104,7 +104,7 @@ void main()
   int opened = int(span.x) + 1;
   int closed = opened + int(span.y);
   vec4 colour = vec4(0.0);
-  float surface = -1.0;
+  float surface = 1e10;
   vec4 sums[{CHUNK}];
   float finest = float(entry(int(span.x)));
   float begin = 3e7;
@@ -180,7 +180,7 @@ void main()
         bool ends_here = opacity >= missing;
         colour.rgb += sums[i].rgb * (ends_here ? missing / opacity : 1.0);
         colour.a = ends_here ? 1.0 : colour.a + opacity;
-        if (surface < 0.0 && colour.a >= 0.5) {{
+        if (surface > 1e9 && colour.a >= 0.5) {{
           surface = spacing * ((begin + finest * float(i) - shift) / secant) + base_depth;
         }}
       }}
@@ -193,7 +193,7 @@ void main()
     }}
   }}
   imageStore(colour_image, target, colour);
-  imageStore(depth_image, target, vec4(surface < 0.0 ? 1e10 : surface));
+  imageStore(depth_image, target, vec4(surface));
 }}
 """
 )

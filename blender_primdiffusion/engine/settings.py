@@ -56,3 +56,10 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
         default="SHADED",
         update=_redraw,
     )
+    in_viewports: bpy.props.BoolProperty(
+        name="Humans",
+        description="Show generated humans in Solid, Material Preview and Wireframe, as the PrimDiffusion engine draws "
+        "them, wherever their volumes are hidden",
+        default=True,
+        update=_redraw,
+    )

@@ -197,7 +197,7 @@ def _border(
     if around.view_perspective == "CAMERA":
         if not render.use_border or space.camera is None or space.camera.type != "CAMERA":
             return None
-        low, high = _camera_frame(context, depsgraph)
+        low, high = camera_frame(context, depsgraph)
         edges = np.array([[render.border_min_x, render.border_min_y], [render.border_max_x, render.border_max_y]])
         corners = low + edges * (high - low)
     elif space.use_render_border:
@@ -214,7 +214,7 @@ def _border(
     return left, bottom, right - left, top - bottom
 
 
-def _camera_frame(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> tuple[np.ndarray, np.ndarray]:
+def camera_frame(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest corner [2] of the camera's picture, pixels of the region."""
     region, camera = context.region, context.space_data.camera
     corners = np.array(camera.data.view_frame(scene=depsgraph.scene), np.float64)

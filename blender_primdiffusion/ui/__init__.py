@@ -38,6 +38,7 @@ from . import (
     shape_settings,
     translations,
     variations_panel,
+    viewport_humans,
 )
 from .setup import operators as setup_operators
 from .setup import preferences
@@ -46,7 +47,7 @@ MODULES = (
     translations, setup_operators, preferences, follow, cycles_check, jobs_panel, attributes, generate_panel,
     variations_panel, human_panel, shape_settings, edit_panel, shape_panel, missing_files, late_volumes,
     import_motion, motion_panel, pose_panel, assets_panel, render_operators, render_panel, captures_settings,
-    captures_panel, reconstruct_panel, export_operators, export_panel, batch, manual,
+    captures_panel, reconstruct_panel, export_operators, export_panel, viewport_humans, batch, manual,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
 

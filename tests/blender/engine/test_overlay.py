@@ -1,0 +1,235 @@
+"""What 3D views show of humans beside Blender's objects, and whom a click selects. `test_composite` draws."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+import synthetic_shape
+from engine_stage import cube
+from mathutils import Matrix
+
+from blender_primdiffusion.engine import overlay as module
+from blender_primdiffusion.engine import studio
+from blender_primdiffusion.engine.boxes import Boxes
+from blender_primdiffusion.engine.overlay import Overlay
+from blender_primdiffusion.engine.view import NO_SURFACE_M
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.convention import points_to_backend
+from blender_primdiffusion.scene.human import armature_of, body_of, person_file
+from blender_primdiffusion.ui.viewport_humans import PRIMDIFFUSION_OT_click_human
+
+SIZE = (40, 30)
+LOOK_ALONG_Y = np.linalg.inv(np.array(Matrix.Translation((0.5, -5, 1)) @ Matrix.Rotation(math.pi / 2, 4, "X")))
+PERSPECTIVE = np.array([[1.5, 0, 0, 0], [0, 2, 0, 0], [0, 0, -1.0002, -0.20002], [0, 0, -1, 0]])
+PARALLEL = np.array([[0.5, 0, 0, 0], [0, 0.6, 0, 0], [0, 0, -0.002, 0], [0, 0, 0, 1]])
+
+
+class Uploads:
+    """In place of `GpuPeople`: a box at the pelvis for each human, without a GPU."""
+
+    def __init__(self):
+        self.files = set()
+
+    def holds(self, pose):
+        return pose.file in self.files
+
+    def placed(self, pose):
+        self.files.add(pose.file)
+        return None, Boxes(points_to_backend(pose.pelvis)[None], np.eye(3)[None], np.full((1, 3), 0.1))
+
+    def keep_only(self, drawn):
+        list(drawn)
+
+
+@pytest.fixture
+def people(addon, tmp_path, monkeypatch):
+    """Two humans whose volumes viewports hide, and the scene's overlay."""
+    uploads = Uploads()
+    monkeypatch.setattr(studio, "gpu_people", lambda: uploads)
+    source = synthetic_shape.write(tmp_path / "human.npz", 12)
+    found = []
+    for name, x in (("Anna", 0.0), ("Bert", 1.0)):
+        file = tmp_path / f"{name}.human.safetensors"
+        file.write_text(name)
+        human = build_human(addon, source, name, [file.rename(tmp_path / "person.human.safetensors")])
+        armature_of(human).location.x = x
+        volumes_of(human).hide_viewport = True
+        found.append(human)
+    bpy.context.view_layer.update()
+    return SimpleNamespace(anna=found[0], bert=found[1], overlay=Overlay())
+
+
+def volumes_of(human) -> bpy.types.Collection:
+    return next(child for child in human.children if child.name.endswith("_primitives"))
+
+
+def context(matrix=PERSPECTIVE) -> SimpleNamespace:
+    """As in the draw handler of a region."""
+    bpy.context.view_layer.update()
+    region = SimpleNamespace(width=SIZE[0], height=SIZE[1], as_pointer=lambda: 1)
+    space = SimpleNamespace(
+        local_view=None, shading=SimpleNamespace(show_xray=False, type="SOLID"), as_pointer=lambda: 2
+    )
+    around = SimpleNamespace(window_matrix=matrix, view_matrix=LOOK_ALONG_Y)
+    return SimpleNamespace(
+        mode="OBJECT", region=region, space_data=space, region_data=around, scene=bpy.context.scene,
+        view_layer=bpy.context.view_layer, evaluated_depsgraph_get=bpy.context.evaluated_depsgraph_get,
+    )  # fmt: skip
+
+
+def read(overlay):
+    overlay.scene_changed()
+    return overlay.reading(context())
+
+
+def names(reading) -> list[str]:
+    return sorted(human.obj.name for human in reading.people.values())
+
+
+def test_humans_whose_volumes_or_meshes_viewports_show_are_not_drawn_twice(people):
+    assert names(read(people.overlay)) == ["Anna", "Bert"]
+    volumes_of(people.bert).hide_viewport = False
+    assert names(read(people.overlay)) == ["Anna"]
+    volumes_of(people.bert).hide_viewport = True
+    body_of(people.anna).hide_viewport = False
+    assert names(read(people.overlay)) == ["Bert"]
+
+
+def test_hidden_humans_are_not_drawn(people):
+    armature_of(people.anna).hide_viewport = True
+    assert names(read(people.overlay)) == ["Bert"]
+
+
+def test_an_instance_is_drawn_and_stands_for_its_human(people):
+    empty = bpy.data.objects.new("Instance", None)
+    empty.instance_type, empty.instance_collection, empty.location = "COLLECTION", people.anna, (3, 0, 0)
+    bpy.context.scene.collection.objects.link(empty)
+    reading = read(people.overlay)
+    assert names(reading) == ["Anna", "Bert", "Instance"]
+    pelvis = {human.obj.name: human.pose.pelvis for human in reading.people.values()}
+    np.testing.assert_allclose(pelvis["Instance"] - pelvis["Anna"], [3, 0, 0], atol=1e-5)
+
+
+def test_a_human_without_its_file_is_named_and_the_others_are_drawn(people):
+    person_file(people.anna).unlink()
+    assert names(read(people.overlay)) == ["Bert"]
+    assert "Anna" in people.overlay.error
+    people.anna.children[0].hide_viewport = people.anna.hide_viewport = True
+    assert names(read(people.overlay)) == ["Bert"]
+    assert people.overlay.error == ""
+
+
+def test_files_of_new_humans_are_read_one_after_the_other(people, monkeypatch):
+    monkeypatch.setattr(module, "READING_S", -1.0)
+    first = read(people.overlay)
+    assert len(first.people) == 1
+    assert not first.complete
+    assert not people.overlay.resting
+    assert people.overlay.advance()
+    assert len(people.overlay.reading(context()).people) == 2
+    assert people.overlay.advance()
+    assert people.overlay.reading(context()).complete
+    assert people.overlay.resting
+
+
+def test_what_a_scene_shows_is_read_again_only_when_it_has_changed(people):
+    reading = read(people.overlay)
+    assert people.overlay.reading(context()) is reading
+    armature_of(people.anna).location.x = 0.5
+    moved = read(people.overlay)
+    assert len(set(moved.people) & set(reading.people)) == 1
+
+
+def test_bones_in_front_stay_visible_unless_hidden(people):
+    armature = armature_of(people.anna)
+    armature.matrix_world = Matrix.Translation((2, 3, 4)) @ Matrix.Scale(2, 4)
+    armature_of(people.bert).show_in_front = False
+    bone = armature.pose.bones["head"]
+    head = armature.matrix_world @ bone.head
+    bones = read(people.overlay).bones
+    assert bones.shape == (24, 2, 3)
+    assert np.abs(bones[:, 0] - head).sum(1).min() < 1e-5
+    (bone if bpy.app.version >= (5, 0) else bone.bone).hide = True
+    bones = read(people.overlay).bones
+    assert bones.shape == (23, 2, 3)
+
+
+@pytest.mark.parametrize("matrix", [PERSPECTIVE, PARALLEL], ids=["perspective", "parallel"])
+def test_a_pixel_at_a_depth_is_a_point_of_the_world(matrix):
+    point = module._point(context(matrix), 12, 20, 4.0)
+    clip = matrix @ LOOK_ALONG_Y @ [*point, 1]
+    np.testing.assert_allclose((clip[:2] / clip[3] + 1) / 2 * SIZE, [12.5, 20.5], atol=1e-9)
+    assert (LOOK_ALONG_Y @ [*point, 1])[2] == pytest.approx(-4.0)
+
+
+def test_clip_planes_follow_from_the_projection():
+    assert module._clip(PERSPECTIVE) == pytest.approx((0.1, 1000), rel=0.01)
+    assert module._clip(PARALLEL) == pytest.approx((-500, 500))
+
+
+def clickable(people, matrix=PERSPECTIVE) -> SimpleNamespace:
+    """The context of a view in which the pelvises, five metres away, fill the whole picture."""
+    depth = SimpleNamespace(read=lambda: np.full(SIZE[::-1], 5.0))
+    people.overlay._regions[1] = SimpleNamespace(shown=SimpleNamespace(picture=SimpleNamespace(depth=depth)))
+    people.overlay.scene_changed()
+    return context(matrix)
+
+
+def pixel_of(matrix, point) -> tuple[int, int]:
+    clip = matrix @ LOOK_ALONG_Y @ [*point, 1]
+    return tuple(((clip[:2] / clip[3] + 1) / 2 * SIZE).astype(int))
+
+
+@pytest.mark.parametrize("matrix", [PERSPECTIVE, PARALLEL], ids=["perspective", "parallel"])
+def test_a_click_finds_the_nearest_human(people, matrix):
+    around = clickable(people, matrix)
+    for x, name in ((0.0, "Anna"), (1.0, "Bert")):
+        assert people.overlay.object_at(around, *pixel_of(matrix, (x, 0, 1))).name == name
+
+
+def test_a_click_on_an_object_in_front_or_on_nothing_is_blenders(people):
+    pixel = pixel_of(PERSPECTIVE, (0.0, 0, 1))
+    cube(centre=(0, 2, 1))
+    assert people.overlay.object_at(clickable(people), *pixel).name == "Anna"
+    cube(centre=(0, -1, 1))
+    assert people.overlay.object_at(clickable(people), *pixel) is None
+    people.overlay._regions[1].shown.picture.depth.read = lambda: np.full(SIZE[::-1], NO_SURFACE_M)
+    assert people.overlay.object_at(context(), *pixel) is None
+    people.overlay._regions.clear()
+    assert people.overlay.object_at(context(), *pixel) is None
+
+
+def test_clicks_select_extend_and_deselect(people, monkeypatch):
+    monkeypatch.setattr(module, "overlay", people.overlay)
+    event = dict(zip(("mouse_region_x", "mouse_region_y"), pixel_of(PERSPECTIVE, (0.0, 0, 1)), strict=True))
+
+    def click(extend: bool) -> list[str]:
+        around = clickable(people)
+        around.selected_objects = list(bpy.context.selected_objects)
+        done = PRIMDIFFUSION_OT_click_human.invoke(SimpleNamespace(extend=extend), around, SimpleNamespace(**event))
+        assert done == {"FINISHED"}
+        return sorted(obj.name for obj in bpy.context.selected_objects)
+
+    for obj in bpy.context.selected_objects:
+        obj.select_set(False)
+    armature_of(people.bert).select_set(True)
+    assert click(extend=True) == ["Anna", "Bert"]
+    assert bpy.context.view_layer.objects.active == armature_of(people.anna)
+    assert click(extend=True) == ["Bert"]
+    assert click(extend=False) == ["Anna"]
+    around = clickable(people)
+    around.space_data.shading.type = "RENDERED"
+    assert PRIMDIFFUSION_OT_click_human.invoke(SimpleNamespace(), around, SimpleNamespace(**event)) == {"PASS_THROUGH"}
+    people.overlay._regions.clear()
+    pass_through = PRIMDIFFUSION_OT_click_human.invoke(SimpleNamespace(), context(), SimpleNamespace(**event))
+    assert pass_through == {"PASS_THROUGH"}
+
+
+def test_without_a_window_nothing_is_drawn(addon):
+    from blender_primdiffusion import engine
+
+    assert engine._draw_handlers == []
