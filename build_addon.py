@@ -1,6 +1,6 @@
 """Build the extension as one zip: the add-on, the backend, the default checkpoints and the manual.
 
-    python build_addon.py [--out dist]
+    python build_addon.py [--out dist] [--index]
 
 The build is reproducible: the same tree gives the same bytes. If `bpy` is installed, Blender's own extension tool
 validates the zip.
@@ -87,14 +87,35 @@ def validate(archive: Path, tool: Path) -> None:
         raise BuildError(f"Blender's extension tool rejects {archive.name}: {(done.stdout + done.stderr).strip()}")
 
 
+def write_index(folder: Path, tool: Path) -> Path:
+    """Write index.json for the zips in `folder`, which makes it an extension repository; returns its path.
+
+    `blender --command extension server-generate` does the same. Raises BuildError with the tool's output.
+    """
+    command = [sys.executable, str(tool), "server-generate", "--repo-dir", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise BuildError(f"no index was written for {folder}: {(done.stdout + done.stderr).strip()}")
+    return folder / "index.json"
+
+
 def main() -> None:
     """Build the zip, validate it and print its size."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder for the zip")
-    archive = build(parser.parse_args().out)
+    parser.add_argument("--index", action="store_true", help="also index.json: the folder is then a repository")
+    arguments = parser.parse_args()
+    archive = build(arguments.out)
     tool = blender_extension_tool()
+    if arguments.index and tool is None:
+        parser.error(
+            "--index needs Blender's extension tool: pip install bpy, or run `blender --command extension "
+            f"server-generate --repo-dir {arguments.out}`"
+        )
     if tool is not None:
         validate(archive, tool)
+        if arguments.index:
+            print(write_index(arguments.out, tool))
     checked = "valid" if tool is not None else "not validated: bpy is not installed"
     print(f"{archive} ({archive.stat().st_size / 1e6:.1f} MB, {len(contents())} files, {checked})")
 

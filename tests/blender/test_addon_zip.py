@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import subprocess
@@ -57,6 +58,16 @@ def test_blenders_own_tool_accepts_the_zip_and_rejects_one_without_a_licence(arc
         target.writestr("__init__.py", source.read("__init__.py"))
     with pytest.raises(build_addon.BuildError, match="licen"):
         build_addon.validate(spoiled, tool)
+
+
+def test_an_index_makes_the_folder_a_repository_that_offers_the_zip(archive, tmp_path):
+    (tmp_path / archive.name).write_bytes(archive.read_bytes())
+    index = json.loads(build_addon.write_index(tmp_path, build_addon.blender_extension_tool()).read_text())
+    (offered,) = index["data"]
+    assert (offered["id"], offered["archive_url"]) == ("primdiffusion", f"./{archive.name}")
+    assert offered["archive_size"] == archive.stat().st_size
+    assert offered["archive_hash"] == f"sha256:{hashlib.sha256(archive.read_bytes()).hexdigest()}"
+    assert {"website", "copyright", "permissions"} <= set(offered)
 
 
 def test_the_installed_zip_generates_a_person_through_its_operator(archive, checkpoint, tmp_path):
