@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 
 import bpy
 
@@ -14,7 +15,6 @@ CHECK_S = 5.0
 """Between checks on a child that may be idle, which is stopped after a while."""
 SHADINGS = frozenset({"SOLID", "MATERIAL", "WIREFRAME"})
 """Of 3D views, in which humans are drawn beside Blender's own objects."""
-_CHANGES = ("depsgraph_update_post", "frame_change_post", "undo_post", "redo_post", "load_post")
 _draw_handlers: list[object] = []
 CLASSES = (PRIMDIFFUSION_PG_render, PRIMDIFFUSION_RenderEngine)
 
@@ -28,8 +28,8 @@ def register() -> None:
     if not bpy.app.background:
         _draw_handlers.append(bpy.types.SpaceView3D.draw_handler_add(_draw_humans, (), "WINDOW", "POST_VIEW"))
         _draw_handlers.append(bpy.types.SpaceView3D.draw_handler_add(_draw_error, (), "WINDOW", "POST_PIXEL"))
-        for name in _CHANGES:
-            getattr(bpy.app.handlers, name).append(_scene_changed)
+        for name, handler in _handlers():
+            getattr(bpy.app.handlers, name).append(handler)
 
 
 def unregister() -> None:
@@ -38,9 +38,9 @@ def unregister() -> None:
         bpy.app.timers.unregister(_check_child)
     while _draw_handlers:
         bpy.types.SpaceView3D.draw_handler_remove(_draw_handlers.pop(), "WINDOW")
-    for name in _CHANGES:
-        if _scene_changed in getattr(bpy.app.handlers, name):
-            getattr(bpy.app.handlers, name).remove(_scene_changed)
+    for name, handler in _handlers():
+        if handler in getattr(bpy.app.handlers, name):
+            getattr(bpy.app.handlers, name).remove(handler)
     for module, ending in (("overlay", "stop"), ("viewport", "stop"), ("studio", "close")):
         if (drawn := sys.modules.get(f"{__package__}.{module}")) is not None:  # imported by the first picture
             getattr(drawn, ending)()
@@ -69,10 +69,21 @@ def _draw_error() -> None:
         module.draw_error(bpy.context)
 
 
+def _handlers() -> list[tuple[str, Callable[..., None]]]:
+    any_change = ("frame_change_post", "undo_post", "redo_post", "load_post")
+    return [("depsgraph_update_post", _depsgraph_changed), *((name, _scene_changed) for name in any_change)]
+
+
 @bpy.app.handlers.persistent
-def _scene_changed(*_changed: object) -> None:
+def _scene_changed(*_given: object) -> None:
     if (module := sys.modules.get(f"{__package__}.overlay")) is not None:
         module.overlay.scene_changed()
+
+
+@bpy.app.handlers.persistent
+def _depsgraph_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    if (module := sys.modules.get(f"{__package__}.overlay")) is not None:
+        module.overlay.scene_changed(update.id for update in depsgraph.updates)
 
 
 def _check_child() -> float:

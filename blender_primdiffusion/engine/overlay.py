@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import blf
 import bpy
@@ -25,7 +25,7 @@ from .boxes import Boxes
 from .composite import NO_PLANES, ViewLook, draw_picture, keep_bones
 from .gpu_march import GpuMarcher, GpuPayload
 from .gpu_refine import GpuRefinement, MarchRequest
-from .picture import PosedHuman, pose_of, visible_armatures
+from .picture import PosedHuman, human_armatures, pose_of
 from .solids import visible_instances
 from .view import NO_SURFACE_M, PinholeView, view_from_matrices
 from .viewport import camera_frame
@@ -40,6 +40,14 @@ TICK_S = 0.02
 REGIONS_KEPT = 8
 WIREFRAME_OPACITY = 0.5
 """At least: without it, people would be invisible, since they have no wires."""
+_UNRELATED = (
+    bpy.types.Mesh,
+    bpy.types.Curve,
+    bpy.types.Material,
+    bpy.types.NodeTree,
+    bpy.types.Light,
+    bpy.types.Camera,
+)
 _STICK_PX, _JOINT_PX = 2.2, 2.2
 """Width of Blender's sticks and radius of their joints."""
 
@@ -81,9 +89,10 @@ class Overlay:
         self.error = ""
         """Why humans are not drawn, or not all of them."""
 
-    def scene_changed(self) -> None:
-        """Read the scene again for the next picture."""
-        self._readings.clear()
+    def scene_changed(self, changed: Iterable[bpy.types.ID] | None = None) -> None:
+        """Read the scene again for the next picture, if one of these data (None: any) may concern humans."""
+        if changed is None or any(map(_concerns_humans, changed)):
+            self._readings.clear()
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the humans into the region that Blender draws now."""
@@ -176,18 +185,24 @@ class Overlay:
         return self._readings[key]
 
     def _read(self, depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D) -> SceneReading:
-        people, bones = {}, [np.zeros((0, 2, 3))]
-        shown = {each.object.original for each in visible_instances(depsgraph, space) if _shows_human(each.object)}
+        people: dict[object, ShownHuman] = {}
+        candidates: list[tuple[bpy.types.Object, bpy.types.Collection, PosedHuman | Exception]] = []
+        bones, drawn = [np.zeros((0, 2, 3))], set[bpy.types.Object]()
         self.error, complete, end = "", True, time.monotonic() + READING_S
-        for obj, armature, matrix, owner in visible_armatures(depsgraph, space):
+        for obj, armature, matrix, owner in human_armatures(_noting(visible_instances(depsgraph, space), drawn)):
             if armature.show_in_front:
                 bones.append(_bones(armature, matrix))
-            if shown and not shown.isdisjoint(owner.all_objects):
+            try:
+                candidates.append((obj, owner, pose_of(armature, matrix, owner)))
+            except (ValueError, OSError) as error:
+                candidates.append((obj, owner, error))
+        for obj, owner, pose in candidates:
+            if drawn and not drawn.isdisjoint(owner.all_objects):
                 continue
             try:
-                pose = pose_of(armature, matrix, owner)
-                key = _key(pose)
-                known = studio.gpu_people().holds(pose)
+                if isinstance(pose, Exception):
+                    raise pose
+                key, known = _key(pose), studio.gpu_people().holds(pose)
                 placed = self._placed.get(key) or studio.gpu_people().placed(pose)
             except (ValueError, OSError) as error:
                 self.error = str(error)
@@ -244,14 +259,27 @@ def draw_error(context: bpy.types.Context) -> None:
     blf.draw(0, f"PrimDiffusion: {overlay.error}")
 
 
+def _concerns_humans(changed: bpy.types.ID) -> bool:
+    """Editing a scene's other objects should not wait until all instances have been looked through."""
+    if isinstance(changed, bpy.types.Object):
+        return changed.type in ("ARMATURE", "EMPTY", "VOLUME") or BODY_MARK in changed or PROXY_MARK in changed
+    return not isinstance(changed, _UNRELATED)
+
+
 def _key(pose: PosedHuman) -> object:
     betas = None if pose.betas is None else tuple(pose.betas)
     return file_version(pose.file), pose.body, pose.object_to_world.tobytes(), pose.joints.tobytes(), betas
 
 
-def _shows_human(obj: bpy.types.Object) -> bool:
-    """Whether Blender draws a human by this object: a volume, the mesh proxy or the body mesh."""
-    return obj.type == "VOLUME" or PROXY_MARK in obj or BODY_MARK in obj
+def _noting(
+    instances: Iterable[bpy.types.DepsgraphObjectInstance], drawn: set[bpy.types.Object]
+) -> Iterator[bpy.types.DepsgraphObjectInstance]:
+    """The same instances; `drawn` gets objects by which Blender draws humans: volumes, mesh proxies, body meshes."""
+    for instance in instances:
+        obj = instance.object
+        if obj.type == "VOLUME" or PROXY_MARK in obj or BODY_MARK in obj:
+            drawn.add(obj.original)
+        yield instance
 
 
 def _bones(armature: bpy.types.Object, matrix: NDArray) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -133,16 +133,17 @@ def posed_humans(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | 
     Raises FileNotFoundError for a human whose file is missing, and ValueError for a shape that is no list of numbers or
     a pose that holds NaN.
     """
-    return [pose_of(obj, matrix, owner) for _, obj, matrix, owner in visible_armatures(depsgraph, space)]
+    armatures = human_armatures(visible_instances(depsgraph, space))
+    return [pose_of(obj, matrix, owner) for _, obj, matrix, owner in armatures]
 
 
-def visible_armatures(
-    depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None
+def human_armatures(
+    instances: Iterable[bpy.types.DepsgraphObjectInstance],
 ) -> Iterator[tuple[bpy.types.Object, bpy.types.Object, NDArray[np.float64], bpy.types.Collection]]:
-    """The object that shows a human (its armature, or what instances it), the evaluated armature, its world matrix
-    [4, 4] and the human's collection; see `posed_humans`. The evaluated armature is valid until the next one."""
+    """Of `visible_instances`, those that show a human: the object that shows it (the armature, or what instances it),
+    the evaluated armature, which is valid until the next one, its world matrix [4, 4], and the human's collection."""
     owners = dict(_armatures())
-    for instance in visible_instances(depsgraph, space):
+    for instance in instances:
         obj = instance.object
         owner = owners.get(obj.original) if obj.type == "ARMATURE" else None
         matrix = np.array(instance.matrix_world, np.float64)

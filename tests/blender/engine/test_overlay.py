@@ -118,7 +118,7 @@ def test_a_human_without_its_file_is_named_and_the_others_are_drawn(people):
     person_file(people.anna).unlink()
     assert names(read(people.overlay)) == ["Bert"]
     assert "Anna" in people.overlay.error
-    people.anna.children[0].hide_viewport = people.anna.hide_viewport = True
+    volumes_of(people.anna).hide_viewport = False
     assert names(read(people.overlay)) == ["Bert"]
     assert people.overlay.error == ""
 
@@ -139,6 +139,11 @@ def test_files_of_new_humans_are_read_one_after_the_other(people, monkeypatch):
 def test_what_a_scene_shows_is_read_again_only_when_it_has_changed(people):
     reading = read(people.overlay)
     assert people.overlay.reading(context()) is reading
+    other = cube()
+    people.overlay.scene_changed([other, other.data])
+    assert people.overlay.reading(context()) is reading
+    people.overlay.scene_changed([other, armature_of(people.bert)])
+    assert people.overlay.reading(context()) is not reading
     armature_of(people.anna).location.x = 0.5
     moved = read(people.overlay)
     assert len(set(moved.people) & set(reading.people)) == 1
