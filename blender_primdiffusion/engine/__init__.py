@@ -13,8 +13,6 @@ from .settings import PRIMDIFFUSION_PG_render
 
 CHECK_S = 5.0
 """Between checks on a child that may be idle, which is stopped after a while."""
-SHADINGS = frozenset({"SOLID", "MATERIAL", "WIREFRAME"})
-"""Of 3D views, in which humans are drawn beside Blender's own objects."""
 _draw_handlers: list[object] = []
 CLASSES = (PRIMDIFFUSION_PG_render, PRIMDIFFUSION_RenderEngine)
 
@@ -51,9 +49,10 @@ def unregister() -> None:
 
 
 def shows_humans(context: bpy.types.Context) -> bool:
-    """Whether humans are drawn into this 3D view beside Blender's own objects."""
-    wanted = context.scene.primdiffusion_render.in_viewports and context.space_data.shading.type in SHADINGS
-    return wanted and any_humans()
+    """Whether humans are drawn into this 3D view beside what Blender draws: in Rendered by other engines alone."""
+    scene = context.scene
+    by_engine = context.space_data.shading.type == "RENDERED" and scene.render.engine == ENGINE
+    return scene.primdiffusion_render.in_viewports and not by_engine and any_humans()
 
 
 def _draw_humans() -> None:

@@ -45,7 +45,9 @@ class BoxRig:
     def __init__(self, model: ShapeModel) -> None:
         """Raises ValueError for a model of an earlier version, without skinning."""
         if model.skin_weights is None:
-            raise ValueError("the body's file was written by an earlier version and holds no skinning")
+            raise ValueError(
+                "the body's file is of an earlier version, without skinning: edit the human, or generate it again"
+            )
         self._model, used = model, model.used()
         self._template, self._basis = model.template[used].astype(np.float64), model.shape_basis[used]
         corners = (model.faces[model.face], model.barycentric)

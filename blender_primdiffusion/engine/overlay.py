@@ -1,4 +1,4 @@
-"""People in the 3D views that do not render: Solid, Material Preview and Wireframe, marched on the viewport's GPU.
+"""Humans in the 3D views that this engine does not render, Solid above all, marched on the viewport's GPU.
 
 Blender calls `draw` for each region that it redraws. A changed view gets a picture at once, as coarse as it must be to
 be quick; a timer marches finer ones in slices when nothing has changed for a while. Nothing is marched otherwise.
@@ -39,7 +39,7 @@ READING_S = 0.1
 TICK_S = 0.02
 REGIONS_KEPT = 8
 WIREFRAME_OPACITY = 0.5
-"""At least: without it, people would be invisible, since they have no wires."""
+"""At least: without it, humans would be invisible, since they have no wires."""
 _UNRELATED = (
     bpy.types.Mesh,
     bpy.types.Curve,

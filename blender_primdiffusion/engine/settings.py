@@ -58,8 +58,8 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
     )
     in_viewports: bpy.props.BoolProperty(
         name="Humans",
-        description="Show generated humans in Solid, Material Preview and Wireframe, as the PrimDiffusion engine draws "
-        "them, wherever their volumes are hidden",
+        description="Show generated humans in 3D views as the PrimDiffusion engine draws them, wherever their volumes "
+        "are hidden",
         default=True,
         update=_redraw,
     )

@@ -12,6 +12,7 @@ from importlib import import_module
 from pathlib import Path
 
 import bpy
+from bpy_extras.view3d_utils import location_3d_to_region_2d
 from mathutils import Quaternion
 from panels import show, sidebar, view, wide_view
 from press import Steps, invoke, press, wait
@@ -223,6 +224,43 @@ def render(module: str, python: str) -> Steps:
     yield "render_outdated"
 
 
+def shadings(module: str, python: str) -> Steps:
+    """Two humans among solids in each shading, turned, clipped and from the camera; clicks select them."""
+    yield from with_people(module, python, FIRST_SEED, SECOND_SEED)
+    bpy.ops.mesh.primitive_cube_add(size=0.4, location=(0.1, -0.4, 0.9))
+    bpy.ops.mesh.primitive_plane_add(size=6, location=(0, 0.15, 0), rotation=(1.4, 0, 0.3))
+    wide_view()
+    window, area = view()
+    space = area.spaces.active
+    space.overlay.show_bones = True
+    for shading in ("SOLID", "MATERIAL", "WIREFRAME"):
+        space.shading.type = shading
+        yield 20.0
+        yield f"shadings_{shading.lower()}"
+    space.shading.type, space.shading.show_xray = "SOLID", True
+    yield 5.0
+    yield "shadings_xray"
+    space.shading.show_xray = False
+    for _ in range(8):
+        space.region_3d.view_rotation = Quaternion((0, 0, 1), 0.1) @ space.region_3d.view_rotation
+        yield 0.3
+    yield "shadings_turning"
+    bpy.ops.object.select_all(action="DESELECT")
+    region = next(region for region in area.regions if region.type == "WINDOW")
+    for armature in armatures():
+        chest = armature.matrix_world @ armature.pose.bones["spine3"].head
+        x, y = location_3d_to_region_2d(region, space.region_3d, chest)
+        yield {"point": [int(region.x + x) + 9, int(window.height - region.y - y)], "click": True}
+        yield 2.0
+        selected = [obj.name for obj in bpy.context.selected_objects]
+        if selected != [armature.name]:
+            raise RuntimeError(f"a click on {armature.name} selected {selected}")
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.screen.region_quadview()
+    yield 15.0
+    yield "shadings_quad"
+
+
 def rendered(module: str, python: str) -> Steps:
     """The engine's view: a human among solids, turned step by step, from the side in parallel, cut by a border."""
     yield from with_people(module, python, FIRST_SEED)
@@ -421,6 +459,7 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "edits": edits,
     "motion": motion,
     "render": render,
+    "shadings": shadings,
     "rendered": rendered,
     "captures": captures,
     "export": export,

@@ -227,7 +227,7 @@ def test_clicks_select_extend_and_deselect(people, monkeypatch):
     assert click(extend=True) == ["Bert"]
     assert click(extend=False) == ["Anna"]
     around = clickable(people)
-    around.space_data.shading.type = "RENDERED"
+    around.space_data.shading.type, around.scene.render.engine = "RENDERED", "PRIMDIFFUSION"
     assert PRIMDIFFUSION_OT_click_human.invoke(SimpleNamespace(), around, SimpleNamespace(**event)) == {"PASS_THROUGH"}
     people.overlay._regions.clear()
     pass_through = PRIMDIFFUSION_OT_click_human.invoke(SimpleNamespace(), context(), SimpleNamespace(**event))
