@@ -12,6 +12,7 @@ import bpy
 import numpy as np
 
 from ..backend.requests import sentence
+from ..scene.attachment import in_viewport
 from ..scene.cycles import overlap_warning_in
 from ..scene.edit import Replaced, edit_destination, replace_person, restore_destination, restore_volumes
 from ..scene.human import MARK, person_file
@@ -31,7 +32,7 @@ def show_in_place(context: bpy.types.Context, person: bpy.types.Collection, resu
     human, file = Path(result["human"]), Path(result["person"])
     written = building.take(human)
     done = replace_person(person, written or write_now(human, edit_destination(person)), file)
-    if written is None:  # otherwise `building` has freed them
+    if in_viewport(person):
         context.view_layer.update()  # evaluated data holds the old grids
         free_unused_grids()
     return done

@@ -1,7 +1,7 @@
 """Follow jobs to their end: by a timer while there is a window, by waiting in background mode.
 
-A result is read, and volumes that viewports show are written and loaded, in slices of time before the operator runs, so
-that it returns quickly. Other volumes are written afterwards (`late_volumes`).
+A result is read, and volumes that viewports show are written, in slices of time before the operator runs, so that it
+returns quickly. Other volumes are written afterwards (`late_volumes`).
 """
 
 from __future__ import annotations
@@ -27,42 +27,29 @@ if TYPE_CHECKING:
     from .queue import Entry, Job
 
 SLICE_S = 0.05
-"""Of writing volumes or reading grids between two redraws."""
+"""Of reading the human or writing volumes between two redraws."""
 _SHOWN_STEPS = 10
 """Of the bar: a redraw may take longer than SLICE_S."""
-_WRITING = 0.6
-"""Share of the time that writing takes."""
 
 
 class Building:
-    """Volumes of one human at a time. All methods are for Blender's main thread."""
+    """The result of one job at a time. All methods are for Blender's main thread."""
 
     def __init__(self) -> None:
         self._entry: Entry | None = None
         self._human: Path | None = None
         self._writing: VolumeWriter | None = None
-        self._read = 0
         self._shown = 0
 
     @property
     def fraction(self) -> float:
         """Progress from 0 to 1; 1 when there is nothing to build."""
-        if self._writing is None:
-            return 1.0
-        if not self._writing.over:
-            return _WRITING * self._writing.fraction
-        written = self._writing.result
-        if written is None or not written.unread:
-            return 1.0
-        return _WRITING + (1 - _WRITING) * self._read / len(written.unread)
+        return 1.0 if self._writing is None or self._writing.over else self._writing.fraction
 
     @property
     def busy(self) -> bool:
-        """Volumes are left to write, or grids to read."""
-        if self._writing is None:
-            return False
-        written = self._writing.result
-        return not self._writing.over or (written is not None and self._read < len(written.unread))
+        """The human is left to read, or volumes to write."""
+        return self._writing is not None and not self._writing.over
 
     def moved(self) -> bool:
         """Whether the bar has advanced a step since the last call."""
@@ -84,24 +71,11 @@ class Building:
 
     def advance(self, *, may_work: bool) -> bool:
         """Do some of the work if `may_work`; whether more is left before the operator runs."""
-        if self._writing is None:
-            return False
-        if not self._writing.over:
-            if may_work:
-                self._writing.work(SLICE_S)
-            return self.busy
-        written = self._writing.result
-        if written is None or self._read == len(written.unread):
+        if not self.busy:
             return False  # after a failure the operator tries again and reports it
         if may_work:
-            from ..scene.volumes import free_unused_grids, read_grids, read_headers  # needs numpy
-
-            if self._read == 0:
-                if not self._entry.job.new_person:  # the old ones; freed later, the new ones would be read twice
-                    free_unused_grids()
-                read_headers(path for path in written.unread if path.is_file())
-            self._read += read_grids(written.unread[self._read :], SLICE_S)
-        return self._read < len(written.unread)
+            self._writing.work(SLICE_S)
+        return True  # the operator has a tick of its own
 
     def take(self, human: Path) -> WrittenHuman | None:
         """The written human of this human.npz, whose files are the caller's from now on; None if not written."""
@@ -112,7 +86,7 @@ class Building:
         if self._writing is not None:
             self._writing.stop()
         self._entry = self._human = self._writing = None
-        self._read = self._shown = 0
+        self._shown = 0
 
 
 def _place(job: Job) -> Destination | None:
@@ -241,7 +215,7 @@ def follow() -> float | None:
     changed |= so_far.show(queue.request.picture if queue.request is not None else None)
     if changed:
         redraw()
-    if building.busy and not in_the_way():
+    if queue.ready and not queue.advancing and not in_the_way():
         return 0.0  # input events still come first
     return TICK_S if queue.busy else None
 

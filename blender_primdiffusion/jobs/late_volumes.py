@@ -60,13 +60,17 @@ class LateVolumes:
         """Write all that is left, with steps of its own: renders call it from another thread."""
         from ..scene.unwritten import write_all_unwritten  # needs numpy
 
-        self._failed.clear()
-        self.error = ""
+        self.forget_failures()
         try:
             write_all_unwritten()
         except (OSError, ValueError) as error:
             self.error = str(error)
             print(f"PrimDiffusion: {error}")
+
+    def forget_failures(self) -> None:
+        """Try again what could not be written."""
+        self._failed.clear()
+        self.error = ""
 
     def tick(self) -> float | None:
         """The timer: a slice of writing, until all is written."""
@@ -115,7 +119,14 @@ def _tick() -> float | None:
 
 @persistent
 def write_soon(*_: object) -> None:
-    """Handler of load_post, save_post, undo_post and redo_post: another .blend, or other folders."""
+    """Handler of save_post, undo_post and redo_post, after which other files may be wanted."""
+    keep_writing()
+
+
+@persistent
+def write_after_loading(*_: object) -> None:
+    """Handler of load_post."""
+    late_volumes.forget_failures()
     keep_writing()
 
 
@@ -133,7 +144,7 @@ def write_before_rendering(scene: bpy.types.Scene, *_: object) -> None:
 
 
 HANDLERS = (
-    ("load_post", write_soon),
+    ("load_post", write_after_loading),
     ("save_pre", stop_writing),
     ("save_post", write_soon),
     ("undo_post", write_soon),

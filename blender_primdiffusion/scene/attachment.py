@@ -13,7 +13,7 @@ _BEFORE = "primdiffusion_attachment_before_merge"
 IN_VIEWPORT = "primdiffusion_volumes_in_viewport"
 """Custom property of a human's collection: whether viewports show the volumes; they do where it is missing, in humans
 of earlier versions."""
-VOLUMES_IN_VIEWPORT = True
+VOLUMES_IN_VIEWPORT = False
 """For new humans."""
 
 
@@ -31,23 +31,35 @@ def set_attachment(collection: bpy.types.Collection, mode: str) -> None:
     by `merged.show_merged` in one pose. Raises ValueError or FileNotFoundError before anything changes. Makes no undo
     step.
     """
-    # numpy, which Blender starts without: panels import this file to show the mode
-    from .merged import merged_of
-    from .surface import build_surface, carrier_of, primitives_of
+    from .surface import build_surface  # needs numpy
 
     if mode not in MODES:
         raise ValueError(f"there is no attachment {mode!r}: choose from {', '.join(MODES)}")
-    check_editable(collection)
-    primitives, merged = primitives_of(collection), merged_of(collection)
-    if mode == "MERGED" and merged is None:
+    parts = _parts(collection)
+    if mode == "MERGED" and parts["MERGED"] is None:
         raise ValueError(f"{collection.name!r} has no merged volume yet: press Merge")
-    carrier = build_surface(collection) if mode == "SURFACE" else carrier_of(collection)
+    if mode == "SURFACE":
+        parts["SURFACE"] = build_surface(collection)
     if mode == "MERGED" and attachment_of(collection) != "MERGED":
         collection[_BEFORE] = attachment_of(collection)
     collection[ATTACHMENT] = mode
-    for part, shown in ((primitives, "ARMATURE"), (carrier, "SURFACE"), (merged, "MERGED")):
+    _show(collection, parts)
+
+
+def _parts(collection: bpy.types.Collection) -> dict[str, bpy.types.Collection | bpy.types.Object | None]:
+    """What each mode shows. Raises ValueError for humans that cannot be edited or whose volumes have no collection."""
+    # numpy, which Blender starts without: panels import this file to show the mode
+    from .merged import merged_of
+    from .surface import carrier_of, primitives_of
+
+    check_editable(collection)
+    return {"ARMATURE": primitives_of(collection), "SURFACE": carrier_of(collection), "MERGED": merged_of(collection)}
+
+
+def _show(collection: bpy.types.Collection, parts: dict[str, bpy.types.Collection | bpy.types.Object | None]) -> None:
+    for mode, part in parts.items():
         if part is not None:
-            part.hide_render = mode != shown
+            part.hide_render = mode != attachment_of(collection)
             part.hide_viewport = part.hide_render or not in_viewport(collection)
 
 
@@ -68,8 +80,9 @@ def show_in_viewport(collection: bpy.types.Collection, shown: bool) -> None:
 
     Makes no undo step. Raises ValueError for a human that cannot be edited, or whose volumes have no collection.
     """
+    parts = _parts(collection)
     collection[IN_VIEWPORT] = shown
-    set_attachment(collection, attachment_of(collection))
+    _show(collection, parts)
 
 
 def attachment_before_merge(collection: bpy.types.Collection) -> str:

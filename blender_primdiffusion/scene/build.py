@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,7 +33,6 @@ from .human import (
 from .human_npz import Destination, WrittenHuman, write_now
 from .material import volume_material
 from .shape import saved_body
-from .volumes import read_headers
 
 GAP_M = 0.2
 """Between the hands of two humans in the T pose."""
@@ -51,7 +51,6 @@ def build_human(
     Raises HumanNpzError or VolumeWriteError, and then leaves neither data nor files.
     """
     written = write_now(human_npz, Destination(next_folder(name), later=volumes_may_wait()))
-    read_headers(written.unread)
     return build_written(context, written, name, keep)
 
 
@@ -195,12 +194,13 @@ def attach_volumes(
     """
     hide_relationship_lines()
     quaternions = matrix_to_quaternion(rotation)
+    folders = {folder: stored_path(folder) for folder in {path.parent for path in files}}
     labels = [f"{name}_prim_{k:04d}" for k in range(len(files))]
     volumes = [bpy.data.volumes.new(label) for label in labels]
     objects = [bpy.data.objects.new(label, volume) for label, volume in zip(labels, volumes, strict=True)]
     for k, primitive in enumerate(objects):  # a loop of its own: new data make these changes slow
         volume = volumes[k]
-        volume.filepath = stored_path(files[k])
+        volume.filepath = os.path.join(folders[files[k].parent], files[k].name)
         volume.render.space = "WORLD"
         volume.materials.append(material)
         primitive.parent = armature

@@ -47,10 +47,7 @@ class Replaced:
 
 def edit_destination(collection: bpy.types.Collection) -> Destination:
     """Where `replace_person` wants the volumes of the edited human."""
-    shown = volumes_of(collection)
-    files = {volume_path(obj.data) for objects in shown.values() for obj in objects}
-    there = frozenset(path for path in files if path.is_file())
-    return Destination(home_of(collection), tuple(shown), there, volumes_may_wait(collection))
+    return Destination(home_of(collection), tuple(volumes_of(collection)), volumes_may_wait(collection))
 
 
 def replace_person(collection: bpy.types.Collection, written: WrittenHuman, person: Path) -> Replaced:

@@ -179,8 +179,6 @@ class Destination:
     """The human's folder."""
     which: tuple[int, ...] | None = None
     """Primitives of a human in the scene that have volumes; None for a new human, where all are written."""
-    shown: frozenset[Path] = frozenset()
-    """Files that Blender has read already, since volumes show them."""
     later: bool = False
     """The volumes are hidden, and written after the human stands (see `unwritten`)."""
 
@@ -195,9 +193,7 @@ class WrittenHuman:
     """JSON, for the custom property `human.MARK`."""
     folder: Path
     files: tuple[Path, ...]
-    """What must be in the folder: volumes that Blender has not read, or the file to write them from."""
-    unread: tuple[Path, ...]
-    """Those of `files` that Blender will read as soon as the human is in the scene."""
+    """What must be in the folder: the volumes, or the file to write them from."""
     made: tuple[Path, ...]
     """Files, of volumes and the body, that did not exist before."""
     existing: Path
@@ -286,9 +282,8 @@ def write_volumes(human_npz: Path, destination: Destination) -> Generator[float,
         made = tuple(path for path in (*staging.paths, *body) if not path.exists())
         if model is not None:
             undone.enter_context(saved_body_file(model, folder.parent))
-    unread = () if destination.later else tuple(path for path in files.values() if path not in destination.shown)
-    needed = tuple(folder / name for name in later) or unread
-    return WrittenHuman(human, grids, provenance, folder, needed, unread, made, existing, names, later, began)
+    needed = tuple(folder / name for name in later) or tuple(files.values())
+    return WrittenHuman(human, grids, provenance, folder, needed, made, existing, names, later, began)
 
 
 def file_names(grids: Grids, blender_version: tuple[int, ...]) -> list[str]:

@@ -10,8 +10,7 @@ import os
 import shutil
 import sys
 import tempfile
-import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -260,38 +259,6 @@ def free_unused_grids() -> None:
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc alone has it
         if trim is not None:
             trim(0)
-
-
-def read_headers(files: Iterable[Path]) -> None:
-    """Make Blender read the headers of VDB files before it reads their voxels: .1 s for 1024 of them.
-
-    Blender never frees headers. Allocated among voxels, they would fragment the memory of these when it is freed, so
-    that as much again is lost. Only for files that exist: Blender remembers the error of a missing one. The .blend is
-    not touched.
-    """
-    with bpy.data.temp_data() as temporary:
-        volume = temporary.volumes.new("PrimDiffusion")
-        for path in files:
-            volume.filepath = str(path)
-            volume.grids.load()
-
-
-def read_grids(files: Sequence[Path], budget_s: float) -> int:
-    """Make Blender read the grids of as many files as it can in `budget_s` seconds, at least one; returns how many.
-
-    They stay in its cache; the .blend is not touched. Otherwise Blender reads all grids of a new human at once.
-    """
-    end = time.monotonic() + budget_s
-    with bpy.data.temp_data() as temporary:  # removing a volume from bpy.data makes Blender evaluate the scene again
-        volume = temporary.volumes.new("PrimDiffusion")
-        for count, path in enumerate(files, 1):
-            if path.is_file():  # Blender remembers the error of a missing file
-                volume.filepath = str(path)
-                for grid in volume.grids if volume.grids.load() else ():
-                    grid.load()
-            if time.monotonic() > end:
-                return count
-    return len(files)
 
 
 def reload_volume(volume: bpy.types.Volume) -> None:

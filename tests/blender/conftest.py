@@ -58,6 +58,15 @@ def saved_scene(empty_scene, tmp_path):
 
 
 @pytest.fixture
+def volumes_shown(monkeypatch):
+    """New humans have volumes that viewports show, as they had in earlier versions."""
+    from blender_primdiffusion.scene import attachment, build
+
+    for module in (attachment, build):
+        monkeypatch.setattr(module, "VOLUMES_IN_VIEWPORT", True)
+
+
+@pytest.fixture
 def addon(saved_scene, tmp_path, monkeypatch):
     """The add-on registered from the checkout, on an interpreter that runs the fake child."""
     import synthetic

@@ -27,12 +27,12 @@ COUNT = 12
 
 @pytest.fixture
 def on_their_way(addon, tmp_path, monkeypatch):
-    """A person whose volumes are written, and whose grids are about to be read."""
+    """A person of whose volumes some are written."""
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared.npz", COUNT)))
     monkeypatch.setattr("blender_primdiffusion.jobs.follow.SLICE_S", 0.0)
     bpy.ops.ed.undo_push(message="before")
     queue.add(addon, GenerateJob(7, 1))
-    until(lambda: 0.6 < building.fraction < 1.0)
+    until(lambda: 0.4 < building.fraction < 1.0)
     return addon
 
 
@@ -68,7 +68,7 @@ def test_no_tick_writes_more_than_its_slice(addon, monkeypatch):
     assert len(humans(addon.scene)) == 1
 
 
-def test_the_bar_continues_while_volumes_are_written_and_read(addon, monkeypatch):
+def test_the_bar_continues_while_volumes_are_written(addon, monkeypatch):
     monkeypatch.setattr("blender_primdiffusion.jobs.follow.SLICE_S", 0.0)
     queue.add(addon, GenerateJob(7, 1))
     seen = []
@@ -76,8 +76,7 @@ def test_the_bar_continues_while_volumes_are_written_and_read(addon, monkeypatch
         if queue.ready:
             seen.append(building.fraction)
     assert seen == sorted(seen)
-    assert seen[-1] > 0.9
-    assert len({fraction for fraction in seen if fraction > 0.6}) >= 7
+    assert len(set(seen)) >= 8
     assert building.fraction == 1.0
 
 
@@ -170,7 +169,7 @@ def test_a_scene_deleted_meanwhile_gets_no_human_and_no_files_stay(on_their_way,
     assert not (tmp_path / "shot_humans").exists()
 
 
-def test_grids_are_not_read_while_the_user_holds_something(on_their_way, monkeypatch):
+def test_nothing_is_written_while_the_user_holds_something(on_their_way, monkeypatch):
     monkeypatch.setattr(follow_module, "in_the_way", lambda: "Move")
     before = building.fraction
     for _ in range(20):

@@ -21,6 +21,8 @@ from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.human import MARK, folder_of, humans, person_file, remove_human, volume_path
 from blender_primdiffusion.scene.missing import missing_files
 
+pytestmark = pytest.mark.usefixtures("volumes_shown")
+
 GIVES_GARBAGE, FINE = 3, 8
 """Seeds that the fake child takes as orders, and one that it does not."""
 COUNT = 12
@@ -40,10 +42,10 @@ def person(addon, tmp_path, monkeypatch):
 
 @pytest.fixture
 def varied(person, monkeypatch):
-    """The person, whose other volumes are written, and whose other grids are about to be read."""
+    """The person, whose other volumes are written and not shown yet."""
     monkeypatch.setattr(SLICE_SECONDS, 0.0)
     vary(person)
-    until_read()
+    until_written()
     return person
 
 
@@ -51,10 +53,10 @@ def vary(person, seed: int = FINE) -> None:
     queue.add(bpy.context, VaryJob.of(person, 2, {"amount": 0.5, "seed": seed}))
 
 
-def until_read(seconds: float = 30.0) -> None:
-    """Until some grids are read, and not all."""
+def until_written(seconds: float = 30.0) -> None:
+    """Until the volumes are written, which the scene does not show yet."""
     end = time.monotonic() + seconds
-    while not 0.6 < building.fraction < 1.0:
+    while building._writing is None or not building._writing.over:
         assert time.monotonic() < end
         assert follow() is not None
         time.sleep(0.005)
@@ -95,12 +97,12 @@ def test_an_edit_writes_its_volumes_in_slices(person, monkeypatch):
     assert len(written) == len(set(written)) == COUNT
 
 
-def test_only_what_the_edit_changes_is_written_and_read(person, monkeypatch):
+def test_only_what_the_edit_changes_is_written(person, monkeypatch):
     monkeypatch.setattr(SLICE_SECONDS, 0.0)
     before = set(shown(person).values())
     queue.add(bpy.context, RedressJob.of(person, 2, {"region": ["top"], "seed": FINE}))
-    until_read()
-    assert len(building._writing.result.files) == OF_THE_REGION
+    until_written()
+    assert len(building._writing.result.made) == OF_THE_REGION
     drive()
     assert len(set(shown(person).values()) - before) == OF_THE_REGION
     check_whole(person)
@@ -151,7 +153,7 @@ def test_undo_that_makes_the_person_another_meanwhile_rejects_the_result(person,
     files = on_disk(folder_of(person).parents[1])
     monkeypatch.setattr(SLICE_SECONDS, 0.0)
     vary(person, FINE + 1)
-    until_read()
+    until_written()
     bpy.ops.ed.undo()
     drive()
     assert "changed during the edit" in error_of("vary")
@@ -169,7 +171,7 @@ def test_volumes_deleted_and_brought_back_meanwhile_show_what_they_should(person
     bpy.ops.ed.undo_push(message="a volume deleted")
     monkeypatch.setattr(SLICE_SECONDS, 0.0)
     vary(person)
-    until_read()
+    until_written()
     assert len(building._writing.result.files) == COUNT - 1
     bpy.ops.ed.undo()
     drive()
@@ -210,7 +212,7 @@ def test_a_first_save_meanwhile_takes_the_edited_person_along(addon, tmp_path, m
     bpy.ops.primdiffusion.generate(seed=7, steps=1)
     monkeypatch.setattr(SLICE_SECONDS, 0.0)
     vary(humans(bpy.context.scene)[0])
-    until_read()
+    until_written()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "late.blend"))
     drive()
     person = humans(bpy.context.scene)[0]
@@ -241,7 +243,7 @@ def test_cancel_leaves_files_that_undo_and_redo_need(person, monkeypatch):
     person = humans(bpy.context.scene)[0]
     monkeypatch.setattr(SLICE_SECONDS, 0.0)
     vary(person)  # to the very person that redo brings
-    until_read()
+    until_written()
     bpy.ops.primdiffusion.cancel()
     drive()
     bpy.ops.ed.redo()
@@ -316,7 +318,7 @@ def lost(person, monkeypatch):
     bpy.context.view_layer.update()
     assert not all(obj.data.grids.load() for obj in person.all_objects if obj.type == "VOLUME")  # seen by Blender
     queue.add(bpy.context, RestoreJob(HumanTarget.of(person), str(person_file(person))))
-    until_read()
+    until_written()
     return person
 
 
@@ -354,7 +356,7 @@ def test_a_person_generated_again_is_written_in_the_thread(person, monkeypatch):
     bpy.context.view_layer.update()
     assert not any(obj.data.grids.load() for obj in person.all_objects if obj.type == "VOLUME")
     queue.add(bpy.context, RegenerateJob(HumanTarget.of(person), made))
-    until_read()
+    until_written()
     drive()
     assert error_of("regenerate") == ""
     assert json.loads(person[MARK])["seed"] == made["seed"]

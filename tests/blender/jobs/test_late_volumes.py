@@ -17,9 +17,10 @@ from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.late_volumes import late_volumes
 from blender_primdiffusion.jobs.missing_files import look, state
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene import attachment, build, unwritten
+from blender_primdiffusion.scene import attachment, unwritten
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import unused
+from blender_primdiffusion.scene.cycles import setup_cycles_preview
 from blender_primdiffusion.scene.duplicate import duplicate_human
 from blender_primdiffusion.scene.human import (
     armature_of,
@@ -41,9 +42,7 @@ ops = bpy.ops.primdiffusion
 
 @pytest.fixture
 def hidden(addon, tmp_path, monkeypatch):
-    """New humans are hidden in viewports, and written as with a window."""
-    monkeypatch.setattr(attachment, "VOLUMES_IN_VIEWPORT", False)
-    monkeypatch.setattr(build, "VOLUMES_IN_VIEWPORT", False)
+    """Volumes are written as with a window."""
     monkeypatch.setattr("blender_primdiffusion.jobs.queue.volumes_may_wait", lambda: True)
     monkeypatch.setattr(
         "blender_primdiffusion.scene.edit.volumes_may_wait", lambda person: not attachment.in_viewport(person)
@@ -163,27 +162,14 @@ def test_a_render_by_the_own_engine_writes_nothing(person):
     assert not on_disk()
 
 
-def test_the_first_picture_of_another_engine_shows_the_human(person):
+def test_the_first_picture_by_cycles_shows_the_human(person, tmp_path):
     scene = bpy.context.scene
-    scene.render.engine = "BLENDER_WORKBENCH"
-    scene.render.resolution_x = scene.render.resolution_y = 8
-    scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-    scene.collection.objects.link(scene.camera)
-    drawn = []
-
-    def look_at_volumes(_scene: bpy.types.Scene, graph: bpy.types.Depsgraph) -> None:
-        if graph.mode == "RENDER":
-            drawn.extend(i.object.data.grids.error_message for i in graph.object_instances if i.object.type == "VOLUME")
-
-    bpy.app.handlers.depsgraph_update_post.append(look_at_volumes)
-    try:
-        bpy.ops.render.render()
-    except RuntimeError:  # no GPU in background mode
-        pass
-    finally:
-        bpy.app.handlers.depsgraph_update_post.remove(look_at_volumes)
+    setup_cycles_preview(scene, size=16)
+    scene.render.filepath = str(tmp_path / "picture.png")
+    bpy.ops.render.render(write_still=True)
     check_complete(person)
-    assert not any(drawn)
+    picture = bpy.data.images.load(scene.render.filepath)
+    assert max(list(picture.pixels)[3::4]) > 0.2
 
 
 def test_undo_redo_and_work_again(in_each_state):
@@ -359,6 +345,22 @@ def test_a_full_disk_is_reported_once_and_a_render_tries_again(person, monkeypat
     check_complete(person)
 
 
+def test_what_failed_is_tried_again_when_the_file_is_opened(person, monkeypatch):
+    def full(*_: object) -> str:
+        raise OSError(28, "No space left on device")
+
+    bpy.ops.wm.save_mainfile()
+    monkeypatch.setattr(unwritten, "write_file", full)
+    while late_volumes.work(0.0):
+        pass
+    monkeypatch.undo()
+    assert not late_volumes.work(0.0)
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    assert late_volumes.error == ""
+    advance("written")
+    check_complete(*humans(bpy.context.scene))
+
+
 def test_a_changed_source_is_reported(person):
     (source,) = unwritten_in(folder_of(person))
     source.write_bytes(b"no human")
@@ -375,9 +377,7 @@ def test_disabling_the_extension_leaves_no_unfinished_files(person):
     blender_primdiffusion.register()
 
 
-def test_background_mode_writes_at_once(addon, monkeypatch):
-    monkeypatch.setattr(attachment, "VOLUMES_IN_VIEWPORT", False)
-    monkeypatch.setattr(build, "VOLUMES_IN_VIEWPORT", False)
+def test_background_mode_writes_at_once(addon):
     assert ops.generate(seed=5) == {"FINISHED"}
     (person,) = humans(bpy.context.scene)
     assert all(path.is_file() for path in paths_of(person))

@@ -18,6 +18,8 @@ from blender_primdiffusion.scene.duplicate import duplicate_human
 from blender_primdiffusion.scene.human import armature_of, body_of, folder_of, humans, volumes_of
 from blender_primdiffusion.scene.surface import GROUP_NAME, carrier_of
 
+pytestmark = pytest.mark.usefixtures("volumes_shown")
+
 COUNT = 12
 
 

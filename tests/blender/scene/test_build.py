@@ -21,6 +21,8 @@ from blender_primdiffusion.scene.cycles import overlap_warning, overlap_warning_
 from blender_primdiffusion.scene.human import MARK, VolumeWriteError, armature_of, folder_of, humans, remove_human
 from blender_primdiffusion.scene.human_npz import HumanNpzError
 
+pytestmark = pytest.mark.usefixtures("volumes_shown")
+
 KINDS = ("objects", "collections", "volumes", "meshes", "armatures", "materials", "actions")
 
 

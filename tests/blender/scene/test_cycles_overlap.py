@@ -19,6 +19,8 @@ from blender_primdiffusion.scene.shape import generated_betas
 from blender_primdiffusion.scene.volumes import bake
 from blender_primdiffusion.ui.shape_panel import details
 
+pytestmark = pytest.mark.usefixtures("volumes_shown")
+
 COUNT = 96
 SMALL = (-4.0, -4.0)
 """The first two betas, by which all shrinks."""

@@ -29,6 +29,8 @@ from blender_primdiffusion.scene.human import (
 )
 from blender_primdiffusion.scene.human_npz import HumanNpzError
 
+pytestmark = pytest.mark.usefixtures("volumes_shown")
+
 COUNT = 12
 TALLER = 1.1
 

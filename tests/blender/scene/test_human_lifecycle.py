@@ -16,6 +16,8 @@ from human_stage import COUNT, named, places, whole
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import MARK, armature_of, humans, person_file
 
+pytestmark = pytest.mark.usefixtures("volumes_shown")
+
 ops = bpy.ops.primdiffusion
 
 

@@ -14,7 +14,6 @@ from blender_primdiffusion.scene.build import build_human, build_written, next_f
 from blender_primdiffusion.scene.human import VolumeWriteError, folder_of, volume_path
 from blender_primdiffusion.scene.human_npz import Destination, HumanNpzError, VolumeWriter, write_now
 from blender_primdiffusion.scene.shape import shape_model_of
-from blender_primdiffusion.scene.volumes import read_grids
 
 
 @pytest.fixture
@@ -162,25 +161,3 @@ def test_writing_keeps_its_failure_for_its_caller(saved_scene, tmp_path):
         assert writer.take() is None
     assert isinstance(bad.error, HumanNpzError)
     assert isinstance(full.error, VolumeWriteError)
-
-
-def test_grids_read_before_are_there_when_volumes_show_them_and_nothing_else_is(saved_scene, source):
-    written = write_now(source, Destination(next_folder("Anna")))
-    read = 0
-    while read < len(written.files):
-        count = read_grids(written.files[read:], 0.0)
-        assert count == 1
-        read += count
-    assert read_grids(written.files, 60.0) == len(written.files)
-    assert not bpy.data.volumes
-    person = build_written(saved_scene, written, "Anna")
-    saved_scene.view_layer.update()
-    volume = next(obj.data for obj in person.all_objects if obj.type == "VOLUME")
-    assert volume.grids.load()
-    assert {grid.name for grid in volume.grids} == {"density", "Cd"}
-
-
-def test_a_missing_file_is_no_reason_not_to_read_the_others(saved_scene, source):
-    written = write_now(source, Destination(next_folder("Anna")))
-    written.files[0].unlink()
-    assert read_grids(written.files, 60.0) == len(written.files)

@@ -38,6 +38,8 @@ from blender_primdiffusion.scene.volumes import person_memory
 bpy.utils.expose_bundled_modules()
 import openvdb  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("volumes_shown")
+
 
 def grid(seed: int = 0) -> MergedGrid:
     rng = np.random.default_rng(seed)

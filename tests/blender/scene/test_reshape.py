@@ -22,6 +22,8 @@ from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, has_custom_shape
 from blender_primdiffusion.scene.surface import build_surface
 
+pytestmark = pytest.mark.usefixtures("volumes_shown")
+
 COUNT = 12
 SHAPE = np.array([2.0, -1.5, 1, 0, 0.5, 0, 0, -2, 0, 1])
 

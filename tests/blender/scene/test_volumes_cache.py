@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import bpy
 import psutil
+import pytest
 import synthetic
 
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import armature_of, volume_path
-from blender_primdiffusion.scene.volumes import free_unused_grids, read_headers
+from blender_primdiffusion.scene.human import armature_of
+from blender_primdiffusion.scene.volumes import free_unused_grids
+
+pytestmark = pytest.mark.usefixtures("volumes_shown")
 
 
 def _resident_mb() -> float:
@@ -59,16 +62,6 @@ def _boxes(person: bpy.types.Collection) -> dict[str, list[tuple[float, ...]]]:
     graph = bpy.context.evaluated_depsgraph_get()
     volumes = [obj for obj in person.all_objects if obj.type == "VOLUME"]
     return {obj.name: [tuple(corner) for corner in obj.evaluated_get(graph).bound_box] for obj in volumes}
-
-
-def test_reading_headers_leaves_the_blend_as_it_was(saved_scene, tmp_path):
-    person = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 8), "Shown")
-    was_dirty = bpy.data.is_dirty
-    read_headers([volume_path(obj.data) for obj in person.all_objects if obj.type == "VOLUME"])
-    assert bpy.data.is_dirty == was_dirty
-    assert len(bpy.data.volumes) == 8
-    saved_scene.view_layer.update()
-    assert not any(obj.data.grids.error_message for obj in person.all_objects if obj.type == "VOLUME")
 
 
 def test_the_users_preferences_are_as_before(empty_scene):

@@ -19,6 +19,8 @@ from blender_primdiffusion.scene.human_file import read_tensors
 from blender_primdiffusion.scene.proxy import proxy_of
 from blender_primdiffusion.scene.surface import primitives_of
 
+pytestmark = pytest.mark.usefixtures("volumes_shown")
+
 OPERATORS = bpy.ops.primdiffusion
 
 

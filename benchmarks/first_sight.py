@@ -1,0 +1,138 @@
+"""What a user meets first: how soon a generated human of 1024 volumes stands, and what it then costs Blender.
+
+    python benchmarks/first_sight.py --json docs/results/first_sight.json
+
+Measured without a window, which adds its redraws: the seconds from the child's answer until the human stands
+(stand_seconds) and the longest step of these without a pause; the seconds in which its volumes are written afterwards;
+memory with undo, milliseconds of a frame change, and rows of the Outliner as Blender opens them (collections open,
+objects closed). second_* are the same with another human in the scene. WINDOW lists figures of a real window; those
+that the file has already are kept.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import blender_isolated  # noqa: F401  before bpy
+import bpy
+import numpy as np
+import resident
+from march_people import checkered_human
+from primdiffusion.human_file import export_for_blender, save_human
+from record import command_line, report
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from blender_primdiffusion.scene.armature import keyframe_poses
+from blender_primdiffusion.scene.build import build_written, next_folder, stand_at_cursor
+from blender_primdiffusion.scene.edit import select_human
+from blender_primdiffusion.scene.human import armature_of
+from blender_primdiffusion.scene.human_npz import Destination, WrittenHuman, write_volumes
+from blender_primdiffusion.scene.unwritten import unwritten, write_unwritten
+
+FRAMES = 60
+WINDOW = (
+    "stand_seconds_window", "longest_stall_s", "viewport_error_999", "viewport_ms_1080p_gpu", "proxy_cpu_seconds",
+    "sidebar_px", "panels_open",
+)  # fmt: skip
+"""Figures that this benchmark does not measure."""
+
+
+def main() -> None:
+    parser = command_line(__doc__)
+    arguments = parser.parse_args()
+    before = json.loads(arguments.json.read_text()) if arguments.json and arguments.json.exists() else {}
+    with tempfile.TemporaryDirectory(prefix="primdiffusion_first_sight_") as folder:
+        figures = measured(Path(folder))
+    report({**{name: before.get(name) for name in WINDOW}, **figures}, arguments.json)
+
+
+def measured(folder: Path) -> dict[str, float]:
+    """Figures of a human in an empty file, and of a second one beside them."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
+    figures: dict[str, float] = {}
+    for seed, prefix in enumerate(("", "second_")):
+        human = checkered_human(seed)
+        npz, person = folder / "human.npz", folder / "person.human.safetensors"
+        export_for_blender(npz, human)
+        save_human(person, human)
+        figures |= {prefix + name: value for name, value in one_human(npz, person).items()}
+    return figures
+
+
+def one_human(npz: Path, person: Path) -> dict[str, float]:
+    resident.trim()
+    memory = resident.resident_mb()
+    steps: list[float] = []
+    prepared = prepare(npz, steps)
+    found: list[bpy.types.Collection] = []
+    steps.append(seconds(lambda: found.append(enter(prepared, person))))
+    del prepared
+    figures = {"stand_seconds": sum(steps), "longest_step_seconds": max(steps)}
+    resident.trim()
+    figures["person_memory_mb"] = resident.resident_mb() - memory
+    figures["person_frame_ms"] = frame_ms(armature_of(found[0]))
+    figures["outliner_rows"] = outliner_rows(found[0])
+    figures["volumes_seconds"] = sum(seconds(lambda path=path: list(write_unwritten(path))) for path in unwritten())
+    return figures
+
+
+def prepare(npz: Path, steps: list[float]) -> WrittenHuman:
+    """The slices before the human enters; their durations are appended to `steps`."""
+    writing = write_volumes(npz, Destination(next_folder("Human"), later=True))
+    while True:
+        began = time.perf_counter()
+        try:
+            next(writing)
+        except StopIteration as done:
+            return done.value
+        finally:
+            steps.append(time.perf_counter() - began)
+
+
+def enter(prepared: WrittenHuman, person: Path) -> bpy.types.Collection:
+    """What blocks the window."""
+    collection = build_written(bpy.context, prepared, "Human", [person])
+    stand_at_cursor(bpy.context, collection)
+    bpy.context.view_layer.update()
+    select_human(bpy.context, collection)
+    bpy.ops.ed.undo_push(message="Generate Human")
+    return collection
+
+
+def seconds(call: Callable[[], object]) -> float:
+    began = time.perf_counter()
+    call()
+    return time.perf_counter() - began
+
+
+def frame_ms(armature: bpy.types.Object) -> float:
+    """Median milliseconds of a frame change while all joints move."""
+    angles = np.random.default_rng(0).normal(0, 0.2, (FRAMES, 24))
+    rotations = np.broadcast_to(np.eye(3), (FRAMES, 24, 3, 3)).copy()
+    rotations[..., 0, 0] = rotations[..., 1, 1] = np.cos(angles)
+    rotations[..., 1, 0], rotations[..., 0, 1] = np.sin(angles), -np.sin(angles)
+    keyframe_poses(armature, np.arange(1.0, FRAMES + 1), rotations, np.zeros((FRAMES, 3)))
+    times = [seconds(lambda frame=frame: bpy.context.scene.frame_set(frame)) for frame in range(1, FRAMES + 1)]
+    return 1e3 * float(np.median(times[4:]))
+
+
+def outliner_rows(collection: bpy.types.Collection) -> int:
+    """Rows of a collection that was never opened or closed: objects are inside the closed rows of their parents, where
+    both are in the same collection."""
+    here = set(collection.objects)
+    return (
+        1
+        + sum(obj.parent not in here for obj in collection.objects)
+        + sum(outliner_rows(child) for child in collection.children)
+    )
+
+
+if __name__ == "__main__":
+    main()
