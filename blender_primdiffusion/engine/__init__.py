@@ -56,10 +56,22 @@ def shows_humans(context: bpy.types.Context) -> bool:
 
 
 def _draw_humans() -> None:
-    if shows_humans(bpy.context):
+    context = bpy.context
+    rendered = sys.modules.get(f"{__package__}.viewport")  # imported by the first picture
+    if shows_humans(context):
         from .overlay import overlay  # numpy, which Blender starts without
 
-        overlay.draw(bpy.context)
+        overlay.draw(context)
+    elif rendered is not None and _shows_overlays(context) and (picture := rendered.picture_above_overlays(context)):
+        from .overlay import draw_above_overlays  # as above
+
+        draw_above_overlays(context, picture)
+
+
+def _shows_overlays(context: bpy.types.Context) -> bool:
+    """Whether the engine draws this 3D view, beneath Blender's overlays."""
+    space = context.space_data
+    return space.shading.type == "RENDERED" and context.engine == ENGINE and space.overlay.show_overlays
 
 
 def _draw_error() -> None:

@@ -15,6 +15,8 @@ from .gpu_march import GpuMarch
 NO_PLANES: NDArray[np.float32] = np.zeros((6, 4), np.float32)
 _NOTHING = "1e9"
 """Depths beyond are pixels without a surface."""
+_OPAQUE = "0.9"
+"""From this alpha on a picture that is drawn again hides what was drawn between."""
 _CORNERS = 10
 """Of the polygon for a joint."""
 
@@ -30,7 +32,7 @@ _FRAGMENT = f"""
 void main()
 {{
   vec4 light = texture(colour, uv);
-  if (light.a < 0.002) {{
+  if (light.a < 0.002 || (again == 1 && light.a < {_OPAQUE})) {{
     discard;
     return;
   }}
@@ -44,6 +46,10 @@ void main()
     }}
   }}
   float far = 1.0;
+  if (again == 1 && metres > {_NOTHING}) {{
+    discard;
+    return;
+  }}
   if (metres < {_NOTHING}) {{
     float w = metres * lens.z + 1.0 - lens.z;
     far = clamp((lens.y - lens.x * metres) / w * 0.5 + 0.5, 0.0, 1.0);
@@ -78,9 +84,19 @@ class ViewLook:
     """Left, bottom, right and top of the camera's picture, as fractions of the region."""
     darkening: float = 0.0
     """Outside of the frame."""
+    again: bool = False
+    """The picture is below the overlays already: only humans, where they are opaque, go above them, by their depth."""
 
 
-def draw_picture(picture: GpuMarch, look: ViewLook) -> None:
+@dataclasses.dataclass(frozen=True)
+class PictureTextures:
+    """A picture as a `GpuMarch` has it, and others."""
+
+    colour: gpu.types.GPUTexture
+    depth: gpu.types.GPUTexture
+
+
+def draw_picture(picture: GpuMarch | PictureTextures, look: ViewLook) -> None:
     """Draw over the whole region, for handlers of the kind POST_VIEW.
 
     Blender's overlays are drawn before: their depth is in the buffer, but for those of objects in front. What is drawn
@@ -99,6 +115,7 @@ def draw_picture(picture: GpuMarch, look: ViewLook) -> None:
     shader.uniform_float("scale", (matrix[0, 0], matrix[1, 1]))
     shader.uniform_float("frame", look.frame)
     shader.uniform_float("opacity", look.opacity)
+    shader.uniform_int("again", int(look.again))
     planes = np.ascontiguousarray(look.planes, np.float32).ravel()
     location = shader.uniform_from_name("planes")
     shader.uniform_vector_float(location, gpu.types.Buffer("FLOAT", planes.size, planes), 4, 6)
@@ -158,6 +175,7 @@ def _picture_shader() -> gpu.types.GPUShader:
         ("VEC4", "frame"),
         ("VEC2", "scale"),
         ("FLOAT", "opacity"),
+        ("INT", "again"),
     ):
         info.push_constant(kind, name)
     info.push_constant("VEC4", "planes", 6)

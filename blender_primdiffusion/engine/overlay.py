@@ -22,7 +22,7 @@ from ..scene.human_file import file_version
 from ..scene.proxy import PROXY_MARK
 from . import studio
 from .boxes import Boxes
-from .composite import NO_PLANES, ViewLook, draw_picture, keep_bones
+from .composite import NO_PLANES, PictureTextures, ViewLook, draw_picture, keep_bones
 from .gpu_march import GpuMarcher, GpuPayload
 from .gpu_refine import GpuRefinement, MarchRequest
 from .picture import PosedHuman, human_armatures, pose_of
@@ -123,10 +123,7 @@ class Overlay:
                     picture.advance()
         if not (picture.resting and reading.complete):
             follow()
-        overlays = context.space_data.overlay
-        if overlays.show_overlays and overlays.show_bones:
-            pixel = context.preferences.system.pixel_size
-            keep_bones(_in_pixels(reading.bones, window @ to_view, size), size, _STICK_PX * pixel, _JOINT_PX * pixel)
+        keep_bones_in_front(context, reading.bones)
         if picture.shown is not None:
             draw_picture(picture.shown.picture, _look(context, window, to_view))
 
@@ -225,6 +222,23 @@ class Overlay:
 
 
 overlay = Overlay()
+
+
+def keep_bones_in_front(context: bpy.types.Context, bones: NDArray) -> None:
+    """Let these bones [N, 2, 3], if the view shows bones, stay above the picture that is drawn next."""
+    overlays, around, region = context.space_data.overlay, context.region_data, context.region
+    if overlays.show_overlays and overlays.show_bones:
+        to_window = np.array(around.window_matrix, np.float64) @ np.array(around.view_matrix, np.float64)
+        pixel, size = context.preferences.system.pixel_size, (region.width, region.height)
+        keep_bones(_in_pixels(bones, to_window, size), size, _STICK_PX * pixel, _JOINT_PX * pixel)
+
+
+def draw_above_overlays(context: bpy.types.Context, picture: PictureTextures) -> None:
+    """Draw a view's picture again where Blender's overlays, such as the grid, are behind a human."""
+    armatures = visible_armatures(context.evaluated_depsgraph_get(), context.space_data)
+    bones = [_bones(armature, matrix) for _, armature, matrix, _ in armatures if armature.show_in_front]
+    keep_bones_in_front(context, np.concatenate([np.zeros((0, 2, 3)), *bones]))
+    draw_picture(picture, ViewLook(np.array(context.region_data.window_matrix, np.float64), again=True))
 
 
 def follow() -> None:

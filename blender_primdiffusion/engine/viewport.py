@@ -13,6 +13,7 @@ import numpy as np
 from gpu_extras.presets import draw_texture_2d
 
 from . import studio
+from .composite import PictureTextures
 from .gpu_picture import GpuPicture, GpuScene, GpuSolids
 from .gpu_refine import GpuRefinement, MarchRequest
 from .picture import SceneContent, scene_content
@@ -48,6 +49,8 @@ class Viewport:
         self._gpu_solids: GpuSolids | None = None
         self._known: tuple[str, bool] | None = None
         """The solids setting and whether the view is local, as of the last reading of solids."""
+        self.region = 0
+        """Address of the region that was drawn last."""
         self._error = ""
         self._no_gpu = ""
         """Why the child draws."""
@@ -75,6 +78,7 @@ class Viewport:
 
     def draw(self, engine: bpy.types.RenderEngine, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """March what the region shows now, or request it from the child, and draw the newest picture."""
+        self.region = context.region.as_pointer()
         if self._known is not None and self._known[1] != (context.space_data.local_view is not None):
             self.update(context, depsgraph)  # Blender reports no change
         if self._picture is not None:
@@ -88,6 +92,15 @@ class Viewport:
         if self._texture is not None:
             self._draw_texture(engine, context, depsgraph, *self._texture)
         engine.update_stats("", self._status())
+
+    def picture_above_overlays(self, context: bpy.types.Context) -> PictureTextures | None:
+        """The picture to draw again over overlays that are behind humans: Blender's overlays know the depth of its own
+        objects alone. None where that cannot be: with a view transform, which handlers lack, and in part of a view."""
+        shown, settings = self._gpu.shown, context.scene.view_settings
+        colours = (settings.view_transform, settings.look, settings.exposure, settings.gamma)
+        if shown is None or self._no_gpu or self._texture[1] is not None or colours != ("Standard", "None", 0, 1):
+            return None
+        return PictureTextures(self._texture[0], shown.picture.march.depth)
 
     @property
     def resting(self) -> bool:
@@ -222,6 +235,13 @@ def camera_frame(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> 
     clip = homogeneous @ np.array(context.region_data.window_matrix, np.float64).T
     pixels = (clip[:, :2] / clip[:, 3:] + 1) / 2 * [region.width, region.height]
     return pixels.min(0), pixels.max(0)
+
+
+def picture_above_overlays(context: bpy.types.Context) -> PictureTextures | None:
+    """As `Viewport.picture_above_overlays`, for the viewport of this region."""
+    address = context.region.as_pointer()
+    viewport = next((viewport for viewport in _viewports if viewport.region == address), None)
+    return None if viewport is None else viewport.picture_above_overlays(context)
 
 
 def follow() -> None:

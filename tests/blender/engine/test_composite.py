@@ -98,6 +98,18 @@ def test_a_faint_rim_is_as_far_as_what_it_surrounds():
     assert not shows(seen)[:, 9:].any()
 
 
+def test_a_picture_drawn_again_covers_only_with_opaque_humans_in_front():
+    look = ViewLook(PERSPECTIVE, again=True)
+    depth, colour = np.full(SIZE[::-1], METRES), np.broadcast_to(COLOUR, (*SIZE[::-1], 4)).copy()
+    depth[:, 16:] = NO_SURFACE_M  # the background
+    colour[8:] *= 0.5  # a faint edge
+    seen = shows(drawn(marched(depth, colour), look, window_depth(PERSPECTIVE, METRES + 1)))
+    assert seen[:8, :16].all()
+    assert not seen[8:].any()
+    assert not seen[:, 17:].any()  # column 16 is as far as its neighbour
+    assert not shows(drawn(marched(), look, window_depth(PERSPECTIVE, METRES - 1))).any()
+
+
 def test_xray_shows_humans_through_objects_and_objects_through_humans():
     look = ViewLook(PERSPECTIVE, opacity=0.25, xray=True)
     seen = drawn(marched(), look, window_depth(PERSPECTIVE, 1.0))
