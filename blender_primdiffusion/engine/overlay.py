@@ -235,9 +235,7 @@ def keep_bones_in_front(context: bpy.types.Context, bones: NDArray) -> None:
 
 def draw_above_overlays(context: bpy.types.Context, picture: PictureTextures) -> None:
     """Draw a view's picture again where Blender's overlays, such as the grid, are behind a human."""
-    armatures = visible_armatures(context.evaluated_depsgraph_get(), context.space_data)
-    bones = [_bones(armature, matrix) for _, armature, matrix, _ in armatures if armature.show_in_front]
-    keep_bones_in_front(context, np.concatenate([np.zeros((0, 2, 3)), *bones]))
+    keep_bones_in_front(context, overlay.reading(context).bones)
     draw_picture(picture, ViewLook(np.array(context.region_data.window_matrix, np.float64), again=True))
 
 

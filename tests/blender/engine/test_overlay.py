@@ -238,3 +238,14 @@ def test_without_a_window_nothing_is_drawn(addon):
     from blender_primdiffusion import engine
 
     assert engine._draw_handlers == []
+
+
+def test_a_picture_above_the_overlays_leaves_the_bones_of_the_same_reading(people, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(module, "overlay", people.overlay)
+    monkeypatch.setattr(module, "keep_bones_in_front", lambda _context, bones: drawn.append(bones))
+    monkeypatch.setattr(module, "draw_picture", lambda picture, look: drawn.append((picture, look.again)))
+    people.overlay.scene_changed()
+    module.draw_above_overlays(context(), "picture")
+    assert drawn[0] is people.overlay.reading(context()).bones
+    assert drawn[1] == ("picture", True)
