@@ -12,11 +12,11 @@ import synthetic_shape
 from oracle import Z_UP, blended_frames, blended_vertices, evaluated_matrices
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import ATTACHMENT, attachment_of, set_attachment
+from blender_primdiffusion.scene.attachment import ATTACHMENT, IN_VIEWPORT, attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.duplicate import duplicate_human
 from blender_primdiffusion.scene.human import armature_of, body_of, folder_of, humans, volumes_of
-from blender_primdiffusion.scene.surface import GROUP_NAME, carrier_of
+from blender_primdiffusion.scene.surface import GROUP_NAME, carrier_of, primitives_of
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 
@@ -216,3 +216,11 @@ def test_unknown_modes_and_what_is_not_merged_are_rejected(person):
     with pytest.raises(ValueError, match="press Merge"):
         set_attachment(person[0], "MERGED")
     assert ATTACHMENT not in person[0]
+
+
+def test_a_human_of_an_earlier_version_stays_shown_in_viewports(person):
+    collection, _ = person
+    del collection[IN_VIEWPORT]
+    set_attachment(collection, "SURFACE")
+    set_attachment(collection, "ARMATURE")
+    assert not primitives_of(collection).hide_viewport
