@@ -40,18 +40,7 @@ def generate(seed: int, position: tuple[float, float] = (0.0, 0.0), attributes: 
     armature = armature_of(person)
     armature.location.xy = position
     bpy.context.view_layer.objects.active = armature
-    leave_out_volumes()
     return person
-
-
-def leave_out_volumes() -> None:
-    """Exclude the volumes from the view layer: the engine does not need them, and each person's take a gigabyte."""
-    waiting = [bpy.context.view_layer.layer_collection]
-    while waiting:
-        layer = waiting.pop()
-        waiting += layer.children
-        if layer.name.endswith("_primitives"):
-            layer.exclude = True
 
 
 def armature_of(person: bpy.types.Collection) -> bpy.types.Object:

@@ -29,19 +29,8 @@ def with_people(module: str, python: str, *seeds: int) -> Steps:
             press("primdiffusion.generate", seed=seed)
         yield from wait(lambda: not queue_of(module).busy, 400)
         bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    leave_out_volumes()
     yield 1.0
     select(armatures()[0])
-
-
-def leave_out_volumes() -> None:
-    """Exclude the volumes from the view layer: the engine does not need them, and each person's take a gigabyte."""
-    waiting = [bpy.context.view_layer.layer_collection]
-    while waiting:
-        layer = waiting.pop()
-        waiting += layer.children
-        if layer.name.endswith("_primitives"):
-            layer.exclude = True
 
 
 def people_file(module: str, count: int = 1) -> Path:

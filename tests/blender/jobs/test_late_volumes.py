@@ -34,6 +34,7 @@ from blender_primdiffusion.scene.human import (
     volumes_of,
 )
 from blender_primdiffusion.scene.unwritten import write_all_unwritten, write_unwritten
+from blender_primdiffusion.scene.volumes import person_memory
 
 COUNT = 12
 """Primitives of the synthetic person."""
@@ -382,6 +383,14 @@ def test_background_mode_writes_at_once(addon):
     (person,) = humans(bpy.context.scene)
     assert all(path.is_file() for path in paths_of(person))
     assert person.children[0].hide_viewport
+
+
+def test_the_memory_of_volumes_is_told_when_they_are_written(in_each_state):
+    person_memory(in_each_state)
+    write_all_unwritten()
+    memory = person_memory(in_each_state)
+    assert memory.files == sum(path.stat().st_size for path in paths_of(in_each_state))
+    assert memory.grids > 0
 
 
 def test_several_humans_are_written_one_after_another(hidden):
