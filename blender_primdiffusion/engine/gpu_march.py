@@ -92,7 +92,7 @@ class GpuMarch:
         self.depth = gpu.types.GPUTexture(size, format="R32F")
         self._shader, self._size, self._done = shaders["march"], size, 0
         self._columns, self._rows = -(-view.width // TILE), -(-view.height // TILE)
-        self._atlas, self._ends = atlas, ends
+        self._atlas, self._ends, self._count = atlas, ends, len(records)
         base = records[0, 0, 1] // (stride := records[:, 0, 3].max()) * stride if len(records) else 0.0
         records[:, 0, :3] -= base
         self._boxes = _texture(_padded(records), "RGBA32F")
@@ -147,7 +147,8 @@ class GpuMarch:
             for name, values in self._constants.items():
                 shader.uniform_float(name, values)
             shader.uniform_int("size", self._size)
-            shader.uniform_int("tiling", (self._done, self._tile_side, int(self._ends is not None)))
+            tiling = (self._done, self._tile_side, int(self._ends is not None), self._count)
+            shader.uniform_int("tiling", tiling)
             gpu.compute.dispatch(shader, self._columns, rows, 1)
             self._done += rows
         return self._done >= self._rows
@@ -166,14 +167,11 @@ class GpuMarcher:
         """Raises RuntimeError where there are no compute shaders or they do not compile."""
         if bpy.app.version < (5, 0) and not gpu.capabilities.compute_shader_support_get():
             raise RuntimeError("this GPU or driver has no compute shaders")
-        try:
-            self._shaders = {
-                "list": gpu_shaders.list_shader(),
-                "march": gpu_shaders.march_shader(),
-                "copy": gpu_shaders.copy_shader(),
-            }
-        except Exception as error:
-            raise RuntimeError(f"the marcher's shaders do not compile on this GPU: {error}") from error
+        self._shaders = {
+            "list": gpu_shaders.list_shader(),
+            "march": gpu_shaders.march_shader(),
+            "copy": gpu_shaders.copy_shader(),
+        }
         self._people: tuple[GpuPayload, ...] = ()
         self._atlas: gpu.types.GPUTexture | None = None
 

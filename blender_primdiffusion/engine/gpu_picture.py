@@ -16,7 +16,7 @@ from mathutils import Matrix
 
 from .boxes import Boxes
 from .gpu_march import GpuMarch, GpuMarcher, GpuPayload
-from .gpu_shaders import TILE, compiled
+from .gpu_shaders import TILE, compiled, shader_of
 from .solids import SceneSolids
 from .view import NO_SURFACE_M, PinholeView
 
@@ -188,7 +188,7 @@ def _solids_shader() -> gpu.types.GPUShader:
     info.fragment_out(1, "FLOAT", "surface")
     info.vertex_source(_VERTEX)
     info.fragment_source(_FRAGMENT)
-    return gpu.shader.create_from_info(info)
+    return shader_of(info)
 
 
 @functools.cache

@@ -19,6 +19,8 @@ WIDER = 8
 """Tiles are listed out of lists of tiles that are as many times wider."""
 CHUNK = 16
 """Lattice points, of the finest in a tile, that are composited together."""
+MOST_CHUNKS = 2**16
+"""Of a ray."""
 
 _RECORDS = f"""
 vec4 record(int box, int texel)
@@ -102,17 +104,18 @@ void main()
 
   vec2 span = texelFetch(tiles, pixel / tiling.y, 0).xy;
   int opened = int(span.x) + 1;
-  int closed = opened + int(span.y);
+  int closed = opened + clamp(int(span.y), 0, tiling.w);
   vec4 colour = vec4(0.0);
   float surface = 1e10;
   vec4 sums[{CHUNK}];
-  float finest = float(entry(int(span.x)));
+  float finest = max(float(entry(int(span.x))), 1.0);
   float begin = 3e7;
   if (span.y > 0.5) {{
     begin = floor(record(entry(opened), 0).y / finest) * finest;
   }}
 
-  while (opened < closed && begin <= ray_last && colour.a < 1.0) {{
+  /* Loops count integers, so that no number, not even NaN from a faulty driver, makes them endless. */
+  for (int chunk = 0; chunk < {MOST_CHUNKS} && opened < closed && begin <= ray_last && colour.a < 1.0; chunk++) {{
     for (int i = 0; i < {CHUNK}; i++) {{
       sums[i] = vec4(0.0);
     }}
@@ -154,7 +157,7 @@ void main()
       vec3 leave = max(one, other);
       float first = max(max(enter.x, enter.y), enter.z);
       float last = min(min(leave.x, leave.y), leave.z);
-      float stride = reach.w;
+      float stride = max(reach.w, 1.0);
       first = max(max(first + reach.x, begin), ray_first);
       last = min(min(last + reach.x, stop - 1.0), ray_last);
       float brick = high.w;
@@ -162,14 +165,17 @@ void main()
       float layer = floor(row / lattice.w);
       vec3 origin = vec3(brick - row * {ACROSS}.0, row - layer * lattice.w, layer) * {VOXELS}.0;
 
-      for (float n = ceil(first / stride) * stride; n <= last; n += stride) {{
+      first = ceil(first / stride) * stride;
+      int count = int(clamp(floor((last - first) / stride) + 1.0, 0.0, {CHUNK}.0));
+      for (int i = 0; i < count; i++) {{
+        float n = first + float(i) * stride;
         vec3 y = p + (n - reach.x) * q;
         /* Voxel centres are at the corners, so filtering stays in the brick. */
         vec4 value = textureLod(atlas, (origin + clamp((y + 1.0) * 3.5, 0.0, 7.0) + 0.5) / atlas_size, 0.0);
         vec3 y2 = y * y;
         vec3 y4 = y2 * y2;
         float opacity = value.a * exp(-8.0 * dot(y4, y4)) * low.w;
-        sums[int((n - begin) / finest)] += vec4(value.rgb * opacity, opacity);
+        sums[clamp(int((n - begin) / finest), 0, {CHUNK} - 1)] += vec4(value.rgb * opacity, opacity);
       }}
     }}
 
@@ -186,10 +192,11 @@ void main()
       }}
     }}
     begin = floor(next / finest) * finest;
-    float done = begin - 1.0;
-    while (opened < closed && done < begin) {{
-      done = record(entry(opened), 0).z;
-      opened += done < begin ? 1 : 0;
+    for (int place = opened; place < closed; place++) {{
+      if (record(entry(place), 0).z >= begin) {{
+        break;
+      }}
+      opened = place + 1;
     }}
   }}
   imageStore(colour_image, target, colour);
@@ -239,7 +246,7 @@ def march_shader() -> gpu.types.GPUShader:
         info.push_constant(kind, name)
     info.push_constant("VEC3", "atlas_size")
     info.push_constant("IVEC2", "size")
-    info.push_constant("IVEC3", "tiling")
+    info.push_constant("IVEC4", "tiling")
     return compiled(info, _MARCH, (TILE, TILE))
 
 
@@ -253,7 +260,15 @@ def copy_shader() -> gpu.types.GPUShader:
 
 
 def compiled(info: gpu.types.GPUShaderCreateInfo, source: str, group: tuple[int, int]) -> gpu.types.GPUShader:
-    """A compute shader with groups of this size."""
+    """A compute shader with groups of this size. Raises RuntimeError as `shader_of`."""
     info.local_group_size(*group)
     info.compute_source(source)
-    return gpu.shader.create_from_info(info)
+    return shader_of(info)
+
+
+def shader_of(info: gpu.types.GPUShaderCreateInfo) -> gpu.types.GPUShader:
+    """The shader. Raises RuntimeError where it does not compile."""
+    try:
+        return gpu.shader.create_from_info(info)
+    except Exception as error:  # Blender raises Exception itself
+        raise RuntimeError(f"a shader does not compile on this GPU: {error}") from error

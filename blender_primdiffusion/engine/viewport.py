@@ -52,8 +52,8 @@ class Viewport:
         self.region = 0
         """Address of the region that was drawn last."""
         self._error = ""
-        self._no_gpu = ""
-        """Why the child draws."""
+        self._no_gpu = self._gpu_fault = ""
+        """Why the child draws, now or from now on."""
         self._shown: ShownPicture | None = None
         self._texture: tuple[gpu.types.GPUTexture, tuple[int, int, int, int] | None] | None = None
         """What is drawn, and the part of the region that it fills."""
@@ -86,6 +86,8 @@ class Viewport:
                 self._march(self._picture, context, depsgraph)
             except (ValueError, OSError, RuntimeError) as error:
                 self._no_gpu = str(error)
+                if isinstance(error, RuntimeError):
+                    self._gpu_fault = self._no_gpu
                 self._ask_child(self._picture, context, depsgraph)
             if not self.resting:
                 follow()
@@ -113,7 +115,7 @@ class Viewport:
 
     def _march(self, picture: SceneContent, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """March for a moment. Raises ValueError, OSError or RuntimeError for what the GPU cannot draw."""
-        marcher = studio.gpu_marcher()
+        marcher = self._gpu_fault or studio.gpu_marcher()
         if isinstance(marcher, str):
             raise RuntimeError(marcher)
         if picture.shown != "colour":

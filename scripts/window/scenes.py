@@ -271,12 +271,14 @@ def rendered(module: str, python: str) -> Steps:
     yield "rendered_still"
     _, area = view()
     around = area.spaces.active.region_3d
+    measured = Stalls()
     for step in range(12):
         around.view_rotation = Quaternion((0, 0, 1), 0.15) @ around.view_rotation
         yield 0.3
         if step in (0, 11):
             yield f"rendered_turning_{step}"
     yield 20.0
+    print(f"turning and refining: {measured.end()}", flush=True)
     yield "rendered_turned"
     around.view_perspective = "ORTHO"
     space = area.spaces.active
