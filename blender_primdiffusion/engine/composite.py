@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from .gpu_march import GpuMarch
 
-NO_PLANES: NDArray[np.float32] = np.zeros((6, 4), np.float32)
+NO_PLANES: NDArray[np.float32] = np.zeros((1, 4), np.float32)
 _NOTHING = "1e9"
 """Depths beyond are pixels without a surface."""
 _OPAQUE = "0.9"
 """From this alpha on a picture that is drawn again hides what was drawn between."""
+_AGAIN, _XRAY = 1, 2
+"""Modes of the shader: as `ViewLook.again`; before everything but bones in front."""
 _CORNERS = 10
 """Of the polygon for a joint."""
 
@@ -32,7 +34,7 @@ _FRAGMENT = f"""
 void main()
 {{
   vec4 light = texture(colour, uv);
-  if (light.a < 0.002 || (again == 1 && light.a < {_OPAQUE})) {{
+  if (light.a < 0.002 || (mode == {_AGAIN} && light.a < {_OPAQUE})) {{
     discard;
     return;
   }}
@@ -46,7 +48,7 @@ void main()
     }}
   }}
   float far = 1.0;
-  if (again == 1 && metres > {_NOTHING}) {{
+  if (mode == {_AGAIN} && metres > {_NOTHING}) {{
     discard;
     return;
   }}
@@ -54,8 +56,8 @@ void main()
     float w = metres * lens.z + 1.0 - lens.z;
     far = clamp((lens.y - lens.x * metres) / w * 0.5 + 0.5, 0.0, 1.0);
     vec4 point = vec4(((uv * 2.0 - 1.0) * w + middle.zw * metres - middle.xy) / scale, -metres, 1.0);
-    for (int i = 0; i < 6; i++) {{
-      if (dot(planes[i], point) < 0.0) {{
+    for (int i = 0; i < textureSize(planes, 0).x; i++) {{
+      if (dot(texelFetch(planes, ivec2(i, 0), 0), point) < 0.0) {{
         discard;
         return;
       }}
@@ -63,7 +65,7 @@ void main()
   }}
   bool outside = any(lessThan(uv, frame.xy)) || any(greaterThan(uv, frame.zw));
   light.rgb *= outside ? 1.0 - lens.w : 1.0;
-  gl_FragDepth = far;
+  gl_FragDepth = mode == {_XRAY} ? 1e-6 : far;
   picture = light * opacity;
 }}
 """
@@ -79,7 +81,7 @@ class ViewLook:
     xray: bool = False
     """Objects do not hide people."""
     planes: NDArray[np.float32] = dataclasses.field(default_factory=lambda: NO_PLANES)
-    """Clipping planes [6, 4] in the view's space; what is on their negative side is not drawn."""
+    """Clipping planes [N, 4] in the view's space; what is on their negative side is not drawn."""
     frame: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
     """Left, bottom, right and top of the camera's picture, as fractions of the region."""
     darkening: float = 0.0
@@ -105,7 +107,7 @@ def draw_picture(picture: GpuMarch | PictureTextures, look: ViewLook) -> None:
     matrix, parallel = look.window_matrix, look.window_matrix[3, 2] == 0
     shader = _picture_shader()
     gpu.state.blend_set("ALPHA_PREMULT")
-    gpu.state.depth_test_set("ALWAYS" if look.xray else "LESS_EQUAL")
+    gpu.state.depth_test_set("LESS_EQUAL")
     gpu.state.depth_mask_set(not look.xray)
     shader.bind()
     shader.uniform_sampler("colour", picture.colour)
@@ -115,10 +117,11 @@ def draw_picture(picture: GpuMarch | PictureTextures, look: ViewLook) -> None:
     shader.uniform_float("scale", (matrix[0, 0], matrix[1, 1]))
     shader.uniform_float("frame", look.frame)
     shader.uniform_float("opacity", look.opacity)
-    shader.uniform_int("again", int(look.again))
-    planes = np.ascontiguousarray(look.planes, np.float32).ravel()
-    location = shader.uniform_from_name("planes")
-    shader.uniform_vector_float(location, gpu.types.Buffer("FLOAT", planes.size, planes), 4, 6)
+    shader.uniform_int("mode", _AGAIN if look.again else _XRAY if look.xray else 0)
+    planes = np.ascontiguousarray(look.planes, np.float32)
+    texels = gpu.types.Buffer("FLOAT", planes.size, planes.ravel())
+    clipping = gpu.types.GPUTexture((len(planes), 1), format="RGBA32F", data=texels)  # too large for push constants
+    shader.uniform_sampler("planes", clipping)
     batch_for_shader(shader, "TRI_STRIP", {"pos": [(-1, -1), (1, -1), (-1, 1), (1, 1)]}).draw(shader)
     _restore()
 
@@ -169,16 +172,16 @@ def _picture_shader() -> gpu.types.GPUShader:
     info.vertex_out(between)
     info.sampler(0, "FLOAT_2D", "colour")
     info.sampler(1, "FLOAT_2D", "depth")
+    info.sampler(2, "FLOAT_2D", "planes")
     for kind, name in (
         ("VEC4", "lens"),
         ("VEC4", "middle"),
         ("VEC4", "frame"),
         ("VEC2", "scale"),
         ("FLOAT", "opacity"),
-        ("INT", "again"),
+        ("INT", "mode"),
     ):
         info.push_constant(kind, name)
-    info.push_constant("VEC4", "planes", 6)
     info.fragment_out(0, "VEC4", "picture")
     info.depth_write("ANY")
     info.vertex_source(_VERTEX)
