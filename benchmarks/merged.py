@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import blender_primdiffusion
 from blender_primdiffusion.scene import merged as merging
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import set_attachment
+from blender_primdiffusion.scene.attachment import set_attachment, show_in_viewport
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
 from blender_primdiffusion.scene.human import armature_of
@@ -126,6 +126,7 @@ def main() -> None:
     began = time.perf_counter()
     person = build_human(bpy.context, folder / "human.npz", keep=[folder / "person.human.safetensors"])
     figures["build_seconds"] = time.perf_counter() - began
+    show_in_viewport(person, True)
     bpy.context.view_layer.update()
     figures["seconds_first_evaluation"] = time.perf_counter() - began - figures["build_seconds"]
     armature = armature_of(person)
