@@ -6,6 +6,7 @@ be quick; a timer marches finer ones in slices when nothing has changed for a wh
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Iterable, Iterator
@@ -86,6 +87,8 @@ class Overlay:
         self._readings: dict[object, SceneReading] = {}
         """By view layer and local view, since the scene has changed."""
         self._placed: dict[object, tuple[GpuPayload, Boxes]] = {}
+        self._fault = ""
+        """Why the GPU cannot march."""
         self.error = ""
         """Why humans are not drawn, or not all of them."""
 
@@ -96,7 +99,7 @@ class Overlay:
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the humans into the region that Blender draws now."""
-        marcher = studio.gpu_marcher()
+        marcher = self._fault or studio.gpu_marcher()
         if isinstance(marcher, str):
             self.error = f"{marcher}: show the volumes instead (tab Output, Volumes in Viewport)"
             return
@@ -104,6 +107,19 @@ class Overlay:
             self._start = self._start or self._starting(marcher)
             follow()
             return
+        with self._noting_faults():
+            self._draw(context, marcher)
+
+    @contextlib.contextmanager
+    def _noting_faults(self) -> Iterator[None]:
+        """After an error of the GPU nothing is marched any more."""
+        try:
+            yield
+        except RuntimeError as error:
+            self._fault, self._start = str(error), None
+            self._regions.clear()
+
+    def _draw(self, context: bpy.types.Context, marcher: GpuMarcher) -> None:
         reading = self.reading(context)
         if not reading.people:
             return
@@ -129,6 +145,12 @@ class Overlay:
 
     def advance(self) -> bool:
         """Do some work that does not need the window; True when it must be drawn again."""
+        news = True
+        with self._noting_faults():
+            news = self._advance()
+        return news
+
+    def _advance(self) -> bool:
         if self._start is not None:
             if next(self._start, self) is self:
                 self._start, self._ready = None, True

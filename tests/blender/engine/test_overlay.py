@@ -249,3 +249,19 @@ def test_a_picture_above_the_overlays_leaves_the_bones_of_the_same_reading(peopl
     module.draw_above_overlays(context(), "picture")
     assert drawn[0] is people.overlay.reading(context()).bones
     assert drawn[1] == ("picture", True)
+
+
+def test_a_gpu_that_fails_is_not_asked_again_and_the_view_says_why(people, monkeypatch):
+    asked = []
+
+    def march(*_given):
+        asked.append(1)
+        raise RuntimeError("the GPU is out of order")
+
+    monkeypatch.setattr(studio, "gpu_marcher", lambda: SimpleNamespace(march=march))
+    people.overlay._ready = True
+    for _ in range(3):
+        people.overlay.draw(context())
+    assert len(asked) == 1
+    assert people.overlay.error.startswith("the GPU is out of order: show the volumes instead")
+    assert people.overlay.resting
