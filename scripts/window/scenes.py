@@ -387,7 +387,10 @@ def stalls(module: str, python: str) -> Steps:
     for seed in (FIRST_SEED, SECOND_SEED):
         measured = Stalls()
         press("primdiffusion.generate", seed=seed)
+        yield from wait(lambda: queue.ready or not queue.busy, 240)
+        answered, entering = time.monotonic(), Stalls()
         yield from wait(lambda: not queue.busy, 240)
+        print(f"stands {time.monotonic() - answered:.2f} s after the answer: {entering.end()}", flush=True)
         yield 3.0
         print(f"adding a person: {measured.end()}", flush=True)
     yield "stalls_person"
