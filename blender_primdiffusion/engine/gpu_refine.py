@@ -19,6 +19,8 @@ from .view import PinholeView
 SLICE_S = 0.1
 SAMPLES = 8
 """Pictures that are averaged when nothing moves, each with its rays elsewhere in the pixels."""
+SLOW_S, SLOW_SAMPLES = 0.5, 4
+"""Where a full picture takes longer, fewer are averaged."""
 _FIRST_ROWS = 4
 _GROWTH = 4.0
 
@@ -120,7 +122,10 @@ class GpuRefinement:
             return self._moving(self._request.view), 0
         if shown.coarseness > 1:
             return shown.coarseness // 2, 0
-        return (1, shown.sample + 1) if shown.sample + 1 < self._samples else None
+        view = self._request.view
+        slow = view.width * view.height * self._pixel_seconds > SLOW_S
+        samples = min(self._samples, SLOW_SAMPLES) if slow else self._samples
+        return (1, shown.sample + 1) if shown.sample + 1 < samples else None
 
     def _begin(self, request: MarchRequest) -> ShownMarch:
         coarseness, sample = self._next()

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blender_primdiffusion.engine.gpu_refine import SAMPLES, SLICE_S, GpuRefinement, MarchRequest, jittered
+from blender_primdiffusion.engine.gpu_refine import (
+    SAMPLES,
+    SLICE_S,
+    SLOW_SAMPLES,
+    GpuRefinement,
+    MarchRequest,
+    jittered,
+)
 from blender_primdiffusion.engine.refine import REST_S
 from blender_primdiffusion.engine.view import PinholeView
 
@@ -95,6 +102,14 @@ def test_a_slow_gpu_is_never_waited_for_and_shows_pictures_while_the_view_moves(
         gpu.longest = max(gpu.longest, gpu.now - began)
     assert shown > 5
     assert gpu.longest < 0.3
+
+
+def test_a_slow_gpu_averages_fewer_pictures():
+    gpu = SlowGpu(1e-5)
+    refinement = GpuRefinement(lambda: gpu.now)
+    refinement.want(request(gpu, "a"))
+    shown = gpu.refine_to_the_end(refinement)
+    assert shown[-1] == (1, SLOW_SAMPLES - 1)
 
 
 def test_a_finer_picture_is_abandoned_when_the_view_moves():
