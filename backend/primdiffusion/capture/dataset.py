@@ -38,6 +38,7 @@ from primdiffusion.capture.reader import (
     windowed_view,
 )
 from primdiffusion.formats import capture_layout
+from primdiffusion.formats.whole_files import replacing
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord
 
@@ -78,7 +79,7 @@ def pack_subject(subject: Subject) -> None:
         )
     stamp = source_stamp(subject)
     shape = (subject.frames, len(subject.views), *sizes.pop(), 4)
-    with capture_layout.replacing(pack_path(subject)) as path:
+    with replacing(pack_path(subject)) as path:
         array = np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=shape)
         for frame in range(shape[0]):
             for camera in range(shape[1]):
@@ -86,7 +87,7 @@ def pack_subject(subject: Subject) -> None:
                 array[frame, camera, ..., 3] = subject.picture("mask", frame, camera)
         array.flush()
         del array
-    with capture_layout.replacing(pack_path(subject).with_suffix(".json")) as path:
+    with replacing(pack_path(subject).with_suffix(".json")) as path:
         path.write_text(json.dumps({"format": PACK_FORMAT, "version": PACK_VERSION, "source": stamp}), encoding="utf-8")
 
 

@@ -25,6 +25,7 @@ from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
 from primdiffusion.formats.capture_repair import is_complete_view, list_subjects
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import PASSES
+from primdiffusion.formats.whole_files import replacing
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.raster.multisample import Figure, RenderedView, figure_from_mesh, render_view
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, encode_bytes
@@ -114,7 +115,7 @@ def write_view(subject: Path, passes: Sequence[str], camera: int, frame: int, re
     for kind in passes:
         path = capture_layout.picture_path(subject, kind, camera, frame)
         if kind == "img":
-            with capture_layout.replacing(path) as partial:
+            with replacing(path) as partial:
                 Image.fromarray(srgb_bytes(rendered.rgb)).save(partial, quality=JPEG_QUALITY, subsampling=0)
         elif kind == "mask":
             picture_files.write_png(path, np.round(rendered.coverage.clip(0, 1) * 255).astype(np.uint8))
@@ -286,5 +287,5 @@ def _write_report(job: RenderJob, outcomes: Sequence[SubjectResult]) -> None:
         ],
         "skipped": [outcome.subject for outcome in outcomes if outcome.status == "skipped"],
     }
-    with capture_layout.replacing(job.out / f"{job.part}.json") as path:
+    with replacing(job.out / f"{job.part}.json") as path:
         path.write_text(json.dumps(report, indent=1), encoding="utf-8")
