@@ -217,7 +217,7 @@ def test_a_named_python_has_no_tick_before_it_was_tried(wheels, monkeypatch):
         if works is not None:
             tried[Path("/some/python")] = works
         assert preferences._icon(known.known()) == icon
-        assert ("Not tested yet: press Test" in draw_preferences().said) == (works is None)
+        assert ("Not tested yet: press Test" in draw_preferences().text) == (works is None)
         assert known.known().usable
 
 
