@@ -26,6 +26,10 @@ SOURCES = {
         "benchmarks/diffusion.py --people DIR --reference DIR --voxel FILE --json docs/results/diffusion.json "
         "--table docs/results/diffusion_table.md",
     ),
+    "coverage_rooms": (
+        "Line coverage of the tests by room",
+        "benchmarks/coverage_by_room.py before.json after.json --json docs/results/coverage_rooms.json",
+    ),
     "layout": ("The grid on the default body", "scripts/bake_layout"),
 }  # fmt: skip
 ABOUT = ("device", "cores", "memory_gb", "python", "commit", "date")
