@@ -222,8 +222,8 @@ def figures(context: bpy.types.Context) -> dict[str, float]:
     return {"panels_open": most[0][1], "sidebar_px": round(max(tabs(context).values()))}
 
 
-def main() -> None:
-    """Print the figures with one synthetic human, as after Generate Human."""
+def measured() -> dict[str, float]:
+    """The figures with one synthetic human, as after Generate Human; prints the tabs."""
     sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blender")]
     import synthetic_shape
 
@@ -243,9 +243,10 @@ def main() -> None:
         for tab, pixels in tabs(bpy.context).items():
             names = [cls.bl_label for cls in open_panels(bpy.context) if cls.bl_category == tab]
             print(f"{tab}: {pixels:.0f} px; open: {', '.join(names)}")
-        print(figures(bpy.context))
+        found = figures(bpy.context)
     blender_primdiffusion.unregister()
+    return found
 
 
 if __name__ == "__main__":
-    main()
+    print(measured())
