@@ -13,6 +13,10 @@ SOURCES = {
     "march": ("The marcher", "benchmarks/march.py --json docs/results/march.json --table docs/results/march_table.md"),
     "march_cuda": ("The marcher on a CUDA device", "benchmarks/march_cuda.py --json docs/results/march_cuda.json"),
     "extension": ("The extension on Blender 5.0 and 4.5", "benchmarks/extension.py --json docs/results/extension.json"),
+    "first_sight": (
+        "From the backend's answer to a human in Blender",
+        "benchmarks/first_sight.py --json docs/results/first_sight.json",
+    ),
     "engine": ("The engine in Blender", "benchmarks/engine.py --json docs/results/engine.json"),
     "denoisers": ("Denoisers on held-out people", "benchmarks/denoisers.py --json docs/results/denoisers.json"),
     "captures": ("Captures", "benchmarks/captures.py --assets DIR --json docs/results/captures.json"),

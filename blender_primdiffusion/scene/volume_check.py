@@ -10,6 +10,7 @@ import tempfile
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 _SIZE = 8
 
@@ -17,8 +18,7 @@ _SIZE = 8
 def draws_volumes(folder: Path) -> bool:
     """Render a cube of shining fog before a black world, in an empty file. Raises RuntimeError without Cycles."""
     bpy.utils.expose_bundled_modules()
-    import numpy as np
-    import openvdb  # both need the line above
+    import openvdb  # needs the line above
 
     fog = openvdb.FloatGrid()
     fog.name, fog.gridClass = "density", openvdb.GridClass.FOG_VOLUME
