@@ -24,9 +24,9 @@ from primdiffusion.human_file import export_for_blender
 from record import command_line, report
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from blender_primdiffusion.scene.body_file import shape_model_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.reshape import reshape
-from blender_primdiffusion.scene.shape import shape_model_of
 
 MOVES, QUICK_MOVES = 30, 5
 

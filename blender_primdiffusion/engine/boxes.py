@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
+from ..scene.body_file import read_body_file
 from ..scene.human_file import HumanPayload, file_version, read_sizes
-from ..scene.shape import SAME_BETAS, ShapeModel, box_growth, read_body_file, tangent_frames
+from ..scene.shape import SAME_BETAS, ShapeModel, box_growth, tangent_frames
 from .picture import PosedHuman
 
 JOINTS = len(JOINT_NAMES)

@@ -73,13 +73,13 @@ void main()
 
 @dataclasses.dataclass(frozen=True)
 class ViewLook:
-    """How a 3D view shows people."""
+    """How a 3D view shows humans."""
 
     window_matrix: NDArray[np.float64]
     """[4, 4], OpenGL's projection."""
     opacity: float = 1.0
     xray: bool = False
-    """Objects do not hide people."""
+    """Objects do not hide humans."""
     planes: NDArray[np.float32] = dataclasses.field(default_factory=lambda: NO_PLANES)
     """Clipping planes [N, 4] in the view's space; what is on their negative side is not drawn."""
     frame: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)

@@ -74,7 +74,7 @@ class GpuMarch:
     """A picture that is marched in slices; `colour` and `depth` are complete when `advance` returns True.
 
     Pictures have their bottom row first. `colour` is RGBA16F, linear and premultiplied; `depth` R32F, metres along the
-    optical axis to where people are half opaque, 1e10 where they are not.
+    optical axis to where humans are half opaque, 1e10 where they are not.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class GpuMarch:
 
 
 class GpuMarcher:
-    """Compiled shaders, and the common atlas of the people that were marched last. Needs a GPU context."""
+    """Compiled shaders, and the common atlas of the humans that were marched last. Needs a GPU context."""
 
     def __init__(self) -> None:
         """Raises RuntimeError where there are no compute shaders or they do not compile."""
@@ -172,35 +172,35 @@ class GpuMarcher:
             "march": gpu_shaders.march_shader(),
             "copy": gpu_shaders.copy_shader(),
         }
-        self._people: tuple[GpuPayload, ...] = ()
+        self._humans: tuple[GpuPayload, ...] = ()
         self._atlas: gpu.types.GPUTexture | None = None
 
     def march(
         self,
-        people: Sequence[tuple[GpuPayload, Boxes]],
+        humans: Sequence[tuple[GpuPayload, Boxes]],
         view: PinholeView,
         step: float,
         ends: gpu.types.GPUTexture | None = None,
     ) -> GpuMarch:
-        """Prepare the picture of `people` from `view`; `advance` marches it. `step` is the distance in metres between
-        samples through large boxes of people of natural size.
+        """Prepare the picture of `humans` from `view`; `advance` marches it. `step` is the distance in metres between
+        samples through large boxes of humans of natural size.
 
-        Overlapping boxes are mixed at lattice points, also those of several people. `ends` holds, as `GpuMarch.depth`
+        Overlapping boxes are mixed at lattice points, also those of several humans. `ends` holds, as `GpuMarch.depth`
         does, where each pixel's ray ends at other objects.
         """
-        spacing, strides = _lattice([boxes.density_scale for _, boxes in people], step)
-        size = (ACROSS * VOXELS, max([payload.rows for payload, _ in people], default=1) * VOXELS)
-        atlas_size = (*size, max(len(people), 1) * VOXELS)
-        records = _all_records(people, view, spacing, strides, atlas_size[1] // VOXELS)
-        return GpuMarch(self._shaders, self._common(people, atlas_size), atlas_size, records, view, spacing, ends)
+        spacing, strides = _lattice([boxes.density_scale for _, boxes in humans], step)
+        size = (ACROSS * VOXELS, max([payload.rows for payload, _ in humans], default=1) * VOXELS)
+        atlas_size = (*size, max(len(humans), 1) * VOXELS)
+        records = _all_records(humans, view, spacing, strides, atlas_size[1] // VOXELS)
+        return GpuMarch(self._shaders, self._common(humans, atlas_size), atlas_size, records, view, spacing, ends)
 
-    def _common(self, people: Sequence[tuple[GpuPayload, Boxes]], size: tuple[int, int, int]) -> gpu.types.GPUTexture:
-        """One atlas of all people, a layer of bricks for each."""
-        payloads = tuple(payload for payload, _ in people)
+    def _common(self, humans: Sequence[tuple[GpuPayload, Boxes]], size: tuple[int, int, int]) -> gpu.types.GPUTexture:
+        """One atlas of all humans, a layer of bricks for each."""
+        payloads = tuple(payload for payload, _ in humans)
         if len(payloads) == 1:
             return payloads[0].texture
-        if self._atlas is None or payloads != self._people:
-            self._people, self._atlas = payloads, gpu.types.GPUTexture(size, format="RGBA16F")
+        if self._atlas is None or payloads != self._humans:
+            self._humans, self._atlas = payloads, gpu.types.GPUTexture(size, format="RGBA16F")
             shader = self._shaders["copy"]
             for number, payload in enumerate(payloads):
                 shader.bind()
@@ -232,11 +232,11 @@ def _lattice(density_scales: list[float], step: float) -> tuple[float, list[int]
 
 
 def _all_records(
-    people: Sequence[tuple[GpuPayload, Boxes]], view: PinholeView, spacing: float, strides: list[int], rows: int
+    humans: Sequence[tuple[GpuPayload, Boxes]], view: PinholeView, spacing: float, strides: list[int], rows: int
 ) -> NDArray[np.float64]:
     """Records [N, TEXELS, 4] of all boxes with content in the view, in the order of their first lattice points; `rows`
     is the height of an atlas layer in bricks."""
-    parts = [_records(payload, boxes, view, spacing, strides) for payload, boxes in people]
+    parts = [_records(payload, boxes, view, spacing, strides) for payload, boxes in humans]
     for number, (part, shown) in enumerate(parts):
         part[:, 6, 3] = number * rows * ACROSS + shown
     records = np.concatenate([part for part, _ in parts]) if parts else np.zeros((0, TEXELS, 4))

@@ -251,7 +251,7 @@ def march_shader() -> gpu.types.GPUShader:
 
 
 def copy_shader() -> gpu.types.GPUShader:
-    """Copies the atlas of one person into layers of a common one."""
+    """Copies the atlas of one human into layers of a common one."""
     info = gpu.types.GPUShaderCreateInfo()
     info.sampler(0, "FLOAT_3D", "one")
     info.image(0, "RGBA16F", "FLOAT_3D", "atlas_image", qualifiers={"WRITE"})

@@ -67,7 +67,7 @@ class ShownHuman:
 class SceneReading:
     """What a 3D view shows besides Blender's objects."""
 
-    people: dict[object, ShownHuman]
+    humans: dict[object, ShownHuman]
     """By what their pictures depend on."""
     bones: NDArray[np.float64]
     """Ends of the bones that are shown in front [N, 2, 3], Blender's world."""
@@ -121,15 +121,15 @@ class Overlay:
 
     def _draw(self, context: bpy.types.Context, marcher: GpuMarcher) -> None:
         reading = self.reading(context)
-        if not reading.people:
+        if not reading.humans:
             return
         region, around = context.region, context.region_data
         size, step = (region.width, region.height), context.scene.primdiffusion_render.step
         window, to_view = (np.array(matrix, np.float64) for matrix in (around.window_matrix, around.view_matrix))
-        placed = [human.placed for human in reading.people.values()]
-        subject = np.mean([human.pose.pelvis for human in reading.people.values()], 0)
+        placed = [human.placed for human in reading.humans.values()]
+        subject = np.mean([human.pose.pelvis for human in reading.humans.values()], 0)
         view = view_from_matrices(window, to_view, _clip(window), size, subject)
-        key = (tuple(reading.people), window.tobytes(), to_view.tobytes(), size, step)
+        key = (tuple(reading.humans), window.tobytes(), to_view.tobytes(), size, step)
         request = MarchRequest(key, view, lambda view: marcher.march(placed, view, step))
         picture = self._picture_of(region)
         if reading.complete:
@@ -180,7 +180,7 @@ class Overlay:
     def object_at(self, context: bpy.types.Context, x: int, y: int) -> bpy.types.Object | None:
         """The object whose human is under a pixel of the region; None where another object is in front."""
         picture, reading = self._regions.get(context.region.as_pointer()), self.reading(context)
-        if picture is None or picture.shown is None or not reading.people:
+        if picture is None or picture.shown is None or not reading.humans:
             return None
         depth = np.asarray(picture.shown.picture.depth.read(), np.float32)
         row = y * depth.shape[0] // context.region.height
@@ -193,7 +193,7 @@ class Overlay:
         hit = context.scene.ray_cast(context.evaluated_depsgraph_get(), origin, ray.normalized(), distance=ray.length)
         if hit[0] and not context.space_data.shading.show_xray:
             return None
-        return min(reading.people.values(), key=lambda human: _distance(human.placed[1], point)).obj
+        return min(reading.humans.values(), key=lambda human: _distance(human.placed[1], point)).obj
 
     def reading(self, context: bpy.types.Context) -> SceneReading:
         """What the space shows."""
@@ -204,7 +204,7 @@ class Overlay:
         return self._readings[key]
 
     def _read(self, depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D) -> SceneReading:
-        people: dict[object, ShownHuman] = {}
+        humans: dict[object, ShownHuman] = {}
         candidates: list[tuple[bpy.types.Object, bpy.types.Collection, PosedHuman | Exception]] = []
         bones, drawn = [np.zeros((0, 2, 3))], set[bpy.types.Object]()
         self.error, complete, end = "", True, time.monotonic() + READING_S
@@ -221,18 +221,18 @@ class Overlay:
             try:
                 if isinstance(pose, Exception):
                     raise pose
-                key, known = _key(pose), studio.gpu_people().holds(pose)
-                placed = self._placed.get(key) or studio.gpu_people().placed(pose)
+                key, known = _key(pose), studio.gpu_humans().holds(pose)
+                placed = self._placed.get(key) or studio.gpu_humans().placed(pose)
             except (ValueError, OSError) as error:
                 self.error = str(error)
                 continue
-            people[key] = ShownHuman(obj, pose, placed)
+            humans[key] = ShownHuman(obj, pose, placed)
             if not known and time.monotonic() > end:
                 complete = False
                 break
-        studio.gpu_people().keep_only(human.pose for human in people.values())
-        self._placed = {key: human.placed for key, human in people.items()}
-        return SceneReading(people, np.concatenate(bones), complete)
+        studio.gpu_humans().keep_only(human.pose for human in humans.values())
+        self._placed = {key: human.placed for key, human in humans.items()}
+        return SceneReading(humans, np.concatenate(bones), complete)
 
     def _picture_of(self, region: bpy.types.Region) -> GpuRefinement:
         address = region.as_pointer()

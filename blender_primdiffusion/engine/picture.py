@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
+from ..scene.body_file import BODY_FILE, body_file
 from ..scene.convention import transforms_to_backend
 from ..scene.human import BETAS, MARK, person_file
-from ..scene.shape import BODY_FILE, body_file
 from .solids import scene_solids, stored, visible_instances
 
 SMALLEST_SCALE = 1e-4

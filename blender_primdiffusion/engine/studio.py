@@ -11,8 +11,8 @@ from ..places import new_backend, preference
 from .frames import SharedFrames
 
 if TYPE_CHECKING:
+    from .gpu_humans import GpuHumans
     from .gpu_march import GpuMarcher
-    from .gpu_people import GpuPeople
 
 frames = SharedFrames()
 """For all renders and viewports."""
@@ -42,11 +42,11 @@ def gpu_marcher() -> GpuMarcher | str:
 
 
 @functools.cache
-def gpu_people() -> GpuPeople:
+def gpu_humans() -> GpuHumans:
     """The humans on the GPU."""
-    from .gpu_people import GpuPeople  # as above
+    from .gpu_humans import GpuHumans  # as above
 
-    return GpuPeople()
+    return GpuHumans()
 
 
 def advance() -> None:

@@ -136,8 +136,8 @@ class Viewport:
         if self._gpu_scene is None or self._gpu_scene[0] != key:
             if self._solids is not None and self._gpu_solids is None:
                 self._gpu_solids = GpuSolids(self._solids)
-            humans = [studio.gpu_people().placed(human) for human in picture.people]
-            studio.gpu_people().keep_only(picture.people)
+            humans = [studio.gpu_humans().placed(human) for human in picture.people]
+            studio.gpu_humans().keep_only(picture.people)
             self._gpu_scene = key, GpuScene(humans, self._gpu_solids, picture.background, picture.step)
         return self._gpu_scene[1]
 

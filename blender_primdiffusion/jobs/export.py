@@ -15,13 +15,14 @@ from ..engine.picture import pose_of
 from ..motion.skeleton import unchain
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
 from ..scene.attachment import attachment_of, set_attachment
+from ..scene.body_file import BODY_FILE, shape_model_of
 from ..scene.convention import points_to_backend
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
 from ..scene.human import armature_of, person_file
 from ..scene.human_file import HumanMotion, motion_in, read_tensors, reshaped, with_motion, write_tensors
 from ..scene.merged import MergedGrid, merged_of, read_grid, write_grid
 from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy, show_textures_in_solid
-from ..scene.shape import BODY_FILE, betas_of, generated_betas, has_custom_shape, shape_model_of
+from ..scene.shape import betas_of, generated_betas, has_custom_shape
 from ..scene.surface import carrier_of, primitives_of
 from .generate import build_person
 from .queue import PREVIEW_PX, Job

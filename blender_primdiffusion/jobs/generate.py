@@ -14,11 +14,14 @@ from ..backend.requests import sentence
 from ..scene.build import build_written, next_folder, stand_at_cursor
 from ..scene.cycles import overlap_warning_in
 from ..scene.edit import select_human
-from ..scene.human import armature_of
+from ..scene.human import armature_of, humans
 from ..scene.human_npz import Destination, write_now
 from .follow import building
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .windows import bring_into_view
+
+FIRST_HUMAN_SHARE = 0.25
+"""Of a view's height: a scene's first human is framed where no view shows it taller."""
 
 
 def build_person(
@@ -36,7 +39,8 @@ def build_person(
     context.view_layer.update()  # which does not hold the human before
     if context.mode == "OBJECT":  # else the user is posing or painting
         select_human(context, collection)
-        bring_into_view(armature_of(collection).location)
+        first = len(humans(context.scene)) == 1
+        bring_into_view(armature_of(collection), FIRST_HUMAN_SHARE if first else 0.0)
     warnings = list(result.get("warnings", ()))
     if overlap := overlap_warning_in(context.scene, collection):
         warnings.append(overlap)

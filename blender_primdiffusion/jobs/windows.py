@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator
 
 import bpy
-from mathutils import Vector
+from mathutils import Matrix, Vector
 
 _IN_THE_WAY = {"UNDO", "BLOCKING", "GRAB_CURSOR", "GRAB_CURSOR_X", "GRAB_CURSOR_Y"}
 """Options of modal operators that block the scene or the mouse; others (screencasts) may run for ever."""
@@ -58,13 +58,16 @@ def redraw() -> None:
                     region.tag_redraw()
 
 
-def bring_into_view(point: Vector) -> None:
-    """Turn the first 3D viewport to the selection, unless one shows `point` [3] (world) or looks through a camera."""
+def bring_into_view(obj: bpy.types.Object, least: float) -> None:
+    """Turn the first 3D viewport to the selection, unless one shows `obj` on more than the share `least` of its height,
+    or looks through a camera."""
     if bpy.app.background:
         return
     windows = bpy.context.window_manager.windows
     areas = [(window, area) for window in windows for area in window.screen.areas if area.type == "VIEW_3D"]
-    if areas and not any(_shows(area.spaces.active.region_3d, point) for _, area in areas):
+    views = [area.spaces.active.region_3d for _, area in areas]
+    cameras = any(view.view_perspective == "CAMERA" for view in views)
+    if areas and not cameras and max(share_of_height(view.perspective_matrix, obj) for view in views) <= least:
         window, area = areas[0]
         region = next(region for region in area.regions if region.type == "WINDOW")
         with bpy.context.temp_override(window=window, area=area, region=region):
@@ -72,6 +75,11 @@ def bring_into_view(point: Vector) -> None:
             bpy.ops.view3d.view_selected()
 
 
-def _shows(view: bpy.types.RegionView3D, point: Vector) -> bool:
-    x, y, _, w = view.perspective_matrix @ point.to_4d()
-    return view.view_perspective == "CAMERA" or (w > 0 and max(abs(x), abs(y)) < w)
+def share_of_height(perspective: Matrix, obj: bpy.types.Object) -> float:
+    """The share of a view's height that an object's bounding box takes; 0 where its middle is not in the view."""
+    corners = [perspective @ (obj.matrix_world @ Vector(corner)).to_4d() for corner in obj.bound_box]
+    if min(corner.w for corner in corners) <= 0:
+        return 0.0
+    x, y = ([corner[axis] / corner.w for corner in corners] for axis in (0, 1))
+    inside = all(abs(min(values) + max(values)) < 2 for values in (x, y))
+    return (max(y) - min(y)) / 2 if inside else 0.0

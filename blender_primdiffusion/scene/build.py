@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from .armature import build_armature
 from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT, volumes_may_wait
+from .body_file import saved_body
 from .convention import frames_to_blender, matrix_to_quaternion, points_to_blender
 from .human import (
     BETAS,
@@ -32,7 +33,6 @@ from .human import (
 )
 from .human_npz import Destination, WrittenHuman, write_now
 from .material import volume_material
-from .shape import saved_body
 
 GAP_M = 0.2
 """Between the hands of two humans in the T pose."""

@@ -14,6 +14,7 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
+from .body_file import BODY_FILE, BODY_NPZ, body_files
 from .human import (
     HOME,
     MARK,
@@ -33,7 +34,6 @@ from .human import (
     unwritten_in,
     volume_path,
 )
-from .shape import BODY_FILE, BODY_NPZ, body_files
 
 _PERSON_FILES = re.compile(r"person(_[0-9a-f]{12})?\.human\.safetensors")
 _OURS = (PRIMITIVE_VDB, _PERSON_FILES, BODY_NPZ, MERGED_VDB, UNWRITTEN_NPZ)
@@ -117,8 +117,8 @@ def unused(folder: Path) -> list[Path]:
     found = []
     for path in sorted(folder.rglob("*")):
         named_so = any(pattern.fullmatch(path.name) for pattern in _OURS)
-        awaited = UNWRITTEN_NPZ.fullmatch(path.name) and path.parent.resolve() in later
-        if named_so and path.name not in in_use and path.resolve() not in used and not awaited:
+        needed = UNWRITTEN_NPZ.fullmatch(path.name) and path.parent.resolve() in later
+        if named_so and path.name not in in_use and path.resolve() not in used and not needed:
             found.append(path)
     return found
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .attachment import volumes_may_wait
+from .body_file import saved_body
 from .human import (
     MARK,
     PERSON,
@@ -27,7 +28,7 @@ from .human import (
 from .human_npz import Destination, WrittenHuman
 from .proxy import follow_shape, proxy_of
 from .reshape import apply_growth, apply_rest, check_shapeable
-from .shape import SAME_BETAS, Rest, betas_of, generated_betas, has_custom_shape, saved_body
+from .shape import SAME_BETAS, Rest, betas_of, generated_betas, has_custom_shape
 from .volumes import reload_volume
 
 

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import ArrayFileError, array_names, check_shapes, read_arrays
 from ..formats.joints import JOINT_NAMES, PARENTS
+from .body_file import body_file_name, saved_body_file
 from .cycles import max_overlap
-from .shape import FIELDS, OPTIONAL_FIELDS, ShapeModel, body_file_name, faulty_field, saved_body_file
+from .shape import FIELDS, OPTIONAL_FIELDS, ShapeModel, faulty_field
 from .volumes import VOXELS, Grids, bake, file_name, remove_empty, staged
 
 FORMAT_VERSION = 2

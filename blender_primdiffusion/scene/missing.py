@@ -15,6 +15,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
+from .body_file import BODY_FILE
 from .human import (
     HOME,
     MARK,
@@ -31,7 +32,7 @@ from .human import (
     volume_path,
 )
 from .human_file import read_tensors
-from .shape import BODY_FILE, generated_betas
+from .shape import generated_betas
 
 _DEEPEST = 6
 _MOST_FOLDERS = 20_000

@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import ArrayFileError, check_shapes, read_arrays
 from ..formats.joints import JOINT_NAMES
+from .body_file import shape_model_of
 from .build import build_body_mesh
 from .convention import points_to_blender
 from .human import BODY_MARK, armature_of, own_data, person_file_name
-from .shape import SAME_BETAS, ShapeModel, shape_model_of
+from .shape import SAME_BETAS, ShapeModel
 
 PROXY_MARK = "primdiffusion_proxy"
 """Custom property of a proxy: the human's file that it was made from and the shape that it shows, as JSON."""

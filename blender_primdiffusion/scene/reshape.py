@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
 from .armature import move_rest_joints
+from .body_file import shape_model_of
 from .convention import frames_to_blender, matrix_to_quaternion, points_to_blender
 from .human import BETA_COUNT, BETAS, LARGEST_BETA, armature_of, body_of, own_data, volumes_of
 from .proxy import follow_shape, proxy_of
-from .shape import Rest, generated_betas, shape_model_of
+from .shape import Rest, generated_betas
 from .surface import scale_surface
 
 _FLOOR_TOLERANCE = 1e-3

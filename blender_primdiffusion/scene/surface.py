@@ -16,8 +16,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from .body_file import shape_model_of
 from .human import armature_of, body_of, own_data, volumes_of
-from .shape import ShapeModel, betas_of, generated_betas, shape_model_of
+from .shape import ShapeModel, betas_of, generated_betas
 
 MARK = "primdiffusion_surface"
 """Custom property of a carrier."""

@@ -58,7 +58,8 @@ class PRIMDIFFUSION_OT_reshape(_Shape, bpy.types.Operator):
     def betas_for(self, _context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
         import numpy as np  # needs numpy
 
-        from ..scene.shape import betas_of, betas_of_measures, shape_model_of  # needs numpy
+        from ..scene.body_file import shape_model_of  # needs numpy
+        from ..scene.shape import betas_of, betas_of_measures  # needs numpy
 
         given = self.properties.is_property_set
         betas = np.array(self.betas) if given("betas") else betas_of(person)
@@ -116,7 +117,8 @@ class PRIMDIFFUSION_OT_copy_shape(_Shape, bpy.types.Operator):
     )
 
     def betas_for(self, context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
-        from ..scene.shape import betas_of, shape_model_of  # needs numpy
+        from ..scene.body_file import shape_model_of  # needs numpy
+        from ..scene.shape import betas_of  # needs numpy
 
         picked = context.scene.primdiffusion_edit.other
         if not self.source and picked is None:
@@ -157,8 +159,9 @@ class PRIMDIFFUSION_PT_shape(_InHuman, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         # needs numpy
+        from ..scene.body_file import shape_model_of
         from ..scene.reshape import check_shapeable
-        from ..scene.shape import shape_model_of, slider_names
+        from ..scene.shape import slider_names
 
         layout = property_columns(self.layout)
         person = selected_person(context)

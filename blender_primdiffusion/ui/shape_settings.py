@@ -26,7 +26,8 @@ def person_of(armature: bpy.types.Object) -> bpy.types.Collection:
 
 def measures_of(armature: bpy.types.Object) -> BodyMeasures:
     """Height and weight as set by the sliders. Raises ValueError or FileNotFoundError where they are unknown."""
-    from ..scene.shape import betas_of, measure, shape_model_of  # needs numpy
+    from ..scene.body_file import shape_model_of  # needs numpy
+    from ..scene.shape import betas_of, measure  # needs numpy
 
     person = person_of(armature)
     return measure(shape_model_of(person), betas_of(person))
@@ -93,8 +94,9 @@ def set_measures(person: bpy.types.Collection, height: float | None = None, weig
     Raises ValueError where no body has these, and as `reshape`.
     """
     # needs numpy
+    from ..scene.body_file import shape_model_of
     from ..scene.reshape import reshape
-    from ..scene.shape import betas_of, betas_of_measures, shape_model_of
+    from ..scene.shape import betas_of, betas_of_measures
 
     return reshape(person, betas_of_measures(shape_model_of(person), betas_of(person), height, weight))
 

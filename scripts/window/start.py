@@ -8,6 +8,8 @@ from pathlib import Path
 import bpy
 from press import Steps, press, wait
 
+FIRST_SEED, SECOND_SEED = 3, 53
+
 
 def begin(module: str, python: str) -> Steps:
     bpy.ops.wm.read_homefile(use_factory_startup=True)

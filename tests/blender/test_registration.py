@@ -17,10 +17,10 @@ ROOT = Path(__file__).parents[2]
 MOST_MODULES = 120
 """Of ours. Each costs about half a millisecond; what works, as against what is drawn, is imported when asked for."""
 LATE = (
-    "scene.build", "scene.edit", "scene.merged", "scene.shape", "scene.surface", "scene.volumes", "scene.human_npz",
-    "scene.collect", "scene.human_file", "scene.proxy", "scene.reshape", "capture.settings", "formats.camera_rig",
-    "motion.poses", "engine.viewport", "engine.studio", "jobs.generate", "jobs.edit", "jobs.assets", "jobs.export",
-    "ui.motion_placing",
+    "scene.build", "scene.edit", "scene.merged", "scene.shape", "scene.body_file", "scene.surface", "scene.volumes",
+    "scene.human_npz", "scene.collect", "scene.human_file", "scene.proxy", "scene.reshape", "capture.settings",
+    "formats.camera_rig", "motion.poses", "engine.viewport", "engine.studio", "jobs.generate", "jobs.edit",
+    "jobs.assets", "jobs.export", "ui.motion_placing",
 )  # fmt: skip
 """Modules of ours that registering must not import: they bring others along, or numpy."""
 OWNERS = (
@@ -79,7 +79,7 @@ def _keymaps() -> Iterator[str]:
 
 
 def traces() -> set[str]:
-    """What of ours, or of anybody's, Blender knows now."""
+    """What Blender knows now, of this extension and of others."""
     found = {*_handlers(), *_drawn_into(), *_keymaps()}
     found |= {f"type {name}" for name in dir(bpy.types) if "primdiffusion" in name.lower()}
     found |= {f"operator {name}" for name in dir(bpy.ops.primdiffusion)}

@@ -15,10 +15,10 @@ from engine_stage import PYTHON, ROOT
 
 from blender_primdiffusion.engine.boxes import boxes_of
 from blender_primdiffusion.engine.picture import PosedHuman
+from blender_primdiffusion.scene.body_file import read_body_file, saved_body_file
 from blender_primdiffusion.scene.human_file import HumanTensors, file_version, read_payload, read_sizes, read_tensors
 from blender_primdiffusion.scene.human_file import write_tensors as write
 from blender_primdiffusion.scene.human_npz import read_human
-from blender_primdiffusion.scene.shape import read_body_file, saved_body_file
 
 pytestmark = pytest.mark.any_blender
 CASES = 20

@@ -29,7 +29,7 @@ PARALLEL = np.array([[0.5, 0, 0, 0], [0, 0.6, 0, 0], [0, 0, -0.002, 0], [0, 0, 0
 
 
 class Uploads:
-    """In place of `GpuPeople`: a box at the pelvis for each human, without a GPU."""
+    """In place of `GpuHumans`: a box at the pelvis for each human, without a GPU."""
 
     def __init__(self):
         self.files = set()
@@ -49,7 +49,7 @@ class Uploads:
 def people(addon, tmp_path, monkeypatch):
     """Two humans whose volumes viewports hide, and the scene's overlay."""
     uploads = Uploads()
-    monkeypatch.setattr(studio, "gpu_people", lambda: uploads)
+    monkeypatch.setattr(studio, "gpu_humans", lambda: uploads)
     source = synthetic_shape.write(tmp_path / "human.npz", 12)
     found = []
     for name, x in (("Anna", 0.0), ("Bert", 1.0)):
@@ -87,7 +87,7 @@ def read(overlay):
 
 
 def names(reading) -> list[str]:
-    return sorted(human.obj.name for human in reading.people.values())
+    return sorted(human.obj.name for human in reading.humans.values())
 
 
 def test_humans_whose_volumes_or_meshes_viewports_show_are_not_drawn_twice(people):
@@ -110,7 +110,7 @@ def test_an_instance_is_drawn_and_stands_for_its_human(people):
     bpy.context.scene.collection.objects.link(empty)
     reading = read(people.overlay)
     assert names(reading) == ["Anna", "Bert", "Instance"]
-    pelvis = {human.obj.name: human.pose.pelvis for human in reading.people.values()}
+    pelvis = {human.obj.name: human.pose.pelvis for human in reading.humans.values()}
     np.testing.assert_allclose(pelvis["Instance"] - pelvis["Anna"], [3, 0, 0], atol=1e-5)
 
 
@@ -126,11 +126,11 @@ def test_a_human_without_its_file_is_named_and_the_others_are_drawn(people):
 def test_files_of_new_humans_are_read_one_after_the_other(people, monkeypatch):
     monkeypatch.setattr(module, "READING_S", -1.0)
     first = read(people.overlay)
-    assert len(first.people) == 1
+    assert len(first.humans) == 1
     assert not first.complete
     assert not people.overlay.resting
     assert people.overlay.advance()
-    assert len(people.overlay.reading(context()).people) == 2
+    assert len(people.overlay.reading(context()).humans) == 2
     assert people.overlay.advance()
     assert people.overlay.reading(context()).complete
     assert people.overlay.resting
@@ -146,7 +146,7 @@ def test_what_a_scene_shows_is_read_again_only_when_it_has_changed(people):
     assert people.overlay.reading(context()) is not reading
     armature_of(people.anna).location.x = 0.5
     moved = read(people.overlay)
-    assert len(set(moved.people) & set(reading.people)) == 1
+    assert len(set(moved.humans) & set(reading.humans)) == 1
 
 
 def test_bones_in_front_stay_visible_unless_hidden(people):

@@ -16,8 +16,8 @@ from blender_primdiffusion.jobs.follow import building, follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene import volumes
+from blender_primdiffusion.scene.body_file import shape_model_of
 from blender_primdiffusion.scene.human import folder_of, humans, person_file, volume_path
-from blender_primdiffusion.scene.shape import shape_model_of
 
 GIVES_GARBAGE = 3
 """A seed that the fake child takes as an order."""

@@ -13,6 +13,7 @@ import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 import blender_primdiffusion
+from blender_primdiffusion.jobs import generate
 from blender_primdiffusion.jobs import queue as queue_module
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
@@ -44,6 +45,15 @@ def test_generate_builds_a_person_and_keeps_the_backends_file_beside_its_volumes
     assert error_of("generate") == ""
     assert queue.info["device_name"] == "fake device"
     assert set(queue.last.seconds) == {"work", "finish"}
+
+
+def test_the_view_frames_the_first_human_and_finds_others(addon, monkeypatch):
+    asked = []
+    monkeypatch.setattr(generate, "bring_into_view", lambda obj, least: asked.append((obj, least)))
+    for seed in (7, 8):
+        bpy.ops.primdiffusion.generate(seed=seed, steps=1)
+    first, second = humans(addon.scene)
+    assert asked == [(armature_of(first), generate.FIRST_HUMAN_SHARE), (armature_of(second), 0.0)]
 
 
 def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_job(addon):

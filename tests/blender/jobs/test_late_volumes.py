@@ -176,7 +176,7 @@ def test_the_first_picture_by_cycles_shows_the_human(person, tmp_path):
 def test_undo_redo_and_work_again(in_each_state):
     bpy.ops.ed.undo()
     assert not humans(bpy.context.scene)
-    assert not late_volumes.work(0.0), "nobody is there to be written"
+    assert not late_volumes.work(0.0), "no human is left to write"
     bpy.ops.ed.redo()
     (person,) = humans(bpy.context.scene)
     advance("written")
@@ -292,7 +292,7 @@ def test_collected_files_include_what_is_still_to_be_written(in_each_state, tmp_
     assert paths_of(in_each_state)[0].parent == tmp_path / "other_humans" / "Human"
 
 
-def test_what_is_awaited_is_no_unused_file_and_what_nobody_awaits_is(person):
+def test_the_source_of_unwritten_volumes_is_unused_once_no_human_needs_it(person):
     source = unwritten_in(folder_of(person))
     assert not unused(humans_folder())
     ops.delete_human(human=person.name)

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import synthetic_shape
 
+from blender_primdiffusion.scene.body_file import BODY_FILE
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import person_file
 from blender_primdiffusion.scene.human_file import HumanTensors, read_tensors, write_tensors
 from blender_primdiffusion.scene.reshape import reshape
-from blender_primdiffusion.scene.shape import BODY_FILE, betas_of
+from blender_primdiffusion.scene.shape import betas_of
 
 COUNT = 12
 CHANGE = np.eye(10)[0] * 2.0 - np.eye(10)[1]

@@ -10,10 +10,10 @@ import synthetic
 import synthetic_shape
 
 from blender_primdiffusion.scene import build
+from blender_primdiffusion.scene.body_file import shape_model_of
 from blender_primdiffusion.scene.build import build_human, build_written, next_folder
 from blender_primdiffusion.scene.human import VolumeWriteError, folder_of, volume_path
 from blender_primdiffusion.scene.human_npz import Destination, HumanNpzError, VolumeWriter, write_now
-from blender_primdiffusion.scene.shape import shape_model_of
 
 
 @pytest.fixture

@@ -17,10 +17,11 @@ from oracle import evaluated_matrices
 from blender_primdiffusion.scene import shape
 from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.attachment import set_attachment
+from blender_primdiffusion.scene.body_file import shape_model_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of, folder_of, humans, person_file
 from blender_primdiffusion.scene.reshape import reshape
-from blender_primdiffusion.scene.shape import betas_of, generated_betas, measure, shape_model_of, slider_names
+from blender_primdiffusion.scene.shape import betas_of, generated_betas, measure, slider_names
 from blender_primdiffusion.scene.surface import node_inputs
 from blender_primdiffusion.ui.human_panel import PRIMDIFFUSION_MT_people, PRIMDIFFUSION_PT_human
 from blender_primdiffusion.ui.shape_panel import (

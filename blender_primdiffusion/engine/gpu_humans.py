@@ -1,4 +1,4 @@
-"""People of the scene for the marcher on the GPU: their payloads, uploaded once, and their boxes where they are."""
+"""Humans of the scene for the marcher on the GPU: their payloads, uploaded once, and their boxes where they are."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from .gpu_march import GpuPayload
 from .picture import PosedHuman
 
 PAYLOADS_KEPT = 4
-"""Of people who are drawn no longer; 4 MB each."""
+"""Of humans that are no longer drawn; 4 MB each."""
 
 
-class GpuPeople:
+class GpuHumans:
     """Payloads on the GPU, by file."""
 
     def __init__(self) -> None:

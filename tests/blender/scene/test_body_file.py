@@ -9,11 +9,12 @@ import synthetic
 import synthetic_shape
 
 from blender_primdiffusion.scene import build
+from blender_primdiffusion.scene.body_file import read_body_file, shape_model_of
 from blender_primdiffusion.scene.build import attach_volumes, build_human
 from blender_primdiffusion.scene.collect import collect_before_saving, unused
 from blender_primdiffusion.scene.human import folder_of, humans, remove_human
 from blender_primdiffusion.scene.human_npz import HumanNpzError, read_human
-from blender_primdiffusion.scene.shape import FIELDS, read_body_file, shape_model_of
+from blender_primdiffusion.scene.shape import FIELDS
 
 SPOILED = {
     "'shape_basis'.*instead of numbers of shape": {"shape_basis": np.zeros((7, 3, 10))},

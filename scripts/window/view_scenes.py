@@ -1,0 +1,121 @@
+"""Scenes of the 3D view: shadings, the engine's own view, and how long the window is blocked (see `scenes.py`)."""
+
+from __future__ import annotations
+
+import time
+
+import bpy
+from bpy_extras.view3d_utils import location_3d_to_region_2d
+from mathutils import Quaternion
+from panels import show, view, wide_view
+from press import Steps, press, wait
+from stalls import Stalls
+from start import FIRST_SEED, SECOND_SEED, armatures, begin, queue_of, select, with_people
+
+
+def shadings(module: str, python: str) -> Steps:
+    """Two humans among solids in each shading, turned, clipped and from the camera; clicks select them."""
+    yield from with_people(module, python, FIRST_SEED, SECOND_SEED)
+    bpy.ops.mesh.primitive_cube_add(size=0.4, location=(0.1, -0.4, 0.9))
+    bpy.ops.mesh.primitive_plane_add(size=6, location=(0, 0.15, 0), rotation=(1.4, 0, 0.3))
+    wide_view()
+    window, area = view()
+    space = area.spaces.active
+    space.overlay.show_bones = True
+    for shading in ("SOLID", "MATERIAL", "WIREFRAME"):
+        space.shading.type = shading
+        yield 20.0
+        yield f"shadings_{shading.lower()}"
+    space.shading.type, space.shading.show_xray = "SOLID", True
+    yield 5.0
+    yield "shadings_xray"
+    space.shading.show_xray = False
+    for _ in range(8):
+        space.region_3d.view_rotation = Quaternion((0, 0, 1), 0.1) @ space.region_3d.view_rotation
+        yield 0.3
+    yield "shadings_turning"
+    bpy.ops.object.select_all(action="DESELECT")
+    region = next(region for region in area.regions if region.type == "WINDOW")
+    for armature in armatures():
+        chest = armature.matrix_world @ armature.pose.bones["spine3"].head
+        x, y = location_3d_to_region_2d(region, space.region_3d, chest)
+        yield {"point": [int(region.x + x) + 9, int(window.height - region.y - y)], "click": True}
+        yield 2.0
+        selected = [obj.name for obj in bpy.context.selected_objects]
+        if selected != [armature.name]:
+            raise RuntimeError(f"a click on {armature.name} selected {selected}")
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.screen.region_quadview()
+    yield 15.0
+    yield "shadings_quad"
+
+
+def rendered(module: str, python: str) -> Steps:
+    """The engine's view: a human among solids, turned step by step, from the side in parallel, cut by a border."""
+    yield from with_people(module, python, FIRST_SEED)
+    for location, size in (((0.5, -0.2, 0.4), 0.8), ((0.0, 0.0, 0.0), 0.1)):
+        bpy.ops.mesh.primitive_cube_add(size=size, location=location)
+    bpy.context.object.scale = (30.0, 30.0, 0.01)
+    yield from rendered_view()
+    yield "rendered_still"
+    _, area = view()
+    around = area.spaces.active.region_3d
+    measured = Stalls()
+    for step in range(12):
+        around.view_rotation = Quaternion((0, 0, 1), 0.15) @ around.view_rotation
+        yield 0.3
+        if step in (0, 11):
+            yield f"rendered_turning_{step}"
+    yield 20.0
+    print(f"turning and refining: {measured.end()}", flush=True)
+    yield "rendered_turned"
+    around.view_perspective = "ORTHO"
+    space = area.spaces.active
+    space.use_render_border = True
+    space.render_border_min_x, space.render_border_max_x = 0.2, 0.7
+    space.render_border_min_y, space.render_border_max_y = 0.2, 0.8
+    yield 20.0
+    yield "rendered_parallel"
+    space.use_render_border = False
+    bpy.context.scene.primdiffusion_render.view = "ALPHA"
+    yield 30.0
+    yield "rendered_by_child"
+
+
+def stalls(module: str, python: str) -> Steps:
+    """Measures how long the window is blocked by adding two people, varying one, and dragging a slider."""
+    yield from begin(module, python)
+    yield from show("PRIMDIFFUSION_PT_generate")
+    queue = queue_of(module)
+    for seed in (FIRST_SEED, SECOND_SEED):
+        measured = Stalls()
+        press("primdiffusion.generate", seed=seed)
+        yield from wait(lambda: queue.ready or not queue.busy, 240)
+        answered, entering = time.monotonic(), Stalls()
+        yield from wait(lambda: not queue.busy, 240)
+        print(f"stands {time.monotonic() - answered:.2f} s after the answer: {entering.end()}", flush=True)
+        yield 3.0
+        print(f"adding a person: {measured.end()}", flush=True)
+    yield "stalls_person"
+    select(armatures()[0])
+    measured = Stalls()
+    press("primdiffusion.vary", seed=SECOND_SEED)
+    yield from wait(lambda: not queue.busy, 240)
+    yield 3.0
+    print(f"varying a person: {measured.end()}", flush=True)
+    settings = armatures()[0].primdiffusion_human
+    yield 2.0
+    measured = Stalls()
+    for move in range(10):
+        settings.betas[0] = 0.2 * move
+        yield 0.01
+    print(f"dragging a slider: {measured.end()}", flush=True)
+
+
+def rendered_view() -> Steps:
+    """The engine in the viewport, with a large view of the person."""
+    scene = bpy.context.scene
+    scene.render.engine = "PRIMDIFFUSION"
+    scene.view_settings.view_transform = "Standard"
+    wide_view()
+    yield 25.0
