@@ -20,11 +20,13 @@ from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec, ReleasedSlab, WholeSlab
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
+from primdiffusion.diffusion.detail import DetailCodec, DetailConfig, DetailDecoder, FineCodec
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkConfig
 from primdiffusion.diffusion.model import BETAS, STANDARD_SHAPES, DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
+from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetupError, find_body_setup
 from primdiffusion.staging import write_atomically
 
@@ -35,9 +37,9 @@ ENCODER_FORMAT = "primdiffusion-encoder"
 """Format of the files of `encoder.model`."""
 FORMAT_VERSION = 2
 _READABLE = {FORMAT: str(FORMAT_VERSION), ENCODER_FORMAT: "1"}
-_HALVED = ("codec.mean", "codec.basis", "denoiser.")
+_HALVED = ("codec.mean", "codec.basis", "denoiser.", "fine.mean", "fine.basis", "detail.")
 _WHOLE = ("prior_variance", "prior_log_weight")
-_SECTIONS = ("held_out_rms_x0_error", "limits")
+_SECTIONS = ("held_out_rms_x0_error", "held_out_rms_detail_error", "limits")
 
 
 class CheckpointError(ValueError):
@@ -57,12 +59,13 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
     architecture |= {"vocabulary": model.vocabulary.to_json()}
     if isinstance(model.codec, CellCodec):
         codec = model.codec.codec
-        tensors |= {
-            f"codec.{name}": getattr(codec, name) for name in ("mean", "basis", "parity", "weight", "dead_zone")
-        }
-        tensors |= {
-            f"shapes.{field.name}": getattr(model.shapes, field.name) for field in dataclasses.fields(ShapePrior)
-        }
+        tensors |= _fields("codec", codec)
+        if isinstance(model.codec, DetailCodec):
+            fine, decoder = model.codec.fine, model.codec.decoder
+            tensors |= _fields("fine", fine.codec) | {"back": fine.back}
+            tensors |= {f"detail.{key}": value for key, value in decoder.state_dict().items()}
+            architecture["detail"] = dataclasses.asdict(decoder.config)
+        tensors |= _fields("shapes", model.shapes)
         architecture |= {"kind": "person"}
     else:
         architecture |= {"kind": "slab"}
@@ -159,7 +162,7 @@ def _model(tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card:
     else:
         prior = PersonPrior(**under(weights, "prior_"))
         denoiser = PersonDenoiser(denoiser_config(config), prior, schedule)
-        codec = CellCodec(LinearCodec(**under(tensors, "codec.")))
+        codec = _cell_codec(tensors, architecture.get("detail"))
         if codec.shape != tuple(prior.mean.shape):
             raise RuntimeError(f"codec latents are {codec.shape}, the network expects {tuple(prior.mean.shape)}")
         shapes = ShapePrior(**under(tensors, "shapes."))
@@ -169,6 +172,19 @@ def _model(tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card:
     chain = CHAINS[architecture.get("chain", "trailing")]
     density = float(architecture["full_density"])
     return DiffusionModel(denoiser, schedule, codec, shapes, density, card, vocabulary, chain)
+
+
+def _cell_codec(tensors: Mapping[str, Tensor], detail: Mapping[str, Any] | None) -> CellCodec:
+    """The codec of latents, with its detail decoder if the checkpoint has one."""
+    codec = LinearCodec(**under(tensors, "codec."))
+    if detail is None:
+        return CellCodec(codec)
+    fine = LinearCodec(**under(tensors, "fine."))
+    config = DetailConfig(**{**detail, "widths": tuple(detail["widths"])})
+    decoder = DetailDecoder(len(codec.basis), len(fine.basis), config)
+    decoder.load_state_dict(under(tensors, "detail."))
+    decoder.eval().requires_grad_(False)
+    return DetailCodec(codec, FineCodec(fine, tensors["back"]), decoder)
 
 
 def _released_model(
@@ -253,6 +269,11 @@ def check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:
             raise CheckpointError(f"{path}: weights {key!r} hold NaN or infinite values: download or train them again")
 
 
+def _fields(prefix: str, record: TensorRecord) -> dict[str, Tensor]:
+    """The tensors of a record by their names in a checkpoint."""
+    return {f"{prefix}.{field.name}": getattr(record, field.name) for field in dataclasses.fields(record)}
+
+
 def _is_halved(key: str, value: Tensor) -> bool:
     return key.startswith(_HALVED) and value.is_floating_point() and value.ndim > 1 and not key.endswith(_WHOLE)
 
@@ -264,9 +285,6 @@ def under(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 def model_card(card: Mapping[str, Any]) -> str:
     """Return the card as Markdown, for docs/model_card.md."""
-    errors = card["held_out_rms_x0_error"]
-    levels = list(next(iter(errors.values())))
-    rows = [f"| {name} | " + " | ".join(f"{by[level]:.4f}" for level in levels) + " |" for name, by in errors.items()]
     facts = {key: value for key, value in card.items() if key not in ("name", "attributes", *_SECTIONS)}
     return "\n".join(
         [
@@ -283,16 +301,37 @@ def model_card(card: Mapping[str, Any]) -> str:
             "geometry and the same noise. `gaussian`: the closed-form denoiser of one Gaussian fitted to",
             "the training set; `mixture`: of a mixture of Gaussians; `denoiser`: this checkpoint.",
             "",
-            "| t | " + " | ".join(levels) + " |",
-            "|---" * (len(levels) + 1) + "|",
-            *rows,
+            *_error_table(card["held_out_rms_x0_error"]),
             "",
+            *_detail_section(card.get("held_out_rms_detail_error")),
             "## Limits",
             "",
             *(f"- {limit}" for limit in card.get("limits", ())),
             "",
         ]
     )
+
+
+def _error_table(errors: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Lines of a table of errors, a row for each method and a column for each t."""
+    levels = list(next(iter(errors.values())))
+    rows = [f"| {name} | " + " | ".join(f"{by[level]:.4f}" for level in levels) + " |" for name, by in errors.items()]
+    return ["| t | " + " | ".join(levels) + " |", "|---" * (len(levels) + 1) + "|", *rows]
+
+
+def _detail_section(errors: Mapping[str, Mapping[str, float]] | None) -> list[str]:
+    """Lines of the section on the detail decoder; empty for a model without."""
+    if errors is None:
+        return []
+    return [
+        "## Held-out error of the detail decoder",
+        "",
+        "Root mean square error of the finer codec's latents, from clean latents (0) and from the denoiser's guesses",
+        "at steps t. `linear`: least squares of each cell; `decoder`: this checkpoint.",
+        "",
+        *_error_table(errors),
+        "",
+    ]
 
 
 def _attribute_section(attributes: Mapping[str, Any]) -> list[str]:

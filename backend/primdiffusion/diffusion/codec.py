@@ -58,6 +58,12 @@ class LinearCodec(TensorRecord):
     dead_zone: Float[Tensor, "2"] = dataclasses.field(default_factory=lambda: torch.tensor(DEAD_ZONE))
     """Start and width, see DEAD_ZONE."""
 
+    @property
+    def zone(self) -> tuple[float, float]:
+        """`dead_zone` as numbers."""
+        start, width = self.dead_zone.tolist()
+        return start, width
+
     def encode(self, cells: Float[Tensor, "*b k v"]) -> Float[Tensor, "*b c 32 32"]:
         """Project cells onto the basis; the remainder is lost."""
         latents = (cells - self.mean) @ (self.basis * self.weight).T * SLAB_UNIT
@@ -211,16 +217,15 @@ class CellCodec:
 
     def to_payload(self, x0: Float[Tensor, "*b c h w"], full_density: float) -> Payload:
         """Decode; clamped, with the dead zone applied."""
-        return payload_from_cells(self.codec.decode(x0), full_density, self._dead_zone)
+        return payload_from_cells(self.codec.decode(x0), full_density, self.codec.zone)
 
     def from_payload(self, payload: Payload, full_density: float) -> Float[Tensor, "*b c h w"]:
         """Encode as latents; the part outside the basis is lost."""
-        return self.codec.encode(cells_from_payload(payload, full_density, self._dead_zone))
+        return self.codec.encode(cells_from_payload(payload, full_density, self.codec.zone))
 
-    @property
-    def _dead_zone(self) -> tuple[float, float]:
-        start, width = self.codec.dead_zone.tolist()
-        return start, width
+    def to(self, device: torch.device | str) -> CellCodec:
+        """The same on another device."""
+        return CellCodec(self.codec.to(device))
 
     @property
     def cell_side(self) -> int:

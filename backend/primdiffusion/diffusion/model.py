@@ -75,7 +75,7 @@ class DiffusionModel:
 
     def to(self, device: torch.device | str) -> DiffusionModel:
         """The same model on another device; moves the networks in place."""
-        codec = CellCodec(self.codec.codec.to(device)) if isinstance(self.codec, CellCodec) else self.codec
+        codec = self.codec.to(device) if isinstance(self.codec, CellCodec) else self.codec
         return dataclasses.replace(self, denoiser=self.denoiser.to(device), codec=codec, shapes=self.shapes.to(device))
 
     def condition(self, attributes: Attributes) -> Float[Tensor, "a"] | None:

@@ -25,7 +25,7 @@ from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import framing, generate_batch, place
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.staging import written_whole
-from primdiffusion.training.config import PhaseConfig, TrainingConfig
+from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.recorder import Interrupt, Recorder, StepMetrics, StepTimer
 from primdiffusion.training.run_folder import PICTURES, append_metrics
 from primdiffusion.training.state import AcceleratedState, NotFiniteError, agreed
@@ -37,6 +37,21 @@ YAW = 0.4
 """Radians."""
 STEP = 0.006
 """Metres between samples of a ray."""
+
+
+class PhaseRun(Protocol):
+    """Settings that a phase takes from its run, as in `TrainingConfig`."""
+
+    @property
+    def run(self) -> Path: ...
+    @property
+    def seed(self) -> int: ...
+    @property
+    def save_every(self) -> float: ...
+    @property
+    def log_every(self) -> int: ...
+    @property
+    def pictures_every(self) -> int: ...
 
 
 class Trainee(Protocol):
@@ -69,7 +84,7 @@ class Trainee(Protocol):
 
 
 def train_phase(
-    config: TrainingConfig, trainee: Trainee, name: str, accelerator: Accelerator, interrupt: Interrupt
+    config: PhaseRun, trainee: Trainee, name: str, accelerator: Accelerator, interrupt: Interrupt
 ) -> AcceleratedState:
     """Train one network until its last step or an interrupt, and install its average.
 
@@ -105,7 +120,7 @@ def train_phase(
     return state
 
 
-def step(config: TrainingConfig, trainee: Trainee, name: str, state: AcceleratedState) -> StepMetrics:
+def step(config: PhaseRun, trainee: Trainee, name: str, state: AcceleratedState) -> StepMetrics:
     """Run one optimiser step; its random numbers depend only on seed, phase, step and process."""
     device, phase = state.accelerator.device, trainee.phases[name]
     seed = step_seed(config.seed, name, state.step, state.accelerator.process_index)
@@ -132,7 +147,7 @@ def step_seed(seed: int, phase: str, step: int, process: int) -> int:
     return int.from_bytes(digest[:8], "big") >> 1
 
 
-def state_path(config: TrainingConfig, name: str) -> Path:
+def state_path(config: PhaseRun, name: str) -> Path:
     """Path of the saved state of a phase."""
     return config.run / f"{name}.state.safetensors"
 
@@ -147,7 +162,7 @@ class _Every:
 class PhaseRecorder(Recorder):
     """Records a phase: held-out error, and people generated with the averaged weights."""
 
-    def __init__(self, config: TrainingConfig, trainee: Trainee, name: str, state: AcceleratedState) -> None:
+    def __init__(self, config: PhaseRun, trainee: Trainee, name: str, state: AcceleratedState) -> None:
         phase = trainee.phases[name]
         every = _Every(config.log_every, phase.evaluate_every, config.pictures_every)
         super().__init__(phase.steps, every, state, name)
