@@ -244,7 +244,8 @@ class DetailTrainee:
         self.decoder = network
 
     def loss(self, name: str, generator: torch.Generator) -> Tensor:
-        """Square error of a random batch: blends of two colourings of a geometry, half of them mirrored."""
+        """Square error of a random batch, relative to that of the linear map: blends of two colourings of a geometry,
+        half of them mirrored."""
         phase, known = self.phases[name], self.prepared.train
         count, draw = phase.batch, torch.Generator().manual_seed(generator.initial_seed())
         first = torch.randint(len(known.fine), (count,), generator=draw)
@@ -263,7 +264,7 @@ class DetailTrainee:
         coarse = torch.where(mirrored, self.coarse_codec.to("cpu").mirror(coarse), coarse)
         fine = torch.where(mirrored, self.prepared.codec.mirror(fine), fine)
         error = self.decoder(coarse.to(self.device)) - fine.to(self.device)
-        return (error.square().mean(1) * self.weight).mean()
+        return (error.square().mean(1) * self.weight).mean() / self.prepared.rest_std.square().mean().to(self.device)
 
     def errors(self) -> Mapping[int, float]:
         """RMS error of held-out fine latents, from guesses at each noise level; 0 is clean latents."""
