@@ -21,6 +21,10 @@ SHAPES_CACHED = 32
 """On one body; 1.2 MB each."""
 
 
+class EarlierVersionError(ValueError):
+    """A human's files are of an earlier version and lack what places its boxes."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Boxes:
     """The boxes of a posed human; metres, the backend's axes (y up)."""
@@ -44,9 +48,9 @@ class BoxRig:
     """
 
     def __init__(self, model: ShapeModel) -> None:
-        """Raises ValueError for a model of an earlier version, without skinning."""
+        """Raises EarlierVersionError for a model without skinning."""
         if model.skin_weights is None:
-            raise ValueError(
+            raise EarlierVersionError(
                 "the body's file is of an earlier version, without skinning: edit the human, or generate it again"
             )
         self._model, used = model, model.used()
@@ -61,12 +65,17 @@ class BoxRig:
     def place(self, human: PosedHuman, payload: HumanPayload) -> Boxes:
         """The boxes of `human`, whose file holds `payload`.
 
-        Raises ValueError for a payload on another body, and for an object or joint scaled to zero.
+        Raises EarlierVersionError where neither body nor payload has the boxes' sizes, and ValueError for a payload on
+        another body, and for an object or joint scaled to zero.
         """
         own = payload.betas.astype(np.float64)
         betas = own if human.betas is None else np.array(human.betas, np.float64)
         extent = self._model.rest_half_extent if payload.rest_half_extent is None else payload.rest_half_extent
-        if extent is None or len(extent) != len(payload.delta_scale) or len(extent) != len(self._model.face):
+        if extent is None:
+            raise EarlierVersionError(
+                "the body's file is of an earlier version, without sizes of boxes: edit the human, or generate it again"
+            )
+        if len(extent) != len(payload.delta_scale) or len(extent) != len(self._model.face):
             raise ValueError(f"the body's file does not fit {human.file.name!r}: generate the human again")
         flat = np.abs(np.linalg.det(human.joints[:, :, :3])) < SMALLEST_SCALE**3
         if flat.any():
@@ -127,11 +136,13 @@ class BoxRig:
 def boxes_of(human: PosedHuman) -> Boxes:
     """The boxes of a human in the scene.
 
-    Raises FileNotFoundError or ValueError for a file of the human or its body that is missing, damaged or of an earlier
-    version, and as `BoxRig.place`.
+    Raises FileNotFoundError or ValueError for a file of the human or its body that is missing or damaged,
+    EarlierVersionError, and as `BoxRig.place`.
     """
     if human.body is None:
-        raise ValueError(f"the human of {human.file.name!r} was made by an earlier version: generate the human again")
+        raise EarlierVersionError(
+            f"the human of {human.file.name!r} was made by an earlier version: generate the human again"
+        )
     return _rig(read_body_file(human.body)).place(human, read_sizes(file_version(human.file)))
 
 

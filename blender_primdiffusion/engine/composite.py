@@ -123,7 +123,7 @@ def draw_picture(picture: GpuMarch | PictureTextures, look: ViewLook) -> None:
     clipping = gpu.types.GPUTexture((len(planes), 1), format="RGBA32F", data=texels)  # too large for push constants
     shader.uniform_sampler("planes", clipping)
     batch_for_shader(shader, "TRI_STRIP", {"pos": [(-1, -1), (1, -1), (-1, 1), (1, 1)]}).draw(shader)
-    _restore()
+    restore()
 
 
 def keep_bones(bones: NDArray, size: tuple[int, int], width: float, radius: float) -> None:
@@ -142,7 +142,7 @@ def keep_bones(bones: NDArray, size: tuple[int, int], width: float, radius: floa
     shader.bind()
     batch_for_shader(shader, "TRIS", {"pos": np.ascontiguousarray(corners, np.float32)}).draw(shader)
     gpu.state.color_mask_set(True, True, True, True)
-    _restore()
+    restore()
 
 
 def _triangles(bones: NDArray, width: float, radius: float) -> NDArray[np.float64]:
@@ -157,8 +157,8 @@ def _triangles(bones: NDArray, width: float, radius: float) -> NDArray[np.float6
     return np.concatenate([sticks, (bones.reshape(-1, 1, 2) + fan).reshape(-1, 2)])
 
 
-def _restore() -> None:
-    """What Blender expects of handlers."""
+def restore() -> None:
+    """Leave the state of drawing as Blender expects of handlers."""
     gpu.state.blend_set("NONE")
     gpu.state.depth_test_set("NONE")
     gpu.state.depth_mask_set(False)

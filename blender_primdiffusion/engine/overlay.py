@@ -22,7 +22,7 @@ from ..scene.human import BODY_MARK
 from ..scene.human_file import file_version
 from ..scene.proxy import PROXY_MARK
 from . import studio
-from .boxes import Boxes
+from .boxes import Boxes, EarlierVersionError
 from .composite import NO_PLANES, PictureTextures, ViewLook, draw_picture, keep_bones
 from .gpu_march import GpuMarcher, GpuPayload
 from .gpu_refine import GpuRefinement, MarchRequest
@@ -41,6 +41,10 @@ TICK_S = 0.02
 REGIONS_KEPT = 8
 WIREFRAME_OPACITY = 0.5
 """At least: without it, humans would be invisible, since they have no wires."""
+_EARLIER = (
+    "the human {!r} was made by an earlier version and its volumes are hidden: show these (in the Outliner, or tab "
+    "Output, Volumes in Viewport), or generate the human again"
+)
 _UNRELATED = (
     bpy.types.Mesh,
     bpy.types.Curve,
@@ -223,6 +227,9 @@ class Overlay:
                     raise pose
                 key, known = _key(pose), studio.gpu_humans().holds(pose)
                 placed = self._placed.get(key) or studio.gpu_humans().placed(pose)
+            except EarlierVersionError:
+                self.error = _EARLIER.format(owner.name)
+                continue
             except (ValueError, OSError) as error:
                 self.error = str(error)
                 continue

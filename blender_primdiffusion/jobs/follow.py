@@ -17,6 +17,7 @@ from ..backend.requests import sentence
 from ..places import missing_packages
 from .late_volumes import keep_writing
 from .memory import release_when_idle
+from .picture_in_view import follow_picture
 from .pictures import so_far
 from .queue import GONE, Entry, Job, JobOutcome, queue
 from .remedies import error_before_the_scene
@@ -213,6 +214,7 @@ def follow() -> float | None:
     if not queue.ready:
         building.close()
     changed |= so_far.show(queue.request.picture if queue.request is not None else None)
+    follow_picture()
     if changed:
         redraw()
     if queue.ready and not queue.advancing and not in_the_way():

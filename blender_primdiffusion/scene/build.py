@@ -10,7 +10,6 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
@@ -38,6 +37,8 @@ GAP_M = 0.2
 """Between the hands of two humans in the T pose."""
 _FLESH_M = 0.1
 """Around bones."""
+_NEW_FOOTPRINT = np.array([[-0.97, -0.3], [0.97, 0.12]])
+"""As `_footprint`, of a new human of medium height at the world's origin."""
 _NAME_LENGTH = 40
 _ABOUT_BETAS = "Shape of the body. The sliders in the sidebar set it; keys and drivers move the engine's picture alone"
 _KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials")
@@ -163,8 +164,8 @@ def build_body_mesh(
     body = bpy.data.objects.new(name, mesh)
     for joint, bone in enumerate(JOINT_NAMES):
         group = body.vertex_groups.new(name=bone)
-        for vertex in np.flatnonzero(skin_weights[:, joint]):
-            group.add([int(vertex)], float(skin_weights[vertex, joint]), "REPLACE")
+        for vertices_alike, weight in _by_weight(skin_weights[:, joint]):
+            group.add(vertices_alike, weight, "REPLACE")
     body.parent = armature
     modifier = body.modifiers.new("Armature", "ARMATURE")
     modifier.object = armature
@@ -173,6 +174,17 @@ def build_body_mesh(
     body.hide_render = True
     body.hide_viewport = True
     return body
+
+
+def _by_weight(weights: NDArray) -> Iterator[tuple[list[int], float]]:
+    """Vertices of the same non-zero weight, and the weight, of weights [V]."""
+    vertices = np.flatnonzero(weights)
+    vertices = vertices[np.argsort(weights[vertices], kind="stable")]
+    ordered = weights[vertices]
+    starts = np.flatnonzero(np.diff(ordered, prepend=np.nan)).tolist()
+    alike = vertices.tolist()
+    for start, end in itertools.pairwise([*starts, len(alike)]):
+        yield alike[start:end], float(ordered[start])
 
 
 def attach_volumes(
@@ -193,30 +205,41 @@ def attach_volumes(
     lines, of which there would be thousands.
     """
     hide_relationship_lines()
-    quaternions = matrix_to_quaternion(rotation)
-    folders = {folder: stored_path(folder) for folder in {path.parent for path in files}}
+    positions, quaternions = np.asarray(position).tolist(), matrix_to_quaternion(rotation).tolist()
+    paths = [os.path.split(path) for path in files]
+    folders = {folder: stored_path(Path(folder)) for folder in {folder for folder, _ in paths}}
+    targets = _targets(weights)
     labels = [f"{name}_prim_{k:04d}" for k in range(len(files))]
     volumes = [bpy.data.volumes.new(label) for label in labels]
     objects = [bpy.data.objects.new(label, volume) for label, volume in zip(labels, volumes, strict=True)]
     for k, primitive in enumerate(objects):  # a loop of its own: new data make these changes slow
         volume = volumes[k]
-        volume.filepath = os.path.join(folders[files[k].parent], files[k].name)
+        folder, file = paths[k]
+        volume.filepath = os.path.join(folders[folder], file)
         volume.render.space = "WORLD"
         volume.materials.append(material)
         primitive.parent = armature
-        primitive.matrix_parent_inverse = Matrix.Identity(4)
         primitive.rotation_mode = "QUATERNION"
-        primitive.location = position[k]
+        primitive.location = positions[k]
         primitive.rotation_quaternion = quaternions[k]
         constraint = primitive.constraints.new("ARMATURE")
         constraint.use_deform_preserve_volume = False
-        for joint in np.flatnonzero(weights[k]):
+        for bone, weight in targets[k]:
             target = constraint.targets.new()
             target.target = armature
-            target.subtarget = JOINT_NAMES[joint]
-            target.weight = weights[k, joint]
+            target.subtarget = bone
+            target.weight = weight
         collection.objects.link(primitive)
     return objects
+
+
+def _targets(weights: NDArray) -> list[list[tuple[str, float]]]:
+    """Bones and their non-zero weights for each row of weights [K, 24]."""
+    rows, joints = np.nonzero(weights)
+    found: list[list[tuple[str, float]]] = [[] for _ in weights]
+    for row, joint, weight in zip(rows.tolist(), joints.tolist(), weights[rows, joints].tolist(), strict=True):
+        found[row].append((JOINT_NAMES[joint], weight))
+    return found
 
 
 def hide_relationship_lines() -> None:
@@ -240,17 +263,23 @@ def stand_beside_others(context: bpy.types.Context, collection: bpy.types.Collec
 
     Compares the bones as posed, so it evaluates the scene if there are others. Raises ValueError as `armature_of`.
     """
-    armature = armature_of(collection)
-    others = [
-        obj
-        for human in humans(context.scene)
-        if human != collection
-        for obj in human.objects
-        if obj.type == "ARMATURE" and obj.data.bones
-    ]
+    armature, others = armature_of(collection), _armatures(context.scene, collection)
     if others:
         context.view_layer.update()
         armature.location.x += _shift(_footprint(armature), [_footprint(other) for other in others])
+
+
+def next_place(scene: bpy.types.Scene) -> NDArray[np.float64]:
+    """Where `stand_at_cursor` will put the soles of a human of medium height that is still to be built [3], metres."""
+    place = np.array(scene.cursor.location, np.float64)
+    place[0] += _shift(_NEW_FOOTPRINT + place[:2], [_footprint(other) for other in _armatures(scene)])
+    return place
+
+
+def _armatures(scene: bpy.types.Scene, but: bpy.types.Collection | None = None) -> list[bpy.types.Object]:
+    """Of the scene's humans except `but`, where they have bones."""
+    found = [obj for human in humans(scene) if human != but for obj in human.objects if obj.type == "ARMATURE"]
+    return [armature for armature in found if armature.data.bones]
 
 
 def _shift(own: NDArray[np.float64], others: list[NDArray[np.float64]]) -> float:

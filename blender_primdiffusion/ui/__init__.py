@@ -14,7 +14,7 @@ from types import ModuleType
 
 import bpy
 
-from ..jobs import cycles_check, follow, late_volumes, missing_files
+from ..jobs import cycles_check, follow, late_volumes, missing_files, picture_in_view
 from . import (
     assets_panel,
     attributes,
@@ -47,7 +47,8 @@ MODULES = (
     translations, setup_operators, preferences, follow, cycles_check, jobs_panel, attributes, generate_panel,
     variations_panel, human_panel, shape_settings, edit_panel, shape_panel, missing_files, late_volumes,
     import_motion, motion_panel, pose_panel, assets_panel, render_operators, render_panel, captures_settings,
-    captures_panel, reconstruct_panel, export_operators, export_panel, viewport_humans, batch, manual,
+    captures_panel, reconstruct_panel, export_operators, export_panel, viewport_humans, picture_in_view,
+    batch, manual,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
 

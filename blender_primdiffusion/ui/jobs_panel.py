@@ -14,6 +14,7 @@ from ..backend.redact import redact
 from ..jobs import follow, memory
 from ..jobs.follow import Reporting, building, redraw, submit
 from ..jobs.memory import device_line
+from ..jobs.picture_in_view import follow_picture
 from ..jobs.pictures import so_far
 from ..jobs.queue import queue
 from ..places import EXTENSION, backend_module_path, preference
@@ -209,6 +210,7 @@ def drop_before_loading(*_: object) -> None:
     queue.drop()
     building.close()
     so_far.show(None)
+    follow_picture()
 
 
 @persistent

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from engine_stage import PYTHON, ROOT
 
-from blender_primdiffusion.engine.boxes import boxes_of
+from blender_primdiffusion.engine.boxes import EarlierVersionError, boxes_of
 from blender_primdiffusion.engine.picture import PosedHuman
 from blender_primdiffusion.scene.body_file import read_body_file, saved_body_file
 from blender_primdiffusion.scene.human_file import HumanTensors, file_version, read_payload, read_sizes, read_tensors
@@ -82,7 +82,7 @@ def test_a_body_of_an_earlier_version_is_rejected_in_a_sentence(plain, tmp_path)
     early = dataclasses.replace(plain.model, skin_weights=None, rest_half_extent=None)
     with saved_body_file(early, tmp_path) as name, pytest.raises(ValueError, match="earlier version"):
         boxes_of(posed(plain, body=tmp_path / name))
-    with pytest.raises(ValueError, match="earlier version"):
+    with pytest.raises(EarlierVersionError):
         boxes_of(posed(plain, body=None))
 
 

@@ -14,12 +14,15 @@ from mathutils import Matrix
 
 from blender_primdiffusion.engine import overlay as module
 from blender_primdiffusion.engine import studio
-from blender_primdiffusion.engine.boxes import Boxes
+from blender_primdiffusion.engine.boxes import Boxes, boxes_of
 from blender_primdiffusion.engine.overlay import Overlay
 from blender_primdiffusion.engine.view import NO_SURFACE_M
+from blender_primdiffusion.scene.attachment import show_in_viewport
+from blender_primdiffusion.scene.body_file import shape_model_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_backend
 from blender_primdiffusion.scene.human import armature_of, body_of, person_file
+from blender_primdiffusion.scene.shape import OPTIONAL_FIELDS
 from blender_primdiffusion.ui.viewport_humans import PRIMDIFFUSION_OT_click_human
 
 SIZE = (40, 30)
@@ -120,6 +123,24 @@ def test_a_human_without_its_file_is_named_and_the_others_are_drawn(people):
     assert "Anna" in people.overlay.error
     volumes_of(people.anna).hide_viewport = False
     assert names(read(people.overlay)) == ["Bert"]
+    assert people.overlay.error == ""
+
+
+def test_the_view_says_how_to_see_a_human_of_an_earlier_version(people, monkeypatch):
+    def placed(pose):
+        return None, boxes_of(pose)
+
+    monkeypatch.setattr(studio.gpu_humans(), "placed", placed)
+    # the body's file as the extension first wrote it: the synthetic human has none of OPTIONAL_FIELDS
+    assert not set(shape_model_of(people.anna).arrays()) & set(OPTIONAL_FIELDS)
+    volumes_of(people.bert).hide_viewport = False
+    read(people.overlay)
+    assert people.overlay.error == (
+        "the human 'Anna' was made by an earlier version and its volumes are hidden: show these (in the Outliner, or "
+        "tab Output, Volumes in Viewport), or generate the human again"
+    )
+    show_in_viewport(people.anna, True)
+    assert names(read(people.overlay)) == []
     assert people.overlay.error == ""
 
 

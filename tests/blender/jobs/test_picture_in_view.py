@@ -1,0 +1,135 @@
+"""A new human's picture in the 3D views: where, in which ones, and how long."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+import synthetic
+from jobs_driven import drive, error_of, until_running
+
+import blender_primdiffusion
+from blender_primdiffusion.engine import billboard
+from blender_primdiffusion.jobs import picture_in_view as module
+from blender_primdiffusion.jobs.follow import follow
+from blender_primdiffusion.jobs.generate import GenerateJob
+from blender_primdiffusion.jobs.picture_in_view import picture_in_view
+from blender_primdiffusion.jobs.pictures import so_far
+from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.scene.build import build_human
+
+pytestmark = pytest.mark.any_blender
+DIES, TAKES_LONG = 1, 4
+"""Seeds that the fake child takes as orders."""
+LEVEL = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""A view along +y."""
+
+
+def context(shading="SOLID", overlays=True, local_view=None) -> SimpleNamespace:
+    """As in the draw handler of a region."""
+    space = SimpleNamespace(
+        local_view=local_view,
+        shading=SimpleNamespace(type=shading),
+        overlay=SimpleNamespace(show_overlays=overlays),
+    )
+    return SimpleNamespace(scene=bpy.context.scene, space_data=space, region_data=SimpleNamespace(view_matrix=LEVEL))
+
+
+def shown() -> bool:
+    return picture_in_view.drawn_in(context())
+
+
+@pytest.fixture
+def redraws(monkeypatch) -> list[bool]:
+    """Whether a picture is shown at each redrawing of the 3D views."""
+    found = []
+    monkeypatch.setattr(module, "redraw_views", lambda: found.append(shown()))
+    return found
+
+
+@pytest.fixture
+def denoising(addon, redraws):
+    """The context of a job whose first picture has come."""
+    queue.add(addon, GenerateJob(TAKES_LONG, 5))
+    until_running()
+    follow()
+    assert shown()
+    return addon
+
+
+def test_the_picture_goes_when_the_job_is_cancelled(denoising, redraws):
+    bpy.ops.primdiffusion.cancel()
+    drive()
+    assert not shown()
+    assert redraws == [True, False], "once for each picture, and once without"
+
+
+def test_the_picture_goes_when_the_job_fails(addon, redraws):
+    queue.add(addon, GenerateJob(DIES, 3))
+    drive()
+    assert error_of("generate")
+    assert redraws == [True, False]
+
+
+def test_the_picture_goes_when_the_human_stands(addon, redraws):
+    queue.add(addon, GenerateJob(7, 3))
+    drive()
+    assert redraws == [True, False]
+    assert bpy.data.collections["Human"]
+
+
+def test_loading_a_file_and_unregistering_remove_the_picture(denoising):
+    picture_in_view._texture = "uploaded"
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    assert (picture_in_view._pixels, picture_in_view._texture) == (None, None)
+    queue.add(bpy.context, GenerateJob(TAKES_LONG, 5))
+    until_running()
+    follow()
+    assert shown()
+    blender_primdiffusion.unregister()
+    assert (picture_in_view._pixels, picture_in_view._texture) == (None, None)
+    assert so_far.shown is None
+    blender_primdiffusion.register()
+
+
+def test_only_views_that_show_humans_of_the_jobs_scene_show_the_picture(denoising):
+    settings = bpy.context.scene.primdiffusion_render
+    settings.in_viewports = False
+    assert not shown()
+    settings.in_viewports = True
+    assert not picture_in_view.drawn_in(context(local_view=bpy.context))
+    bpy.context.scene.render.engine = "PRIMDIFFUSION"
+    assert picture_in_view.drawn_in(context("RENDERED"))
+    assert not picture_in_view.drawn_in(context("RENDERED", overlays=False))
+    elsewhere = context()
+    elsewhere.scene = bpy.data.scenes.new("Other")
+    assert not picture_in_view.drawn_in(elsewhere)
+
+
+def test_a_picture_is_uploaded_once_and_drawn_where_the_human_will_stand(denoising, tmp_path, monkeypatch):
+    uploaded, drawn = [], []
+    monkeypatch.setattr(billboard, "texture_of", lambda pixels: uploaded.append(pixels.shape) or "texture")
+    monkeypatch.setattr(billboard, "draw", lambda texture, corners: drawn.append(corners))
+    bpy.context.scene.cursor.location = (3, 4, 0.5)
+    picture_in_view.draw(context())
+    np.testing.assert_allclose(drawn[0].mean(0)[:2], [3, 4], atol=1e-6)
+    bpy.context.scene.cursor.location = (5, 4, 0.5)
+    picture_in_view.draw(context())
+    np.testing.assert_allclose(drawn[1].mean(0)[:2], [5, 4], atol=1e-6)
+    assert uploaded == [(8, 8, 4)]
+    build_human(bpy.context, synthetic.write(tmp_path / "one.npz", 4))
+    bpy.context.scene.cursor.location = (0.5, 0, 0)
+    picture_in_view.draw(context())
+    assert drawn[2].mean(0)[0] > 1.5, "beside the human there"
+
+
+def test_edits_show_no_picture_in_the_views(denoising, monkeypatch):
+    monkeypatch.setattr(GenerateJob, "new_person", "")
+    follow()
+    assert not shown()
+
+
+def test_without_a_window_there_is_no_handler(addon):
+    assert module._handlers == []
