@@ -89,7 +89,8 @@ def denoising_in_view(module: str, python: str) -> Steps:
     bpy.ops.mesh.primitive_cube_add(size=0.4, location=(1.9, -0.5, 0.3))
     bpy.ops.mesh.primitive_plane_add(size=8)
     wide_view()
-    around, queue = view()[1].spaces.active.region_3d, queue_of(module)
+    space, queue = view()[1].spaces.active, queue_of(module)
+    space.shading.type, around = "SOLID", space.region_3d
     picture = import_module(f"{module}.jobs.picture_in_view").picture_in_view
     around.view_location, around.view_distance = (1.0, 0.0, 0.9), 7.0
     yield 15.0
