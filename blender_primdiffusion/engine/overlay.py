@@ -43,7 +43,7 @@ WIREFRAME_OPACITY = 0.5
 """At least: without it, humans would be invisible, since they have no wires."""
 _EARLIER = (
     "the human {!r} was made by an earlier version and its volumes are hidden: show these (in the Outliner, or tab "
-    "Output, Volumes in Viewport), or generate the human again"
+    "Output, Volumes in Viewport), edit the human, or generate it again"
 )
 _UNRELATED = (
     bpy.types.Mesh,
