@@ -61,7 +61,7 @@ def posed(person, case: int = 0, **changes) -> PosedHuman:
 @pytest.mark.parametrize("case", range(CASES))
 def test_boxes_are_where_the_backend_places_them(person, case):
     boxes, expected = boxes_of(posed(person, case)), {name: values[case] for name, values in person.cases.items()}
-    tolerance = 1e-5 * max(1.0, 1 / float(expected["density_scale"]))  # metres on a body of natural size
+    tolerance = 3e-5 * max(1.0, 1 / float(expected["density_scale"]))  # metres; the backend computes in float32
     assert np.abs(boxes.position - expected["position"]).max() < tolerance
     sides = boxes.rotation * boxes.half_extent[:, None]
     assert np.abs(sides - expected["rotation"] * expected["half_extent"][:, None]).max() < tolerance
