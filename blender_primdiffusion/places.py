@@ -29,6 +29,16 @@ def backend_module_path() -> Path | None:
     return None
 
 
+def body_data(name: str) -> Path:
+    """body.npz or layout.npz of the default body, which every build has. Raises FileNotFoundError."""
+    root = Path(__file__).resolve().parent
+    for folder in (root / "bundled", root.parent / "backend"):
+        path = folder / "primdiffusion" / "body" / "data" / name
+        if path.is_file():
+            return path
+    raise FileNotFoundError(f"the extension lacks {name} of the default body: install its zip again")
+
+
 _PACKAGES = {"numpy": "python3-numpy", "openvdb": "python3-openvdb"}
 """Python packages that Blender brings, and their names in Debian, whose Blender does not bring them."""
 

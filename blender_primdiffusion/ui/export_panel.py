@@ -19,6 +19,7 @@ class PRIMDIFFUSION_PT_export(SidebarPanel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = property_columns(self.layout), context.scene.primdiffusion_export
         layout.prop(settings, "motion")
+        layout.prop(settings, "compact")
         layout.operator("primdiffusion.export_human", icon="EXPORT")
 
 

@@ -9,10 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from primdiffusion.formats.body_layout import GRID
 from primdiffusion.geometry.records import TensorRecord
 
-GRID = 32
-"""Primitives along a side of the UV grid; primitive k is at row k // GRID, column k % GRID."""
 K = GRID * GRID
 """Primitives per human."""
 S = 8
