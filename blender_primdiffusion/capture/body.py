@@ -98,7 +98,8 @@ def skin(points: NDArray, weights: NDArray, transforms: NDArray) -> NDArray[np.f
 def read_body(path: Path | None = None) -> Body:
     """The default body, or a user's own SMPL as an .npz of plain arrays.
 
-    Raises FileNotFoundError without a default body, BodyError where the file is not there, holds pickled arrays, or is not of SMPL's form.
+    Raises FileNotFoundError without a default body, and BodyError where the file is not there, holds pickled arrays, or
+    is not of SMPL's form.
     """
     source = body_data("body.npz") if path is None else Path(path)
     if not source.is_file():

@@ -97,7 +97,7 @@ def test_a_damaged_file_is_rejected_by_name_with_its_damage(human, tmp_path, how
 
 @pytest.mark.parametrize(
     ("version", "message"),
-    [("3", "newer PrimDiffusion"), ("10", "newer PrimDiffusion"), ("one", "format version 'one'"), ("0", "'0'")],
+    [("4", "newer PrimDiffusion"), ("10", "newer PrimDiffusion"), ("one", "format version 'one'"), ("0", "'0'")],
 )
 def test_a_file_of_another_version_is_rejected_with_what_to_do(human, tmp_path, version, message):
     path = tmp_path / "other.human.safetensors"
@@ -109,7 +109,7 @@ def test_a_file_of_another_version_is_rejected_with_what_to_do(human, tmp_path, 
 
 def test_a_newer_file_is_rejected_for_its_version_even_where_its_tensors_are_others(human, tmp_path):
     path = tmp_path / "newer.human.safetensors"
-    safetensors.torch.save_file({"latents": torch.zeros(3)}, path, {**META, "format_version": "3"})
+    safetensors.torch.save_file({"latents": torch.zeros(3)}, path, {**META, "format_version": "4"})
     with pytest.raises(HumanFileError, match="newer PrimDiffusion"):
         load_human(path)
 

@@ -136,6 +136,8 @@ class GenerateCommand(GenerateRequest):
     batch: int = 1
     """Humans sampled at once: faster, above all on a GPU, and needs more memory. Results differ from those of single
     humans in the last digits."""
+    compact: bool = False
+    """Store colours and densities of person.human.safetensors in 8 bits: 2 MB instead of 8, without visible loss."""
 
     def check(self) -> None:
         """See `RequestRecord`."""
@@ -151,7 +153,7 @@ class GenerateCommand(GenerateRequest):
             began, seeds = time.perf_counter(), range(first, min(first + self.batch, end))
             folders = {seed: self.out_dir if self.count == 1 else self.out_dir / f"seed_{seed:06d}" for seed in seeds}
             with progress_bar(f"seed {', '.join(map(str, seeds))}") as report:
-                generate_humans(self, folders, session, report)
+                generate_humans(self, folders, session, report, compact=self.compact)
             seconds = (time.perf_counter() - began) / len(seeds)
             for seed, folder in folders.items():
                 print(f"{folder}  seed {seed}, {self.steps} steps, {seconds:.1f} s")
