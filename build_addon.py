@@ -5,7 +5,9 @@
 
 The viewer is a second extension of the same sources, for repositories that reject extensions which download code: it
 opens, poses, animates, reshapes, draws and exports humans, and generates with a backend that the user has installed. It
-has no set-up, no backend and no checkpoints, and may bring a gallery of .human files. The build is reproducible: the same tree gives the same bytes. If `bpy` is installed, Blender's own extension tool
+has no set-up, no backend and no checkpoints, and may bring a gallery of .human files.
+
+The build is reproducible: the same tree gives the same bytes. If `bpy` is installed, Blender's own extension tool
 validates the zip.
 """
 
