@@ -20,7 +20,7 @@ def found() -> tuple[bool, str]:
         return False, sentence(lacking)
     own = own_python_has_backend()
     named = next(candidates(preference("backend_python"), None, installed_backend(), own_python=own), None)
-    return (False, sentence(NOT_INSTALLED)) if named is None else (True, f"Uses {named[1]}, found by {named[0]}")
+    return (False, sentence(NOT_INSTALLED)) if named is None else (True, f"Uses {named[1]}, named by {named[0]}")
 
 
 def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
