@@ -92,9 +92,14 @@ class GenerateRequest:
 
 
 def generate_humans(
-    request: GenerateRequest, folders: dict[int, Path], session: Session, report: ReportProgress
+    request: GenerateRequest,
+    folders: dict[int, Path],
+    session: Session,
+    report: ReportProgress,
+    *,
+    compact: bool = False,
 ) -> float:
-    """Sample a human for each seed as one batch and write each to its folder, all of them or none.
+    """Sample a human for each seed as one batch and write each to its folder, all of them or none; see `save_human`.
 
     Returns the time (of `perf_counter`) when sampling ended. Raises as load_checkpoint and generate_batch, and OSError.
     """
@@ -118,7 +123,7 @@ def generate_humans(
         sampled = time.perf_counter()
         report("write", steps, steps, None)
         for folder, human in zip(unfinished, humans, strict=True):
-            write_human(folder, human, request.size)
+            write_human(folder, human, request.size, compact=compact)
         report("write", steps, steps, 0.0)  # the last chance to cancel
     return sampled
 

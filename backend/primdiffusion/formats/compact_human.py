@@ -26,8 +26,8 @@ def compact(rgb: NDArray, density: NDArray) -> tuple[NDArray[np.uint8], NDArray[
     power = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, power)
     root = np.sqrt(np.clip(density / scales["density"], 0, 1))
-    stored = (np.round(values * LEVELS).astype(np.uint8) for values in (encoded, root))
-    return (*stored, json.dumps(scales))
+    colour, opacity = (np.round(values * LEVELS).astype(np.uint8) for values in (encoded, root))
+    return colour, opacity, json.dumps(scales)
 
 
 def expand(arrays: Mapping[str, NDArray], metadata: str) -> dict[str, NDArray]:

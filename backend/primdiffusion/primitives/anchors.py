@@ -18,12 +18,13 @@ from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.formats import body_layout
-from primdiffusion.formats.body_layout import CHARTS
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.surface import signed_volume, surface_points, uv_gradient
 from primdiffusion.primitives.primitives import GRID, Frames, K, S
 from primdiffusion.raster.uv_atlas import closest_in_uv, rasterise_uv
 
+CHARTS = body_layout.CHARTS
+"""Regions of the body; `Anchors.chart` holds indices into this tuple."""
 JOINT_REGION = (
     "torso", "left_leg", "right_leg", "torso", "left_leg", "right_leg", "torso", "left_foot", "right_foot",
     "torso", "left_foot", "right_foot", "head", "torso", "torso", "head", "left_arm",

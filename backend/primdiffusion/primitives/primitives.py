@@ -9,9 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.formats.body_layout import GRID
+from primdiffusion.formats import body_layout
 from primdiffusion.geometry.records import TensorRecord
 
+GRID = body_layout.GRID
+"""Primitives along a side of the UV grid."""
 K = GRID * GRID
 """Primitives per human."""
 S = 8
