@@ -1,6 +1,11 @@
 """Build the extension as one zip: the add-on, the backend, the default checkpoints and the manual.
 
     python build_addon.py [--out dist] [--index]
+    python build_addon.py --viewer [--gallery DIR] [--out dist]
+
+The viewer is a second extension of the same sources, for repositories that reject extensions which download code: it
+opens, poses, animates, reshapes, draws and exports humans, and generates with a backend that the user has installed. It
+has no set-up, no backend and no checkpoints, and may bring a gallery of .human files.
 
 The build is reproducible: the same tree gives the same bytes. If `bpy` is installed, Blender's own extension tool
 validates the zip.
@@ -28,6 +33,20 @@ STORED_SUFFIXES = {".safetensors", ".npz"}
 """Compressed already, or not compressible: stored without compression, for a fast build and a fast install."""
 
 
+VIEWER = {
+    "id": "primdiffusion_viewer",
+    "name": "PrimDiffusion Viewer",
+    "tagline": "Pose, animate, reshape and render generated 3D humans",
+}
+"""Entries of the viewer's manifest that differ."""
+VIEWER_LACKS = ("backend/setup.py", "backend/packages.py", "requirements/", "ui/setup/", "bundled/")
+"""What downloads or is downloaded for: files and folders that the viewer does not have."""
+VIEWER_BUNDLES = ("bundled/primdiffusion/formats/", "bundled/primdiffusion/body/data/")
+"""Parts of the backend that the viewer does have."""
+LARGEST_IN_GALLERY = 3_000_000
+"""Bytes of a .human file; compact ones have 2.1 MB."""
+
+
 class BuildError(RuntimeError):
     """The zip cannot be built or is not valid; the message says why."""
 
@@ -47,16 +66,53 @@ def contents(addon: Path = ADDON, backend: Path = BACKEND) -> dict[str, Path]:
     return dict(sorted(files.items()))
 
 
-def build(out: Path) -> Path:
-    """Write `primdiffusion-<version>.zip` into `out` and return its path. Raises BuildError when a part is missing."""
-    manifest = tomllib.loads((ADDON / "blender_manifest.toml").read_text(encoding="utf-8"))
-    files = contents()
-    if "bundled/primdiffusion/__init__.py" not in files:
+def viewer_contents(gallery: Path | None = None) -> dict[str, Path]:
+    """As `contents`, of the viewer with the .human files in the folder `gallery`. Raises BuildError for a large one."""
+    files = {
+        name: path
+        for name, path in contents().items()
+        if name.startswith(VIEWER_BUNDLES) or not name.startswith(VIEWER_LACKS)
+    }
+    humans = [] if gallery is None else sorted(gallery.glob("*.human"))
+    if gallery is not None and not humans:
+        raise BuildError(f"there are no .human files in {gallery}: make some with scripts/make_gallery.py")
+    for path in humans:
+        if path.stat().st_size > LARGEST_IN_GALLERY:
+            raise BuildError(f"{path} is larger than {LARGEST_IN_GALLERY / 1e6:.0f} MB: export it as a compact file")
+        files[f"gallery/{path.name}"] = path
+    return dict(sorted(files.items()))
+
+
+def viewer_manifest(manifest: str) -> str:
+    """The viewer's manifest, from the other one: other names, and no permission to use the network."""
+    lines = []
+    for line in manifest.splitlines(keepends=True):
+        key = line.partition(" = ")[0]
+        if key in VIEWER:
+            line = f'{key} = "{VIEWER[key]}"\n'
+        if key == "files":
+            line = 'files = "Write volumes beside the .blend, run a generator you installed"\n'
+        if key != "network":
+            lines.append(line)
+    return "".join(lines)
+
+
+def build(out: Path, *, viewer: bool = False, gallery: Path | None = None) -> Path:
+    """Write `primdiffusion-<version>.zip`, or that of the viewer, into `out` and return its path.
+
+    Raises BuildError when a part is missing, and as `viewer_contents`.
+    """
+    text = (ADDON / "blender_manifest.toml").read_text(encoding="utf-8")
+    text = viewer_manifest(text) if viewer else text
+    manifest = tomllib.loads(text)
+    files = viewer_contents(gallery) if viewer else contents()
+    if not viewer and "bundled/primdiffusion/__init__.py" not in files:
         raise BuildError(f"the backend was not found in {BACKEND}: build from a complete checkout")
     try:
         pages = {f"manual/{name}": page for name, page in manual().items()}
     except ManualError as error:
         raise BuildError(str(error)) from error
+    pages["blender_manifest.toml"] = text.encode()
     out.mkdir(parents=True, exist_ok=True)
     target = out / f"{manifest['id']}-{manifest['version']}.zip"
     unfinished = target.with_suffix(".zip.part")
@@ -104,8 +160,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder for the zip")
     parser.add_argument("--index", action="store_true", help="also index.json: the folder is then a repository")
+    parser.add_argument("--viewer", action="store_true", help="the extension without set-up, backend and checkpoints")
+    parser.add_argument("--gallery", type=Path, help="folder of .human files that the viewer brings")
     arguments = parser.parse_args()
-    archive = build(arguments.out)
+    if arguments.gallery is not None and not arguments.viewer:
+        parser.error("--gallery goes with --viewer")
+    archive = build(arguments.out, viewer=arguments.viewer, gallery=arguments.gallery)
+    with zipfile.ZipFile(archive) as made:
+        count = len(made.namelist())
     tool = blender_extension_tool()
     if arguments.index and tool is None:
         parser.error(
@@ -117,7 +179,7 @@ def main() -> None:
         if arguments.index:
             print(write_index(arguments.out, tool))
     checked = "valid" if tool is not None else "not validated: bpy is not installed"
-    print(f"{archive} ({archive.stat().st_size / 1e6:.1f} MB, {len(contents())} files, {checked})")
+    print(f"{archive} ({archive.stat().st_size / 1e6:.1f} MB, {count} files, {checked})")
 
 
 if __name__ == "__main__":

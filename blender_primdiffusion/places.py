@@ -5,13 +5,14 @@ from __future__ import annotations
 import functools
 import importlib.util
 import os
+import shutil
 from collections.abc import Generator
 from pathlib import Path
 
 import bpy
 
 from .backend import environment
-from .backend.client import BackendClient
+from .backend.client import PROGRAM, BackendClient
 from .backend.requests import Backend
 
 EXTENSION = str(__package__)
@@ -27,6 +28,26 @@ def backend_module_path() -> Path | None:
         if (folder / "primdiffusion" / "__init__.py").is_file():
             return folder
     return None
+
+
+INSTALLS_BACKEND = (Path(__file__).parent / "backend" / "setup.py").is_file()
+"""Whether this build can set up a backend; the viewer build has no code for it (see build_addon.py)."""
+
+
+def installed_backend() -> Path | None:
+    """The program `primdiffusion` that the user has installed, where the extension brings no backend."""
+    found = shutil.which(PROGRAM) if backend_module_path() is None else None
+    return Path(found) if found else None
+
+
+def body_data(name: str) -> Path:
+    """body.npz or layout.npz of the default body, which every build has. Raises FileNotFoundError."""
+    root = Path(__file__).resolve().parent
+    for folder in (root / "bundled", root.parent / "backend"):
+        path = folder / "primdiffusion" / "body" / "data" / name
+        if path.is_file():
+            return path
+    raise FileNotFoundError(f"the extension lacks {name} of the default body: install its zip again")
 
 
 _PACKAGES = {"numpy": "python3-numpy", "openvdb": "python3-openvdb"}
@@ -85,7 +106,10 @@ def new_backend(python: str) -> Backend:
     own_environment = set_up_folder().environment
 
     def make_client() -> Generator[None, None, BackendClient]:
-        found = yield from environment.search(python or None, own_environment, module_path, cache_dir=cache)
+        installed = installed_backend()
+        found = yield from environment.search(
+            python or None, own_environment, module_path, installed=installed, cache_dir=cache
+        )
         made = BackendClient(found.path, module_path, cache_dir=cache)
         made.info["torch"] = found.torch  # the child does not report it
         return made

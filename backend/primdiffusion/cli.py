@@ -30,6 +30,7 @@ COMMANDS = {
     "render": ("commands.render:run", "Render a human in a pose"),
     "export": ("commands.export:run", "Export a human to other programs: .glb, .obj or .ply"),
     "merge": ("commands.merge:run", "Merge humans into one voxel grid: .vdb or .npz"),
+    "serve": ("serve.server:run", "Be the backend of the Blender extension: answer JSON-RPC requests"),
     "info": ("commands.info:run", "Describe this installation, a checkpoint or a human, as JSON"),
     "people": ("commands.people:run_people", "Make dressed, rigged humans (glTF) from a MakeHuman asset folder"),
     "payloads": ("commands.people:run_payloads", "Make primitives to train on, of such humans or captures; pack them"),

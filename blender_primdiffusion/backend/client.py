@@ -19,6 +19,8 @@ from typing import Any
 
 from .child_streams import LOG_LINES, Input, Output
 
+PROGRAM = "primdiffusion"
+"""The backend's package, and its command line."""
 SILENCE_S = 20.0
 """The child sends a heartbeat every 0.5 s; importing torch from a cold disk can hold it up for seconds."""
 LONGEST_POLL_GAP_S = 1.0
@@ -75,6 +77,11 @@ class Silent:
 Event = Response | ErrorResponse | Notification | Died | Silent
 
 
+def is_program(path: Path) -> bool:
+    """Whether a path is that of the backend's command line, instead of a Python's."""
+    return path.stem.lower() == PROGRAM
+
+
 def child_environment(module_path: Path | None, cache_dir: Path | None, extra: Mapping[str, str]) -> dict[str, str]:
     """The environment of a backend process: this one's, without what would lead its Python astray.
 
@@ -94,7 +101,10 @@ def child_environment(module_path: Path | None, cache_dir: Path | None, extra: M
 
 
 class BackendClient:
-    """One child process. Make it, `start` it, send requests, `poll` from a timer, `shutdown` at the end."""
+    """One child process, of a Python or of the program `primdiffusion`.
+
+    Make it, `start` it, send requests, `poll` from a timer, `shutdown` at the end.
+    """
 
     def __init__(
         self,
@@ -105,7 +115,7 @@ class BackendClient:
         cache_dir: Path | None = None,
         silence_s: float = SILENCE_S,
     ):
-        self._command = [str(python), "-m", "primdiffusion.serve"]
+        self._command = [str(python), "serve"] if is_program(python) else [str(python), "-m", f"{PROGRAM}.serve"]
         self._environment = child_environment(module_path, cache_dir, env or {})
         self._silence_s = silence_s
         self._process: subprocess.Popen[bytes] | None = None

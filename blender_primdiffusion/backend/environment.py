@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import os
 import subprocess
@@ -12,7 +13,7 @@ from collections.abc import Generator, Iterator, Mapping
 from pathlib import Path
 
 from .child_streams import Output
-from .client import child_environment
+from .client import PROGRAM, child_environment, is_program
 
 VARIABLE = "PRIMDIFFUSION_PYTHON"
 MARK = "ready.json"
@@ -31,6 +32,11 @@ TRIAL = (
 )
 
 
+NOT_INSTALLED = (
+    "there is no backend on this computer: install PrimDiffusion's as the manual describes, then name its program "
+    "or its Python in the extension's preferences"
+)
+"""Where the extension brings none."""
 tried: dict[Path, bool] = {}
 """Interpreters that were tried since Blender was started, and whether they imported torch and the backend."""
 
@@ -83,18 +89,18 @@ class SetUpFolder:
         return python_of_environment(self.environment)
 
     @property
-    def pip_cache(self) -> Path:
-        """What has been downloaded."""
-        return self.root / "pip"
+    def downloads(self) -> Path:
+        """Packages that were downloaded for a set-up that has not finished."""
+        return self.root / "downloads"
 
     @property
     def temporary(self) -> Path:
-        """Of pip and of the self-test."""
+        """Of the set-up and the self-test."""
         return self.root / "temporary"
 
     @property
     def log(self) -> Path:
-        """The output of venv and pip."""
+        """The output of the set-up."""
         return self.root / "set_up.log"
 
 
@@ -105,8 +111,15 @@ def short_root(own: Path, local: Path | None, name: str) -> Path:
     return own if local is None or longest <= WINDOWS_LONGEST else local / "primdiffusion" / name
 
 
-def candidates(preference: str | Path | None, own_environment: Path | None) -> Iterator[tuple[str, Path]]:
-    """Who may name the Python, strongest first: the preferences, the variable, the extension's own, the running one.
+def candidates(
+    preference: str | Path | None,
+    own_environment: Path | None,
+    installed: Path | None = None,
+    *,
+    own_python: bool = True,
+) -> Iterator[tuple[str, Path]]:
+    """Who may name the Python, strongest first: the preferences, the variable, the extension's own, the program
+    `installed` by the user, the running one (with `own_python`).
 
     An explicit wish (preferences or variable) that fails is an error and not a reason to look further. An environment
     of the extension's own that is not finished is passed over.
@@ -119,7 +132,15 @@ def candidates(preference: str | Path | None, own_environment: Path | None) -> I
         return
     if own_environment is not None and (own_environment / MARK).exists():
         yield "the extension's own environment", python_of_environment(own_environment)
-    yield "Blender's own Python", Path(sys.executable)
+    if installed is not None:
+        yield "the PATH", installed
+    if own_python:
+        yield "Blender's own Python", Path(sys.executable)
+
+
+def own_python_has_backend() -> bool:
+    """Whether the backend is installed in Blender's own Python."""
+    return importlib.util.find_spec(PROGRAM) is not None
 
 
 def search(
@@ -127,18 +148,20 @@ def search(
     own_environment: Path | None = None,
     module_path: Path | None = None,
     *,
+    installed: Path | None = None,
     cache_dir: Path | None = None,
     timeout_s: float = TRIAL_S,
 ) -> Generator[None, None, BackendPython]:
     """Try each candidate in a process of its own, which takes seconds; yields while it runs, and returns the first that
     imports primdiffusion and torch.
 
-    `module_path` and `cache_dir` as in `child_environment`. Raises BackendNotFound with one reason for each candidate,
-    ImportTimedOut where one of them took longer than `timeout_s`.
+    `installed` as in `candidates`; `module_path` and `cache_dir` as in `child_environment`. Raises BackendNotFound with
+    one reason for each candidate, ImportTimedOut where one of them took longer than `timeout_s`.
     """
     environment = child_environment(module_path, cache_dir, {})
     errors: list[BackendNotFound] = []
-    for source, path in candidates(preference, own_environment):
+    own_python = module_path is not None or own_python_has_backend()
+    for source, path in candidates(preference, own_environment, installed, own_python=own_python):
         try:
             found = yield from _try(path, source, environment, timeout_s)
         except BackendNotFound as e:
@@ -148,7 +171,11 @@ def search(
             tried[path] = True
             return found
     reasons = "; ".join(map(str, errors))
-    advice = "press Set Up Backend, or name a Python with PrimDiffusion's packages in the extension's preferences"
+    if not errors:
+        raise BackendNotFound(NOT_INSTALLED)
+    advice = "name a Python with PrimDiffusion's packages in the extension's preferences"
+    if module_path is not None:
+        advice = f"press Set Up Backend, or {advice}"
     if any(isinstance(error, ImportTimedOut) for error in errors):
         raise ImportTimedOut(f"No Python for the backend: {reasons}. The machine may be busy: try again, or {advice}.")
     raise BackendNotFound(f"No Python for the backend: {reasons}. To go on, {advice}.")
@@ -161,7 +188,7 @@ def _try(
     answer, errors = Output(), Output()
     try:
         process = subprocess.Popen(
-            [str(path), "-c", TRIAL],
+            [str(path), "serve", "--about"] if is_program(path) else [str(path), "-c", TRIAL],
             stdin=subprocess.DEVNULL,
             stdout=answer.target,
             stderr=errors.target,

@@ -365,3 +365,13 @@ class ChildRequest:
 
     def _end(self, state: State, message: str) -> None:
         self.state, self.message, self.eta_s = state, message, None
+
+
+class FinishedRequest(ChildRequest):
+    """A request whose result Blender has computed itself; no child is started."""
+
+    def __init__(self, backend: Backend, method: str, result: Mapping[str, Any]):
+        """`result` as the child's method returns it."""
+        super().__init__(backend, method, {})
+        self.result, self.step = dict(result), self.total
+        self._end("done", "Done")

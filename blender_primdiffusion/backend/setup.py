@@ -85,7 +85,7 @@ def set_up(
     folder.temporary.mkdir(exist_ok=True)
     folder.log.unlink(missing_ok=True)
     yield Step("Making the environment", 0.0)
-    environment = clean_environment(folder.temporary, folder.pip_cache)
+    environment = clean_environment(folder.temporary, folder.downloads)
     making = [host, *_VENV, str(folder.environment)]
     for _ in followed(making, folder.log, environment, _no_venv):
         yield Step("Making the environment", 0.0)
@@ -106,7 +106,7 @@ def set_up(
     unfinished = folder.environment / f"{MARK}.part"
     unfinished.write_text(json.dumps(marked, indent=1), encoding="utf-8")
     os.replace(unfinished, folder.environment / MARK)
-    for leftover in (folder.pip_cache, folder.temporary):
+    for leftover in (folder.downloads, folder.temporary):
         shutil.rmtree(leftover, ignore_errors=True)
     return _ready(about)
 
@@ -122,10 +122,10 @@ def remove(folder: SetUpFolder, cache: Path | None) -> Steps:
     """Environment, downloads and `cache`, where it is not shared, are gone; nothing else in the folder is touched."""
     _, about = state_of(folder)
     (folder.environment / MARK).unlink(missing_ok=True)
-    going = [folder.environment, folder.pip_cache, folder.temporary, *([cache] if cache is not None else ())]
+    going = [folder.environment, folder.downloads, folder.temporary, *([cache] if cache is not None else ())]
     program = "import shutil, sys; [shutil.rmtree(path) for path in sys.argv[1:]]"
     command = [sys.executable, "-I", "-c", program, *(str(path) for path in going if path.exists())]
-    environment = clean_environment(folder.root, folder.pip_cache)
+    environment = clean_environment(folder.root, folder.downloads)
     yield Step("Removing the environment", 0.0)
     for _ in followed(command, folder.log, environment, _in_use):
         yield Step("Removing the environment", 0.5)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..formats.arrays import ArrayFileError, read_arrays
 from ..formats.joints import JOINT_NAMES, PARENTS
 from ..motion.skeleton import chain, joint_positions
-from ..places import backend_module_path
+from ..places import body_data
 
 BETAS = 10
 """Shape components in use."""
@@ -95,21 +95,13 @@ def skin(points: NDArray, weights: NDArray, transforms: NDArray) -> NDArray[np.f
     return (blended[..., :3] @ points[..., None])[..., 0] + blended[..., 3]
 
 
-def default_body_path() -> Path:
-    """The body that ships with the backend. Raises BodyError where the backend is not there."""
-    backend = backend_module_path()
-    path = backend / "primdiffusion" / "body" / "data" / "body.npz" if backend is not None else None
-    if path is None or not path.is_file():
-        raise BodyError("the default body is not part of this installation: install the extension again")
-    return path
-
-
 def read_body(path: Path | None = None) -> Body:
     """The default body, or a user's own SMPL as an .npz of plain arrays.
 
-    Raises BodyError where the file is not there, holds pickled arrays, or is not of SMPL's form.
+    Raises FileNotFoundError without a default body, and BodyError where the file is not there, holds pickled arrays, or
+    is not of SMPL's form.
     """
-    source = default_body_path() if path is None else Path(path)
+    source = body_data("body.npz") if path is None else Path(path)
     if not source.is_file():
         raise BodyError(f"there is no body model {source}: check the path")
     try:

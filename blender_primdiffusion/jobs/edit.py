@@ -20,6 +20,7 @@ from ..scene.human_npz import Destination, read_human, write_now
 from ..scene.volumes import free_unused_grids
 from .follow import building
 from .missing_files import look
+from .open_human import opened
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .target import HumanTarget
 
@@ -130,6 +131,9 @@ class RestoreJob(Job):
 
     def params(self, folder: Path) -> dict[str, Any]:
         return {"person": self.file, "out_dir": str(folder), "size": PREVIEW_PX}
+
+    def result_here(self, folder: Path) -> dict[str, Any] | None:
+        return opened(Path(self.file), folder)
 
     def place(self) -> Destination:
         return restore_destination(self.target.found())

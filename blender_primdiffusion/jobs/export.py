@@ -19,12 +19,22 @@ from ..scene.body_file import BODY_FILE, shape_model_of
 from ..scene.convention import points_to_backend
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
 from ..scene.human import armature_of, person_file
-from ..scene.human_file import HumanMotion, motion_in, read_tensors, reshaped, with_motion, write_tensors
+from ..scene.human_file import (
+    HumanMotion,
+    compacted,
+    expanded,
+    motion_in,
+    read_tensors,
+    reshaped,
+    with_motion,
+    write_tensors,
+)
 from ..scene.merged import MergedGrid, merged_of, read_grid, write_grid
 from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy, show_textures_in_solid
 from ..scene.shape import betas_of, generated_betas, has_custom_shape
 from ..scene.surface import carrier_of, primitives_of
 from .generate import build_person
+from .open_human import opened
 from .queue import PREVIEW_PX, Job
 from .target import HumanTarget
 
@@ -161,9 +171,16 @@ def posed_frames(
 
 
 def write_human(
-    context: bpy.types.Context, person: bpy.types.Collection, path: Path, frames: FrameRange | None
+    context: bpy.types.Context,
+    person: bpy.types.Collection,
+    path: Path,
+    frames: FrameRange | None,
+    *,
+    compact: bool = False,
 ) -> None:
-    """Write the human with its current shape, and its motion on `frames`. Raises ValueError or OSError.
+    """Write the human with its current shape, and its motion on `frames`; `compact` with 8-bit colours and densities.
+
+    Raises ValueError or OSError.
 
     The motion is that of the joints in the armature's space, constraints and layers included; the object's own
     transform is left out.
@@ -175,7 +192,7 @@ def write_human(
             growth = shape_model_of(person).growth(generated_betas(person), betas)
         human = reshaped(human, betas, growth)
     motion = None if frames is None else _motion(context, person, frames)
-    write_tensors(path, with_motion(human, motion))
+    write_tensors(path, with_motion(compacted(human) if compact else expanded(human), motion))
 
 
 def _motion(context: bpy.types.Context, person: bpy.types.Collection, frames: FrameRange) -> HumanMotion:
@@ -281,6 +298,9 @@ class ImportHumanJob(Job):
 
     def params(self, folder: Path) -> dict[str, Any]:
         return {"person": self.path, "out_dir": str(folder), "size": PREVIEW_PX}
+
+    def result_here(self, folder: Path) -> dict[str, Any] | None:
+        return opened(Path(self.path), folder)
 
     def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         motion = motion_in(read_tensors(Path(self.path)))

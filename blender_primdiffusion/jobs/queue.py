@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import bpy
 
 from ..backend.client import Died, Silent
-from ..backend.requests import Backend, ChildRequest, RequestError
+from ..backend.requests import Backend, ChildRequest, FinishedRequest, RequestError
 from ..places import new_backend, preference
 from ..scene.attachment import volumes_may_wait
 from .remedies import defect_in_the_scene, error_in_the_scene
@@ -58,6 +58,12 @@ class Job(abc.ABC):
         Runs inside an operator, in object mode where `undo` is given; that operator makes the undo step. ValueError,
         OSError and RuntimeError become the panel's error, and must leave the scene as it was.
         """
+
+    def result_here(self, folder: Path) -> dict[str, Any] | None:
+        """The result where Blender can compute it itself, in less than a second; None to request it from the child.
+
+        `folder` as in `params`. Raises ValueError or OSError."""
+        return None
 
     def advance(self, folder: Path) -> bool:
         """Process some of the files that the child has written so far, for a timer's tick at most; whether there is
@@ -277,11 +283,15 @@ class Queue:
         self.current = entry
         try:
             self._folder = Path(tempfile.mkdtemp(prefix=f"{entry.job.kind}_", dir=bpy.app.tempdir or None))
-            params = entry.job.params(self._folder)
+            params, result = entry.job.params(self._folder), entry.job.result_here(self._folder)
         except (ValueError, OSError) as error:
             self._end(JobOutcome(entry, error=error_in_the_scene(error)))
             return
-        self.request = ChildRequest(self._backend_for(preference("backend_python")), entry.job.method, params)
+        backend, method = self._backend_for(preference("backend_python")), entry.job.method
+        if result is None:
+            self.request = ChildRequest(backend, method, params)
+        else:
+            self.request = FinishedRequest(backend, method, result)
 
     def _end(self, outcome: JobOutcome) -> JobOutcome:
         self.outcomes[outcome.entry.job.kind] = self.last = outcome

@@ -10,6 +10,7 @@ import traceback
 import bpy
 
 from ..backend.requests import RequestError, sentence
+from ..places import INSTALLS_BACKEND
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
 
@@ -24,12 +25,15 @@ class Remedy:
 
 
 _TRY_AGAIN = Remedy("primdiffusion.try_again", "Try Again", "FILE_REFRESH")
+_PREFERENCES = Remedy("preferences.addon_show", "Open Preferences", "PREFERENCES")
 _SAVE_AS = Remedy("wm.save_as_mainfile", "Save As...", "FILE_TICK")
 _REMEDIES = {
-    "environment": Remedy("primdiffusion.set_up_backend", "Set Up Backend", "IMPORT"),
+    "environment": Remedy("primdiffusion.set_up_backend", "Set Up Backend", "IMPORT")
+    if INSTALLS_BACKEND
+    else _PREFERENCES,
     "missing_volumes": Remedy("primdiffusion.find_missing_volumes", "Find Missing Volumes", "VIEWZOOM"),
     "out_of_memory": Remedy("primdiffusion.release_memory", "Release Memory", "MEMORY"),
-    "missing_file": Remedy("preferences.addon_show", "Open Preferences", "PREFERENCES"),  # a checkpoint's path
+    "missing_file": _PREFERENCES,  # a checkpoint's path
     "unwritable": _SAVE_AS,
     "file_system": _SAVE_AS,
     "busy": _TRY_AGAIN,

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats import compact_human
 from ..formats.arrays import check_shapes
 from .human import BETA_COUNT
 
@@ -22,8 +23,10 @@ _LARGEST_HEADER = 1 << 20
 _METADATA = "__metadata__"
 _DTYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U8": "|u1", "BF16": "<u2"}
 _MOTION = {"motion.frames": ("F",), "motion.rotations": ("F", 24, 3, 3), "motion.translations": ("F", 3)}
+_EIGHT_BIT = ("rgb", "density")
+"""Arrays that compact files hold in eight bits."""
 _FLOATS = ("F64", "F32", "F16")
-_FORMAT_VERSIONS = ("1", "2")
+_FORMAT_VERSIONS = ("1", "2", "3")
 _PAYLOAD: dict[str, tuple[int | str, ...]] = {
     "rgb": ("K", 3, 8, 8, 8), "density": ("K", 8, 8, 8), "delta_scale": ("K", 3), "betas": (BETA_COUNT,),
     "rest_half_extent": ("K", 3),
@@ -109,19 +112,24 @@ def file_version(path: Path) -> FileVersion:
 
 def read_payload(path: Path) -> HumanPayload:
     """Read what is drawn of a .human file. Raises ValueError for a damaged file or a newer one, OSError."""
-    human = read_tensors(path)
+    return payload_in(read_tensors(path), path.name)
+
+
+def payload_in(human: HumanTensors, name: str) -> HumanPayload:
+    """As `read_payload`, of a file of this name that was read."""
     if human.metadata.get("format_version") not in _FORMAT_VERSIONS:
-        raise ValueError(f"{path.name!r} was written by a newer PrimDiffusion: update it")
-    shapes = {name: shape for name, shape in _PAYLOAD.items() if name in human.arrays or name != "rest_half_extent"}
+        raise ValueError(f"{name!r} was written by a newer PrimDiffusion: update it")
+    shapes = {field: shape for field, shape in _PAYLOAD.items() if field in human.arrays or field != "rest_half_extent"}
     try:
-        if wrong := [name for name in shapes if human.arrays[name][0] not in _FLOATS]:
+        stored = expanded(human).arrays
+        if wrong := [field for field in shapes if stored[field][0] not in _FLOATS]:
             raise ValueError(f"{wrong[0]!r} holds no numbers")
-        arrays = {name: _loaded(*human.arrays[name]).astype(np.float32, copy=False) for name in shapes}
-        check_shapes(path.name, arrays, shapes, {})
-        if wrong := [name for name, values in arrays.items() if not np.isfinite(values).all()]:
+        arrays = {field: _loaded(*stored[field]).astype(np.float32, copy=False) for field in shapes}
+        check_shapes(name, arrays, shapes, {})
+        if wrong := [field for field, values in arrays.items() if not np.isfinite(values).all()]:
             raise ValueError(f"{wrong[0]!r} holds NaN or infinite numbers")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{path.name!r} is damaged ({error}); {_REMEDY}") from error
+        raise ValueError(f"{name!r} is damaged ({error}); {_REMEDY}") from error
     return HumanPayload(**{"rest_half_extent": None, **arrays})
 
 
@@ -145,6 +153,33 @@ def reshaped(human: HumanTensors, betas: NDArray, growth: NDArray | None) -> Hum
             raise ValueError(f"the human's file holds sizes of boxes as {given}, not {expected}; {_REMEDY}")
         arrays["delta_scale"] = _stored((_loaded(dtype, shape, raw) * growth).astype(np.float32))
     return HumanTensors(human.metadata, arrays)
+
+
+def compacted(human: HumanTensors) -> HumanTensors:
+    """The human with 8-bit colours and densities, a quarter of the size. Raises ValueError for a damaged file."""
+    if compact_human.METADATA in human.metadata:
+        return human
+    try:
+        rgb, density, scales = compact_human.compact(*(_loaded(*human.arrays[name]) for name in _EIGHT_BIT))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"the human's file is damaged ({error}); {_REMEDY}") from error
+    arrays = {
+        name: ("U8", array.shape, array.tobytes()) for name, array in zip(_EIGHT_BIT, (rgb, density), strict=True)
+    }
+    version = str(compact_human.FORMAT_VERSION)
+    metadata = {**human.metadata, "format_version": version, compact_human.METADATA: scales}
+    return HumanTensors(metadata, {**human.arrays, **arrays})
+
+
+def expanded(human: HumanTensors) -> HumanTensors:
+    """The inverse of `compacted`, up to rounding. Raises ValueError or KeyError for a damaged file."""
+    if compact_human.METADATA not in human.metadata:
+        return human
+    metadata = {name: text for name, text in human.metadata.items() if name != compact_human.METADATA}
+    metadata["format_version"] = "2" if "body" in metadata else "1"
+    stored = {name: _loaded(*human.arrays[name]) for name in _EIGHT_BIT}
+    floats = compact_human.expand(stored, human.metadata[compact_human.METADATA])
+    return HumanTensors(metadata, {**human.arrays, **{name: _stored(values) for name, values in floats.items()}})
 
 
 def with_motion(human: HumanTensors, motion: HumanMotion | None) -> HumanTensors:

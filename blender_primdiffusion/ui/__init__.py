@@ -18,12 +18,14 @@ from ..jobs import cycles_check, follow, late_volumes, missing_files, picture_in
 from . import (
     assets_panel,
     attributes,
+    backend_state,
     batch,
     captures_panel,
     captures_settings,
     edit_panel,
     export_operators,
     export_panel,
+    gallery,
     generate_panel,
     human_panel,
     import_motion,
@@ -31,6 +33,7 @@ from . import (
     manual,
     motion_panel,
     pose_panel,
+    preferences,
     reconstruct_panel,
     render_operators,
     render_panel,
@@ -40,14 +43,12 @@ from . import (
     variations_panel,
     viewport_humans,
 )
-from .setup import operators as setup_operators
-from .setup import preferences
 
 MODULES = (
-    translations, setup_operators, preferences, follow, cycles_check, jobs_panel, attributes, generate_panel,
+    translations, *backend_state.MODULES, preferences, follow, cycles_check, jobs_panel, attributes, generate_panel,
     variations_panel, human_panel, shape_settings, edit_panel, shape_panel, missing_files, late_volumes,
     import_motion, motion_panel, pose_panel, assets_panel, render_operators, render_panel, captures_settings,
-    captures_panel, reconstruct_panel, export_operators, export_panel, viewport_humans, picture_in_view,
+    captures_panel, reconstruct_panel, export_operators, gallery, export_panel, viewport_humans, picture_in_view,
     batch, manual,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""

@@ -105,6 +105,11 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
         description="Include the motion of the scene's frame range in the .human file; otherwise only the human",
         default=False,
     )
+    compact: bpy.props.BoolProperty(
+        name="Compact",
+        description="Store colours and densities of the .human file in 8 bits: 2 MB instead of 8, without visible loss",
+        default=False,
+    )
 
 
 class _Export(OnPerson):
@@ -293,6 +298,7 @@ class PRIMDIFFUSION_OT_export_human(_ToFile, bpy.types.Operator):
     bl_label = "Export Human File"
 
     motion: bpy.props.BoolProperty(name="With Motion", description=PANELS, options=SKIP)
+    compact: bpy.props.BoolProperty(name="Compact", description=PANELS, options=SKIP)
 
     def endings(self, _context: bpy.types.Context) -> tuple[str, ...]:
         return HUMAN_ENDINGS
@@ -301,9 +307,8 @@ class PRIMDIFFUSION_OT_export_human(_ToFile, bpy.types.Operator):
         from ..jobs.export import scene_frames, write_human  # needs numpy
 
         path = destination(self.filepath, HUMAN_ENDINGS)
-        write_human(
-            context, person, path, scene_frames(context.scene, True) if self.chosen(context, "motion") else None
-        )
+        frames = scene_frames(context.scene, True) if self.chosen(context, "motion") else None
+        write_human(context, person, path, frames, compact=self.chosen(context, "compact"))
         self.report({"INFO"}, f"Exported {person.name} to {path.name}")
         return {"FINISHED"}
 

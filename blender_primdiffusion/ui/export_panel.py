@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..jobs.target import selected_person
+from . import gallery
 from .drawing import OUTPUT, SidebarPanel, draw_job, draw_lines, property_columns
 
 
@@ -19,6 +20,7 @@ class PRIMDIFFUSION_PT_export(SidebarPanel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = property_columns(self.layout), context.scene.primdiffusion_export
         layout.prop(settings, "motion")
+        layout.prop(settings, "compact")
         layout.operator("primdiffusion.export_human", icon="EXPORT")
 
 
@@ -27,10 +29,12 @@ class PRIMDIFFUSION_PT_from_file(SidebarPanel, bpy.types.Panel):
 
     bl_label = "From File"
     bl_order = 2
-    bl_options = {"DEFAULT_CLOSED"}
+    bl_options = set() if gallery.items() else {"DEFAULT_CLOSED"}
     manual_page, manual_section = "export", "human-files"
 
     def draw(self, _context: bpy.types.Context) -> None:
+        if gallery.items():
+            self.layout.operator_menu_enum("primdiffusion.add_from_gallery", "human", icon="COMMUNITY")
         draw_job(self.layout, "import_human", "primdiffusion.import_human", "IMPORT")
 
 

@@ -17,10 +17,10 @@ from ..jobs.memory import device_line
 from ..jobs.queue import queue
 from ..scene.human import humans
 from .attributes import CATEGORIES, SCALARS, PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed
+from .backend_state import draw_set_up
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
 from .manual import draw_manual_button
 from .render_panel import draw_engines
-from .setup.preferences import draw_set_up
 from .translations import CONTEXT
 
 LARGEST_SEED = 2**31 - 1

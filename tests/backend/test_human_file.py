@@ -9,9 +9,11 @@ import safetensors.torch
 import torch
 from primdiffusion.body.model import default_body
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.human import Human, generate, place
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.human_file import HumanFileError, export_for_blender, load_human, save_human
 from primdiffusion.primitives.primitives import K
+from primdiffusion.render.march import march
 from tiny_model import tiny_model
 
 
@@ -31,6 +33,18 @@ def test_a_saved_person_comes_back_bit_for_bit(human, tmp_path):
     assert torch.equal(back.betas, human.betas)
     assert back.provenance == human.provenance
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_compact_file_renders_as_the_whole_one_to_a_level_of_255(human, tmp_path):
+    save_human(tmp_path / "a.human", human, compact=True)
+    pictures = []
+    for one in (human, load_human(tmp_path / "a.human")):
+        primitives = place(one)
+        view = march(primitives, framing(primitives, 0.3, 96, 96))
+        pictures.append(torch.cat([encode_srgb(view.rgb.clamp(0, 1)), view.alpha[..., None]], -1))
+    drawn = pictures[0][..., 3] > 0
+    assert drawn.sum() > 500
+    assert torch.quantile((pictures[1] - pictures[0])[drawn].abs(), 0.99) <= 1 / 255
 
 
 def test_a_person_with_nan_is_not_written(human, tmp_path):
@@ -97,7 +111,7 @@ def test_a_damaged_file_is_rejected_by_name_with_its_damage(human, tmp_path, how
 
 @pytest.mark.parametrize(
     ("version", "message"),
-    [("3", "newer PrimDiffusion"), ("10", "newer PrimDiffusion"), ("one", "format version 'one'"), ("0", "'0'")],
+    [("4", "newer PrimDiffusion"), ("10", "newer PrimDiffusion"), ("one", "format version 'one'"), ("0", "'0'")],
 )
 def test_a_file_of_another_version_is_rejected_with_what_to_do(human, tmp_path, version, message):
     path = tmp_path / "other.human.safetensors"
@@ -109,7 +123,7 @@ def test_a_file_of_another_version_is_rejected_with_what_to_do(human, tmp_path, 
 
 def test_a_newer_file_is_rejected_for_its_version_even_where_its_tensors_are_others(human, tmp_path):
     path = tmp_path / "newer.human.safetensors"
-    safetensors.torch.save_file({"latents": torch.zeros(3)}, path, {**META, "format_version": "3"})
+    safetensors.torch.save_file({"latents": torch.zeros(3)}, path, {**META, "format_version": "4"})
     with pytest.raises(HumanFileError, match="newer PrimDiffusion"):
         load_human(path)
 

@@ -29,9 +29,10 @@ def write_store(folder: Path) -> None:
 
 
 def write_person(path: Path, betas: np.ndarray | None = None, **metadata: str) -> None:
-    """A small safetensors file with a person's metadata."""
+    """A small safetensors file with a person's metadata, on a body of the user's files: the child opens it."""
     raw = np.asarray(synthetic.arrays(8)["betas"] if betas is None else betas, "<f4").tobytes()
-    about = {"format": "primdiffusion.human", "format_version": "1", "provenance": json.dumps({"seed": 5}), **metadata}
+    about = {"format": "primdiffusion.human", "format_version": "2", "body": "{}"}
+    about |= {"provenance": json.dumps({"seed": 5}), **metadata}
     header = {"__metadata__": about, "betas": {"dtype": "F32", "shape": [10], "data_offsets": [0, len(raw)]}}
     text = json.dumps(header).encode()
     path.write_bytes(len(text).to_bytes(8, "little") + text + raw)

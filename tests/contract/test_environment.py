@@ -7,8 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from backend.client import BackendClient
 from backend.environment import (
     MARK,
+    NOT_INSTALLED,
     TRIAL,
     VARIABLE,
     BackendNotFound,
@@ -19,6 +21,7 @@ from backend.environment import (
     tried,
 )
 from backend.requests import run_to_end
+from tiny_packages import until
 
 PYTHON = Path(sys.executable)
 
@@ -63,6 +66,32 @@ def test_the_preference_goes_before_the_variable_and_that_before_the_extensions_
     monkeypatch.setenv(VARIABLE, "/by/variable")
     assert [path for _, path in candidates("", tmp_path)] == [Path("/by/variable")]
     assert [path for _, path in candidates("/by/preference", tmp_path)] == [Path("/by/preference")]
+
+
+def test_a_program_that_the_user_has_installed_goes_before_blenders_own_python(tmp_path):
+    program = tmp_path / "primdiffusion"
+    assert [path for _, path in candidates(None, None, program)] == [program, PYTHON]
+    assert list(candidates(None, None, own_python=False)) == []
+
+
+@pytest.mark.skipif(os.name == "nt", reason="shell scripts")
+def test_an_installed_program_is_tried_and_serves(tmp_path):
+    program = script(tmp_path / "primdiffusion", f'exec {PYTHON} -m primdiffusion "$@"')
+    found = run_to_end(search(installed=program))
+    assert (found.path, found.source) == (program, "the PATH")
+    assert found.torch[0].isdigit()
+    client = BackendClient(program)
+    client.start()
+    until(lambda: client.poll() is not None and client.info.get("version") == found.version)
+    client.shutdown()
+
+
+def test_where_nothing_is_installed_one_sentence_says_what_to_do(monkeypatch):
+    monkeypatch.setattr("backend.environment.own_python_has_backend", lambda: False)
+    with pytest.raises(BackendNotFound) as error:
+        run_to_end(search())
+    assert str(error.value) == NOT_INSTALLED
+    assert ". " not in NOT_INSTALLED
 
 
 def test_a_wish_that_fails_is_an_error_and_not_replaced_by_another_python(tmp_path):

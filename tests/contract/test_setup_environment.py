@@ -67,7 +67,7 @@ def test_an_environment_is_made_of_a_folder_of_wheels_tested_and_marked_ready(pl
     assert state == "ready"
     assert (about["packages"], about["compute"], about["device"]) == (2, "cpu", "tiny device")
     assert about["bytes"] == 2000
-    assert not place.folder.pip_cache.exists()
+    assert not place.folder.downloads.exists()
     assert not place.folder.temporary.exists()
     assert next(candidates(None, place.folder.environment))[1] == place.folder.python
 
@@ -91,10 +91,10 @@ def test_removing_takes_environment_and_caches_and_nothing_else(place):
 
 
 def test_removing_leaves_a_cache_that_is_shared(place):
-    place.folder.pip_cache.mkdir(parents=True)
+    place.folder.downloads.mkdir(parents=True)
     place.cache.mkdir()
     done(setup.remove(place.folder, None))
-    assert not place.folder.pip_cache.exists()
+    assert not place.folder.downloads.exists()
     assert place.cache.exists()
 
 

@@ -52,13 +52,13 @@ class OutputFiles:
 FILES = OutputFiles()
 
 
-def write_human(folder: Path, human: Human, size: int) -> None:
+def write_human(folder: Path, human: Human, size: int, *, compact: bool = False) -> None:
     """Write all FILES: the human for Blender and for this program, and previews of size x size pixels in the T pose.
 
     The first preview on a machine takes some seconds longer: the marcher is compiled, and cached. Raises OSError.
     """
     export_for_blender(folder / FILES.blender, human)
-    save_human(folder / FILES.human, human)
+    save_human(folder / FILES.human, human, compact=compact)
     primitives = place(human)
     front = march(primitives, framing(primitives, 0.0, size, size))
     to_png(folder / FILES.front, front)

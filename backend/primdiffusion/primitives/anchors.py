@@ -17,42 +17,20 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, default_body
+from primdiffusion.formats import body_layout
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.surface import signed_volume, surface_points, uv_gradient
 from primdiffusion.primitives.primitives import GRID, Frames, K, S
 from primdiffusion.raster.uv_atlas import closest_in_uv, rasterise_uv
 
-CHARTS = (
-    "torso",
-    "head",
-    "left_arm",
-    "right_arm",
-    "left_hand",
-    "right_hand",
-    "left_leg",
-    "right_leg",
-    "left_foot",
-    "right_foot",
-)
+CHARTS = body_layout.CHARTS
 """Regions of the body; `Anchors.chart` holds indices into this tuple."""
-
 JOINT_REGION = (
     "torso", "left_leg", "right_leg", "torso", "left_leg", "right_leg", "torso", "left_foot", "right_foot",
     "torso", "left_foot", "right_foot", "head", "torso", "torso", "head", "left_arm",
     "right_arm", "left_arm", "right_arm", "left_hand", "right_hand", "left_hand", "right_hand",
 )  # fmt: skip
 """Region of each of SMPL's 24 joints, in their order."""
-SPACING_TO_HALF_EXTENT = 1.0
-"""In-plane half extent relative to the distance to the next cell; 0.5 would tile. Boxes overlap because the marcher's
-window fades the outer fifth of a box, and neighbouring boxes diverge where cloth hangs off the skin: of the surface of
-eight dressed humans 94 % lies in the unfaded part of some box at 0.75, 97 % at 0.9, 97.6 % at 1.0 (coarser voxels)."""
-SMALLEST_IN_PLANE = 0.008
-"""Metres; gives voxels of about 2 mm, finer than any rendering needs."""
-LARGEST_IN_PLANE = {"torso": 0.050, "head": 0.050, "arm": 0.050, "hand": 0.035, "leg": 0.050, "foot": 0.050}
-"""Metres, by region. Cells at the thumb span the gap to the fingers, which one coarse box would fill."""
-NORMAL_HALF_EXTENT = {"torso": 0.055, "head": 0.055, "arm": 0.045, "hand": 0.025, "leg": 0.060, "foot": 0.040}
-"""Metres along the normal, by region. Jackets, skirts and hair are 4-6 cm away from the skin; surface outside all boxes
-is missing from the result. Sleeves and shoes are closer, and a hand's eight voxels must resolve fingers 2 cm thick."""
 RELEASED_NEIGHBOURS = 23
 RELEASED_DISTANCE_LIMITS = (0.005, 0.050)
 """Metres; SPEC 2."""
@@ -116,28 +94,24 @@ def default_anchors() -> Anchors:
     return footprint_anchors(
         body.template.double(),
         body.faces,
-        layout["cell_face"].long(),
+        layout["cell_face"],
         layout["cell_barycentric"],
-        layout["cell_chart"].long(),
-        *_texels_of(layout),
+        layout["cell_chart"],
+        layout["texel_face"],
+        layout["texel_barycentric"],
     ).to(dtype=torch.float32)
 
 
 @functools.lru_cache(maxsize=1)
 def default_texels() -> tuple[Int[Tensor, "h w"], Float[Tensor, "h w 3"]]:
     """Face and barycentric coordinates of every texel of the default body's layout, 8 x 8 texels per primitive."""
-    face, barycentric = _texels_of(_layout())
-    return face, barycentric.float()
+    layout = _layout()
+    return layout["texel_face"], layout["texel_barycentric"].float()
 
 
 def _layout() -> dict[str, Tensor]:
-    with resources.files("primdiffusion.body").joinpath("data/layout.npz").open("rb") as file, np.load(file) as stored:
-        return {name: torch.from_numpy(stored[name].astype(np.float64)) for name in stored}
-
-
-def _texels_of(layout: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-    first, second = (layout["texel_barycentric"] / 65535).unbind(-1)
-    return layout["texel_face"].long(), torch.stack([first, second, 1 - first - second], -1)
+    with resources.as_file(resources.files("primdiffusion.body") / "data/layout.npz") as path:
+        return {name: torch.from_numpy(values) for name, values in body_layout.read_layout(path).items()}
 
 
 def footprint_anchors(
@@ -154,56 +128,24 @@ def footprint_anchors(
     dP/du of a cell is the mean of its last column of texels minus the mean of its first, scaled to the cell's width;
     dP/dv likewise along rows. A single face of a 4 cm cell may be part of a nostril, so its plane is unreliable.
     """
-    side = texel_face.shape[0] // GRID
-
-    def cells(texels: Tensor) -> Tensor:
-        return texels.unflatten(0, (GRID, side)).unflatten(2, (GRID, side)).transpose(1, 2).flatten(0, 1)
-
-    vertex = faces[cells(texel_face)]
-    weight = cells(texel_barycentric) / (side - 1)
-    rise = torch.zeros(side, dtype=weight.dtype)
-    rise[0], rise[-1] = -1, 1
-    du = weight * rise[None, :, None]
-    dv = weight * rise[:, None, None]
-    stencil_vertex, stencil_du, stencil_dv = _merge(vertex.flatten(1), du.flatten(1), dv.flatten(1))
+    found = body_layout.stencils(faces.numpy(), texel_face.numpy(), texel_barycentric.numpy())
+    vertex, du, dv = map(torch.from_numpy, found)
     anchors = Anchors(
         face=cell_face,
         barycentric=cell_barycentric,
         rest_half_extent=torch.zeros(len(cell_face), 3, dtype=template.dtype),
-        stencil_vertex=stencil_vertex,
-        stencil_du=stencil_du,
-        stencil_dv=stencil_dv,
+        stencil_vertex=vertex,
+        stencil_du=du,
+        stencil_dv=dv,
         chart=chart,
     )
     return dataclasses.replace(anchors, rest_half_extent=paper_half_extent(anchors, template))
 
 
-def _merge(
-    vertex: Int[Tensor, "k n"], du: Float[Tensor, "k n"], dv: Float[Tensor, "k n"]
-) -> tuple[Int[Tensor, "k m"], Float[Tensor, "k m"], Float[Tensor, "k m"]]:
-    """Merge duplicate vertices in each row; pad rows with weight 0 to equal length."""
-    rows = []
-    for k in range(len(vertex)):
-        used = (du[k] != 0) | (dv[k] != 0)
-        unique, index = vertex[k, used].unique(return_inverse=True)
-        sums = torch.zeros(2, len(unique), dtype=du.dtype)
-        rows.append((unique, sums.index_add_(1, index, torch.stack([du[k, used], dv[k, used]]))))
-    longest = max(len(unique) for unique, _ in rows)
-    merged_vertex = torch.zeros(len(rows), longest, dtype=torch.int64)
-    merged = torch.zeros(2, len(rows), longest, dtype=du.dtype)
-    for k, (unique, sums) in enumerate(rows):
-        merged_vertex[k, : len(unique)] = unique
-        merged[:, k, : len(unique)] = sums
-    return merged_vertex, merged[0], merged[1]
-
-
 def paper_half_extent(anchors: Anchors, template: Float[Tensor, "v 3"]) -> Float[Tensor, "k 3"]:
     """Half extents per axis, metres: in-plane from the UV gradient (paper sec. 3.1), along the normal by region."""
-    along_t, along_b = (SPACING_TO_HALF_EXTENT * edge.norm(dim=-1) for edge in tangent_plane(anchors, template))
-    limits = [(LARGEST_IN_PLANE[region], NORMAL_HALF_EXTENT[region]) for region in (c.split("_")[-1] for c in CHARTS)]
-    largest, depth = template.new_tensor(limits)[anchors.chart].unbind(-1)
-    in_plane = torch.stack([along_t, along_b], -1).clamp_min(SMALLEST_IN_PLANE).minimum(largest[:, None])
-    return torch.cat([in_plane, depth[:, None]], -1)
+    du, dv = (edge.cpu().numpy() for edge in tangent_plane(anchors, template))
+    return torch.from_numpy(body_layout.half_extents(du, dv, anchors.chart.cpu().numpy())).to(template)
 
 
 def released_half_extent(position: Float[Tensor, "k 3"]) -> Float[Tensor, "k 3"]:

@@ -9,10 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from primdiffusion.formats import body_layout
 from primdiffusion.geometry.records import TensorRecord
 
-GRID = 32
-"""Primitives along a side of the UV grid; primitive k is at row k // GRID, column k % GRID."""
+GRID = body_layout.GRID
+"""Primitives along a side of the UV grid."""
 K = GRID * GRID
 """Primitives per human."""
 S = 8

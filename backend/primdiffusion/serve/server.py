@@ -12,13 +12,14 @@ closes, because its parent has exited. File descriptor 1 is redirected to stderr
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import platform
 import queue
 import sys
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn, TypeVar
 
 from primdiffusion import __version__
@@ -29,7 +30,7 @@ from primdiffusion.commands.info import AttributesRequest
 from primdiffusion.commands.merge import FitGainRequest, MergeFramesRequest, MergeRequest
 from primdiffusion.commands.reconstruct import ReconstructRequest
 from primdiffusion.commands.render import DrawRequest, RenderRequest
-from primdiffusion.commands.request import ParameterError, RequestRecord, read_record, read_request
+from primdiffusion.commands.request import ParameterError, RequestRecord, parse, read_record, read_request
 from primdiffusion.failures import ErrorDescription, describe
 from primdiffusion.machine import memory, share_processors
 from primdiffusion.serve.rpc import (
@@ -296,6 +297,28 @@ def guard_streams() -> tuple[BinaryIO, BinaryIO]:
     os.dup2(nothing, 0)
     os.close(nothing)
     return os.fdopen(source, "rb"), os.fdopen(sink, "wb")
+
+
+@dataclasses.dataclass(frozen=True)
+class ServeCommand:
+    """Answer JSON-RPC requests on stdin and stdout: the backend of the Blender extension."""
+
+    about: bool = False
+    """Print the versions of this program, torch and Python as one line of JSON, and end."""
+
+    def check(self) -> None:
+        """See `RequestRecord`."""
+
+
+def run(arguments: Sequence[str]) -> None:
+    """`primdiffusion serve`."""
+    if parse(ServeCommand, arguments, "serve").about:
+        import torch  # loaded late
+
+        about = {"version": __version__, "torch": torch.__version__, "python": sys.version.split()[0]}
+        print(json.dumps(about))
+    else:
+        main()
 
 
 def main() -> None:

@@ -24,6 +24,7 @@ from ...engine import studio
 from ...engine.engine import ENGINE
 from ...formats.whole_files import replacing
 from ...jobs import cycles_check
+from ...jobs.open_human import opened
 from ...scene.cycles import fit_cycles_to_volumes, new_camera
 from ...scene.human import NPZ_FILE, PERSON_FILE, humans, humans_folder, volume_path
 from ...scene.unwritten import write_all_unwritten
@@ -240,7 +241,7 @@ class _Drawing:
             npz, person = source.path.with_name(NPZ_FILE), source.path
             if not (source.has_npz and npz.is_file()):
                 asked = {"person": str(source.path), "out_dir": folder, "size": 16}
-                made = ask(self._backend, "human_npz", asked, self._stop)
+                made = opened(source.path, Path(folder)) or ask(self._backend, "human_npz", asked, self._stop)
                 npz, person = Path(made["human"]), Path(made["person"])
             build_person(bpy.context, npz, person, source.name, self._movement)
         render = bpy.context.scene.render

@@ -261,7 +261,7 @@ class PRIMDIFFUSION_OT_remove_backend(bpy.types.Operator):
         )
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        if not any(path.exists() for path in (set_up_folder().environment, set_up_folder().pip_cache)):
+        if not any(path.exists() for path in (set_up_folder().environment, set_up_folder().downloads)):
             self.report({"ERROR"}, "There is no backend to remove: none was set up here")
             return {"CANCELLED"}
         return _begin(self, removing)

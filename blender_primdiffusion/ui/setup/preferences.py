@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-
 import bpy
 
 from ...backend.requests import sentence
-from ...jobs.late_volumes import keep_writing
-from ...jobs.queue import queue
-from ...places import EXTENSION, missing_packages, set_up_folder
+from ...places import EXTENSION, set_up_folder
 from ..drawing import draw_lines
+from ..preferences import WIDTH, CommonPreferences, forget_failures
 from .known import Known, chosen, cost, gigabytes, known, machine
 from .operators import redraw, session
 
@@ -75,41 +72,23 @@ def draw_result(layout: bpy.types.UILayout, width: int) -> None:
         draw_lines(layout, session.notice, "INFO", width)
 
 
-_WIDTH = 90
-"""Characters in a line of the preferences window at its default size."""
 _COMPUTE = (
     ("AUTOMATIC", "Automatic", "NVIDIA where there is a driver that is new enough, else the processor"),
     ("CPU", "CPU", "Smallest download; a human takes seconds instead of fractions of one"),
     ("CUDA", "NVIDIA (CUDA)", "Large download; needs an NVIDIA card and driver"),
     ("APPLE", "Apple", "For Apple Silicon; computes on its processor"),
 )
-_VOLUMES = (
-    ("ALWAYS", "Always", "Volumes are written as soon as the human stands, so that any renderer has them"),
-    (
-        "WHEN_RENDERING",
-        "When Rendering",
-        "Volumes are written when another engine than PrimDiffusion renders for the first time",
-    ),
-)
-
-
-def _keep_writing(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
-    keep_writing()
 
 
 def _python_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
     """What the former Python did is of no interest any more."""
     session.error = session.notice = ""
-    for kind, outcome in list(queue.outcomes.items()):
-        if outcome.error is not None and outcome.error.kind in {"environment", "timeout"}:
-            del queue.outcomes[kind]
+    forget_failures()
     redraw()
 
 
-class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
+class PRIMDIFFUSION_AP_preferences(CommonPreferences, bpy.types.AddonPreferences):
     """Shown in Edit > Preferences > Add-ons > PrimDiffusion."""
-
-    bl_idname = EXTENSION
 
     compute: bpy.props.EnumProperty(
         name="Compute On", description="Device that packages are installed for", items=_COMPUTE
@@ -121,57 +100,29 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         subtype="FILE_PATH",
         update=_python_changed,
     )
-    checkpoint: bpy.props.StringProperty(
-        name="Checkpoint",
-        description="Diffusion model, a .safetensors file; empty: the bundled one",
-        subtype="FILE_PATH",
-    )
-    encoder: bpy.props.StringProperty(
-        name="Encoder",
-        description="Encoder for humans from captures, a .safetensors file; empty: the bundled one",
-        subtype="FILE_PATH",
-    )
-    idle_minutes: bpy.props.IntProperty(
-        name="Release Memory After",
-        description="Minutes after the last job until the backend releases its memory, including the graphics card's; "
-        "0: never",
-        default=10,
-        min=0,
-        soft_max=120,
-    )
-
-    volumes: bpy.props.EnumProperty(
-        name="Write Volumes",
-        description="When the volumes that Cycles and EEVEE draw are written; 25 MB a human",
-        items=_VOLUMES,
-        update=_keep_writing,
-    )
 
     def draw(self, _context: bpy.types.Context) -> None:
         layout = self.layout
         self._draw_backend(layout.box())
-        layout.use_property_split = True
-        layout.use_property_decorate = False
-        for name in ("backend_python", "checkpoint", "encoder", "idle_minutes", "volumes"):
-            layout.prop(self, name)
+        self.draw_properties(layout)
 
     def _draw_backend(self, box: bpy.types.UILayout) -> None:
         if session.busy:
-            draw_progress(box, _WIDTH)
+            draw_progress(box, WIDTH)
             return
         now, folder = known(), set_up_folder()
-        draw_lines(box, now.line, _icon(now), _WIDTH)
+        draw_lines(box, now.line, _icon(now), WIDTH)
         if now.state == "lacking":
             return
         if now.usable and now.works is None:
-            draw_lines(box, "Not tested yet: press Test", "BLANK1", _WIDTH)
+            draw_lines(box, "Not tested yet: press Test", "BLANK1", WIDTH)
         if folder.environment.is_dir():
             size = f"{gigabytes(now.about['bytes'])} in " if "bytes" in now.about else ""
-            draw_lines(box, f"{size}{folder.environment}", "FILE_FOLDER", _WIDTH)
+            draw_lines(box, f"{size}{folder.environment}", "FILE_FOLDER", WIDTH)
         if now.state != "named":
             _draw_private(self, box)
         self._draw_buttons(box, now.state, folder.environment.is_dir())
-        draw_result(box, _WIDTH)
+        draw_result(box, WIDTH)
         if session.error and folder.log.is_file():
             box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(folder.log)
 
@@ -181,31 +132,6 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         if private or state not in {"absent", "own Python", "named"}:
             row.operator("primdiffusion.repair_backend", icon="TOOL_SETTINGS")
             row.operator("primdiffusion.remove_backend", icon="TRASH")
-
-
-def register() -> None:
-    """Say which Python packages are missing: on the console, and to a user who has just enabled the extension."""
-    if lacking := missing_packages():
-        print(f"PrimDiffusion: {lacking}", file=sys.stderr, flush=True)
-        if not bpy.app.background:
-            bpy.app.timers.register(_pop_up, first_interval=0.1)
-
-
-def _pop_up() -> None:
-    """A message over the preferences, if they are shown; elsewhere the sidebar has it."""
-    for window in bpy.context.window_manager.windows:
-        if any(area.type == "PREFERENCES" for area in window.screen.areas):
-            with bpy.context.temp_override(window=window):
-                window_manager = bpy.context.window_manager
-                window_manager.popup_menu(
-                    lambda menu, _: draw_lines(menu.layout, known().line, "NONE", _WIDTH), title="PrimDiffusion"
-                )
-
-
-def unregister() -> None:
-    """No message after the extension was disabled."""
-    if bpy.app.timers.is_registered(_pop_up):
-        bpy.app.timers.unregister(_pop_up)
 
 
 def _icon(now: Known) -> str:
@@ -218,8 +144,8 @@ def _draw_private(preferences: PRIMDIFFUSION_AP_preferences, box: bpy.types.UILa
     """The private environment: device, cost, buttons."""
     row = box.row()
     row.prop(preferences, "compute", expand=True)
-    draw_lines(box, f"Found: {machine().described}", "SYSTEM", _WIDTH)
-    here = draw_cost(box, _WIDTH)
+    draw_lines(box, f"Found: {machine().described}", "SYSTEM", WIDTH)
+    here = draw_cost(box, WIDTH)
     row = box.row()
     row.enabled = here
     row.operator("primdiffusion.set_up_backend", icon="IMPORT")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from primdiffusion.commands import output, session
-from primdiffusion.commands.generate import GenerateRequest
+from primdiffusion.commands.generate import GenerateRequest, run
 from primdiffusion.commands.session import Session
 from tiny_model import save_tiny_checkpoint
 
@@ -18,7 +18,7 @@ def checkpoint(tmp_path_factory) -> Path:
 @pytest.fixture
 def only_sampling(monkeypatch):
     """Leaves out files and pictures."""
-    monkeypatch.setattr(output, "write_human", lambda *_: None)
+    monkeypatch.setattr(output, "write_human", lambda *_, **__: None)
 
 
 def test_time_left_is_the_mean_of_the_warm_steps_times_the_steps_left(checkpoint, tmp_path, monkeypatch, only_sampling):
@@ -69,3 +69,22 @@ def test_a_request_can_be_ended_at_every_report(checkpoint, tmp_path):
         with pytest.raises(Stop):
             request.run(Session(), stop)
         assert not (tmp_path / "out").exists()
+
+
+def test_the_command_line_writes_compact_files(checkpoint, tmp_path):
+    run(
+        [
+            "--seed",
+            "3",
+            "--steps",
+            "1",
+            "--size",
+            "16",
+            "--compact",
+            "--checkpoint",
+            str(checkpoint),
+            "--out",
+            str(tmp_path),
+        ]
+    )
+    assert (tmp_path / "person.human.safetensors").stat().st_size < 2.2e6

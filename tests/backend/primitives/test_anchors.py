@@ -5,13 +5,11 @@ import dataclasses
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.formats.body_layout import LARGEST_IN_PLANE, NORMAL_HALF_EXTENT, SPACING_TO_HALF_EXTENT
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.surface import surface_points, vertex_normals
 from primdiffusion.primitives.anchors import (
     CHARTS,
-    LARGEST_IN_PLANE,
-    NORMAL_HALF_EXTENT,
-    SPACING_TO_HALF_EXTENT,
     Anchors,
     anchor_skin_weights,
     attach,

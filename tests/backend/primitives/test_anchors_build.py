@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyModel, default_body
+from primdiffusion.formats.body_layout import NORMAL_HALF_EXTENT, SPACING_TO_HALF_EXTENT
 from primdiffusion.primitives.anchors import (
     CHARTS,
     JOINT_REGION,
-    NORMAL_HALF_EXTENT,
-    SPACING_TO_HALF_EXTENT,
     attach,
     build_anchors,
     footprint_anchors,

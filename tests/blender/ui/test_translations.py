@@ -20,6 +20,8 @@ SAME = frozenset(
 """Names and numbers that are the same in every language."""
 FROM_BLENDER = {"Add Preset", "Menu Name", "Name", "Remove"}
 """Words of Blender's own mix-ins."""
+VIEWER = ["The program primdiffusion, or the Python that it is installed in; empty: the program on the PATH"]
+"""Words of the viewer build alone."""
 WORDS = {language: translations.words_of(language) for language in translations.LANGUAGES}
 ENGLISH = WORDS["de_DE"].keys()
 
@@ -39,6 +41,7 @@ def composed() -> set[str]:
     facts |= {"Volumes", "Files", "Memory once drawn"} | {name.capitalize() for name in _SHOWN}
     menus = {item[1] for name in CATEGORIES for item in menu(name)} | set(LIBRARY)
     buttons = {remedy.label for remedy in _REMEDIES.values()}
+    menus |= set(VIEWER)
     menus |= {"No preference", "A pose of your own", "A built-in pose"}
     return (
         sliders

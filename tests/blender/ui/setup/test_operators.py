@@ -91,6 +91,7 @@ def draw_preferences() -> Layout:
     fake = type("Preferences", (), {"layout": layout})()
     fake._draw_backend = lambda box: preferences.PRIMDIFFUSION_AP_preferences._draw_backend(fake, box)
     fake._draw_buttons = lambda box, *words: preferences.PRIMDIFFUSION_AP_preferences._draw_buttons(fake, box, *words)
+    fake.draw_properties = lambda box: preferences.PRIMDIFFUSION_AP_preferences.draw_properties(fake, box)
     preferences.PRIMDIFFUSION_AP_preferences.draw(fake, bpy.context)
     return layout
 

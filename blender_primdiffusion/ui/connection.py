@@ -1,0 +1,54 @@
+"""The backend of the viewer build, which sets up none: the user installs it and names it in the preferences."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..backend.environment import NOT_INSTALLED, candidates, own_python_has_backend
+from ..backend.requests import sentence
+from ..places import EXTENSION, installed_backend, missing_packages, preference
+from .drawing import draw_lines
+from .preferences import WIDTH, CommonPreferences, forget_failures
+
+_SIDEBAR = 30
+"""Characters that fit a box in a sidebar of default width, beside an icon."""
+
+
+def found() -> tuple[bool, str]:
+    """Whether there is a backend to try, without trying it; and which, or what to do, for panels."""
+    if lacking := missing_packages():
+        return False, sentence(lacking)
+    own = own_python_has_backend()
+    named = next(candidates(preference("backend_python"), None, installed_backend(), own_python=own), None)
+    return (False, sentence(NOT_INSTALLED)) if named is None else (True, f"Uses {named[1]}, named by {named[0]}")
+
+
+def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
+    """For panels that need the backend: what to do where there is none. Returns whether there is one."""
+    usable, line = found()
+    if not usable:
+        box = layout.box()
+        draw_lines(box, line, "ERROR", width)
+        if not missing_packages():
+            box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = EXTENSION
+    return usable
+
+
+def _backend_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
+    forget_failures()
+
+
+class PRIMDIFFUSION_AP_preferences(CommonPreferences, bpy.types.AddonPreferences):
+    """Shown in Edit > Preferences > Add-ons > PrimDiffusion Viewer."""
+
+    backend_python: bpy.props.StringProperty(
+        name="Backend",
+        description="The program primdiffusion, or the Python that it is installed in; empty: the program on the PATH",
+        subtype="FILE_PATH",
+        update=_backend_changed,
+    )
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        usable, line = found()
+        draw_lines(self.layout.box(), line, "CHECKMARK" if usable else "ERROR", WIDTH)
+        self.draw_properties(self.layout)

@@ -1,0 +1,100 @@
+"""Preferences that every build has, and the message about missing Python packages."""
+
+from __future__ import annotations
+
+import sys
+
+import bpy
+
+from ..backend.requests import sentence
+from ..jobs.late_volumes import keep_writing
+from ..jobs.queue import queue
+from ..places import EXTENSION, missing_packages
+from .drawing import draw_lines
+
+WIDTH = 90
+"""Characters in a line of the preferences window at its default size."""
+_VOLUMES = (
+    ("ALWAYS", "Always", "Volumes are written as soon as the human stands, so that any renderer has them"),
+    (
+        "WHEN_RENDERING",
+        "When Rendering",
+        "Volumes are written when another engine than PrimDiffusion renders for the first time",
+    ),
+)
+
+
+def _keep_writing(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
+    keep_writing()
+
+
+def forget_failures() -> None:
+    """Forget how jobs failed for want of a backend: another one was chosen."""
+    for kind, outcome in list(queue.outcomes.items()):
+        if outcome.error is not None and outcome.error.kind in {"environment", "timeout"}:
+            del queue.outcomes[kind]
+
+
+class CommonPreferences:
+    """Base of the preferences, which declare `backend_python` too; `bpy.types.AddonPreferences` is their other base."""
+
+    bl_idname = EXTENSION
+
+    checkpoint: bpy.props.StringProperty(
+        name="Checkpoint",
+        description="Diffusion model, a .safetensors file; empty: the bundled one",
+        subtype="FILE_PATH",
+    )
+    encoder: bpy.props.StringProperty(
+        name="Encoder",
+        description="Encoder for humans from captures, a .safetensors file; empty: the bundled one",
+        subtype="FILE_PATH",
+    )
+    idle_minutes: bpy.props.IntProperty(
+        name="Release Memory After",
+        description="Minutes after the last job until the backend releases its memory, including the graphics card's; "
+        "0: never",
+        default=10,
+        min=0,
+        soft_max=120,
+    )
+
+    volumes: bpy.props.EnumProperty(
+        name="Write Volumes",
+        description="When the volumes that Cycles and EEVEE draw are written; 25 MB a human",
+        items=_VOLUMES,
+        update=_keep_writing,
+    )
+
+    def draw_properties(self, layout: bpy.types.UILayout) -> None:
+        """All properties that need no more than a field."""
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        for name in ("backend_python", "checkpoint", "encoder", "idle_minutes", "volumes"):
+            layout.prop(self, name)
+
+
+def register() -> None:
+    """Say which Python packages are missing: on the console, and to a user who has just enabled the extension."""
+    if lacking := missing_packages():
+        print(f"PrimDiffusion: {lacking}", file=sys.stderr, flush=True)
+        if not bpy.app.background:
+            bpy.app.timers.register(_pop_up, first_interval=0.1)
+
+
+def _pop_up() -> None:
+    """A message over the preferences, if they are shown; elsewhere the sidebar has it."""
+    for window in bpy.context.window_manager.windows:
+        if any(area.type == "PREFERENCES" for area in window.screen.areas):
+            with bpy.context.temp_override(window=window):
+                window_manager = bpy.context.window_manager
+                window_manager.popup_menu(
+                    lambda menu, _: draw_lines(menu.layout, sentence(missing_packages()), "NONE", WIDTH),
+                    title="PrimDiffusion",
+                )
+
+
+def unregister() -> None:
+    """No message after the extension was disabled."""
+    if bpy.app.timers.is_registered(_pop_up):
+        bpy.app.timers.unregister(_pop_up)

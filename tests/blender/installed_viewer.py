@@ -1,0 +1,64 @@
+"""Run by test_viewer in a Blender of its own: install the viewer, use a human of its gallery, report as JSON.
+
+python installed_viewer.py ZIP FOLDER
+"""
+
+import json
+import os
+import sys
+import time
+from importlib import import_module
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+archive, folder = sys.argv[1], Path(sys.argv[2])
+sys.modules["primdiffusion"] = None  # as in a Blender whose Python has no backend
+os.environ["PATH"] = ""
+bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)
+(module,) = [name for name in bpy.context.preferences.addons.keys() if name.endswith("_viewer")]  # noqa: SIM118
+human, picture, boxes = (
+    import_module(f"{module}.{name}") for name in ("scene.human", "engine.picture", "engine.boxes")
+)
+press = bpy.ops.primdiffusion
+bpy.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
+
+
+def centres() -> np.ndarray:
+    """Where the engine draws the boxes of the first human."""
+    bpy.context.view_layer.update()
+    person = human.humans(bpy.context.scene)[0]
+    armature = human.armature_of(person)
+    return boxes.boxes_of(picture.pose_of(armature, np.array(armature.matrix_world), person)).position
+
+
+report = {"module": module}
+started = time.perf_counter()
+report["added"] = sorted(press.add_from_gallery(human="Ada.human"))
+report["seconds"] = time.perf_counter() - started
+person = human.humans(bpy.context.scene)[0]
+armature = human.armature_of(person)
+report["name"], report["bones"] = person.name, len(armature.data.bones)
+rest = centres()
+bone = armature.pose.bones["left_shoulder"]
+bone.rotation_mode = "XYZ"
+bone.rotation_euler = (0, 0, 1)
+bone.keyframe_insert("rotation_euler", frame=1)
+posed = centres()
+
+report["reshaped"] = sorted(press.reshape(betas=[2.0] + [0.0] * 9))
+reshaped = centres()
+report["moved"] = [float(np.abs(after - before).max()) for before, after in ((rest, posed), (posed, reshaped))]
+file = folder / "again.human"
+report["exported"] = sorted(press.export_human(filepath=str(file), compact=True))
+report["bytes"] = file.stat().st_size
+report["imported"] = sorted(press.import_human(filepath=str(file)))
+report["humans"] = len(human.humans(bpy.context.scene))
+report["volumes"] = len(list(folder.rglob("*.vdb")))
+try:
+    press.generate(seed=7)
+except RuntimeError as error:
+    report["generate"] = str(error)
+bpy.ops.preferences.addon_disable(module=module)
+print("REPORT " + json.dumps(report), flush=True)

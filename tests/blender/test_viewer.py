@@ -1,0 +1,106 @@
+"""The viewer's zip: no code that downloads, accepted by Blender; in it humans are opened, posed, reshaped, exported."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+from export_people import person
+from primdiffusion.human_file import load_human, save_human
+
+import build_addon
+from blender_primdiffusion.backend.environment import NOT_INSTALLED
+
+PROGRAM = Path(__file__).parent / "installed_viewer.py"
+
+
+@pytest.fixture(scope="module")
+def gallery(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("gallery")
+    save_human(folder / "Ada.human", person(), compact=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def archive(gallery, tmp_path_factory) -> Path:
+    return build_addon.build(tmp_path_factory.mktemp("dist"), viewer=True, gallery=gallery)
+
+
+def test_the_zip_is_small_whole_and_accepted(archive):
+    assert archive.name.startswith("primdiffusion_viewer-")
+    assert archive.stat().st_size < 10e6
+    tool = build_addon.blender_extension_tool()
+    assert tool is not None
+    build_addon.validate(archive, tool)
+    with zipfile.ZipFile(archive) as made:
+        manifest, names = tomllib.loads(made.read("blender_manifest.toml").decode()), set(made.namelist())
+    assert list(manifest["permissions"]) == ["files"]
+    assert len(manifest["permissions"]["files"]) <= 64
+    assert {"LICENSE", "gallery/Ada.human", "bundled/primdiffusion/formats/arrays.py"} <= names
+    assert not [name for name in names if name.endswith((".safetensors", ".txt"))]
+    assert not [name for name in names if name.startswith(("ui/setup", "requirements"))]
+
+
+def test_no_code_in_it_downloads_or_installs(archive):
+    words = re.compile(r"\b(pip|ensurepip|urllib|urlopen|http|ssl|ftplib|wheel)\b", re.IGNORECASE)
+    with zipfile.ZipFile(archive) as made:
+        for name in made.namelist():
+            if name.endswith(".py"):
+                tree = ast.parse(text := made.read(name).decode())
+                assert not words.search(re.sub(r"https?://", "", text)), name
+                imported = {
+                    alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names
+                }
+                assert not imported & {"requests", "venv", "site"}, name
+                assert "sys.path" not in text, name
+
+
+def test_a_human_too_large_for_the_gallery_is_rejected(gallery, tmp_path):
+    save_human(tmp_path / "Big.human", person())
+    with pytest.raises(build_addon.BuildError, match=r"Big\.human is larger than 3 MB"):
+        build_addon.viewer_contents(tmp_path)
+    with pytest.raises(build_addon.BuildError, match=r"no \.human files"):
+        build_addon.viewer_contents(gallery / "none")
+
+
+@pytest.fixture(scope="module")
+def used(archive, tmp_path_factory) -> tuple[dict, Path]:
+    """What the viewer did in a Blender of its own, and the folder of its files."""
+    folder = tmp_path_factory.mktemp("used")
+    (folder / "user").mkdir()
+    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(folder / "user")}
+    environment = {name: text for name, text in environment.items() if not name.startswith(("PYTHON", "PRIMDIFFUSION"))}
+    command = [sys.executable, str(PROGRAM), str(archive), str(folder)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, cwd=folder)
+    reports = [line for line in done.stdout.splitlines() if line.startswith("REPORT ")]
+    assert reports, done.stdout[-3000:] + done.stderr[-3000:]
+    return json.loads(reports[0].removeprefix("REPORT ")), folder
+
+
+def test_a_human_of_the_gallery_is_added_posed_and_reshaped_without_a_backend(used):
+    report, _ = used
+    assert report["module"] == "bl_ext.user_default.primdiffusion_viewer"
+    assert (report["added"], report["name"], report["bones"]) == (["FINISHED"], "Ada", 24)
+    assert report["reshaped"] == ["FINISHED"]
+    assert min(report["moved"]) > 0.02
+    assert report["volumes"] >= 1024
+
+
+def test_its_export_is_compact_and_comes_back(used):
+    report, folder = used
+    assert (report["exported"], report["imported"], report["humans"]) == (["FINISHED"], ["FINISHED"], 2)
+    assert report["bytes"] < build_addon.LARGEST_IN_GALLERY
+    assert load_human(folder / "again.human").betas[0] == pytest.approx(2.0)
+
+
+def test_generate_without_a_backend_says_in_one_sentence_what_to_do(used):
+    report, _ = used
+    assert report["generate"].removeprefix("Error: ").strip().rstrip(".").lower() == NOT_INSTALLED.lower()

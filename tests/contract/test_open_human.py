@@ -1,0 +1,81 @@
+"""The extension opens .human files by numpy as the backend does."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from export_people import person
+from primdiffusion.human import Human
+from primdiffusion.human_file import export_for_blender, load_human, save_human
+
+from blender_primdiffusion.jobs.open_human import opened, rest_arrays
+from blender_primdiffusion.scene.human_file import compacted, expanded, read_payload, read_tensors, write_tensors
+from blender_primdiffusion.scene.human_npz import read_human
+
+
+@pytest.fixture(scope="module")
+def human() -> Human:
+    generator = torch.Generator().manual_seed(3)
+    payload = dataclasses.replace(
+        person().payload,
+        rgb=torch.rand(person().payload.rgb.shape, generator=generator) ** 2,
+        density=100 * torch.rand(person().payload.density.shape, generator=generator) ** 4,
+        delta_scale=0.8 + 0.4 * torch.rand(person().payload.delta_scale.shape, generator=generator),
+    )
+    return dataclasses.replace(person(), payload=payload, betas=torch.linspace(-2, 2, 10))
+
+
+def test_the_arrays_equal_the_backends(human, tmp_path):
+    save_human(tmp_path / "a.human", human)
+    export_for_blender(tmp_path / "human.npz", human)
+    arrays = rest_arrays(tmp_path / "a.human")
+    with np.load(tmp_path / "human.npz") as wanted:
+        assert set(arrays) == set(wanted)
+        for name in wanted:
+            assert np.asarray(arrays[name]).dtype == wanted[name].dtype, name
+            if wanted[name].dtype.kind == "U":
+                assert np.array_equal(arrays[name], wanted[name]), name
+            else:
+                assert np.allclose(arrays[name], wanted[name], rtol=0, atol=1e-5), name
+
+
+def test_what_is_opened_is_a_whole_human(human, tmp_path):
+    save_human(tmp_path / "a.human", human, compact=True)
+    result = opened(tmp_path / "a.human", tmp_path)
+    assert np.allclose(read_human(result["human"]).betas, human.betas)
+    assert load_human(result["person"]).betas.equal(human.betas)
+
+
+def test_a_compact_file_is_a_quarter_of_the_size_and_the_same_to_both_programs(human, tmp_path):
+    plain, ours, theirs = (tmp_path / name for name in ("plain.human", "ours.human", "theirs.human"))
+    save_human(plain, human)
+    save_human(theirs, human, compact=True)
+    write_tensors(ours, compacted(read_tensors(plain)))
+    assert theirs.stat().st_size < 0.26 * plain.stat().st_size
+    payload = load_human(theirs).payload
+    for path in (ours, theirs):
+        assert np.array_equal(read_payload(path).rgb, payload.rgb.numpy())
+        assert np.array_equal(read_payload(path).density, load_human(ours).payload.density.numpy())
+    assert (payload.density.sqrt() - human.payload.density.sqrt()).abs().max() <= 10 / 255
+    write_tensors(tmp_path / "again.human", expanded(read_tensors(theirs)))
+    assert torch.equal(load_human(tmp_path / "again.human").payload.rgb, payload.rgb)
+
+
+def test_humans_on_other_bodies_are_left_to_the_backend(human, tmp_path):
+    save_human(tmp_path / "a.human", human)
+    tensors = read_tensors(tmp_path / "a.human")
+    other = dataclasses.replace(tensors, metadata={**tensors.metadata, "body": "{}", "format_version": "2"})
+    write_tensors(tmp_path / "b.human", other)
+    assert opened(tmp_path / "b.human", tmp_path) is None
+
+
+@pytest.mark.parametrize("change", [{"compact": "{}"}, {"format_version": "4"}, {"provenance": "none"}])
+def test_damaged_files_are_rejected(human, tmp_path, change):
+    save_human(tmp_path / "a.human", human)
+    tensors = read_tensors(tmp_path / "a.human")
+    write_tensors(tmp_path / "a.human", dataclasses.replace(tensors, metadata={**tensors.metadata, **change}))
+    with pytest.raises(ValueError, match=r"a\.human"):
+        opened(tmp_path / "a.human", tmp_path)
+    with pytest.raises(ValueError, match=r"a\.human"):
+        load_human(tmp_path / "a.human")
